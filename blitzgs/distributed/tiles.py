@@ -112,5 +112,5 @@ class TileAssignment:
         """Compute which tiles each rank composites."""
         self.ranks, self.ranges = ranks, ranges
         self.tiles = ranges.of(ranks.rank)
-        self.composited = ranges.composited(ranks.rank)
         self.all_composited = [ranges.composited(rank) for rank in range(ranks.world_size)]
+        self.composited = self.all_composited[ranks.rank]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -61,10 +62,16 @@ def _(*_args: object) -> None:
 def current_stream(device: torch.device) -> torch.cuda.Stream:
     """Return the current stream of a CUDA device.
 
-    By the number of the device: torch looks up other forms in Python, which takes longer than the rest of the
-    call, and a step asks several times.
+    A step asks several times, and torch's own function makes a new object each time.
     """
-    return torch.cuda.current_stream(device.index)
+    number = -1 if device.index is None else device.index  # -1: the current device
+    return _stream(*torch._C._cuda_getCurrentStream(number))
+
+
+@lru_cache(maxsize=64)
+def _stream(stream_id: int, device_index: int, device_type: int) -> torch.cuda.Stream:
+    """Return the object of a stream. It does not own the stream, so it can be stored."""
+    return torch.cuda.Stream(stream_id=stream_id, device_index=device_index, device_type=device_type)
 
 
 def to_host(tensor: Tensor) -> Tensor:

@@ -40,17 +40,16 @@ class ProjectedSplats(NamedTuple):
     counts: Tensor  # int64 [3] on the CPU: U, P, and at least the sum of tiles_touched
 
 
-def splats_of(allocated: Sequence[Tensor], counts: Tensor) -> ProjectedSplats:
+def splats_of(allocated: Sequence[Tensor], sizes: Sizes) -> ProjectedSplats:
     """Return the valid splats of columns that were allocated with more capacity.
 
     Args:
         allocated: a `ProjectedSplats`; its `counts` are not read.
-        counts: `counts` of the result.
+        sizes: numbers of valid Gaussians and splats; `blocks` is not read.
     """
-    sizes = Sizes(*counts.tolist())
     if allocated[0].shape[0] > sizes.splats or allocated[2].shape[0] > sizes.visible:
         allocated = first_rows(allocated[:12], lengths_of(sizes))
-    return ProjectedSplats._make((*allocated[:12], counts))
+    return ProjectedSplats._make((*allocated[:12], torch.tensor(sizes[:3], device="cpu")))
 
 
 def lengths_of(sizes: Sizes) -> list[int]:
@@ -97,7 +96,7 @@ class Splats(NamedTuple):
 
     def first(self, count: int) -> Splats:
         """Return the first `count` splats."""
-        return Splats(*(column[:count] for column in self))
+        return Splats(*first_rows(self, [count] * len(self)))
 
 
 class ProjectionOptions(NamedTuple):
@@ -231,21 +230,24 @@ class Projected(NamedTuple):
         s = self.splats
         return Splats(s.means2d, s.conics, s.opacities, s.colors, s.depths, s.camera_ids, self.ids)
 
+    def first(self, sizes: Sizes) -> Projected:
+        """Return only the valid splats, with their `counts`; `sizes` has the numbers in `totals`."""
+        return Projected(splats_of(self.splats, sizes), self.ids[: sizes.splats], self.totals)
+
 
 def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
     """Project without gradients and wait for the number of splats; `project` with grouped arguments."""
     return splats_of(*_projected(inputs))
 
 
-def _projected(inputs: ProjectionInputs) -> tuple[ProjectedSplats, Tensor]:
-    """Return columns that may be longer than their valid part, and `ProjectedSplats.counts`."""
+def _projected(inputs: ProjectionInputs) -> tuple[ProjectedSplats, Sizes]:
+    """Return columns that may be longer than their valid part, and their sizes."""
     with torch._C._AutoDispatchBelowAutograd():
         for attempt in capacity_for(inputs).attempts():
             projected = inputs.run(attempt.sizes)
-            counts = HostCopy(projected.totals).read()[:3]
-            needed = Sizes(*counts.tolist())
+            needed = Sizes(*HostCopy(projected.totals).read()[:3].tolist())
             attempt.end(needed, attempt.sizes is None or attempt.sizes.holds(needed[:2]))
-        return projected.splats, counts
+        return projected.splats, needed
 
 
 def capacity_for(inputs: ProjectionInputs) -> CapacityEstimate:

@@ -39,10 +39,10 @@ class Rank:
         places, plan = ops.send_splats_(
             list(projected.composited), splats.rank_masks, everyone, self.number, buffers, capacity
         )
-        counts, rest = totals[:3].cpu(), everyone[:, VIEW_TOTALS + VIEWS :]
+        sizes, rest = Sizes(*totals[:3].tolist()), everyone[:, VIEW_TOTALS + VIEWS :]
         most = max(everyone[:, 1].max(), rest[:, ::2].sum(0).max(), rest[:, ::2].sum(1).max())
         assert plan[0] == (rest[:, 2 * self.number].sum() if most <= capacity else 0)
-        return [*splats_of(splats, counts)[:12], places[: runs_of(int(counts[1]))]]
+        return [*splats_of(splats, sizes)[:12], places[: runs_of(sizes.splats)]]
 
 
 def exchange(counts, slack=0, capacity=None):

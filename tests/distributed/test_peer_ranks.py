@@ -16,7 +16,7 @@ from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import Shared
 from blitzgs.distributed.tiles import LOSS_HALO, TileAssignment, TileRanges
-from blitzgs.distributed.transport import PeerTransport
+from blitzgs.distributed.transport import PeerTransport, peer
 from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, room_for
 from blitzgs.distributed.transport.way_back import PeerWayBack
 from blitzgs.model import GaussianTable
@@ -114,7 +114,7 @@ def without_gpu(monkeypatch):
     monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
     monkeypatch.setattr(torch.ops.blitzgs, "intersect", _intersect)
     monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda _: None)
+    monkeypatch.setattr(peer, "current_stream", lambda _: None)
     returned = PeerWayBack.return_gradients
 
     def from_columns(self, gradients):

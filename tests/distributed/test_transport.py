@@ -9,8 +9,15 @@ import torch
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.tiles import LOSS_HALO, TileAssignment, TileRanges
-from blitzgs.distributed.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport
+from blitzgs.distributed.transport import (
+    CollectiveTransport,
+    LocalTransport,
+    PeerTransport,
+    open_transport,
+    peer,
+)
 from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT
+from blitzgs.distributed.transport.protocol import Traffic
 from blitzgs.distributed.transport.way_back import CollectiveWayBack
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.intersect import intersect
@@ -190,7 +197,7 @@ def alone(monkeypatch):
     monkeypatch.setattr(torch.ops.blitzgs, "send_splats_", send)
 
     monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda _: None)
+    monkeypatch.setattr(peer, "current_stream", lambda _: None)
     monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
     return Ranks(memory=LoneMemory(64 * WORDS_PER_SPLAT))
 
@@ -247,6 +254,16 @@ def test_a_frame_by_shared_memory_is_the_local_one(alone):
         assert torch.equal(frame.visible, expected.visible)
 
 
+def test_traffic_of_uneven_ranks():
+    # Visible Gaussians, splats, tiles and blocks; splats of two views; splats and tiles for each rank.
+    totals = [[4, 7, 30, 2, 3, 4, 5, 11, 1, 2, 6, 9], [2, 3, 8, 9, 1, 2, 0, 0, 3, 5, 2, 4], [0] * 12]
+    traffic = Traffic.of(totals, 2, 1)
+    assert traffic.own == Sizes(2, 3, 8, 9) and traffic.splats == [[5, 1, 6], [0, 3, 2], [0, 0, 0]]
+    assert (traffic.sent, traffic.received, traffic.starts) == ([0, 3, 2], [1, 3, 0], [5, 1, 6])
+    assert (traffic.most, traffic.n_isects, traffic.most_isects, traffic.most_blocks) == (12, 7, 13, 9)
+    assert traffic.needed == Sizes(12, 12, 13, 9)
+
+
 def test_a_transport_that_does_not_serve_the_job_says_so():
     assignment = TileAssignment(Ranks(), ranges_for(1))
     with pytest.raises(ValueError, match="serves one rank"):
@@ -297,6 +314,6 @@ def test_sums_return_to_the_splats_that_were_sent(splats, world_size):
     for which, group in zip(sent, returned.split(counts), strict=True):
         expected.index_add_(0, which, group)
     ranks = SimpleNamespace(all_to_all=lambda *_: returned)
-    traffic = SimpleNamespace(sent=counts, received=counts, counts=torch.tensor([0, splats, 0]))
+    traffic = SimpleNamespace(sent=counts, received=counts, own=Sizes(0, splats, 0))
     way_back = CollectiveWayBack(ranks, traffic, places, half=False)
     assert torch.equal(way_back.return_sums(returned), expected)

@@ -58,7 +58,7 @@ def test_spare_capacity_changes_nothing(cameras, spare):
     capacity = Sizes(*(int(n) + spare for n in sizes))
     projected = tables.run(capacity)
     found, rows = colored_rows(projected.splats, tables, (sh,), projected.totals)
-    require_equal(splats_of(found, sizes), expected)
+    require_equal(splats_of(found, Sizes(*sizes.tolist())), expected)
     visible = expected.visible_ids.long()
     assert torch.equal(rows.inputs.gaussians[0][: len(visible)], geometry[0][visible])
 

@@ -11,9 +11,9 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, Traffic, unmarked
 from blitzgs.distributed.transport.way_back import CollectiveWayBack
-from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
+from blitzgs.ops.capacity import Attempt, CapacityEstimate
 from blitzgs.ops.host import to_host
-from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, Splats, splats_of
+from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, Splats
 from blitzgs.ops.scatter import gather_splats, scatter_splats, words_per_splat
 
 
@@ -71,14 +71,14 @@ class CollectiveExchange:
             visible = everyone[:, VIEW_TOTALS : VIEW_TOTALS + n_views].sum(0)
             totals = to_host(everyone).tolist()
         traffic = Traffic.of(totals, n_views, ranks.rank)
-        needed = Sizes._make((*traffic.counts.tolist(), traffic.most_blocks))
+        needed = traffic.own._replace(blocks=traffic.most_blocks)
         if sizes is not None and not sizes.holds(needed[:2]):
             projected = inputs.run(None, tiles)  # no queued work waits for another rank now
         # All ranks decide the same, because they have estimated the same number of blocks.
         attempt.end(needed, sizes is None or needed.blocks <= sizes.blocks)
         mark("project")
-        own = splats_of(projected.splats, traffic.counts)
-        sent = projected.composited.first(needed.splats)
+        projected = projected.first(needed)
+        own, sent = projected.splats, projected.composited
         shape = (sent.conics, sent.opacities, sent.colors)
         columns = [sent.means2d, sent.depths, sent.camera_ids, sent.ids]
         columns += [codec.encode(*shape)] if codec is not None else shape

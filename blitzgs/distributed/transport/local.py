@@ -9,7 +9,7 @@ from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, unmarked
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.host import HostCopy
-from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, splats_of
+from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs
 
 
 class LocalTransport:
@@ -53,11 +53,10 @@ class LocalExchange:
 
     def finish(self) -> HostCounts | None:
         """See `Exchange.finish`."""
-        totals = self._copy.read()
-        counts, needed = totals[:3], Sizes._make(totals[:VIEW_TOTALS].tolist())
-        # If the capacity was too small, the splats are undefined.
-        own = splats_of(self._projected.splats, counts)
-        composited = self.arrived.splats.first(needed.splats)
+        needed = Sizes(*self._copy.read()[:VIEW_TOTALS].tolist())
         fits = self._capacity is None or self._capacity.holds(needed)
         self._attempt.end(needed, fits)
-        return HostCounts(own, composited, self._visible, None, None) if fits else None
+        if not fits:
+            return None  # the splats are undefined
+        own = self._projected.first(needed)
+        return HostCounts(own.splats, own.composited, self._visible, None, None)

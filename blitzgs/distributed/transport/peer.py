@@ -44,7 +44,6 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.shared_memory import SharedMemory
 from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, Traffic, unmarked
 from blitzgs.distributed.transport.way_back import PeerWayBack
@@ -118,6 +117,9 @@ class PeerTransport:
         self.capacity = capacity or CapacityEstimate()
         self._ranks, self._memory = ranks, ranks.memory
         self._buffers: PeerBuffers | None = None
+        # One event serves all exchanges. The host waits for it before it starts the next exchange; if an
+        # exchange was given up, a later record of the event comes after its counts, too.
+        self._counted = torch.cuda.Event()
 
     def start(
         self,
@@ -137,7 +139,7 @@ class PeerTransport:
                     self._memory.reserve(words)
         if self._buffers is None or self._buffers.buffers[0] is not self._memory.buffers[0]:
             self._buffers = PeerBuffers(self._memory.buffers, self._ranks.rank)
-        return PeerExchange(self._ranks, self._memory, self._buffers, inputs, assignment, attempt, mark)
+        return PeerExchange(self._ranks, self._buffers, self._counted, inputs, assignment, attempt, mark)
 
 
 class PeerExchange:
@@ -146,23 +148,24 @@ class PeerExchange:
     def __init__(
         self,
         ranks: Ranks,
-        memory: SharedMemory,
         buffers: PeerBuffers,
+        counted: torch.cuda.Event,
         inputs: ProjectionInputs,
         assignment: TileAssignment,
         attempt: Attempt,
         mark: Mark,
     ) -> None:
-        """Queue the projection and the writing of the splats."""
-        self._ranks, self._memory, self._buffers, self._attempt = ranks, memory, buffers, attempt
+        """Queue the projection and the writing of the splats; record `counted` behind the counts."""
+        assert ranks.memory is not None  # see `PeerTransport`
+        self._memory = memory = ranks.memory
+        self._ranks, self._buffers, self._counted, self._attempt = ranks, buffers, counted, attempt
         self._n_views = inputs.n_views
         self._traffic: Traffic | None = None
         capacity = Sizes(buffers.length, buffers.length, 0)
         projected = inputs.run(capacity, assignment.all_composited)
         self._own = projected.splats
         self._shared = memory.share(projected.totals)  # barrier A
-        self._counted = torch.cuda.Event()
-        self._counted.record(current_stream(ranks.device))
+        counted.record(current_stream(ranks.device))
         self._places, plan = torch.ops.blitzgs.send_splats_(
             list(projected.composited), projected.splats.rank_masks, self._shared.everyone, ranks.rank,
             buffers.buffers, buffers.length,
@@ -185,14 +188,13 @@ class PeerExchange:
         self._attempt.end(traffic.needed, fits)
         if not fits:
             return None
-        own = splats_of(self._own, traffic.counts)
         visible = self._shared.sums[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
         composited = self._buffers.splats.first(sum(traffic.received))
         way_back = PeerWayBack(
             self._ranks, self._memory, self._generation, self._buffers.tables, traffic,
-            self._places[: runs_of(len(own.camera_ids))],
+            self._places[: runs_of(traffic.own.splats)],
         )  # fmt: skip
-        return HostCounts(own, composited, visible, traffic, way_back)
+        return HostCounts(splats_of(self._own, traffic.own), composited, visible, traffic, way_back)
 
     def _read(self) -> Traffic:
         """Wait for the counts of all ranks."""

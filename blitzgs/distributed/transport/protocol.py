@@ -17,11 +17,9 @@ gradients for the last two.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
-import torch
 from torch import Tensor
 
 from blitzgs.distributed.tiles import TileAssignment
@@ -37,12 +35,11 @@ def unmarked(stage: str) -> None:
     """Do nothing at the end of a stage."""
 
 
-@dataclass(frozen=True)
-class Traffic:
+class Traffic(NamedTuple):
     """The numbers of splats that the ranks send each other.
 
     Attributes:
-        counts: int64 [3] on the CPU: this rank's visible Gaussians, splats and tiles they touch.
+        own: numbers of this rank's visible Gaussians, splats, tiles that they touch, and blocks.
         splats: splats[s][d] is the number of splats that rank s sends to rank d.
         sent: number of splats sent to each rank.
         received: number of splats received from each rank.
@@ -53,7 +50,7 @@ class Traffic:
         most_blocks: largest number of blocks, of any rank, of which a view may see a part.
     """
 
-    counts: Tensor
+    own: Sizes
     splats: list[list[int]]
     sent: list[int]
     received: list[int]
@@ -64,23 +61,24 @@ class Traffic:
     most_blocks: int
 
     @classmethod
-    def of(cls, totals: Sequence[Sequence[int]], n_views: int, rank: int) -> Traffic:
+    def of(cls, totals: list[list[int]], n_views: int, rank: int) -> Traffic:
         """Read the numbers from every rank's `Projected.totals`."""
-        sizes = [Sizes._make(numbers[:VIEW_TOTALS]) for numbers in totals]
-        of_ranks = [numbers[VIEW_TOTALS + n_views :] for numbers in totals]
-        splats = [list(numbers[::2]) for numbers in of_ranks]
-        isects = [sum(column) for column in zip(*(numbers[1::2] for numbers in of_ranks), strict=True)]
-        most = max(*(size.splats for size in sizes), *map(sum, splats), *map(sum, zip(*splats, strict=True)))
+        first = VIEW_TOTALS + n_views
+        columns = list(zip(*totals, strict=True))  # columns[i][s] is number i of rank s
+        _, owned, _, blocks = columns[:VIEW_TOTALS]  # as in `Sizes`
+        received = columns[first::2]  # by each rank, from each rank
+        isects = [sum(column) for column in columns[first + 1 :: 2]]
+        splats = [numbers[first::2] for numbers in totals]
         return cls(
-            counts=torch.tensor(sizes[rank][:3]),
+            own=Sizes(*totals[rank][:VIEW_TOTALS]),
             splats=splats,
             sent=splats[rank],
-            received=[sent[rank] for sent in splats],
-            starts=[sum(column[:rank]) for column in zip(*splats, strict=True)],
-            most=most,
+            received=list(received[rank]),
+            starts=[sum(column[:rank]) for column in received],
+            most=max(*owned, *map(sum, splats), *map(sum, received)),
             n_isects=isects[rank],
             most_isects=max(isects),
-            most_blocks=max(size.blocks for size in sizes),
+            most_blocks=max(blocks),
         )
 
     @property

@@ -8,7 +8,7 @@ splats have been sent.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,8 +20,7 @@ from blitzgs.ops.scatter import RUN, as_column, words_of
 from blitzgs.ops.splat_gradients import SplatGradients
 
 
-@dataclass(frozen=True)
-class CollectiveWayBack:
+class CollectiveWayBack(NamedTuple):
     """Returns gradients by an all-to-all, and adds them up at the owner in the order of ranks.
 
     Attributes:
@@ -52,15 +51,14 @@ class CollectiveWayBack:
             returned = as_column(words, halves).to(columns.dtype)
         else:
             returned = self.ranks.all_to_all(columns, traffic.received, traffic.sent)
-        return gradients.sum_returned(returned, self.places, traffic.sent, int(traffic.counts[1]))
+        return gradients.sum_returned(returned, self.places, traffic.sent, traffic.own.splats)
 
     def return_sums(self, sums: Tensor) -> Tensor:
         """See `WayBack.return_sums`."""
         return _return_sums(sums, self.places, self.traffic, self.ranks)
 
 
-@dataclass(frozen=True)
-class PeerWayBack:
+class PeerWayBack(NamedTuple):
     """Lets owners read gradients in the memory of the ranks that added them up.
 
     Attributes:
@@ -113,7 +111,7 @@ def _return_sums(sums: Tensor, places: Tensor, traffic: Traffic, ranks: Ranks) -
         ranks: the job.
     """
     returned = ranks.all_to_all(sums, traffic.received, traffic.sent)
-    total = sums.new_zeros(int(traffic.counts[1]), sums.shape[1])
+    total = sums.new_zeros(traffic.own.splats, sums.shape[1])
     lanes = torch.arange(RUN, device=sums.device)
     for group, runs in zip(returned.split(traffic.sent), places.unbind(1), strict=True):
         if group.shape[0] == 0:
