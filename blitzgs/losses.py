@@ -93,7 +93,7 @@ class _L1Ssim(torch.autograd.Function):
             return loss
         counts = pixel_counts(renders, masks)
         divisors, share = counts.clamp_min(1), torch.full_like(counts, 1 / len(renders))
-        parts, v_renders, _ = photometric_fwd_bwd(
+        parts, v_renders, *_ = photometric_fwd_bwd(
             renders, targets, masks, (1 - weight) * share, -weight * share, samples=divisors
         )
         ctx.save_for_backward(v_renders)

@@ -180,7 +180,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "photometric_fwd_bwd(Tensor renders, Tensor targets, Tensor? masks, Tensor l1_weights, "
       "Tensor ssim_weights, int tile_size, int tile_begin, int tile_end, Tensor? samples=None, "
-      "Tensor? visible=None, float scale_weight=0.0) -> (Tensor parts, Tensor v_renders, Tensor scale_reg)");
+      "Tensor? visible=None, float scale_weight=0.0, float opacity_weight=0.0) -> (Tensor parts, "
+      "Tensor v_renders, Tensor scale_reg, Tensor opacity_reg)");
   m.def(
       "report_(Tensor? parts, Tensor? tile_work, int tile_begin, int tile_end, int rank, int n_ranks, "
       "Tensor(a!)[] targets) -> ()");

@@ -103,7 +103,8 @@ def photometric_fwd_bwd(
     samples: Tensor | None = None,
     visible: Tensor | None = None,
     scale_weight: float = 0.0,
-) -> tuple[Tensor, Tensor, Tensor]:
+    opacity_weight: float = 0.0,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the sums of `photometric_sums` and the gradient of their weighted total, without autograd.
 
     The sums are returned as K partial sums; `blitzgs.ops.report` adds them up later, off the critical path of
@@ -125,17 +126,20 @@ def photometric_fwd_bwd(
         visible: int64 [B], number of Gaussians visible in each view.
         scale_weight: weight of L_scale, a view's mean smallest axis of its visible Gaussians; only used to
             return the weight of a single Gaussian's axis.
+        opacity_weight: weight of L_opacity, the mean over the views of the mean opacity of their visible
+            Gaussians; only used to return the weight of a single Gaussian's opacity.
 
     Returns:
         (sums float64 [B, K, 2] in K parts, v_renders [B, H, W, 3], undefined beyond the owned pixels,
-        ``scale_weight / max(visible, 1)`` [B], or [0] without `visible`).
+        ``scale_weight / max(visible, 1)`` [B], ``opacity_weight / (B max(visible, 1))`` [B]; the last two
+        are [0] without `visible`).
 
     Raises:
         RuntimeError: wrong shapes or dtypes.
     """
     return torch.ops.blitzgs.photometric_fwd_bwd(
         renders, targets, _as_bytes(masks), l1_weights, ssim_weights, tile_size, tile_begin, tile_end,
-        samples, visible, scale_weight,
+        samples, visible, scale_weight, opacity_weight,
     )  # fmt: skip
 
 
@@ -166,12 +170,15 @@ def _(
     samples: Tensor | None = None,
     visible: Tensor | None = None,
     scale_weight: float = 0.0,
-) -> tuple[Tensor, Tensor, Tensor]:
+    opacity_weight: float = 0.0,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     views, n_parts = renders.shape[0], torch.library.get_ctx().new_dynamic_size()
+    n_regs = 0 if visible is None else views
     return (
         renders.new_empty(views, n_parts, 2, dtype=torch.float64),
         torch.empty_like(renders, memory_format=torch.contiguous_format),
-        renders.new_empty(0 if visible is None else views),
+        renders.new_empty(n_regs),
+        renders.new_empty(n_regs),
     )
 
 

@@ -73,7 +73,7 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, extent: float) ->
     count, assignment = len(frame.views), frame.assignment
     if assignment is not None and assignment.ranges.halo < LOSS_HALO:
         raise ValueError(f"the loss reads {LOSS_HALO} px beyond a rank's tiles: divide them with that halo")
-    parts, v_renders, scale_reg = photometric_fwd_bwd(
+    parts, v_renders, scale_reg, opacity_reg = photometric_fwd_bwd(
         frame.renders,
         batch.targets,
         batch.masks,
@@ -81,12 +81,18 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, extent: float) ->
         frame.options.tile_size,
         *((0, -1) if assignment is None else assignment.tiles),
         samples=batch.samples,
-        visible=frame.visible if config.scale > 0 else None,
+        visible=frame.visible,
         scale_weight=config.scale / (extent * config.scale_reference * count),
+        opacity_weight=config.opacity,
     )
-    opacity_reg = config.opacity / (count * frame.visible.clamp(min=1)) if config.opacity > 0 else None
     size_reg = config.size / (extent * count * frame.visible.clamp(min=1)) if config.size > 0 else None
-    return LossTerms(parts, v_renders, scale_reg if config.scale > 0 else None, opacity_reg, size_reg)
+    return LossTerms(
+        parts,
+        v_renders,
+        scale_reg if config.scale > 0 else None,
+        opacity_reg if config.opacity > 0 else None,
+        size_reg,
+    )
 
 
 @lru_cache(maxsize=64)

@@ -9,11 +9,11 @@
 namespace blitzgs {
 
 // Defined in photometric_op.cpp.
-std::tuple<Tensor, Tensor, Tensor> photometric_fwd_bwd(
+std::tuple<Tensor, Tensor, Tensor, Tensor> photometric_fwd_bwd(
     const Tensor& renders, const Tensor& targets, const std::optional<Tensor>& masks,
     const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size, std::int64_t tile_begin,
     std::int64_t tile_end, const std::optional<Tensor>& samples, const std::optional<Tensor>& visible,
-    double scale_weight);
+    double scale_weight, double opacity_weight);
 
 namespace {
 
@@ -25,8 +25,9 @@ std::tuple<Tensor, Tensor> l1_ssim_fwd_bwd(const Tensor& renders, const Tensor& 
       "blitzgs::l1_ssim_fwd_bwd: expected weights (l1_weights, ssim_weights, samples) and factors "
       "(l1, ssim, offset), got ",
       weights.size(), " and ", factors.size(), " entries");
-  const auto [parts, v_renders, _] = photometric_fwd_bwd(renders, targets, std::nullopt, weights[0],
-                                                         weights[1], 16, 0, -1, weights[2], std::nullopt, 0);
+  const auto outputs = photometric_fwd_bwd(renders, targets, std::nullopt, weights[0], weights[1], 16, 0, -1,
+                                           weights[2], std::nullopt, 0, 0);
+  const Tensor &parts = std::get<0>(outputs), &v_renders = std::get<1>(outputs);
   const double* sums = data<double>(parts);
   const std::int64_t n = parts.size(0) * parts.size(1);
   Tensor loss = make_empty(renders, {});

@@ -15,8 +15,8 @@
 // ALL tiles. Each rank computes it for its owned pixels, so the gradients of all ranks together are the
 // gradient of the whole. For other pixels v_renders is zero with clear_rest, otherwise zero or not written.
 // The gradient reads x up to 10 pixels beyond the owned tiles. The derivative of |x - y| at 0 is 0. With
-// samples [B], the weights of view b are divided by samples[b]. The kernel also writes
-// scale_reg[b] = scale_weight / max(visible[b], 1), the weight of the scale term of the training loss.
+// samples [B], the weights of view b are divided by samples[b]. The kernel also writes what one visible
+// Gaussian weighs in two terms of the training loss (MeanTerms).
 //
 // SSIM is computed from four windowed quantities: mean(x), e = mean(x) - mean(y), P = E[x^2 + y^2] and
 // Q = E[(x - y)^2]. With A = mean(x)^2 + mean(y)^2 + C1, V = Q - e^2 (the variance of x - y) and
@@ -37,18 +37,25 @@ namespace blitzgs {
 constexpr int kSsimRadius = 5;
 constexpr int kSsimTaps = 2 * kSsimRadius + 1;
 
+// Terms of the training loss that are means over the visible Gaussians of a view. One of n visible Gaussians
+// weighs scale_reg = scale_weight / n and opacity_reg = opacity_weight / (B n); n is at least 1.
+template <class T>
+struct MeanTerms {
+  const std::int64_t* visible;  // [B]; null: no such terms
+  T scale_weight, opacity_weight;
+  T *scale_reg, *opacity_reg;  // [B]
+};
+
 template <class T>
 struct PhotometricArgs {
   const T* renders;
   const T* targets;  // null if the targets are uint8
   const std::uint8_t* targets_u8;
-  const std::uint8_t* masks;    // null: all pixels count
-  const T* l1_weights;          // [B]; null: no gradient
-  const T* ssim_weights;        // [B]
-  const T* samples;             // [B]; null: 1
-  const std::int64_t* visible;  // [B]; null: no scale_reg
-  T scale_weight;
-  T* scale_reg;   // [B]
+  const std::uint8_t* masks;  // null: all pixels count
+  const T* l1_weights;        // [B]; null: no gradient
+  const T* ssim_weights;      // [B]
+  const T* samples;           // [B]; null: 1
+  MeanTerms<T> means;
   double* parts;  // [B, K, 2], K of photometric_parts(); null: no sums
   T* v_renders;   // with l1_weights
   bool clear_rest;
@@ -83,9 +90,11 @@ BLITZGS_HD T weight_of(const PhotometricArgs<T>& args, const T* weights, std::in
 }
 
 template <class T>
-BLITZGS_HD T scale_reg_of(const PhotometricArgs<T>& args, std::int64_t view) {
-  const std::int64_t visible = args.visible[view];
-  return args.scale_weight / static_cast<T>(visible > 1 ? visible : 1);
+BLITZGS_HD void write_mean_terms(const MeanTerms<T>& means, std::int64_t views, std::int64_t view) {
+  const std::int64_t n = means.visible[view] > 1 ? means.visible[view] : 1;
+  means.scale_reg[view] = means.scale_weight / static_cast<T>(n);
+  // Rounded as torch rounds a number divided by a tensor, so that trainings repeat those of earlier versions.
+  means.opacity_reg[view] = means.opacity_weight * (T(1) / static_cast<T>(views * n));
 }
 
 // One window: its SSIM and the derivatives by mean(x), P and Q.

@@ -56,8 +56,8 @@ void photometric(const PhotometricArgs<T>& args, Workspace& workspace, CudaStrea
   }
   parallel_for(0, count, 1,
                [&](std::int64_t begin, std::int64_t end) { run_strips(args, strips, begin, end, sums); });
-  if (!args.visible) return;
-  for (std::int64_t view = 0; view < args.views; ++view) args.scale_reg[view] = scale_reg_of(args, view);
+  if (!args.means.visible) return;
+  for (std::int64_t view = 0; view < args.views; ++view) write_mean_terms(args.means, args.views, view);
 }
 
 template std::int64_t photometric_parts<float>(const PhotometricArgs<float>&);

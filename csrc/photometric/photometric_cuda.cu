@@ -282,16 +282,16 @@ __device__ void clear_parts(const PhotometricArgs<float>& args, const Launch& la
 
 // The loss and its gradient (photometric.h). The grid is (blocks of kOut pixels in a row, strips of all
 // views). Reads renders, targets and masks; writes parts [B, K, 2] (kSums), v_renders [B, H, W, 3] and
-// scale_reg [B] (kGradient).
+// the mean terms [B] (kGradient).
 template <bool kBytes, bool kGradient, bool kSums>
 __global__ void __launch_bounds__(kThreads, 2)
     photometric_kernel(const __grid_constant__ PhotometricArgs<float> args,
                        const __grid_constant__ Launch launch) {
   wait_for_earlier_kernels();
   if (kSums && threadIdx.x == 0) clear_parts(args, launch);
-  if (kGradient && args.visible && blockIdx.x == 0 && blockIdx.y == 0) {
+  if (kGradient && args.means.visible && blockIdx.x == 0 && blockIdx.y == 0) {
     for (int view = threadIdx.x; view < args.views; view += kThreads) {
-      args.scale_reg[view] = scale_reg_of(args, view);
+      write_mean_terms(args.means, args.views, view);
     }
   }
   if (launch.strips == 0) return;

@@ -21,7 +21,7 @@ void fill_window(T (&window)[kSsimTaps]) {
 }
 
 struct PhotometricOutputs {
-  std::optional<Tensor> parts, v_renders, scale_reg;
+  std::optional<Tensor> parts, v_renders, scale_reg, opacity_reg;
 };
 
 // The weights of the sums in the loss whose gradient is computed.
@@ -29,7 +29,7 @@ struct PhotometricWeights {
   const Tensor& l1;
   const Tensor& ssim;
   std::optional<Tensor> samples, visible;
-  double scale = 0;
+  double scale = 0, opacity = 0;
 };
 
 PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, const Tensor& targets_in,
@@ -58,6 +58,7 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
     visible = checked(op, "visible", weights->visible, ScalarType::Long, {views});
     outputs.v_renders = make_empty(renders, {views, height, width, 3});
     outputs.scale_reg = make_empty(renders, {visible ? views : 0});
+    outputs.opacity_reg = make_empty(renders, {visible ? views : 0});
   }
   if (renders.numel() == 0) {
     if (sums) outputs.parts = make_empty(renders, {views, 0, 2}, ScalarType::Double);
@@ -76,9 +77,9 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
     args.ssim_weights = data_or_null<T>(ssim_weights);
     args.samples = data_or_null<T>(samples);
     if (visible) {
-      args.visible = data<std::int64_t>(*visible);
-      args.scale_weight = static_cast<T>(weights->scale);
-      args.scale_reg = mutable_data<T>(*outputs.scale_reg);
+      args.means = {data<std::int64_t>(*visible), static_cast<T>(weights->scale),
+                    static_cast<T>(weights->opacity), mutable_data<T>(*outputs.scale_reg),
+                    mutable_data<T>(*outputs.opacity_reg)};
     }
     args.v_renders = outputs.v_renders ? mutable_data<T>(*outputs.v_renders) : nullptr;
     args.clear_rest = !sums;
@@ -132,15 +133,15 @@ Tensor photometric_bwd(const Tensor& renders, const Tensor& targets, const std::
 }  // namespace
 
 // Not in the unnamed namespace, because l1_ssim_op.cpp calls it, too.
-std::tuple<Tensor, Tensor, Tensor> photometric_fwd_bwd(
+std::tuple<Tensor, Tensor, Tensor, Tensor> photometric_fwd_bwd(
     const Tensor& renders, const Tensor& targets, const std::optional<Tensor>& masks,
     const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size, std::int64_t tile_begin,
     std::int64_t tile_end, const std::optional<Tensor>& samples, const std::optional<Tensor>& visible,
-    double scale_weight) {
-  const PhotometricWeights weights{l1_weights, ssim_weights, samples, visible, scale_weight};
+    double scale_weight, double opacity_weight) {
+  const PhotometricWeights weights{l1_weights, ssim_weights, samples, visible, scale_weight, opacity_weight};
   PhotometricOutputs out = run_photometric("photometric_fwd_bwd", renders, targets, masks, &weights, true,
                                            tile_size, tile_begin, tile_end);
-  return {*out.parts, *out.v_renders, *out.scale_reg};
+  return {*out.parts, *out.v_renders, *out.scale_reg, *out.opacity_reg};
 }
 
 }  // namespace blitzgs

@@ -61,7 +61,7 @@ def test_reference_is_one_for_equal_images_and_low_for_noise():
 
 
 def sums_and_gradient(*arguments):
-    parts, v_renders, _ = photometric_fwd_bwd(*arguments)
+    parts, v_renders, *_ = photometric_fwd_bwd(*arguments)
     return *sum_parts(parts), v_renders
 
 
@@ -92,15 +92,18 @@ def test_weights_are_divided_by_samples_and_visible_gaussians(device, tiles):
     x, targets, masks = images(device=device)
     weights, samples = torch.tensor([0.4, 0.3], device=device), torch.tensor([111.0, 7.0], device=device)
     visible = torch.tensor([0, 1_000_001], device=device)
-    parts, v_renders, scale_reg = photometric_fwd_bwd(
-        x, targets, masks, weights, -weights, 16, *tiles, samples=samples, visible=visible, scale_weight=0.7
-    )
+    parts, v_renders, scale_reg, opacity_reg = photometric_fwd_bwd(
+        x, targets, masks, weights, -weights, 16, *tiles, samples=samples, visible=visible, scale_weight=0.7,
+        opacity_weight=0.3,
+    )  # fmt: skip
     expected = photometric_fwd_bwd(x, targets, masks, weights / samples, -weights / samples, 16, *tiles)
     assert torch.equal(parts, expected[0])
     if tiles == (0, -1):
         assert torch.equal(v_renders, expected[1])
     assert torch.equal(scale_reg, torch.tensor(0.7, device=device) / visible.clamp(min=1))
-    assert len(expected[2]) == 0
+    opacity = 0.3 / (2 * visible.clamp(min=1))
+    torch.testing.assert_close(opacity_reg, opacity, rtol=0 if device == "cpu" else 2e-7, atol=0)
+    assert len(expected[2]) == len(expected[3]) == 0
 
 
 def test_float64_matches_to_rounding():
@@ -220,7 +223,7 @@ def test_vector_width_does_not_change_the_result(tmp_path):
 def test_empty_batch(device):
     x = torch.zeros(0, 8, 8, 3, device=device)
     outputs = photometric_fwd_bwd(x, x, None, x.new_zeros(0), x.new_zeros(0))
-    assert [tuple(t.shape) for t in outputs] == [(0, 0, 2), (0, 8, 8, 3), (0,)]
+    assert [tuple(t.shape) for t in outputs] == [(0, 0, 2), (0, 8, 8, 3), (0,), (0,)]
 
 
 def test_errors_name_the_value():
@@ -252,5 +255,5 @@ def test_opcheck(device):
     torch.library.opcheck(torch.ops.blitzgs.photometric_bwd, (x, targets, masks, weights, weights, 16, 0, -1))
     torch.library.opcheck(
         torch.ops.blitzgs.photometric_fwd_bwd,
-        (x, targets, None, weights, weights, 16, 0, -1, weights, weights.long(), 0.5),
+        (x, targets, None, weights, weights, 16, 0, -1, weights, weights.long(), 0.5, 0.2),
     )
