@@ -14,7 +14,7 @@ from harness import make_parser, write_json
 from timing import copy_bandwidth, median_ms
 from torch import Tensor
 
-from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_
+from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, lazy_adam_step_
 
 FLOATS = 59  # a row with SH of degree 3
 BETA1, BETA2, EPS = 0.9**4, 0.999**4, 1e-15 / 2
@@ -34,22 +34,18 @@ class State:
         self.moment_step = torch.empty_like(self.last_step)
         self.lr_table = torch.full((30_001, 6), 1e-6, device=device)
 
-    def columns(self) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
-        """Return parameters and moments."""
-        return self.params, self.exp_avgs, self.exp_avg_sqs
+    def state(self) -> AdamState:
+        """Return parameters, moments and the steps that they stand at."""
+        return AdamState(self.params, self.exp_avgs, self.exp_avg_sqs, self.last_step, self.moment_step)
 
     def catch_up(self, ids: Tensor) -> None:
         """Bring rows to the step before `STEP`."""
-        lazy_adam_catch_up_(
-            *self.columns(), ids, self.last_step, self.moment_step, self.lr_table, STEP - 1, BETA1, BETA2, EPS
-        )
+        lazy_adam_catch_up_(self.state(), AdamSchedule(self.lr_table, BETA1, BETA2, EPS), STEP - 1, ids)
 
     def step(self, ids: Tensor, grads: list[Tensor], sparse: bool) -> None:
         """Take step `STEP`."""
-        lazy_adam_step_(
-            *self.columns(), grads, ids, self.last_step, self.moment_step, self.lr_table, STEP, BETA1, BETA2,
-            EPS, sparse,
-        )  # fmt: skip
+        schedule = AdamSchedule(self.lr_table, BETA1, BETA2, EPS, sparse)
+        lazy_adam_step_(self.state(), schedule, STEP, grads, ids)
 
     def time(self, work: Callable[[], None], gaps: Tensor, repeats: int) -> float:
         """Return the median ms of `work` on rows that are `gaps` steps behind `STEP` - 1."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,11 +47,13 @@ class AdamState(NamedTuple):
         return [*self.params, *self.exp_avgs, *self.exp_avg_sqs, self.last_step, self.moment_step]
 
 
-class AdamSchedule(NamedTuple):
-    """Adam's constants, and its learning rates of every step.
+@dataclass(frozen=True, eq=False)
+class AdamSchedule:
+    """Adam's constants, its learning rates of every step, and the tables that the ops make of these.
 
     Attributes:
-        lr_table: float32 [S + 1, 6], as for `lazy_adam_step_`.
+        lr_table: float32 [S + 1, 6], learning rates of means, quats, scales, opacities, SH DC and SH rest
+            for every step of the schedule (row 0 unused). Must not change while this object is used.
         beta1: decay of the first moment, below sqrt(beta2).
         beta2: decay of the second moment, in (0, 1).
         eps: added to the root of the second moment.
@@ -61,32 +65,32 @@ class AdamSchedule(NamedTuple):
     beta2: float
     eps: float
     sparse: bool = False
+    _tables: dict[torch.dtype, list[Tensor]] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def decays(self) -> list[float]:
         """The group `decays` of the ops."""
         return [self.beta1, self.beta2, self.eps]
 
+    @cached_property
+    def table(self) -> Tensor:
+        """The `schedule_table`."""
+        return schedule_table(self.lr_table, self.beta1, self.beta2)
+
+    def tables(self, like: Tensor) -> list[Tensor]:
+        """Return the `schedule_tables` for parameters of the dtype of `like`."""
+        if like.dtype not in self._tables:
+            made = schedule_tables(self.lr_table, self.beta1, self.beta2, self.eps, like)
+            self._tables[like.dtype] = made
+        return self._tables[like.dtype]
+
     def steps(self, step: int, dtype: torch.dtype) -> list[int]:
         """Return the group `steps` of the ops: step number `step` of parameters of a dtype."""
         return [step, explicit_steps(self.beta1, self.beta2, dtype), int(self.sparse)]
 
 
-@torch.no_grad()
 def lazy_adam_step_(
-    params: Sequence[Tensor],
-    exp_avgs: Sequence[Tensor],
-    exp_avg_sqs: Sequence[Tensor],
-    grads: Sequence[Tensor],
-    ids: Tensor,
-    last_step: Tensor,
-    moment_step: Tensor,
-    lr_table: Tensor,
-    step: int,
-    beta1: float,
-    beta2: float,
-    eps: float,
-    sparse: bool = False,
+    state: AdamState, schedule: AdamSchedule, step: int, grads: Sequence[Tensor], ids: Tensor
 ) -> None:
     """Take Adam step ``step`` for the rows `ids`, in place, after the zero-gradient steps they skipped.
 
@@ -95,75 +99,57 @@ def lazy_adam_step_(
     csrc/lazy_adam/lazy_adam.h for the closed form. All tensors on one device; float32 (CPU also float64).
 
     Args:
-        params: (means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3]).
-        exp_avgs: first moments, shaped like `params`.
-        exp_avg_sqs: second moments, shaped like `params`.
-        grads: gradients of the listed rows, shaped like `params` with U rows.
-        ids: int32 [U], the rows, each once.
-        last_step: int32 [N], step up to which each row's parameters are current; becomes `step` for `ids`.
-        moment_step: int32 [N], <= `last_step`, the same of its moments; becomes `step` for `ids`.
-        lr_table: float32 [S + 1, 6], learning rates of means, quats, scales, opacities, SH DC and SH rest
-            for every step of the schedule (row 0 unused). Must not change between calls.
+        state: of N rows; `last_step` and `moment_step` become `step` for `ids`.
+        schedule: of S steps.
         step: 1 <= step <= S.
-        beta1: decay of the first moment, below sqrt(beta2).
-        beta2: decay of the second moment, in (0, 1).
-        eps: added to the root of the second moment.
-        sparse: plain sparse Adam instead: moments of unlisted rows keep their values and nothing drifts.
+        grads: gradients of the listed rows, shaped like the parameters with U rows.
+        ids: int32 [U], the rows, each once.
 
     Raises:
         ValueError: decay rates outside their range.
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
-    schedule = AdamSchedule(lr_table, beta1, beta2, eps, sparse)
-    torch.ops.blitzgs.lazy_adam_step_(
-        AdamState(params, exp_avgs, exp_avg_sqs, last_step, moment_step).tensors,
-        schedule_tables(lr_table, beta1, beta2, eps, params[0]),
-        schedule.steps(step, params[0].dtype),
-        schedule.decays,
-        list(grads),
-        ids,
-    )
+    like = state.params[0]
+    tables = schedule.tables(like)
+    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+        torch.ops.blitzgs.lazy_adam_step_(
+            state.tensors, tables, schedule.steps(step, like.dtype), schedule.decays, list(grads), ids
+        )
 
 
-@torch.no_grad()
 def lazy_adam_catch_up_(
-    params: Sequence[Tensor],
-    exp_avgs: Sequence[Tensor],
-    exp_avg_sqs: Sequence[Tensor],
-    ids: Tensor | None,
-    last_step: Tensor,
-    moment_step: Tensor,
-    lr_table: Tensor,
+    state: AdamState,
+    schedule: AdamSchedule,
     step: int,
-    beta1: float,
-    beta2: float,
-    eps: float,
+    ids: Tensor | None = None,
     count: Tensor | None = None,
 ) -> None:
     """Apply the missed zero-gradient steps up to ``step`` to the rows `ids` (None: all), in place.
 
-    Only parameters change. Afterwards these parameters are those of dense Adam after ``step``. Rows that are
-    current already do not change.
-    Moments and `moment_step` do not change either: the next step with a gradient applies the pending decay,
-    beta^(step - moment_step). Arguments as in
-    `lazy_adam_step_`; ``step`` may be 0 (nothing to do). ``count``, int32 [1]: only the first `count` of
-    `ids` are rows; the host does not wait for it.
+    Only parameters and `last_step` change. Afterwards these parameters are those of dense Adam after
+    ``step``. Rows that are current already do not change. The next step with a gradient applies the pending
+    decay of the moments, beta^(step - moment_step).
+
+    Args:
+        state: of N rows.
+        schedule: of S steps.
+        step: 0 <= step <= S; 0: nothing to do.
+        ids: int32 [A], the rows, each once; None: all.
+        count: int32 [1], only the first `count` of `ids` are rows; the host does not wait for it. None: all.
 
     Raises:
         ValueError: decay rates outside their range.
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
-    schedule = AdamSchedule(lr_table, beta1, beta2, eps)
-    torch.ops.blitzgs.lazy_adam_catch_up_(
-        AdamState(params, exp_avgs, exp_avg_sqs, last_step, moment_step).tensors,
-        schedule_tables(lr_table, beta1, beta2, eps, params[0]),
-        schedule.steps(step, params[0].dtype),
-        schedule.decays,
-        ids,
-        count,
-    )
+    like = state.params[0]
+    tables = schedule.tables(like)
+    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+        torch.ops.blitzgs.lazy_adam_catch_up_(
+            state.tensors, tables, schedule.steps(step, like.dtype), schedule.decays, ids, count
+        )
 
 
+@lru_cache(maxsize=16)
 def explicit_steps(beta1: float, beta2: float, dtype: torch.dtype) -> int:
     """Return the number of zero-gradient steps after which a row's remaining movement is below rounding."""
     ratio = beta1 / math.sqrt(beta2)

@@ -8,7 +8,7 @@ import math
 from torch import Tensor
 
 from blitzgs.model import GaussianTable
-from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, schedule_table
+from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_
 from blitzgs.ops.project_step import project_bwd_step_
 from blitzgs.ops.projection import WeightedViews
 from blitzgs.ops.splat_gradients import SplatGradients
@@ -47,7 +47,8 @@ class LazyAdam:
         rates = schedule.learning_rates(self._config, self._extent)
         self._position_rates = rates[:, 0].tolist()
         self.lr_table: Tensor = rates.to(self._device)  # type: ignore[call-overload]
-        self.pending_table = None if self._sparse else schedule_table(self.lr_table, *self._betas)
+        self._schedule = AdamSchedule(self.lr_table, *self._betas, self._eps, self._sparse)
+        self.pending_table = None if self._sparse else self._schedule.table
 
     def position_rate(self, step: int) -> float:
         """Return the learning rate of the means in step `step` (from 1), in their unit."""
@@ -63,19 +64,7 @@ class LazyAdam:
         """
         if self._sparse:
             return
-        lazy_adam_catch_up_(
-            table.parameters,
-            table.exp_avgs,
-            table.exp_avg_sqs,
-            ids,
-            table["last_step"],
-            table["moment_step"],
-            self.lr_table,
-            step,
-            *self._betas,
-            self._eps,
-            count,
-        )
+        lazy_adam_catch_up_(_state_of(table), self._schedule, step, ids, count)
 
     def step(
         self,
@@ -107,14 +96,8 @@ class LazyAdam:
             absolute_sums: `means2d_sums` receives the sum over pixels of absolute gradients instead.
         """
         project_bwd_step_(
-            AdamState(
-                table.parameters,
-                table.exp_avgs,
-                table.exp_avg_sqs,
-                table["last_step"],
-                table["moment_step"],
-            ),
-            AdamSchedule(self.lr_table, *self._betas, self._eps, self._sparse),
+            _state_of(table),
+            self._schedule,
             step,
             WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg, size_reg),
             frame.projected,
@@ -124,3 +107,9 @@ class LazyAdam:
             means2d_sums,
             absolute_sums,
         )
+
+
+def _state_of(table: GaussianTable) -> AdamState:
+    return AdamState(
+        table.parameters, table.exp_avgs, table.exp_avg_sqs, table["last_step"], table["moment_step"]
+    )

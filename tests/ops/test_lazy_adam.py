@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from blitzgs.ops.lazy_adam import (
+    AdamSchedule,
     AdamState,
     explicit_steps,
     lazy_adam_catch_up_,
@@ -34,20 +35,18 @@ class State:
     def moments(self):
         return self.exp_avgs, self.exp_avg_sqs
 
-    def tensors(self):
-        return AdamState(self.params, *self.moments(), self.last_step, self.moment_step).tensors
+    def state(self):
+        return AdamState(self.params, *self.moments(), self.last_step, self.moment_step)
 
-    def step(self, grads, ids, lr_table, step, **kwargs):
-        lazy_adam_step_(
-            self.params, *self.moments(), grads, ids, self.last_step, self.moment_step, lr_table, step,
-            BETA1, BETA2, EPS, **kwargs,
-        )  # fmt: skip
+    def tensors(self):
+        return self.state().tensors
+
+    def step(self, grads, ids, lr_table, step, sparse=False):
+        schedule = AdamSchedule(lr_table, BETA1, BETA2, EPS, sparse)
+        lazy_adam_step_(self.state(), schedule, step, grads, ids)
 
     def catch_up(self, ids, lr_table, step):
-        lazy_adam_catch_up_(
-            self.params, *self.moments(), ids, self.last_step, self.moment_step, lr_table, step,
-            BETA1, BETA2, EPS,
-        )  # fmt: skip
+        lazy_adam_catch_up_(self.state(), AdamSchedule(lr_table, BETA1, BETA2, EPS), step, ids)
 
     def moments_at(self, step):
         """Return both moments with their pending decay up to `step`, float64."""
@@ -295,6 +294,10 @@ def test_tables_belong_to_the_schedule_and_not_to_the_step(steps):
     assert [len(table) for table in tables] == [steps + 1, steps + 1, max(0, steps + 1 - reach)]
     again = schedule_tables(lr_table, BETA1, BETA2, EPS, like)
     assert all(a is b for a, b in zip(tables, again, strict=True))
+    schedule = AdamSchedule(lr_table, BETA1, BETA2, EPS)
+    assert all(a is b for a, b in zip(tables, schedule.tables(like), strict=True))
+    wide = schedule.tables(like.double())
+    assert wide[0] is tables[0] and wide[2].shape[1] == 2 * tables[2].shape[1]
     lr_table.mul_(0.5)
     assert schedule_tables(lr_table, BETA1, BETA2, EPS, like)[2] is not tables[2]
 
@@ -363,10 +366,7 @@ def test_empty_list_and_zero_gradient():
 def test_errors_name_the_value():
     state, lr_table = one_update()
     with pytest.raises(ValueError, match=r"beta1=0.9, beta2=0.5"):
-        lazy_adam_catch_up_(
-            state.params, *state.moments(), None, state.last_step, state.moment_step, lr_table, 5,
-            0.9, 0.5, EPS,
-        )  # fmt: skip
+        lazy_adam_catch_up_(state.state(), AdamSchedule(lr_table, 0.9, 0.5, EPS), 5)
     with pytest.raises(
         RuntimeError, match="step 9999 is outside the learning-rate table, which ends at step 4000"
     ):

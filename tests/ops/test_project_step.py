@@ -42,8 +42,7 @@ class Scene:
         self.viewmats = viewmats.to(device, dtype)
         K = torch.tensor([[80.0, 0, 45], [0, 80, 30], [0, 0, 1]])
         self.Ks = K.repeat(views, 1, 1).to(device, dtype)
-        self.optimiser = self.lr_table, STEP, BETA1, BETA2, EPS
-        lazy_adam_catch_up_(*self.columns(), None, *self.stands(), self.lr_table, STEP - 1, BETA1, BETA2, EPS)
+        lazy_adam_catch_up_(self.state(), self.schedule(), STEP - 1)
         self.degree = min(3, math.isqrt(k) - 1)
         self.scale_reg = torch.linspace(0.1, 0.2, views).to(device, dtype)
         self.opacity_reg = torch.linspace(0.3, -0.2, views).to(device, dtype)
@@ -53,8 +52,8 @@ class Scene:
     def columns(self):
         return self.params, self.exp_avgs, self.exp_avg_sqs
 
-    def stands(self):
-        return self.last_step, self.moment_step
+    def state(self):
+        return AdamState(*self.columns(), self.last_step, self.moment_step)
 
     def render(self, antialiased):
         self.splats = project(
@@ -90,12 +89,12 @@ class Scene:
     def one_after_the_other(self, sparse):
         r = self.splats
         *gradients, _ = self.backward()
-        lazy_adam_step_(*self.columns(), gradients, r.visible_ids, *self.stands(), *self.optimiser, sparse)
+        lazy_adam_step_(self.state(), self.schedule(sparse), STEP, gradients, r.visible_ids)
 
     def at_once(self, sparse, means2d_sums=None):
         project_bwd_step_(
-            AdamState(*self.columns(), *self.stands()), self.schedule(sparse), STEP, self.views(),
-            self.splats, self.options, self.v, means2d_sums=means2d_sums,
+            self.state(), self.schedule(sparse), STEP, self.views(), self.splats, self.options, self.v,
+            means2d_sums=means2d_sums,
         )  # fmt: skip
 
     def pack(self, width):
@@ -318,7 +317,7 @@ def test_errors_name_what_does_not_fit():
 def test_opcheck():
     scene = Scene(20, 16, 1, "cpu", torch.float32)
     scene.render(False)
-    state, schedule = AdamState(*scene.columns(), *scene.stands()), scene.schedule()
+    state, schedule = scene.state(), scene.schedule()
     tables = [schedule_table(scene.lr_table, BETA1, BETA2), scene.lr_table]
     torch.library.opcheck(
         torch.ops.blitzgs.project_bwd_step_,

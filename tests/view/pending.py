@@ -4,14 +4,21 @@
 import torch
 from torch import Tensor
 
-from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
-from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_, schedule_table
+from blitzgs.model import PARAMETERS, GaussianTable
+from blitzgs.ops.lazy_adam import (
+    AdamSchedule,
+    AdamState,
+    lazy_adam_catch_up_,
+    lazy_adam_step_,
+    schedule_table,
+)
 
 _BETAS, _EPS = (0.9, 0.999), 1e-15
 
 
-def _columns(table: GaussianTable) -> list[list[Tensor]]:
-    return [[table[name] for name in names] for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)]
+def _state(table: GaussianTable) -> AdamState:
+    groups = table.parameters, table.exp_avgs, table.exp_avg_sqs
+    return AdamState(*groups, table["last_step"], table["moment_step"])
 
 
 def schedule_of(rates: Tensor) -> Tensor:
@@ -22,9 +29,7 @@ def schedule_of(rates: Tensor) -> Tensor:
 def caught_up(table: GaussianTable, rates: Tensor, step: int) -> GaussianTable:
     """Return a copy of a table with no pending steps up to `step`."""
     copy = GaussianTable({name: table[name].clone() for name in table})
-    lazy_adam_catch_up_(
-        *_columns(copy), None, copy["last_step"], copy["moment_step"], rates, step, *_BETAS, _EPS
-    )
+    lazy_adam_catch_up_(_state(copy), AdamSchedule(rates, *_BETAS, _EPS), step)
     return copy
 
 
@@ -37,7 +42,5 @@ def step_some(
         torch.randn((len(stepped), *table[name].shape[1:]), generator=generator).to(ids.device)
         for name in PARAMETERS
     ]
-    lazy_adam_step_(
-        *_columns(table), grads, stepped, table["last_step"], table["moment_step"], rates, step, *_BETAS, _EPS
-    )
+    lazy_adam_step_(_state(table), AdamSchedule(rates, *_BETAS, _EPS), step, grads, stepped)
     return stepped

@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from blitzgs.ops.blocks import cull_blocks, morton_keys
-from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, schedule_table
+from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, schedule_table
 from blitzgs.ops.project import project
 from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions
 from blitzgs.view.blocks import BlockIndex, morton_order
@@ -161,10 +161,9 @@ def caught_up_and_projected(table, ids, views, count, viewmats, Ks):
     """The columns of a table whose rows `ids` were caught up, and their projection."""
     after = {name: table[name].clone() for name in table}
     rates = torch.full((101, 6), 1e-3, device=table.device)
-    lazy_adam_catch_up_(
-        *([after[name] for name in names] for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)), ids,
-        after["last_step"], after["moment_step"], rates, 50, 0.9, 0.999, 1e-15, count,
-    )  # fmt: skip
+    groups = ([after[name] for name in names] for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS))
+    state = AdamState(*groups, after["last_step"], after["moment_step"])
+    lazy_adam_catch_up_(state, AdamSchedule(rates, 0.9, 0.999, 1e-15), 50, ids, count)
     active = [tensor for tensor in (ids, views, count) if tensor is not None]
     options = ProjectionOptions(WIDTH, HEIGHT, near_plane=NEAR, far_plane=FAR)
     inputs = ProjectionInputs([after[name] for name in PARAMETERS], (viewmats, Ks), options, active)
