@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Protocol
 
 import torch
@@ -23,6 +24,10 @@ EXP_AVG_SQS = tuple(f"exp_avg_sq.{name}" for name in PARAMETERS)
 # move with their rows.
 REQUIRED = (*PARAMETERS, "last_step", "id", "parent", "birth", "level")
 ZERO_AT_BIRTH = (*EXP_AVGS, *EXP_AVG_SQS, "moment_step", "grad_sum", "grad_count", "max_radii")
+# A step asks for these columns several times; one call finds all of a group.
+_PARAMETERS_OF, _EXP_AVGS_OF, _EXP_AVG_SQS_OF = (
+    itemgetter(*names) for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)
+)
 NO_PARENT = -1
 # The cull matrix, from the first importance pass on: which views leave a row out.
 CULL = "cull"
@@ -222,17 +227,17 @@ class GaussianTable:
     @property
     def parameters(self) -> tuple[Tensor, ...]:
         """The five learned columns in the order of `PARAMETERS`."""
-        return tuple(self.columns[name] for name in PARAMETERS)
+        return _PARAMETERS_OF(self.columns)
 
     @property
     def exp_avgs(self) -> tuple[Tensor, ...]:
         """Adam's first moments in the order of `PARAMETERS`."""
-        return tuple(self.columns[name] for name in EXP_AVGS)
+        return _EXP_AVGS_OF(self.columns)
 
     @property
     def exp_avg_sqs(self) -> tuple[Tensor, ...]:
         """Adam's second moments in the order of `PARAMETERS`."""
-        return tuple(self.columns[name] for name in EXP_AVG_SQS)
+        return _EXP_AVG_SQS_OF(self.columns)
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Add rows at the end.

@@ -10,7 +10,6 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.ops.blocks import ActiveRows, GateRules
 
 
-@torch.no_grad()
 def gate_views_(active: ActiveRows, means: Tensor, viewmats: Tensor, rules: GateRules) -> None:
     """Clear the bits of `active.views` for the (row, view) pairs that B views leave out; no row is removed.
 
@@ -25,9 +24,10 @@ def gate_views_(active: ActiveRows, means: Tensor, viewmats: Tensor, rules: Gate
             or a column that the cull matrix lacks.
     """
     level, reach, lod_views, cull, columns = rules
-    torch.ops.blitzgs.gate_views_(
-        active.ids, active.views, active.length, means, level, viewmats, reach, lod_views, cull, columns
-    )
+    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+        torch.ops.blitzgs.gate_views_(
+            active.ids, active.views, active.length, means, level, viewmats, reach, lod_views, cull, columns
+        )
 
 
 @torch.library.register_fake("blitzgs::gate_views_")

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from operator import itemgetter
+
 import torch
 from torch import Tensor
 
@@ -15,6 +17,11 @@ from blitzgs.ops.blocks import (
     cull_blocks,
     morton_keys,
     update_block_bounds_,
+)
+
+# The columns of `PendingSteps`.
+_PENDING_OF = itemgetter(
+    "exp_avg.means", "exp_avg_sq.means", "exp_avg.scales", "exp_avg_sq.scales", "last_step", "moment_step"
 )
 
 
@@ -98,15 +105,7 @@ class BlockIndex:
     def _pending(self, table: GaussianTable) -> PendingSteps | None:
         if self._schedule is None:
             return None
-        return PendingSteps(
-            table["exp_avg.means"],
-            table["exp_avg_sq.means"],
-            table["exp_avg.scales"],
-            table["exp_avg_sq.scales"],
-            table["last_step"],
-            table["moment_step"],
-            self._schedule,
-        )
+        return PendingSteps._make((*_PENDING_OF(table.columns), self._schedule))
 
 
 def _level_ranges(level: Tensor, blocks: int) -> Tensor:
