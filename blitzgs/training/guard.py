@@ -53,8 +53,10 @@ class LossGuard:
 
 def _check_loss(step: int, names: Sequence[str], sums: HostSum, origin: Callable[[], str]) -> None:
     # Plain Python numbers: this runs in every step while the GPU waits, and one torch op would take longer.
-    finite = [math.isfinite(value) for value in sums.read().numpy()[: 2 * len(names)].tolist()]
-    if not all(finite):
+    values = sums.read().numpy()[: 2 * len(names)].tolist()
+    # A sum of float32 numbers is within the range of Python's numbers: it is finite if all of them are.
+    if not math.isfinite(sum(values)):
+        finite = [math.isfinite(value) for value in values]
         l1, ssim = finite[: len(names)], finite[len(names) :]
         views = ", ".join(f"'{name}'" for name, *good in zip(names, l1, ssim, strict=True) if not all(good))
         raise NonFiniteError(f"step {step}: the loss of view {views} is not finite; {origin()}")

@@ -92,3 +92,11 @@ def test_the_guard_names_the_pixel_and_says_what_it_has_looked_at(frame):
     spoiled = Broken(rendered._replace(projected=splats), "cuda")
     with pytest.raises(NonFiniteError, match="found in step 10: .* op project, output depths"):
         guard.check(10, ("c", "d"), Sums(0, 0, 0, 0), table, spoiled)
+
+
+@pytest.mark.parametrize("bad", [(0, float("inf"), 0, 0), (float("inf"), 0, float("-inf"), 0)])
+def test_infinite_sums_stop_the_run_but_not_large_ones(frame, bad):
+    table, rendered = frame
+    LossGuard().check(1, ("a", "b"), Sums(*[torch.finfo(torch.float32).max] * 4), table, rendered)
+    with pytest.raises(NonFiniteError, match=f"the loss of view '{'ba'[bad[0] > 0]}' is not finite"):
+        LossGuard().check(1, ("a", "b"), Sums(*bad), table, rendered)
