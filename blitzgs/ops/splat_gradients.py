@@ -89,7 +89,10 @@ class SplatGradients(NamedTuple):
     @property
     def means2d(self) -> Tensor | None:
         """The gradient of means2d, [P, 2] per pixel; None if its parts are at several ranks."""
-        return None if self.places is not None else self._columns()[0]
+        if self.places is not None:
+            return None
+        first = self.parts[0]
+        return first[:, _MEAN2D : _MEAN2D + 2] if len(self.parts) == 1 else first
 
     def side_by_side(self) -> Tensor:
         """Return all columns, and `means2d_abs` if it is there, as one [P, F].

@@ -159,11 +159,12 @@ class Stepper:
         table = self.table
         absolute &= keep_means2d
         gradients = pipeline.backward_splats(frame, terms.v_renders, mark, absolute)
-        v_means2d = gradients.means2d_abs if absolute else gradients.means2d
-        sums = None
-        if v_means2d is None and keep_means2d:
-            # The gradients are in the memory of several ranks. The optimiser's kernel adds them up.
-            v_means2d = sums = torch.empty_like(frame.projected.means2d)
+        v_means2d = sums = None
+        if keep_means2d:
+            v_means2d = gradients.means2d_abs if absolute else gradients.means2d
+            if v_means2d is None:
+                # The gradients are in the memory of several ranks. The optimiser's kernel adds them up.
+                v_means2d = sums = torch.empty_like(frame.projected.means2d)
         self._optimiser.step(
             table, frame, gradients, terms.scale_reg, terms.opacity_reg, terms.size_reg, step, sums, absolute
         )
@@ -174,4 +175,4 @@ class Stepper:
         mark("optimiser")
         self._blocks.update(table, frame.projected.visible_ids)
         mark("other")
-        return v_means2d if keep_means2d else None
+        return v_means2d
