@@ -63,14 +63,12 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "int[] ints, float[] floats, Tensor? totals=None) -> Tensor[] rows");
   // views: cameras and, of each view, weights of the Gaussians' smallest axes, opacities and mean axes:
   // (viewmats, Ks[, scale_reg[, opacity_reg[, size_reg]]]). v_splats: (v_means2d, v_conics, v_opacities[,
-  // v_colors]) or, on CUDA, one table of splat gradients. dense: the gradients have a row for each Gaussian,
-  // not only for each visible one. zeros: dense gradients in which all values are 0, as
-  // rasterize_bwd_packed_ returns them; the op writes those of the visible Gaussians and returns empty ones.
+  // v_colors]) or, on CUDA, one table of splat gradients.
   m.def(
       "project_bwd(Tensor[] gaussians, Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, "
-      "Tensor[] v_splats, Tensor? v_depths, bool need_viewmats, bool dense=False, Tensor? level=None, "
-      "Tensor(a!)[]? zeros=None) -> (Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, "
-      "Tensor v_sh, Tensor v_viewmats)");
+      "Tensor[] v_splats, Tensor? v_depths, bool need_viewmats, bool dense=False, Tensor? level=None) -> ("
+      "Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, Tensor v_sh, "
+      "Tensor v_viewmats)");
   // project_bwd, then lazy_adam_step_ of the visible Gaussians. splats: (camera_ids, visible_ids,
   // splat_offsets[, places]); with places, v_splats are the tables of the ranks that composited the splats.
   // Groups of the optimiser, as blitzgs/ops/lazy_adam.py names them: state (params, exp_avgs, exp_avg_sqs,
@@ -143,12 +141,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor v_renders, Tensor? v_alphas, int[] grid, bool absgrad, bool deterministic) -> ("
       "Tensor v_means2d, "
       "Tensor v_conics, Tensor v_splat_opacities, Tensor v_colors, Tensor v_means2d_abs)");
-  // zero_sizes: (N, K), or empty. With it, the op returns `zeros` for project_bwd of N Gaussians with K SH
-  // coefficients; the device sets them to 0 while it computes the gradients of compositing.
   m.def(
       "rasterize_bwd_packed_(Tensor[] splats, Tensor? backgrounds, Tensor[] lists, Tensor[] composited, "
-      "Tensor v_renders, int[] grid, bool deterministic, Tensor(a!) packed, bool absgrad=False, "
-      "int[] zero_sizes=[]) -> Tensor[] zeros");
+      "Tensor v_renders, int[] grid, bool deterministic, Tensor(a!) packed, bool absgrad=False) -> ()");
 
   // The contributions of the splats to the image: their weights alpha T (or the squares of these) and pixels,
   // without colours.

@@ -19,7 +19,7 @@ from blitzgs.ops.projection import (
     project_splats,
 )
 from blitzgs.ops.sparse_rows import HandOver, full_gradients
-from blitzgs.ops.splat_gradients import DenseZeros, packed_table
+from blitzgs.ops.splat_gradients import packed_table
 
 
 def project(
@@ -173,7 +173,6 @@ def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats, rows: Tab
     index = splats.camera_ids, visible_ids, splats.splat_offsets
     ctx.save_for_backward(*read.gaussians, *read.cameras, *index, inputs.level, ids)
     ctx.options = inputs.options
-    ctx.dense_zeros = None
 
 
 class _Differentiable(NamedTuple):
@@ -237,15 +236,21 @@ def _first_gradients(
 ) -> tuple[Tensor | None, ...]:
     _, visible_ids, _ = saved.splats
     gathered = ctx.tables is not None
-    complete, dense = _whole_tables(gathered, sparse, needed, visible_ids, saved.gaussians)
-    zeros = None if ctx.dense_zeros is None else ctx.dense_zeros.take()
+    all_dense = not gathered and not any(sparse)
+    # If all Gaussians are visible, the rows of these are all rows. While torch traces the backward pass, the
+    # number of rows is unknown, and tensors are of another type.
+    complete = (
+        all_dense and type(visible_ids) is Tensor and visible_ids.shape[0] == saved.gaussians[0].shape[0]
+    )
+    # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
+    dense = all_dense and not complete and all(needed)
     # Torch resolves the negative bit of an op's tensors, but not of those in a list of optional ones.
     cameras = [tensor.resolve_neg() for tensor in saved.cameras]
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
         saved.gaussians, cameras, saved.splats, ctx.options.ints, ctx.options.floats,
-        _splat_gradients(saved, v), v.depths, need_viewmats, dense, saved.level, zeros,
+        _splat_gradients(saved, v), v.depths, need_viewmats, dense, saved.level,
     )  # fmt: skip
-    found: list[Tensor | None] = (zeros or gradients)[: len(saved.gaussians)]
+    found: list[Tensor | None] = gradients[: len(saved.gaussians)]
     if len(ctx.parts) > 1:
         # Autograd would copy a gradient that is not contiguous, and its indices with it.
         found[4:] = split_rows(gradients[4], ctx.parts)
@@ -259,31 +264,6 @@ def _first_gradients(
         shapes = [table.shape for table in ctx.tables or saved.gaussians]
         found = full_gradients(ids, found, shapes, sparse)
     return (v_viewmats if need_viewmats else None, *found)
-
-
-def _whole_tables(
-    gathered: bool,
-    sparse: Sequence[bool],
-    needed: Sequence[bool],
-    visible_ids: Tensor,
-    gaussians: Sequence[Tensor],
-) -> tuple[bool, bool]:
-    """Tell whether the op's gradients of the visible rows, or else its dense ones, are those of the tables.
-
-    Args:
-        gathered: whether the gaussians are rows of the tables.
-        sparse: see `_gradients`.
-        needed: see `_gradients`.
-        visible_ids: int32 [U].
-        gaussians: see `ProjectionInputs`.
-    """
-    if gathered or any(sparse):
-        return False, False
-    # If all Gaussians are visible, the rows of these are all rows. While torch traces the backward pass, the
-    # number of rows is unknown, and tensors are of another type.
-    complete = type(visible_ids) is Tensor and visible_ids.shape[0] == gaussians[0].shape[0]
-    # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
-    return complete, not complete and all(needed)
 
 
 def _splat_gradients(saved: _Saved, v: _Differentiable) -> list[Tensor]:
@@ -323,14 +303,6 @@ class _Project(torch.autograd.Function):
             call.sparse_grad and (i < 3 or call.rows is not None or (len(tables) > 4 and table.is_leaf))
             for i, table in enumerate(tables)
         ]
-        gaussians, needed = call.inputs.gaussians, ctx.needs_input_grad[2:]
-        _, dense = _whole_tables(
-            call.rows is not None, ctx.sparse, needed, call.splats.visible_ids, gaussians
-        )
-        if dense:
-            # Compositing's backward pass looks for this attribute.
-            coefficients = gaussians[4].shape[1] if len(gaussians) > 4 else 0
-            ctx.dense_zeros = DenseZeros(gaussians[0].shape[0], coefficients)
         return tuple(_Differentiable.of(call.splats))
 
     @staticmethod

@@ -309,7 +309,6 @@ def _(
     need_viewmats: bool,
     dense: bool = False,
     level: Tensor | None = None,
-    zeros: Sequence[Tensor] | None = None,
 ) -> tuple[Tensor, ...]:
     means, (_, visible_ids, _), viewmats = gaussians[0], splats, views[0]
     assert viewmats is not None

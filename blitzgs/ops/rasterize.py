@@ -13,7 +13,7 @@ from blitzgs._library import without_autograd
 from blitzgs.ops.arrange_splats import Places
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.intersect import tile_counts
-from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, DenseZeros, GradientBuffer, gradient_columns
+from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, GradientBuffer, gradient_columns
 
 rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
 # `1 - t` takes 5 us more of the host's time, in which torch makes a tensor of the number. A tensor without
@@ -283,14 +283,7 @@ def _first_gradients(
     v_splats: Sequence[Tensor]
     if may_pack and colors.is_cuda and colors.shape[1] == 3 and v_alphas is None and not absgrad:
         packed = ctx.gradients.take(means2d)
-        # Of the projection's node, if the colours are from there.
-        dense: DenseZeros | None = getattr(ctx.next_functions[3][0], "dense_zeros", None)
-        zero_sizes = [] if dense is None else dense.missing()
-        zeros = torch.ops.blitzgs.rasterize_bwd_packed_(
-            *saved, v_renders, ctx.grid, deterministic, packed, False, zero_sizes
-        )
-        if dense is not None:
-            dense.put(zeros)
+        torch.ops.blitzgs.rasterize_bwd_packed_(*saved, v_renders, ctx.grid, deterministic, packed)
         v_splats = gradient_columns(packed)
     else:
         *v_splats, v_abs = torch.ops.blitzgs.rasterize_bwd(

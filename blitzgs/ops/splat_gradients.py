@@ -174,32 +174,6 @@ class GradientBuffer:
         return means2d.new_zeros(count, SPLAT_GRADIENT) if others is None else others
 
 
-class DenseZeros:
-    """Zeros for the dense gradients of one projection.
-
-    Compositing's backward pass makes them, because the device then writes them while it composites, and the
-    projection's backward pass takes them. If a pass ends between the two, the next one takes them.
-    """
-
-    def __init__(self, gaussians: int, coefficients: int) -> None:
-        """Begin without zeros, for N Gaussians with K SH coefficients each."""
-        self._sizes = [gaussians, coefficients]
-        self._made: list[list[Tensor]] = []
-
-    def missing(self) -> list[int]:
-        """Return `zero_sizes` of the op `rasterize_bwd_packed_`."""
-        return [] if self._made else self._sizes
-
-    def put(self, zeros: list[Tensor]) -> None:
-        """Keep the result of `rasterize_bwd_packed_` for the next `take`."""
-        if zeros:
-            self._made.append(zeros)
-
-    def take(self) -> list[Tensor] | None:
-        """Return `zeros` of the op `project_bwd`: what `put` kept, once; None: nothing is kept."""
-        return self._made.pop() if self._made else None
-
-
 @torch.library.register_fake("blitzgs::splat_gradient_layout")
 def _() -> list[int]:
     return [_MEAN2D, _CONIC, _OPACITY, _COLOR, _MEAN2D_ABS, SPLAT_GRADIENT]

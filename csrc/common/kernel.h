@@ -34,9 +34,7 @@ inline constexpr int kMaxPeers = 16;   // ranks that write to each other's memor
 
 }  // namespace blitzgs
 
-// cudaStream_t and cudaEvent_t are pointers to these; declared so that no CUDA header is needed.
-struct CUstream_st;
-struct CUevent_st;
+struct CUstream_st;  // cudaStream_t is a pointer to this; declared so that no CUDA header is needed
 
 namespace blitzgs {
 

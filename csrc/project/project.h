@@ -241,7 +241,7 @@ struct ProjectGradients {
 };
 
 // Arrays that are set to zero together; on CUDA by one launch, because each launch takes the host
-// microseconds. They are the dense gradients of ProjectGradients but for viewmats.
+// microseconds.
 template <class T>
 struct ZeroedArrays {
   static constexpr int kCount = 5;
@@ -301,29 +301,5 @@ template <class T>
 void project_bwd_step(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource<T>&,
                       const Regularisers<T>&, AdamArgs<T> adam, Workspace&, CudaStream);
 }  // namespace BLITZGS_BACKEND
-
-#ifdef BLITZGS_BACKEND_CUDA
-namespace cuda {
-// Sets arrays to zero on another stream of the current device, beside kernels of the caller's stream. To the
-// caller this is one more work on its stream, queued by run().
-class ZeroBeside {
- public:
-  // The arrays are written when all work that is on the stream now has ended, so they may have been freed and
-  // allocated again in its order.
-  explicit ZeroBeside(CudaStream stream);
-  ~ZeroBeside();
-  ZeroBeside(const ZeroBeside&) = delete;
-  ZeroBeside& operator=(const ZeroBeside&) = delete;
-
-  // The kernels beside which the arrays are zeroed have been queued since the constructor. Work that is
-  // queued on the stream after this call finds zeros.
-  void run(const ZeroedArrays<float>& arrays);
-
- private:
-  CudaStream stream_;
-  CUevent_st* event_;
-};
-}  // namespace cuda
-#endif
 
 }  // namespace blitzgs

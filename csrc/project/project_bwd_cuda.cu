@@ -1,8 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
 #include <cub/block/block_reduce.cuh>
-#include <map>
-#include <mutex>
 
 #include "project/project_bwd_device.cuh"
 
@@ -118,14 +115,10 @@ __global__ void reduce_poses_kernel(const double* partial, std::int64_t n_blocks
   v_viewmats[16 * view + i] = static_cast<float>(sum);
 }
 
-// A multiprocessor has room for one such block beside three of compositing's backward pass, which have 256
-// threads of 80 registers each: of its 65536 registers, these leave 4096.
-constexpr int kZeroThreads = 128, kZeroRegisters = 32;
-constexpr int kZeroBlocks = 16;  // on each multiprocessor, where nothing else runs
+constexpr int kZeroThreads = 256;
 
-// The arrays begin at multiples of 16 bytes, so a thread writes four floats at a time. The L2 cache evicts
-// the zeros first and so keeps what a kernel beside this one reads.
-__global__ void __maxnreg__(kZeroRegisters) zero_arrays_kernel(const ZeroedArrays<float> arrays) {
+// The arrays begin at multiples of 16 bytes, so a thread writes four floats at a time.
+__global__ void __launch_bounds__(kZeroThreads) zero_arrays_kernel(const ZeroedArrays<float> arrays) {
   wait_for_earlier_kernels();
   const std::int64_t first = blockIdx.x * std::int64_t{kZeroThreads} + threadIdx.x;
   const std::int64_t step = gridDim.x * std::int64_t{kZeroThreads};
@@ -134,68 +127,24 @@ __global__ void __maxnreg__(kZeroRegisters) zero_arrays_kernel(const ZeroedArray
     float* const begin = arrays.begin[a];
     const std::int64_t fours = arrays.length[a] / 4;
     for (std::int64_t i = first; i < fours; i += step) {
-      __stcs(reinterpret_cast<float4*>(begin) + i, make_float4(0.f, 0.f, 0.f, 0.f));
+      reinterpret_cast<float4*>(begin)[i] = make_float4(0.f, 0.f, 0.f, 0.f);
     }
     const std::int64_t rest = 4 * fours + first;
     if (rest < arrays.length[a]) begin[rest] = 0.f;
   }
 }
 
-// The number of blocks that zero the arrays with at most `each` blocks on a multiprocessor.
-unsigned zero_blocks(const ZeroedArrays<float>& arrays, int each) {
-  const std::int64_t most = *std::max_element(arrays.length, arrays.length + ZeroedArrays<float>::kCount);
-  const std::int64_t needed = (most + 4 * kZeroThreads - 1) / (4 * kZeroThreads);
-  return static_cast<unsigned>(std::min<std::int64_t>(needed, std::int64_t{each} * multiprocessors()));
-}
-
-// The stream of the current device on which ZeroBeside works. Its priority is the highest: the device places
-// blocks of a kernel of lower or equal priority only when those of an earlier kernel, which are many more
-// than fit, have all been placed.
-cudaStream_t zero_stream() {
-  static std::mutex mutex;
-  static std::map<int, cudaStream_t> streams;  // by device
-  int device = 0, lowest = 0, highest = 0;
-  check(cudaGetDevice(&device), "zero_arrays");
-  const std::lock_guard lock(mutex);
-  cudaStream_t& stream = streams[device];
-  if (!stream) {
-    check(cudaDeviceGetStreamPriorityRange(&lowest, &highest), "zero_arrays");
-    check(cudaStreamCreateWithPriority(&stream, cudaStreamNonBlocking, highest), "zero_arrays");
-  }
-  return stream;
-}
-
 }  // namespace
 
 template <>
 void zero_arrays<float>(const ZeroedArrays<float>& arrays, CudaStream stream) {
-  const unsigned blocks = zero_blocks(arrays, kZeroBlocks);
-  if (blocks == 0) return;
-  launch_early("zero_arrays", zero_arrays_kernel, {blocks, kZeroThreads, stream}, arrays);
-}
-
-ZeroBeside::ZeroBeside(CudaStream stream) : stream_(stream), event_(nullptr) {
-  check(cudaEventCreateWithFlags(&event_, cudaEventDisableTiming), "zero_arrays");
-  check(cudaEventRecord(event_, stream_), "zero_arrays");
-}
-
-// An event may be destroyed while streams wait for it.
-ZeroBeside::~ZeroBeside() { cudaEventDestroy(event_); }
-
-void ZeroBeside::run(const ZeroedArrays<float>& arrays) {
-  const unsigned blocks = zero_blocks(arrays, 1);
-  if (blocks == 0) return;
-  const cudaStream_t beside = zero_stream();
-  check(cudaStreamWaitEvent(beside, event_, 0), "zero_arrays");
-  // A multiprocessor divides its memory into cache and shared memory. A kernel that asks for the division of
-  // the kernel beside it need not wait for another one.
-  check(cudaFuncSetAttribute(zero_arrays_kernel, cudaFuncAttributePreferredSharedMemoryCarveout,
-                             cudaSharedmemCarveoutMaxShared),
-        "zero_arrays");
-  zero_arrays_kernel<<<blocks, kZeroThreads, 0, beside>>>(arrays);
-  check_launch("zero_arrays");
-  check(cudaEventRecord(event_, beside), "zero_arrays");
-  check(cudaStreamWaitEvent(stream_, event_, 0), "zero_arrays");
+  std::int64_t most = 0;
+  for (const std::int64_t length : arrays.length) most = length > most ? length : most;
+  if (most == 0) return;
+  const unsigned at_a_time = 8u * static_cast<unsigned>(multiprocessors());
+  const std::int64_t needed = (most + 4 * kZeroThreads - 1) / (4 * kZeroThreads);
+  const unsigned blocks = needed < at_a_time ? static_cast<unsigned>(needed) : at_a_time;
+  launch_early("project_bwd", zero_arrays_kernel, {blocks, kZeroThreads, stream}, arrays);
 }
 
 template <>

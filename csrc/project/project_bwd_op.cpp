@@ -143,45 +143,39 @@ struct BackwardSplats {
 
 using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-// Checks the argument `zeros` of project_bwd, which the kernels write in place.
-void check_zeros(const char* op, const ProjectArguments& p, const TensorList& zeros) {
-  check_group(op, "zeros like means, quats, scales, opacities and sh", zeros, 5, 5);
-  const ScalarType dtype = p.means.scalar_type();
-  check_in_place(op, "zeros[0]", zeros[0], dtype, {p.count, 3});
-  check_in_place(op, "zeros[1]", zeros[1], dtype, {p.count, 4});
-  check_in_place(op, "zeros[2]", zeros[2], dtype, {p.count, 3});
-  check_in_place(op, "zeros[3]", zeros[3], dtype, {p.count});
-  check_in_place(op, "zeros[4]", zeros[4], dtype, {p.count, p.sh_stride, 3});
-}
-
 BackwardTensors project_bwd(const TensorList& gaussians, const OptionalTensorList& views_in,
                             const TensorList& splats, const IntList& ints, const FloatList& floats,
                             const TensorList& v_splats, const OptionalTensor& v_depths, bool need_viewmats,
-                            bool dense, const OptionalTensor& level, const std::optional<TensorList>& zeros) {
+                            bool dense, const OptionalTensor& level) {
   constexpr const char* kOp = "project_bwd";
   const WeightedViews views(kOp, views_in);
   const ProjectArguments p(kOp, gaussians, views.cameras, ints, floats, level);
   const BackwardSplats b(kOp, p, views, splats, /*reads_places=*/false);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
                              std::nullopt);
-  if (zeros) check_zeros(kOp, p, *zeros);
-  TensorList out = zeros ? *zeros : make_gradients(p.means, dense ? p.count : b.visible(), p.sh_stride);
-  Tensor v_viewmats = make_empty(p.means, {need_viewmats ? p.n_views : 0, 4, 4});
+  const std::int64_t length = dense ? p.count : b.visible();
+  Tensor v_means = make_empty(p.means, {length, 3}), v_quats = make_empty(p.means, {length, 4}),
+         v_scales = make_empty(p.means, {length, 3}), v_opacities = make_empty(p.means, {length}),
+         v_sh = make_empty(p.means, {length, p.sh_stride, 3}),
+         v_viewmats = make_empty(p.means, {need_viewmats ? p.n_views : 0, 4, 4});
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&](auto zero) {
     using T = decltype(zero);
-    const ZeroedArrays<T> arrays = arrays_of<T>(out);
-    if (dense && !zeros) backend::zero_arrays(arrays, scope.stream);
-    const auto& [v_means, v_quats, v_scales, v_opacities, v_sh] = arrays.begin;
+    if (dense) {
+      backend::zero_arrays(
+          ZeroedArrays<T>{{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),
+                           mutable_data<T>(v_opacities), mutable_data<T>(v_sh)},
+                          {3 * length, 4 * length, 3 * length, length, 3 * p.sh_stride * length}},
+          scope.stream);
+    }
     backend::project_bwd(
         p.inputs<T>(), b.pointers(), v.source<T>(), b.regularisers<T>(),
-        ProjectGradients<T>{v_means, v_quats, v_scales, v_opacities, p.sh ? v_sh : nullptr,
-                            need_viewmats ? mutable_data<T>(v_viewmats) : nullptr, dense || zeros},
+        ProjectGradients<T>{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),
+                            mutable_data<T>(v_opacities), p.sh ? mutable_data<T>(v_sh) : nullptr,
+                            need_viewmats ? mutable_data<T>(v_viewmats) : nullptr, dense},
         scope.workspace, scope.stream);
   });
-  // The caller has the gradients already, and a result must not be an argument.
-  if (zeros) out.assign(5, make_empty(p.means, {0}));
-  return {out[0], out[1], out[2], out[3], out[4], v_viewmats};
+  return {v_means, v_quats, v_scales, v_opacities, v_sh, v_viewmats};
 }
 
 void project_bwd_step(const TensorList& state_in, const TensorList& tables, const IntList& steps,

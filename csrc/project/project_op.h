@@ -25,23 +25,6 @@ void check_group(const char* op, const char* names, const List& list, std::size_
                   ", got ", list.size(), " entries");
 }
 
-// Allocates the gradients of means, quats, scales, opacities and sh with n rows each.
-inline TensorList make_gradients(const Tensor& like, std::int64_t n, std::int64_t sh_stride) {
-  return {make_empty(like, {n, 3}), make_empty(like, {n, 4}), make_empty(like, {n, 3}), make_empty(like, {n}),
-          make_empty(like, {n, sh_stride, 3})};
-}
-
-// The memory of such gradients, to be set to zero.
-template <class T>
-ZeroedArrays<T> arrays_of(TensorList& gradients) {
-  ZeroedArrays<T> arrays;
-  for (int i = 0; i < ZeroedArrays<T>::kCount; ++i) {
-    arrays.begin[i] = mutable_data<T>(gradients[i]);
-    arrays.length[i] = gradients[i].numel();
-  }
-  return arrays;
-}
-
 // ints: width, height, tile_size, sh_degree, antialiased, raw. floats: near_plane, far_plane, eps2d,
 // radius_clip and, with smooth levels, the floats of set_fade.
 inline ProjectOptions<double> checked_options(const char* op, const IntList& ints, const FloatList& floats) {

@@ -4,7 +4,6 @@
 #include <tuple>
 
 #include "common/op.h"
-#include "project/project_op.h"
 
 namespace blitzgs {
 namespace {
@@ -224,28 +223,19 @@ CompositedTensors rasterize_fwd_packed(const Tensor& means2d, const Tensor& coni
   return composite(splats, packed, false);
 }
 
-TensorList rasterize_bwd_packed(const TensorList& splats_in, const OptionalTensor& backgrounds,
-                                const TensorList& lists, const TensorList& composited_in,
-                                const Tensor& v_renders, const IntList& grid_numbers, bool deterministic,
-                                Tensor packed, bool absgrad, const IntList& zero_sizes) {
+void rasterize_bwd_packed(const std::vector<Tensor>& splats_in, const std::optional<Tensor>& backgrounds,
+                          const std::vector<Tensor>& lists, const std::vector<Tensor>& composited_in,
+                          const Tensor& v_renders, const std::vector<std::int64_t>& grid_numbers,
+                          bool deterministic, Tensor packed, bool absgrad) {
   constexpr const char* kOp = "rasterize_bwd_packed_";
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   const Splats splats = backward_splats(kOp, splats_in, backgrounds, lists, grid);
   check_packed(kOp, splats, packed);
   const Composited composited(kOp, splats, composited_in, v_renders, std::nullopt);
   DeviceScope scope(splats.means2d);
-  TensorList zeros;
-  std::optional<cuda::ZeroBeside> beside;
-  if (!zero_sizes.empty()) {
-    check_group(kOp, "zero_sizes (N, K)", zero_sizes, 2, 2);
-    zeros = make_gradients(packed, zero_sizes[0], zero_sizes[1]);
-    beside.emplace(scope.stream);
-  }
   cuda::rasterize_bwd_packed(splats.input<float>(), composited.saved<float>(), splats.isect_splats.size(0),
                              composited.aux(), deterministic, absgrad, mutable_data<float>(packed),
                              scope.workspace, scope.stream);
-  if (beside) beside->run(arrays_of<float>(zeros));
-  return zeros;
 }
 #endif
 
