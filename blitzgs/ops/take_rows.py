@@ -13,8 +13,9 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 def take_rows(column: Tensor, rows: Tensor, fresh: Tensor | None = None) -> Tensor:
     """Return the rows `rows` of the concatenation of a column and new rows.
 
-    The result equals `torch.cat([column, fresh]).index_select(0, rows)`. Torch's `index_select` is slower,
-    because it uses a whole block of threads for each row whose size is a multiple of 16 bytes.
+    The result equals `torch.cat([column, fresh]).index_select(0, rows)`. Rows may have any size. For rows
+    whose size is a multiple of 16 bytes, torch's `index_select` is slower, because it uses a whole block of
+    threads for each.
 
     Args:
         column: [N, ...], any dtype.

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The importance pass: one sweep over all training views that scores every Gaussian (BlitzGS, section 3.2).
 
-For view v and Gaussian i, w is the sum of alpha T over the pixels at which the renderer composites i, a is
-their number, c_rad tells whether i is visible, and c_vis whether it is in the smallest set, by descending w
-(ties by id), that holds 99 % of the view's total. Then::
+For view v and Gaussian i, w is the sum of alpha T over the pixels at which the renderer composites i, a
+is their number, c_rad tells whether the box around its alpha >= 1/255 overlaps the image, and c_vis
+whether it is in the smallest set, by descending w (ties by id), that holds 99 % of the view's total.
+Then::
 
     score_i = sum over v with a > 0 of w / (a + SCORE_EPS)^p, p = 1 for "density", 1/2 "root", 0 "weight"
             = sum over v and these pixels of (alpha T)^2 for "energy"
@@ -41,13 +42,16 @@ from blitzgs.survey import Survey, survey
 from blitzgs.view.gate import SceneGate
 from blitzgs.view.visible_scene import Scene, VisibleScene, find_visible, table_of
 
+# The constants of the formulas above. PHI_EPS and VIEW_MASS are the paper's values; the paper calls the
+# epsilon of the score small and gives no value.
 SCORE_EPS = 1e-6
 PHI_EPS = 0.1
 VIEW_MASS = 0.99
 # Column of a table from the first pass on, beside `CULL`.
 PHI = "phi"
 ScoreRule = Literal["density", "root", "weight", "energy"]
-# Bits before the binary point of a view's term, for fewer than 2^31 pixels.
+# Bits before the binary point of a view's term, for a < 2^31 pixels: w < a < 2^31, so w / a < 1 and
+# w / sqrt(a) < sqrt(a) < 2^16. A sum of squares is less than w.
 _TERM_BITS: dict[ScoreRule, int] = {"density": 0, "root": 16, "weight": 31, "energy": 31}
 
 

@@ -116,8 +116,10 @@ class ScheduleConfig:
             measures its speed and changes its pace; `scale` stays 1. 0: no limit.
         pace: pairs (image of the run, factor): from that image on, `scale` is multiplied by the factor. A run
             with `minutes` writes its changes of pace here; a run without `minutes` repeats them.
-        adaptive: the run places `t1`, `densify_until` and `t2`, in this order, by its growth and its loss
-            (`blitzgs/training/adaptive.py`).
+        adaptive: the run places `t1`, `densify_until` and `t2`, in this order, by the demand of density
+            control and by its loss (`blitzgs/training/adaptive.py`). `t1` and `t2` have no effect without
+            `population.importance`. With "relocation", the demand hardly changes: `t1` comes at its latest
+            time, and the loss decides on the others.
         adaptive_limit: largest change of these times by `adaptive`, earlier or later, as a share of each.
         placed: the times placed so far, up to three. A run with `adaptive` writes them here; a run without it
             repeats them.
@@ -126,7 +128,8 @@ class ScheduleConfig:
         size_prune_after: density events later than this also prune by size.
         reset_every: all opacities are capped at `population.reset_opacity` at every multiple of this before
             `densify_until`; 0: never.
-        gate_from: from here on `population.gate` judges the candidates of density events.
+        gate_from: from here on `population.gate` judges the candidates of density events; no effect without a
+            gate.
         t1, t2: times of the first and the second importance pass, if `population.importance` is set; 0: no
             pass. A pass happens after the density event of the same time.
         levels_until: from here on `view.lod` may keep all octree levels; at the start it keeps those up to
@@ -225,6 +228,10 @@ class LossConfig:
 class PopulationConfig:
     """Density control: which Gaussians are cloned, split and pruned, and the two importance passes.
 
+    Some fields have no effect on some runs. With "relocation": `grad_threshold`, `absolute_gradients`,
+    `absolute_threshold`, `clone_scale`, `min_observations` and `phi`. With "density": `growth`. Without
+    `importance`: `score`, `pass1_keep`, `pass2_mass`, `pass2_keep` and `phi`. Without `gate`: `gate_rate`.
+
     Attributes:
         strategy: what a density event does: "density" (clone and split by gradients, prune) or "relocation"
             (3DGS-MCMC: Gaussians that would be pruned are replaced by copies of others, drawn by opacity, and
@@ -254,14 +261,15 @@ class PopulationConfig:
         pass1_keep: share of the Gaussians that the first pass keeps, drawn in proportion to their scores; 1:
             it keeps all and only computes phi and the cull matrix.
         pass2_mass: the second pass keeps the fewest Gaussians that hold this share of the total score,
-            without those below `min_opacity`; 1: it keeps all and only computes phi and the cull matrix.
-        pass2_keep: largest share of the Gaussians that the second pass keeps, those of the highest scores; 1:
-            no such limit.
+            without those below `min_opacity`. 1: it keeps all whose score is not zero.
+        pass2_keep: largest share of the Gaussians that the second pass keeps, those of the highest scores,
+            without those below `min_opacity`; 1: no such limit. If `pass2_mass` and `pass2_keep` are both 1,
+            the pass keeps all Gaussians and only computes phi and the cull matrix.
         phi: from the first pass on, density control multiplies the gradients that it sums with phi: among the
             views that see a Gaussian, the share of those in which it counts.
         gate: model file of a spawn gate (`blitzgs gate fit`), or "default" for the one that comes with
-            BlitzGS, for configs/compact.yaml with schedule.t1=8999 and pass1_keep=0.85; or "random" to
-            withhold as many at random, which a gate has to surpass; null: none.
+            BlitzGS, for configs/compact.yaml with schedule.t1=8999, pass1_keep=0.85 and score=weight; or
+            "random" to withhold as many at random, which a gate has to surpass; null: none.
         gate_rate: share of the candidates, clones and splits apart, that the gate withholds at each density
             event from `schedule.gate_from` on.
         lineage: log every birth and death as Parquet files in the run's folder `lineage` (needs pyarrow).

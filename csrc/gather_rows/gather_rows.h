@@ -3,7 +3,7 @@
 //   column.to[i stride + k] = column.from[ids[i] from_stride + k],  0 <= i < n,  0 <= k < width.
 // With a stride above the width, several columns are gathered side by side into one; with a from_stride above
 // the width, a column is a part of wider rows. ids int32 [n], rows of the columns, not checked; null: 0 to n
-// - 1. known: null, or (CUDA) the number of valid ids, see valid_splat_count.
+// - 1. known: null, or (CUDA) the number of valid ids, see valid_splat_count in common/kernel.h.
 #pragma once
 #include <cstdint>
 
