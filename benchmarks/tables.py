@@ -3,10 +3,10 @@ r"""The paper's tables on any scenes: runs what is missing, and writes Markdown 
 
     python benchmarks/tables.py ablation --out TABLES --seeds 0 1 2 --gpus 4 \
         --scenes town=DATA/town "park=DATA/park --data.downscale=2" \
-        --config configs/compact.yaml --gate gates/aerial.json
+        --config configs/compact.yaml --gate gates/mine.json
     python benchmarks/tables.py scaling --out TABLES --scenes city=DATA/city --gpus 4 --ranks 1 2 4
     python benchmarks/tables.py cost --out TABLES --scenes city=DATA/city --gpus 4 --ranks 1 2 4
-    python benchmarks/tables.py oracle --out TABLES --runs town=RUNS/town --gate gates/aerial.json --gpus 1
+    python benchmarks/tables.py oracle --out TABLES --runs town=RUNS/town --gate gates/mine.json --gpus 1
     python benchmarks/tables.py popping --out TABLES --runs town=RUNS/town
 
 main, ablation, rho, onset, scaling and trajectory train, by `bm_quality.py`: a process for each run, into
@@ -14,7 +14,8 @@ TABLES/runs. `benchmarks/paper_tables.yaml` has their arms and the paper's figur
 importance passes, phi, LOD gate, per-view mask and --gate, less what its row leaves out. Without --gate the
 arms that differ by the gate alone are left out. cost runs `bm_exchange.py`, on the octree by
 `--lod.visible_threshold` of --flags; oracle `blitzgs gate replay` from a run with lineage and checkpoints;
-popping `bm_popping.py` on the model of a run with levels.
+popping `bm_popping.py` on the model of a run with levels. gates/mine.json is a gate that `blitzgs gate fit`
+makes from trainings of other scenes.
 
 The ablation of the model level alone, for captures too small to have levels:
     python benchmarks/tables.py ablation --flags "--view.lod=false --view.cull=false" \
