@@ -26,7 +26,7 @@ from blitzgs.training.schedule import Schedule
 HELP = """\
 A spawn gate is a predictor that withholds candidates of densification whose children would probably be pruned
 later. It is fitted on the lineage of finished runs: the log of all births and deaths of Gaussians.
-docs/guide/fewer-gaussians.md has an example.
+The repository's docs/guide/fewer-gaussians.md has an example.
 
   blitzgs train ... --population.lineage=true       log births and deaths (for each scene)
   blitzgs gate fit RUN RUN RUN --out gate.json      fit on them; prints figures for scenes left out

@@ -46,8 +46,8 @@ tensorboard/ if TensorBoard is installed. A checkpoint is written every 10 minut
 and when the run is interrupted (Ctrl-C, SIGTERM or SIGHUP). The same command with --resume continues from the
 newest checkpoint; without any checkpoint it starts a new run and says so.
 
-Several processes share the work with torchrun --nproc-per-node=M train.py (the same flags). With --resume and
---max-restarts=K, a job that loses a process continues from its last checkpoint.
+Several processes share the work with torchrun --nproc-per-node=M -m blitzgs train (the same flags). With
+--resume and --max-restarts=K, a job that loses a process continues from its last checkpoint.
 """
 
 
