@@ -36,9 +36,11 @@ EVENTS = 3
 FALLEN, GONE = 0.5, 0.1
 # The loss is compared between neighbouring spans of whole epochs, each at least this share of the schedule.
 SPAN = 1 / 60
-# The fall of the logarithm of the loss, per length of the schedule, below which it counts as settled; so a
-# loss that rises counts as settled too. No other value was measured.
+# The fall of the logarithm of the loss, per length of the schedule, below which it counts as settled. No other
+# value was measured.
 SETTLED = 0.5
+# A loss that rises by more than this factor was disturbed, as by a reset of the opacities, and has not settled.
+DISTURBED = 1.1
 
 
 @dataclass
@@ -152,6 +154,6 @@ class Signals:
             for epochs in (self.epochs[-2 * span : -span], self.epochs[-span:])
         )
         fall = math.log(max(first, 1e-12) / max(last, 1e-12)) * config.iterations / sum(lengths[-span:])
-        if fall > SETTLED:
+        if fall > SETTLED or last > DISTURBED * first:
             return None
         return f"the loss went from {first:.5f} to {last:.5f} until {ends[-1]:,.0f}, over {span} epochs each"

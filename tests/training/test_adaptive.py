@@ -78,6 +78,9 @@ def test_densification_ends_with_demand_or_when_the_loss_settles():
         found = place(signals(wanted, epochs_of_50(rate, 950)), config, now)
         assert (found is not None) == settled
         assert not settled or "until 950, over 1 epochs each" in found[1]
+    # The loss doubles when opacities are reset.
+    calm = epochs_of_50(0, 950)
+    assert place(signals(wanted, [*calm[:-1], (calm[-1][0], 2 * calm[-1][1])]), config, now) is None
     # Measurements before T1 are not used for the times after it.
     assert place(signals(wanted, epochs_of_50(0, 750)), config, now) is None
     assert place(signals(wanted, epochs_of_50(0, 800)), config, now) is not None
