@@ -36,10 +36,10 @@ EVENTS = 3
 FALLEN, GONE = 0.5, 0.1
 # The loss is compared between neighbouring spans of whole epochs, each at least this share of the schedule.
 SPAN = 1 / 60
-# The fall of the logarithm of the loss, per length of the schedule, below which it counts as settled. No other
-# value was measured.
+# The fall of the logarithm of the loss, per length of the schedule, below which it counts as settled. No
+# other value was measured.
 SETTLED = 0.5
-# A loss that rises by more than this factor was disturbed, as by a reset of the opacities, and has not settled.
+# A loss that rises by more than this factor has not settled: something raised it, as a reset of opacities.
 DISTURBED = 1.1
 
 
