@@ -61,7 +61,7 @@ COMMANDS = {
 COMMANDS |= {
     "compact": (
         "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/compact "
-        "--capture NAME=CAPTURE"
+        '--capture "NAME=CAPTURE --schedule.scale=0.5"'
     ),
     "adaptive": (
         "python benchmarks/bm_quality.py --plan benchmarks/adaptive.yaml --out runs/adaptive "
