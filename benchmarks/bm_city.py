@@ -80,9 +80,13 @@ def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
     capture = {"city": f"'{args.city}' --data.split={json.dumps(str(split.resolve()))}"}
     common = " ".join([f"--schedule.scale={args.scale}", "--log.every=200", *overrides])
     recipes = {arm: f"'{CONFIG}' {ARMS[arm]} {common}" for arm in args.arms}
-    first, device, sizes = args.arms[0], "cuda" if args.gpus else "cpu", args.batch_sizes or [None]
+    first, device, sizes = (
+        args.arms[0],
+        "cuda" if args.gpus else "cpu",
+        list(dict.fromkeys(args.batch_sizes)) or [None],
+    )
     runs = []
-    for ranks, size in itertools.product(args.ranks, sizes):
+    for ranks, size in itertools.product(dict.fromkeys(args.ranks), sizes):
         is_first = ranks == 1 and size == sizes[0]
         batch = "" if size is None else f" --schedule.batch_size={size}"
         chosen = {arm: recipes[arm] + batch for arm in (args.arms if is_first else [first])}

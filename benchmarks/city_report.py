@@ -25,6 +25,8 @@ NONE = "–"
 def title_of(run: Json) -> str:
     """Return the name of a run in the tables."""
     title = TITLES[run["recipe"]]
+    if run.get("batch_size", 4) != 4:
+        title += f", {run['batch_size']} views a step"
     if run["ranks"] > 1:
         title += f", {run['ranks']} ranks"
     if not run["finished"] and "images" in run:
@@ -103,10 +105,12 @@ def arm_rows(file: Json) -> Rows:
 
 def cost_rows(file: Json) -> Rows:
     """Tabulate what the gate and the mask cost and gain: full, against a run without them."""
-    runs = {run["recipe"]: run for run in trained(file, 1) if run["finished"] and "psnr" in run}
-    compared = {"LOD gate": "no_lod", "mask": "no_mask", "both": "all_off"}
+    done = [run for run in trained(file, 1) if run["finished"] and "psnr" in run]
+    # The arms of the first batch size; only one arm may have others.
+    runs = {run["recipe"]: run for run in done if run["batch_size"] == done[0]["batch_size"]}
+    others = {"LOD gate": "no_lod", "mask": "no_mask", "both": "all_off"}
     rows = []
-    for name, other in compared.items():
+    for name, other in others.items():
         if "full" not in runs or other not in runs:
             continue
         ours, theirs = runs["full"], runs[other]

@@ -33,6 +33,8 @@ class _Place(NamedTuple):
 class _Side:
     """A second stream of a device, for work that the step does not wait for, and what is used with it again.
 
+    One thread uses it at a time: another one might record `ready` anew before the first has waited for it.
+
     Attributes:
         stream: the second stream.
         ready: event that is recorded on the step's stream before each use of the second one. It can be
@@ -61,8 +63,10 @@ class _Queued:
     """
 
     def __init__(self, side: _Side, words: int, tensors: tuple[Tensor | None, ...]) -> None:
+        self._side: _Side = side
+        self._tensors: tuple[Tensor | None, ...] = ()  # in case there is no memory for a place
         self.place = side.place(words)
-        self._side, self._tensors = side, tensors
+        self._tensors = tensors
 
     def has_ended(self) -> None:
         """Let later work use all this again: the host has waited for `written` and copied the numbers."""

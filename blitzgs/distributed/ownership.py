@@ -20,6 +20,7 @@ from blitzgs.distributed.tiles import TileRanges, count_tiles
 from blitzgs.ops.tile_costs import divide_tiles, tile_costs
 
 # Fixed cost of a tile, in units of one list entry: its pixels are written and compared with the photograph.
+# The sums of `divide_tiles` are exact from 8 on.
 TILE_COST = 8
 # Largest number of costs that are stored for a view, 16 KB; a view with fewer tiles has one for each tile.
 _MOST_NUMBERS = 8192

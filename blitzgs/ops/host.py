@@ -80,5 +80,5 @@ def to_host(tensor: Tensor) -> Tensor:
         return tensor.cpu()
     # Pinned: a copy to pageable memory passes through the driver's own buffer first.
     values = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor, non_blocking=True)
-    torch.cuda.current_stream(tensor.device).synchronize()
+    current_stream(tensor.device).synchronize()
     return values

@@ -114,8 +114,8 @@ def rasterization(
         first read.
 
     Warns:
-        RuntimeWarning: an argument has values that are NaN or infinite. On CUDA every 32nd call looks for
-            them, and every call with a view that sees no Gaussian looks at the cameras.
+        RuntimeWarning: an argument has values that are NaN or infinite. On CUDA every call looks for them in
+            the cameras, and every 32nd call in the Gaussians.
 
     Raises:
         TypeError: an argument is not a tensor, or not the kind of number it should be, or gsplat has no such

@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs.ops.host import HostCopy
 from blitzgs.rendering.arguments import Gaussians
 from blitzgs.rendering.layout import Layout
 
 # On CUDA, the first of this many calls of a size checks all arguments: the check is a pass over all
-# Gaussians, and their values that are not finite stay so. Cameras differ from call to call; a call with a
-# view that sees nothing, as one with a bad camera does, checks the cameras.
+# Gaussians, and their values that are not finite stay so. Cameras differ from call to call, so every call
+# looks for bad ones.
 EVERY_CUDA_CALLS = 32
 COLOURS = ("colors", "sh0", "shN")
 
@@ -79,10 +80,19 @@ def _rows_not_finite(values: Tensor) -> Tensor:
     return bad
 
 
+def find_bad_cameras(gaussians: Gaussians) -> HostCopy:
+    """Start to look for views whose cameras are not finite; the copy reads 0 if all are finite, int64 [1]."""
+    named = gaussians.named
+    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+        return HostCopy(
+            torch.ops.blitzgs.find_non_finite([*named["viewmats"], *named["Ks"]], []).view(1).long()
+        )
+
+
 def watch_for_non_finite(
-    gaussians: Gaussians, layout: Layout, function: str, zeros: Sequence[Tensor], has_blank_view: bool
+    gaussians: Gaussians, layout: Layout, function: str, colours: Sequence[Tensor], suspects_cameras: bool
 ) -> None:
-    """Warn, now and then on CUDA, about arguments with values that are not finite.
+    """Warn about arguments of a renderer with values that are not finite; on CUDA see `EVERY_CUDA_CALLS`.
 
     SH coefficients, the largest part of a Gaussian, are only checked for visible Gaussians.
 
@@ -90,36 +100,26 @@ def watch_for_non_finite(
         gaussians: the arguments of a call.
         layout: its splats.
         function: name of the public function.
-        zeros: NaN for Gaussians whose colours are values that are not finite.
-        has_blank_view: whether some view may see no Gaussian.
+        colours: a value for each Gaussian, NaN if its colours are values that are not finite.
+        suspects_cameras: whether a camera may be not finite.
     """
     named = gaussians.named
     first = named["means"][0]
     if first.is_cuda and next(_calls(first.device, first.shape[0])) % EVERY_CUDA_CALLS:
-        if has_blank_view:
-            _warn(gaussians, [*named["viewmats"], *named["Ks"]], [], function)
-        return
-    columns = [t for name, given in named.items() if name not in COLOURS for t in given]
-    # Splats whose SH are not finite have no opacity, and no other splat is below 1/255.
-    _warn(gaussians, [*columns, *zeros], [layout.splats.opacities], function)
-
-
-def _warn(gaussians: Gaussians, columns: Sequence[Tensor], nonzero: Sequence[Tensor], function: str) -> None:
-    """Warn if `columns` have values that are not finite, or `nonzero` has zeros, because of an argument.
-
-    One pass over the columns tells whether a closer check is needed.
-    """
-    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
-        if not torch.ops.blitzgs.find_non_finite(columns, nonzero).item():
+        if not suspects_cameras:
             return
-    names = ", ".join(non_finite(gaussians))
-    if names:
-        warnings.warn(
-            f"blitzgs.{function}: NaN or infinite values in {names}; the Gaussians or views that have them "
-            "are not rendered. meta['non_finite'] has their indices.",
-            RuntimeWarning,
-            stacklevel=5,
-        )
+        columns, opacities = [*named["viewmats"], *named["Ks"]], []
+    else:
+        columns = [*(t for name, given in named.items() if name not in COLOURS for t in given), *colours]
+        # Splats whose SH are not finite have no opacity, and no other splat is below 1/255.
+        opacities = [layout.splats.opacities]
+    # One pass over the columns tells whether a closer check is needed.
+    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+        if not torch.ops.blitzgs.find_non_finite(columns, opacities).item():
+            return
+    if names := ", ".join(non_finite(gaussians)):
+        ending = "are not rendered. meta['non_finite'] has their indices."
+        _warn(function, names, ending, stacklevel=5)
 
 
 def warn_of_non_finite(gaussians: Gaussians, function: str, stacklevel: int) -> None:
@@ -133,12 +133,16 @@ def warn_of_non_finite(gaussians: Gaussians, function: str, stacklevel: int) -> 
     found = {name: indices[:5].tolist() for name, indices in non_finite(gaussians).items()}
     if found:
         shown = "; ".join(f"{name}, first at {', '.join(map(str, at))}" for name, at in found.items())
-        warnings.warn(
-            f"blitzgs.{function}: NaN or infinite values in {shown}; the Gaussians or views that have them "
-            "contribute nothing",
-            RuntimeWarning,
-            stacklevel=stacklevel,
-        )
+        _warn(function, shown, "contribute nothing", stacklevel + 1)
+
+
+def _warn(function: str, where: str, ending: str, stacklevel: int) -> None:
+    warnings.warn(
+        f"blitzgs.{function}: NaN or infinite values in {where}; the Gaussians or views that have them "
+        f"{ending}",
+        RuntimeWarning,
+        stacklevel=stacklevel,
+    )
 
 
 @torch.library.register_fake("blitzgs::find_non_finite")

@@ -15,7 +15,7 @@ from blitzgs.ops.projection import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import Through, rasterize
 from blitzgs.ops.render import Rendered, ShTables, render_queued
 from blitzgs.rendering.arguments import Gaussians, Scene
-from blitzgs.rendering.finite import watch_for_non_finite
+from blitzgs.rendering.finite import find_bad_cameras, watch_for_non_finite
 from blitzgs.rendering.groups import Group, groups_of, project_groups
 from blitzgs.rendering.layout import Layout
 from blitzgs.rendering.meta import Lists, make_meta
@@ -65,16 +65,18 @@ def render(
         groups: `groups_of` the Gaussians, which have SH, if they are already known.
     """
     compiling = torch.compiler.is_compiling()
-    zeros: list[Tensor] = []
+    colours: list[Tensor] = []
     if groups is None:
         shown = gaussians
         if gaussians.colors is not None and gaussians.sh_degree is None:
-            zeros = [_zeros_of(scene) for scene in gaussians.scenes]
-            shown = _without_non_finite(gaussians, zeros)
+            colours = [_nan_or_zero(scene) for scene in gaussians.scenes]
+            shown = _without_non_finite(gaussians, colours)
         groups = groups_of(shown, project)
-    ready = None
+    ready, bad_cameras = None, None
     if job is None and not compiling and may_queue(groups):
         ready = _queued(groups[0], gaussians, image, tables)
+    elif not compiling and gaussians.opacities.is_cuda:
+        bad_cameras = find_bad_cameras(gaussians)
     splats = project_groups(groups, image.sparse_grad, ready)
     layout = Layout(splats, gaussians.lead, gaussians.count, image.packed)
     arranged = _arranged(layout, gaussians, project, image)
@@ -102,9 +104,11 @@ def render(
         composited=None if ready is None else ready.composited, through=through,
     )  # fmt: skip
     if not compiling:
-        # Only calls whose work was queued know the numbers of splats of each view.
-        has_blank_view = ready is None or ready.has_blank_view
-        watch_for_non_finite(gaussians, layout, function, zeros, has_blank_view)
+        # A view with a bad camera sees nothing. The check of the cameras came before the projection, whose
+        # end the host has waited for.
+        suspects_cameras = ready is not None and ready.has_blank_view
+        suspects_cameras |= bad_cameras is not None and bool(bad_cameras.read()[0])
+        watch_for_non_finite(gaussians, layout, function, colours, suspects_cameras)
     size = (*lead, project.height, project.width)
     alphas = alphas.unsqueeze(-1)
     if image.render_mode.endswith("ED"):
@@ -179,8 +183,8 @@ def _lists(
     return lists, lists_of(CUDA_TILE_SIZE, -1)
 
 
-def _zeros_of(scene: Scene) -> Tensor:
-    """Return [N]: 0, or NaN for a Gaussian with a colour, in some view, that is not finite."""
+def _nan_or_zero(scene: Scene) -> Tensor:
+    """Return [N]: NaN for a Gaussian with a colour, in some view, that is not finite, 0 for all others."""
     assert scene.colors is not None
     # Zero times a number is zero unless the number is NaN or infinite. The product of a few channels at a
     # time needs little memory.
@@ -189,11 +193,11 @@ def _zeros_of(scene: Scene) -> Tensor:
     return total if total.dim() == 1 else total.sum(dim=0)
 
 
-def _without_non_finite(gaussians: Gaussians, zeros: Sequence[Tensor]) -> Gaussians:
-    """Zero the opacity of Gaussians whose `zeros` are NaN, so that NaN spreads to no pixel."""
+def _without_non_finite(gaussians: Gaussians, colours: Sequence[Tensor]) -> Gaussians:
+    """Set the opacity of Gaussians to 0 whose `colours` (`_nan_or_zero`) are NaN: NaN reaches no pixel."""
     scenes = [
-        scene._replace(opacities=scene.opacities.masked_fill(zero != 0, 0))
-        for scene, zero in zip(gaussians.scenes, zeros, strict=True)
+        scene._replace(opacities=scene.opacities.masked_fill(value.isnan(), 0))
+        for scene, value in zip(gaussians.scenes, colours, strict=True)
     ]
     return replace(gaussians, scenes=tuple(scenes))
 

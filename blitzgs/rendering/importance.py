@@ -10,10 +10,10 @@ from blitzgs.ops.importance import UNITS, splat_contributions
 from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions, project_splats
 from blitzgs.rendering.arguments import check_options, check_tensors, gaussians_of
 from blitzgs.rendering.finite import warn_of_non_finite
+from blitzgs.rendering.images import CUDA_TILE_SIZE
 
 # Views that are projected at once.
 _VIEWS = 8
-TILE_SIZE = 16
 
 
 @torch.no_grad()
@@ -72,7 +72,7 @@ def contributions(
         RuntimeError: float64 tensors are on a GPU.
     """
     check_options(
-        width, height, near_plane, far_plane, 0.0, eps2d, None, TILE_SIZE, "D", rasterize_mode, "pinhole"
+        width, height, near_plane, far_plane, 0.0, eps2d, None, CUDA_TILE_SIZE, "D", rasterize_mode, "pinhole"
     )
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {})
@@ -88,7 +88,7 @@ def contributions(
         views = slice(begin, begin + _VIEWS)
         n_views = len(viewmats[views])
         options = ProjectionOptions(
-            width, height, TILE_SIZE, near_plane=near_plane, far_plane=far_plane, eps2d=eps2d,
+            width, height, CUDA_TILE_SIZE, near_plane=near_plane, far_plane=far_plane, eps2d=eps2d,
             antialiased=rasterize_mode == "antialiased", raw=False,
         )  # fmt: skip
         cameras = viewmats[views], Ks[views]
@@ -106,7 +106,7 @@ def _contributions_of_splats(
 ) -> tuple[Tensor, Tensor]:
     """Return the weights and pixels of all splats of a projection."""
     geometry = splats.means2d, splats.conics, splats.opacities
-    grid = [n_views, width, height, TILE_SIZE, 0, -1]
+    grid = [n_views, width, height, CUDA_TILE_SIZE, 0, -1]
     lists = torch.ops.blitzgs.intersect(
         *geometry, splats.depths, splats.camera_ids, None, grid, int(splats.counts[2]), None, True
     )

@@ -83,7 +83,7 @@ def raw_rasterization(
     The result is that of `blitzgs.rasterization` with `exp(scales)`, `sigmoid(opacities)` and `cat([sh0,
     shN], 1)`, but none of these tensors is made: the function first finds the visible Gaussians, and only
     gathers, activates and renders these. Gradients are sparse and have only the visible Gaussians, so the
-    parameters must be leaves.
+    parameters must be leaves, or `sparse_grad` False.
 
     Args:
         means: [N, 3] in world units, float32, or float64 on the CPU.
@@ -104,7 +104,8 @@ def raw_rasterization(
         tile_size: edge of a tile in px, 1 to 64; None: 16. The image is the same, on CUDA to rounding.
         backgrounds: [C, D] behind everything; None for zero. Depth channels have none.
         render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
-        sparse_grad: False: dense gradients, for optimisers and gradient clipping that take no others.
+        sparse_grad: False: dense gradients, for parameters that are not leaves (`means + offsets`), and for
+            optimisers and gradient clipping that take no others.
         absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
         rasterize_mode: "classic" or "antialiased".
         optimizers: the parameters' optimisers: one, a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
@@ -145,12 +146,13 @@ def raw_rasterization(
     )
     geometry = (means, quats, scales, opacities)
     whole = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, False, raw=True)
+    shaded = "RGB" in render_mode
     if sparse_grad and torch.is_grad_enabled():
-        _check_leaves({**tensors, "shN": shN})
+        sh = {"sh0": sh0, "shN": shN} if shaded else {}
+        _check_leaves({"means": means, "quats": quats, "scales": scales, "opacities": opacities, **sh})
     lazy = _lazy(optimizers)
     for optimizer in lazy:
         optimizer.catch_up(geometry)
-    shaded = "RGB" in render_mode
     hand_over = None
     if direct_grad and torch.is_grad_enabled():
         hand_over = _hand_over(lazy, (*geometry, *(harmonics if shaded else ())), sparse_grad)

@@ -39,8 +39,6 @@ SPAN = 1 / 60
 # The fall of the logarithm of the loss, per length of the schedule, below which it counts as settled. No
 # other value was measured.
 SETTLED = 0.5
-# A loss that rises by more than this factor has not settled: something raised it, as a reset of opacities.
-DISTURBED = 1.1
 
 
 @dataclass
@@ -154,6 +152,16 @@ class Signals:
             for epochs in (self.epochs[-2 * span : -span], self.epochs[-span:])
         )
         fall = math.log(max(first, 1e-12) / max(last, 1e-12)) * config.iterations / sum(lengths[-span:])
-        if fall > SETTLED or last > DISTURBED * first:
+        begin = ends[-2 * span] - lengths[-2 * span]
+        if fall > SETTLED or _last_reset(config, ends[-1]) >= begin:
             return None
         return f"the loss went from {first:.5f} to {last:.5f} until {ends[-1]:,.0f}, over {span} epochs each"
+
+
+def _last_reset(config: ScheduleConfig, time: float) -> float:
+    """Return when opacities were last reset until `time`, which raises the loss; -1: they were not."""
+    if config.reset_every == 0:
+        return -1
+    until = config.placed[1] if len(config.placed) > 1 else config.densify_until
+    last = min(time, until - 1) // config.reset_every * config.reset_every
+    return last if last > 0 else -1

@@ -78,9 +78,13 @@ def test_densification_ends_with_demand_or_when_the_loss_settles():
         found = place(signals(wanted, epochs_of_50(rate, 950)), config, now)
         assert (found is not None) == settled
         assert not settled or "until 950, over 1 epochs each" in found[1]
-    # The loss doubles when opacities are reset.
-    calm = epochs_of_50(0, 950)
-    assert place(signals(wanted, [*calm[:-1], (calm[-1][0], 2 * calm[-1][1])]), config, now) is None
+    # A reset of opacities raises the loss, so spans with a reset in them do not count: here from 850 to 950.
+    calm = signals(wanted, epochs_of_50(0, 950))
+    for reset_every, settled in ((400, True), (450, False), (850, False), (849, True), (0, True)):
+        found = place(calm, replace(config, reset_every=reset_every), now)
+        assert (found is not None) == settled, reset_every
+    after = replace(config, placed=(700, 880), reset_every=900)  # there is none after densification
+    assert place(signals((), epochs_of_50(0, 1_000)), after, 1_000) is not None
     # Measurements before T1 are not used for the times after it.
     assert place(signals(wanted, epochs_of_50(0, 750)), config, now) is None
     assert place(signals(wanted, epochs_of_50(0, 800)), config, now) is not None
