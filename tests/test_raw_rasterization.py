@@ -229,6 +229,9 @@ def test_sparse_gradients_need_leaves():
     raw(p, scene, sparse_grad=False)[0].sum().backward()
     with torch.no_grad():
         raw(p, scene)
+    p = raw_parameters(scene)
+    p["sh0"] = p["sh0"] * 2
+    raw(p, scene, render_mode="D")[0].sum().backward()  # SH get no gradient
 
 
 @pytest.mark.parametrize("device", DEVICES)

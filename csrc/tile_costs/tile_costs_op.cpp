@@ -48,7 +48,8 @@ std::vector<std::int64_t> divide_tiles(const std::vector<Tensor>& costs, const s
   STD_TORCH_CHECK(!costs.empty(), "blitzgs::", kOp, ": there must be views");
   STD_TORCH_CHECK(tiles > 0 && grain > 0, "blitzgs::", kOp, ": tiles and grain must be at least 1, got ",
                   tiles, " and ", grain);
-  STD_TORCH_CHECK(parts > 0 && parts <= (1 << 20), "blitzgs::", kOp, ": parts must be 1 to 2^20, got ", parts);
+  STD_TORCH_CHECK(parts > 0 && parts <= (1 << 20), "blitzgs::", kOp, ": parts must be 1 to 2^20, got ",
+                  parts);
   STD_TORCH_CHECK(tile_cost >= 8, "blitzgs::", kOp, ": sums are exact for a tile_cost from 8 on, got ",
                   tile_cost);
   const std::int64_t pieces = (tiles + grain - 1) / grain;

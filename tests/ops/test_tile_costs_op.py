@@ -119,3 +119,6 @@ def test_errors_name_the_value():
         divide_tiles([half.float()], [], 4, 1, 8, 2)
     with pytest.raises(RuntimeError, match="exact for a tile_cost from 8 on, got 7"):
         divide_tiles([half], [], 4, 1, 7, 2)
+    for parts in (0, 2**63 - 1):
+        with pytest.raises(RuntimeError, match=rf"parts must be 1 to 2\^20, got {parts}"):
+            divide_tiles([half], [], 4, 1, 8, parts)

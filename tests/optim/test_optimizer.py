@@ -212,6 +212,10 @@ def test_wrong_use_is_refused():
         LazyAdam([param], betas=(0.99, 0.9))
     with pytest.raises(ValueError, match="a parameter must have rows"):
         LazyAdam([torch.nn.Parameter(torch.tensor(1.0))])
+    optimizer = LazyAdam([torch.nn.Parameter(torch.ones(3))])
+    with pytest.raises(ValueError, match="a parameter must have rows"):
+        optimizer.add_param_group({"params": [torch.nn.Parameter(torch.tensor(1.0))]})
+    assert len(optimizer.param_groups) == 1
     with pytest.raises(ValueError, match="lr must be 0 or more, got -1"):
         LazyAdam([param], lr=-1)
     with pytest.raises(ValueError, match="weight_decay=0.1 is not supported"):
