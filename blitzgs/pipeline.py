@@ -17,6 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from blitzgs._library import below_autograd
 from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport import (
     LocalTransport,
@@ -214,7 +215,7 @@ def forward_once(
     inputs, grid = inputs_of(table, views, options, active), tile_grid(views, options, assignment)
     backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
     # Skip autograd: for an op with a registered gradient formula, its Python takes 20 us of the host's time.
-    with torch._C._AutoDispatchBelowAutograd():
+    with below_autograd():
         exchange = transport.start(inputs, assignment, attempt, mark)
         splats, n_splats, n_isects = exchange.arrived
         geometry = (splats.means2d, splats.conics, splats.opacities)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from blitzgs._library import below_autograd
 from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport import LocalTransport, Transport, open_transport
 from blitzgs.model import GaussianTable
@@ -63,7 +64,7 @@ def survey(
     options = replace(options, sh_degree=0)
     inputs, grid = inputs_of(table, views, options, active), tile_grid(views, options, assignment)
 
-    with torch._C._AutoDispatchBelowAutograd():
+    with below_autograd():
         for attempt in transport.capacity.attempts():
             exchange = transport.start(inputs, assignment, attempt)
             splats, n_splats, n_isects = exchange.arrived

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs._library import below_autograd
 
 BLOCK_ROWS = 256
 
@@ -119,7 +119,7 @@ def update_block_bounds_(
     Raises:
         RuntimeError: wrong shapes or dtypes.
     """
-    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+    with below_autograd():
         torch.ops.blitzgs.update_block_bounds_(bounds, ids, _rows(means, scales, pending))
 
 

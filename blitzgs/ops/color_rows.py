@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs._library import below_autograd
 from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs
 
 
@@ -42,7 +42,7 @@ def colored_rows(
     Returns:
         The splats with colours, and the rows, both of the capacity of `splats`.
     """
-    with torch._C._AutoDispatchBelowAutograd():
+    with below_autograd():
         numbers, indices, colors, *gaussians = torch.ops.blitzgs.color_rows_(
             tables.gaussians,
             sh,

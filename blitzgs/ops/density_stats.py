@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs._library import below_autograd
 
 
 def density_stats_(
@@ -46,7 +46,7 @@ def density_stats_(
     Raises:
         RuntimeError: wrong shapes or dtypes.
     """
-    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+    with below_autograd():
         torch.ops.blitzgs.density_stats_(
             grad_sum,
             grad_count,

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs._library import below_autograd
 
 # Columns of the schedule's table, as in csrc/lazy_adam/lazy_adam.h: tails of 4 orders for 6 groups, powers of
 # the decay rates, bias corrections.
@@ -111,7 +111,7 @@ def lazy_adam_step_(
     """
     like = state.params[0]
     tables = schedule.tables(like)
-    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+    with below_autograd():
         torch.ops.blitzgs.lazy_adam_step_(
             state.tensors, tables, schedule.steps(step, like.dtype), schedule.decays, list(grads), ids
         )
@@ -143,7 +143,7 @@ def lazy_adam_catch_up_(
     """
     like = state.params[0]
     tables = schedule.tables(like)
-    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+    with below_autograd():
         torch.ops.blitzgs.lazy_adam_catch_up_(
             state.tensors, tables, schedule.steps(step, like.dtype), schedule.decays, ids, count
         )

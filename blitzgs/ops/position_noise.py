@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs._library import below_autograd
 
 
 def position_noise_(
@@ -45,7 +45,7 @@ def position_noise_(
     Raises:
         RuntimeError: wrong shapes or dtypes.
     """
-    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+    with below_autograd():
         torch.ops.blitzgs.position_noise_(
             means, quats, scales, opacities, ids, visible_ids, seed, step, threshold, strength
         )

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from blitzgs._library import below_autograd
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState
 from blitzgs.ops.projection import ProjectedSplats, ProjectionOptions, WeightedViews
 from blitzgs.ops.splat_gradients import SplatGradients
@@ -52,7 +53,7 @@ def project_bwd_step_(
     of_splats = [splats.camera_ids, splats.visible_ids, splats.splat_offsets]
     if gradients.places is not None:
         of_splats.append(gradients.places)
-    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+    with below_autograd():
         torch.ops.blitzgs.project_bwd_step_(
             state.tensors,
             [schedule.table, schedule.lr_table],

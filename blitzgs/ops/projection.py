@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs._library import below_autograd
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
 from blitzgs.ops.host import HostCopy
 
@@ -242,7 +242,7 @@ def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
 
 def _projected(inputs: ProjectionInputs) -> tuple[ProjectedSplats, Sizes]:
     """Return columns that may be longer than their valid part, and their sizes."""
-    with torch._C._AutoDispatchBelowAutograd():
+    with below_autograd():
         for attempt in capacity_for(inputs).attempts():
             projected = inputs.run(attempt.sizes)
             needed = Sizes(*HostCopy(projected.totals).read()[:3].tolist())

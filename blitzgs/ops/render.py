@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from blitzgs._library import below_autograd
 from blitzgs.ops.capacity import Attempt, Sizes
 from blitzgs.ops.color_rows import VisibleRows, colored_rows
 from blitzgs.ops.host import HostCopy
@@ -84,7 +85,7 @@ def render_queued(
     """
     options = inputs.options
     grid = [inputs.n_views, options.width, options.height, options.tile_size, 0, -1]
-    with torch._C._AutoDispatchBelowAutograd():
+    with below_autograd():
         for attempt in (Attempt(None),) if exact else capacity_for(inputs).attempts():
             capacity = attempt.sizes
             projected = inputs.run(capacity)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs._library import below_autograd
 from blitzgs.ops.blocks import ActiveRows, GateRules
 
 
@@ -24,7 +24,7 @@ def gate_views_(active: ActiveRows, means: Tensor, viewmats: Tensor, rules: Gate
             or a column that the cull matrix lacks.
     """
     level, reach, lod_views, cull, columns = rules
-    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+    with below_autograd():
         torch.ops.blitzgs.gate_views_(
             active.ids, active.views, active.length, means, level, viewmats, reach, lod_views, cull, columns
         )

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from blitzgs._library import below_autograd
 from blitzgs.ops.lazy_adam import explicit_steps, table_without_rates
 
 # csrc/lazy_adam/lazy_adam.h: a row has 4 orders of 6 groups, then powers and corrections.
@@ -122,7 +123,7 @@ class Drift:
             indices: int64 [1, A] or [A], the rows, each once.
             current: of each table, whether the parameters of all rows stand at the step before.
         """
-        with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+        with below_autograd():
             torch.ops.blitzgs.drift_step_(
                 self._tables,
                 self._lr_tables,

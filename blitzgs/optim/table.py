@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 import blitzgs.ops.lazy_adam  # noqa: F401  (registers the ops)
+from blitzgs._library import below_autograd
 from blitzgs.optim.drift import Drift
 
 # Entries of a parameter's state: the step up to which each row's values, and its moments, are current,
@@ -62,7 +63,7 @@ class Table:
     def catch_up(self, step: int, rows: Tensor | None = None, count: Tensor | None = None) -> None:
         """Apply the steps that rows have missed up to `step`; as `LazyAdam.catch_up`."""
         if self._rows > 0:
-            with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+            with below_autograd():
                 torch.ops.blitzgs.lazy_adam_catch_up_(self.tensors, *self._schedule(step), rows, count)
 
     def bring_up_to_date(self, step: int) -> None:

@@ -11,7 +11,7 @@ from itertools import count
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs._library import below_autograd
 from blitzgs.ops.host import HostCopy
 from blitzgs.rendering.arguments import Gaussians
 from blitzgs.rendering.layout import Layout
@@ -83,7 +83,7 @@ def _rows_not_finite(values: Tensor) -> Tensor:
 def find_bad_cameras(gaussians: Gaussians) -> HostCopy:
     """Start to look for views whose cameras are not finite; the copy reads 0 if all are finite, int64 [1]."""
     named = gaussians.named
-    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+    with below_autograd():
         return HostCopy(
             torch.ops.blitzgs.find_non_finite([*named["viewmats"], *named["Ks"]], []).view(1).long()
         )
@@ -114,7 +114,7 @@ def watch_for_non_finite(
         # Splats whose SH are not finite have no opacity, and no other splat is below 1/255.
         opacities = [layout.splats.opacities]
     # One pass over the columns tells whether a closer check is needed.
-    with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+    with below_autograd():
         if not torch.ops.blitzgs.find_non_finite(columns, opacities).item():
             return
     if names := ", ".join(non_finite(gaussians)):
