@@ -122,7 +122,11 @@ OUR_ARMS = {
     "early_alone": "gate from 2,000 on, no pass 1, pass 2 keeps 0.7",
     "early_32": "gate from 2,000 on with rate 0.3, 32 pixels for each Gaussian, pass 2 keeps 0.64",
 }
-ADAPTIVE_ARMS = {"fixed": "fixed schedule", "adaptive": "adaptive schedule"}
+ADAPTIVE_ARMS = {
+    "fixed": "fixed schedule",
+    "adaptive": "adaptive schedule",
+    "short": "shorter fixed schedule",
+}
 # Arms of the tables rho and onset that are arms of the ablation.
 SAME_ARMS = {"rate_0": "no_gate", "rate_60": "full", "from_24k": "full"}
 
