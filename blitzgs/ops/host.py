@@ -74,6 +74,11 @@ def _stream(stream_id: int, device_index: int, device_type: int) -> torch.cuda.S
     return torch.cuda.Stream(stream_id=stream_id, device_index=device_index, device_type=device_type)
 
 
+def to_device(values: Tensor, device: torch.device) -> Tensor:
+    """Return a copy of a small CPU tensor on a device, without waiting for the device's earlier work."""
+    return values.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else values.to(device)
+
+
 def to_host(tensor: Tensor) -> Tensor:
     """Return a small tensor's values on the CPU; waits for the device that holds it."""
     if not tensor.is_cuda:

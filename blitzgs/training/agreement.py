@@ -18,9 +18,10 @@ from types import FrameType
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.ops.host import to_host
+from blitzgs.ops.host import HostCopy, to_device
 
-# The ranks agree at least this often: in steps, and in seconds as far as single steps allow.
+# The ranks agree at least this often: in steps, and in seconds as far as single steps allow. On GPUs they
+# learn the decision one step later.
 MOST_STEPS = 16
 MOST_SECONDS = 4.0
 
@@ -90,13 +91,17 @@ class Decision:
 
 
 class Agreement:
-    """Gives every rank the same decision after the same step."""
+    """Gives every rank the same decision after the same step.
+
+    On GPUs the requests are collected while the next step runs, so the host does not wait for them.
+    """
 
     def __init__(self, ranks: Ranks, stop: StopRequest, clock: SaveClock) -> None:
         """Prepare to collect the requests that `stop` and `clock` note on each of `ranks`."""
         self._ranks, self._stop, self._clock = ranks, stop, clock
         self._next = 0
         self._last: tuple[int, float] | None = None
+        self._asked: HostCopy | None = None  # the requests of all ranks, until they are read
         self._agreed_to_stop = False
 
     def after(self, step: int, lost: bool = False) -> Decision:
@@ -104,27 +109,38 @@ class Agreement:
 
         `lost`: whether this rank continues without a photograph that it could not read.
         """
-        if self._ranks.world_size > 1 and step < self._next and not self._agreed_to_stop:
-            return Decision(None, False)
-        return self.now(step, lost)
+        if self._ranks.world_size == 1 or self._agreed_to_stop:
+            return self.now(step, lost)
+        if self._asked is None:
+            if step < self._next:
+                return Decision(None, False)
+            self._asked = self._ask(step, lost)
+            if self._ranks.device.type == "cuda":
+                return Decision(None, False)
+        return self._answer(step, self._asked)
 
     def now(self, step: int, lost: bool = False) -> Decision:
         """Return a decision at once, whatever the step; every rank calls this."""
         if self._ranks.world_size == 1:
             return self._decision(self._stop.number, self._clock.is_due, lost)
+        return self._answer(step, self._ask(step, lost))
+
+    def _ask(self, step: int, lost: bool) -> HostCopy:
+        """Collect the requests of all ranks."""
         now = time.monotonic()
         # The duration of a step is not known at first, so the ranks agree again after the next one.
         seconds = MOST_SECONDS
         if self._last is not None and step > self._last[0]:
             seconds = (now - self._last[1]) / (step - self._last[0])
-        values = torch.tensor(
-            [self._stop.number, self._clock.is_due, seconds, lost],
-            dtype=torch.float64,
-            device=self._ranks.device,
-        )
-        self._ranks.all_reduce(values, "max")
+        requests = [self._stop.number, self._clock.is_due, seconds, lost]
+        values = to_device(torch.tensor(requests, dtype=torch.float64), self._ranks.device)
+        return HostCopy(self._ranks.all_reduce(values, "max").view(torch.int64))
+
+    def _answer(self, step: int, asked: HostCopy) -> Decision:
+        """Decide by the requests of all ranks; wait for them."""
         with self._ranks.watchdog.waiting("agree"):
-            number, due, slowest, any_lost = to_host(values).tolist()
+            number, due, slowest, any_lost = asked.read().view(torch.float64).tolist()
+        self._asked = None
         interval = max(1, min(MOST_STEPS, int(MOST_SECONDS / max(slowest, 1e-9))))
         self._next, self._last = (step // interval + 1) * interval, (step, time.monotonic())
         self._agreed_to_stop = number > 0

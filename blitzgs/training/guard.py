@@ -7,7 +7,9 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 
 import torch
+from torch import Tensor
 
+from blitzgs._library import below_autograd
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.model import PARAMETERS, GaussianTable
@@ -103,11 +105,17 @@ def _first_in(table: GaussianTable, frame: Frame, names: Sequence[str]) -> str |
     return None
 
 
+def find_bad(table: GaussianTable, names: Iterable[str] = PARAMETERS) -> Tensor:
+    """Return whether some columns have a value that is not finite: int64 [], 1 if so; does not wait."""
+    with below_autograd():
+        bad: Tensor = torch.ops.blitzgs.find_non_finite([table[name] for name in names], [])
+    return bad.long()
+
+
 def bad_column(table: GaussianTable, names: Iterable[str] = PARAMETERS) -> str | None:
     """Name the first of some columns with a value that is not finite, and its Gaussians; None: all are."""
     names = list(names)
-    # The sum of a column is not finite if one of its values is not. So one pass suffices if all are finite.
-    if bool(torch.stack([table[name].sum() for name in names]).isfinite().all()):
+    if not find_bad(table, names):
         return None
     for name in names:
         finite = table[name].isfinite().flatten(1).all(1) if table[name].dim() > 1 else table[name].isfinite()

@@ -12,6 +12,7 @@ from torch import Tensor
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.transport import Mark, unmarked
+from blitzgs.ops.host import to_device
 from blitzgs.ops.projection import MOST_VIEWS
 from blitzgs.pipeline import Frame, RenderOptions
 from blitzgs.population.position_noise import PositionNoise
@@ -53,10 +54,8 @@ class UpcomingCameras:
         """Return the views of a step (from 1) and of the following ones, at most 32 views."""
         batches = [self._sampler.batch(step - 1 + ahead) for ahead in range(MOST_VIEWS // self.batch_size)]
         # A view's index among the training views is also its column in the cull matrix.
-        columns = torch.tensor([view for batch in batches for view in batch])
-        device = self._columns[0].device
-        if device.type == "cuda":
-            columns = columns.pin_memory().to(device, non_blocking=True)
+        views = torch.tensor([view for batch in batches for view in batch])
+        columns = to_device(views, self._columns[0].device)
         viewmats, Ks, sizes = (column[columns] for column in self._columns)  # noqa: N806
         return Cameras(viewmats, Ks, sizes, limits, columns)
 

@@ -3,68 +3,79 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
 from blitzgs.distributed.host_sum import HostSum
+from blitzgs.ops.host import HostCopy
 from blitzgs.pipeline import Frame
 from blitzgs.training.batches import Batch
-from blitzgs.training.guard import check_table
+from blitzgs.training.guard import check_table, find_bad
 from blitzgs.training.loss import batch_psnr, opacity_term, photometric, scale_term, size_term
 from blitzgs.training.state import TrainingState
 
 
-def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> Tensor:
-    """Return figures about a batch, float64 [7], without waiting for the device.
+class StepRecord(NamedTuple):
+    """The figures of a step, which the host reads later, so that it does not wait for the device.
 
-    They are its L_scale, L_opacity, L_size and PSNR, and the Gaussians of all ranks: those that the step
-    projected, those of them that are visible in a view, and all.
+    Attributes:
+        figures: float64 as int64 [8 + B]. Of all ranks: the number of ranks with parameters that are not
+            finite, the Gaussians that the step projected, those of them that are visible in a view, and all
+            Gaussians. Of the batch: L_scale, L_opacity and L_size (0 if their weights are), PSNR, and
+            `Batch.samples` [B].
+        sums: `LossTerms.parts` over all ranks.
     """
-    loss, extent = state.config.loss, state.space.extent
-    scale = scale_term(frame, state.stepper.table, extent * loss.scale_reference).mean()
-    opacity = size = scale.new_zeros(())
-    if loss.opacity > 0:
-        opacity = opacity_term(frame, state.stepper.table).mean()
-    if loss.size > 0:
-        size = size_term(frame, state.stepper.table, extent).mean()
+
+    figures: HostCopy
+    sums: HostSum
+
+
+def measure_step(state: TrainingState, frame: Frame, batch: Batch, sums: HostSum) -> StepRecord:
+    """Queue the measurement of a step between its forward and its backward pass. Collective."""
+    loss, extent, table = state.config.loss, state.space.extent, state.stepper.table
     assert frame.active is not None  # as in every step of a training
-    active = frame.active.considered().double()
+    active = frame.active.considered()
     visible, population = (
-        active.new_full((), float(count)) for count in (len(frame.projected.visible_ids), len(state.table))
+        active.new_full((), count) for count in (len(frame.projected.visible_ids), len(state.table))
     )
-    counts = state.ranks.all_reduce(torch.stack([active, visible, population]))
-    terms = torch.stack([scale, opacity, size, batch_psnr(frame, batch)]).double()
-    return torch.cat([terms, counts])
+    counts = state.ranks.all_reduce(torch.stack([find_bad(table), active, visible, population]))
+    scale = opacity = size = batch.samples.new_zeros(())
+    if loss.scale > 0:
+        scale = scale_term(frame, table, extent * loss.scale_reference).mean()
+    if loss.opacity > 0:
+        opacity = opacity_term(frame, table).mean()
+    if loss.size > 0:
+        size = size_term(frame, table, extent).mean()
+    terms = torch.stack([scale, opacity, size, batch_psnr(frame, batch)])
+    figures = torch.cat([counts.double(), terms.double(), batch.samples.double()])
+    return StepRecord(HostCopy(figures.view(torch.int64)), sums)
 
 
-def log_step(
-    state: TrainingState, measured: Tensor, batch: Batch, names: Sequence[str], sums: HostSum
-) -> None:
-    """Write one log record; wait for the device, and check the parameters.
+def log_step(state: TrainingState, record: StepRecord) -> None:
+    """Write the log record of the last step; wait for its figures, and check the parameters.
 
     Args:
         state: state of the run after the step.
-        measured: from `measure_step`.
-        batch: batch of the step.
-        names: names of the batch's views.
-        sums: `LossTerms.parts` over all ranks.
+        record: of the step.
 
     Raises:
         NonFiniteError: a parameter is not finite.
     """
-    check_table(state.stepper.table, state.progress.step)
-    loss = state.config.loss
-    losses = photometric(sums.read()[: 2 * len(names)], batch.samples.cpu(), loss)
-    scale, opacity, size, psnr, active, visible, population = measured.tolist()
+    figures = record.figures.read().view(torch.float64)
+    bad, active, visible, population, scale, opacity, size, psnr = figures[:8].tolist()
+    if bad:
+        check_table(state.stepper.table, state.progress.step)
+    samples, loss = figures[8:].float(), state.config.loss
+    losses = photometric(record.sums.read()[: 2 * len(samples)], samples, loss)
     values = {
         "loss": losses.mean().item() + loss.scale * scale + loss.opacity * opacity + loss.size * size,
-        "l_scale": scale,
         "psnr": psnr,
         "active": active,
         "visible": visible,
         "gaussians": int(population),
         "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
     } | state.stepper.report()
+    if loss.scale > 0:
+        values["l_scale"] = scale
     state.log.scalars(state.images_seen, values)

@@ -32,7 +32,7 @@ from blitzgs.training.population_report import MemoryMeter, describe, population
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.setup import set_up
 from blitzgs.training.state import never
-from blitzgs.training.step_report import log_step, measure_step
+from blitzgs.training.step_report import StepRecord, log_step, measure_step
 from blitzgs.training.views import render_options
 from blitzgs.view.residence import ResidenceError
 
@@ -67,6 +67,7 @@ class Trainer:
             state.owners if ranks.world_size > 1 else None,
         )
         self._guard = LossGuard()
+        self._record: StepRecord | None = None  # of the last step, until it is written
         self.memory = MemoryMeter()
 
     @torch.no_grad()
@@ -102,7 +103,10 @@ class Trainer:
                 # The budget may change the number of steps.
                 while (step := state.progress.step + 1) <= state.schedule.steps:
                     self._step_or_save(step, is_first=step == done + 1)
-                    if not handle_all(state, state.schedule.events((step - 1) * size, step * size)):
+                    events = state.schedule.events((step - 1) * size, step * size)
+                    if events or step == state.schedule.steps:
+                        self._write_record()
+                    if not handle_all(state, events):
                         self._stop_for(agreement.now(step).signal)
                         return None
                     budget.after(step)
@@ -145,10 +149,13 @@ class Trainer:
         reasons = self.state.ranks.all_gather_object(self.loader.lost)
         lost = [f"rank {rank}: {reason}" for rank, reason in enumerate(reasons) if reason is not None]
         if lost:
-            raise PhotographError(f"{'; '.join(lost)}. The last steps, {MOST_STEPS} at most, went without it")
+            raise PhotographError(
+                f"{'; '.join(lost)}. The last steps, {MOST_STEPS + 1} at most, went without it"
+            )
 
     def _stop_for(self, signal: str | None) -> None:
         """Save where the run is, because of a signal."""
+        self._write_record()
         self._stop(_stopped_by(signal))
 
     def _stop(self, text: str) -> None:
@@ -179,13 +186,15 @@ class Trainer:
         gate = view_level.batch_gate(state, batch.indices)
         options = render_options(config, state.space, degree, lod_gate(config, state.progress))
         frame, terms, sums = state.stepper.forward(step, options, batch, gate=gate)
+        self._write_record()  # whose figures were copied meanwhile
         names = [state.capture.cameras[i].name for i in batch.indices]
         self._guard.check(step, names, sums, state.stepper.table, frame)
         if state.signals is not None:
             pixels = batch.views.width * batch.views.height
             state.signals.add(sums, len(names), pixels, end, len(state.capture.train))
         is_logged = end // config.log.every > begin // config.log.every
-        measured = measure_step(state, frame, batch) if is_logged else None
+        if is_logged:
+            self._record = measure_step(state, frame, batch, sums)
         v_means2d = state.stepper.backward(
             step,
             frame,
@@ -196,9 +205,16 @@ class Trainer:
         if v_means2d is not None:
             self._gather(frame, v_means2d)
         state.stepped(step, degree)
-        if measured is not None:
-            log_step(state, measured, batch, names, sums)
+        if is_logged:
             self.memory.sample(state.ranks.device)
+            if state.ranks.device.type != "cuda":
+                self._write_record()
+
+    def _write_record(self) -> None:
+        """Write the log record of the last step, if any; on CUDA the host may wait for its figures."""
+        if self._record is not None:
+            log_step(self.state, self._record)
+            self._record = None
 
     def _gather(self, frame: Frame, v_means2d: Tensor) -> None:
         """Add a step's screen-space gradients to the statistics that density control reads."""

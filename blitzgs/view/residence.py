@@ -25,6 +25,7 @@ from torch import Tensor
 
 from blitzgs.model import CULL, EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from blitzgs.ops.blocks import BLOCK_ROWS
+from blitzgs.ops.host import to_device
 from blitzgs.ops.residence import swap_blocks_
 from blitzgs.view.block_visibility import BlockVisibility, Cameras, culled_blocks
 from blitzgs.view.blocks import BlockIndex
@@ -276,9 +277,7 @@ class Residence:
     def _index(self) -> BlockIndex:
         blocks = np.where(self._block_in < 0, len(self._bounds) - 1, self._block_in)
         places = torch.from_numpy(np.append(blocks, self._blocks) if self._rest else blocks)
-        if self._stream is not None:
-            places = places.pin_memory()
-        self._places = places.to(self._device, non_blocking=True)
+        self._places = to_device(places, self._device)
         return BlockIndex.of_bounds(
             self._bounds[self._places], self._level_ranges[self._places], self._schedule
         )
@@ -342,7 +341,7 @@ class Residence:
             assert after is not None
             self._stream.wait_event(after)
             with torch.cuda.stream(self._stream):
-                lists = lists.pin_memory().to(self._device, non_blocking=True)
+                lists = to_device(lists, self._device)
                 swap_blocks_(*columns, len(_WRITTEN), *lists)
         self._slot_of[old[old >= 0]] = _FREE
         self._block_in[slots], self._is_changed[slots] = coming, False

@@ -61,7 +61,7 @@ def test_the_logged_loss_has_all_terms(tmp_path):
         lines = (tmp_path / override / "log.jsonl").read_text().splitlines()
         first[override] = next(record for record in map(json.loads, lines) if "loss" in record)
     plain = first["loss.opacity=0"]
-    axis, reference = plain["l_scale"], LossConfig().scale_reference
+    axis, reference = first["loss.scale=5"]["l_scale"], LossConfig().scale_reference
     for override, term in (
         ("loss.opacity=2", 2 * 0.25),
         ("loss.size=3", 3 * axis * reference),
