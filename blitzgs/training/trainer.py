@@ -67,7 +67,7 @@ class Trainer:
             state.owners if ranks.world_size > 1 else None,
         )
         self._guard = LossGuard()
-        self._record: StepRecord | None = None  # of the last step, until it is written
+        self._unwritten: StepRecord | None = None  # the record of the last step
         self.memory = MemoryMeter()
 
     @torch.no_grad()
@@ -194,7 +194,7 @@ class Trainer:
             state.signals.add(sums, len(names), pixels, end, len(state.capture.train))
         is_logged = end // config.log.every > begin // config.log.every
         if is_logged:
-            self._record = measure_step(state, frame, batch, sums)
+            self._unwritten = measure_step(state, frame, batch, sums)
         v_means2d = state.stepper.backward(
             step,
             frame,
@@ -212,9 +212,9 @@ class Trainer:
 
     def _write_record(self) -> None:
         """Write the log record of the last step, if any; on CUDA the host may wait for its figures."""
-        if self._record is not None:
-            log_step(self.state, self._record)
-            self._record = None
+        if self._unwritten is not None:
+            log_step(self.state, self._unwritten)
+            self._unwritten = None
 
     def _gather(self, frame: Frame, v_means2d: Tensor) -> None:
         """Add a step's screen-space gradients to the statistics that density control reads."""
