@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,26 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.ops.host import current_stream
+from blitzgs.ops.host import PinnedPlace, current_stream
 from blitzgs.ops.report import report_
 
 
-class _Place(NamedTuple):
-    """Pinned memory of the host for the numbers of one step.
-
-    Attributes:
-        memory: float32 [words].
-        numbers: the same memory.
-        written: event that is recorded after the copy to the memory.
-    """
-
-    memory: Tensor
-    numbers: NDArray[np.float32]
-    written: torch.cuda.Event
-
-
 class _Side:
-    """A second stream of a device, for work that the step does not wait for, and what is used with it again.
+    """A second stream of a device, for work that the step does not wait for.
 
     One thread uses it at a time: another one might record `ready` anew before the first has waited for it.
 
@@ -39,20 +24,11 @@ class _Side:
         stream: the second stream.
         ready: event that is recorded on the step's stream before each use of the second one. It can be
             recorded again at once: what a stream waits for is fixed when it is told to wait.
-        idle: places that no sums use at present. Making a place takes more of the host's time than the copy.
     """
 
     def __init__(self, device: torch.device) -> None:
         self.stream = torch.cuda.Stream(device)
         self.ready = torch.cuda.Event()
-        self.idle: list[_Place] = []
-
-    def place(self, words: int) -> _Place:
-        """Return a place with this number of words; one of another size is given back to torch."""
-        if self.idle and len((found := self.idle.pop()).numbers) == words:
-            return found
-        memory = torch.empty(words, pin_memory=True)
-        return _Place(memory, memory.numpy(), torch.cuda.Event())
 
 
 class _Queued:
@@ -60,17 +36,24 @@ class _Queued:
 
     Torch knows that the tensors of the step are used on the step's stream alone. It would give their memory
     to new tensors as soon as nothing refers to them, so they are kept until the second stream has read them.
+
+    Attributes:
+        memory: float32 [words], pinned.
+        written: event that is recorded after the copy to `memory`.
     """
 
     def __init__(self, side: _Side, words: int, tensors: tuple[Tensor | None, ...]) -> None:
         self._side: _Side = side
         self._tensors: tuple[Tensor | None, ...] = ()  # in case there is no memory for a place
-        self.place = side.place(words)
+        # Powers of two, so that images of many sizes need few places.
+        length = 1 << (words - 1).bit_length()
+        self._place = PinnedPlace.take(length, torch.float32, side.stream.device)
         self._tensors = tensors
+        self.memory, self.written = self._place.memory[:words], self._place.written
 
     def has_ended(self) -> None:
         """Let later work use all this again: the host has waited for `written` and copied the numbers."""
-        self._side.idle.append(self.place)
+        self._place.give_back()
         self._tensors = ()
 
     def __del__(self) -> None:
@@ -117,7 +100,7 @@ class HostSum:
             self._numbers = ranks.all_reduce(value).numpy()
             return
         self._queued = _Queued(side, words, (parts, tile_work))
-        self._numbers = self._queued.place.numbers
+        self._numbers = self._queued.memory.numpy()
         main = current_stream(ranks.device)
         side.ready.record(main)
         side.stream.wait_event(side.ready)
@@ -125,8 +108,8 @@ class HostSum:
         torch.cuda.set_stream(side.stream)
         try:
             total = self._queue(parts, tile_work, tiles, words)
-            self._queued.place.memory.copy_(total, non_blocking=True)
-            self._queued.place.written.record(side.stream)
+            self._queued.memory.copy_(total, non_blocking=True)
+            self._queued.written.record(side.stream)
         finally:
             torch.cuda.set_stream(main)
 
@@ -155,7 +138,7 @@ class HostSum:
         if self._total is None:
             if self._queued is not None:
                 with self._ranks.watchdog.waiting("read_sums"):
-                    self._queued.place.written.synchronize()
+                    self._queued.written.synchronize()
             self._total = self._folded(self._numbers)
             del self._numbers
             if self._queued is not None:

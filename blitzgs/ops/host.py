@@ -5,17 +5,43 @@ from __future__ import annotations
 
 from collections import defaultdict
 from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-# Pinned memory, and an event that is recorded when it has been written.
-_Place = tuple[Tensor, torch.cuda.Event]
-# The places that no copy uses at present, by device and number of values. Making one takes more of the host's
-# time than the copy.
-_idle: defaultdict[tuple[int, int], list[_Place]] = defaultdict(list)
+
+class PinnedPlace(NamedTuple):
+    """Pinned memory of the host, into which the device writes numbers, with an event.
+
+    Attributes:
+        memory: [n] numbers.
+        written: event of one device; the user records it after the work that writes the memory.
+        idle: the places of this kind that are not in use.
+    """
+
+    memory: Tensor
+    written: torch.cuda.Event
+    idle: list[PinnedPlace]
+
+    @classmethod
+    def take(cls, n: int, dtype: torch.dtype, device: torch.device) -> PinnedPlace:
+        """Return a place of `n` numbers, an idle one if possible: making one takes longer than a copy."""
+        idle = _idle[n, dtype, device.index]
+        try:
+            return idle.pop()
+        except IndexError:
+            return cls(torch.empty(n, dtype=dtype, pin_memory=True), torch.cuda.Event(), idle)
+
+    def give_back(self) -> None:
+        """Let others use the place: the host has waited for `written` and read the numbers."""
+        self.idle.append(self)
+
+
+# Idle places by number of values, dtype and index of the device.
+_idle: defaultdict[tuple[int, torch.dtype, int], list[PinnedPlace]] = defaultdict(list)
 
 
 class HostCopy:
@@ -28,26 +54,21 @@ class HostCopy:
 
     def __init__(self, values: Tensor) -> None:
         """Start to copy `values`, int64 [n], to the host."""
-        self._place: _Place | None = None
+        self._place: PinnedPlace | None = None
         self._host = values
         if values.is_cuda:
-            self._idle = _idle[values.device.index, values.shape[0]]
-            try:
-                place = self._idle.pop()
-            except IndexError:
-                memory = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
-                place = memory, torch.cuda.Event()
-            torch.ops.blitzgs.copy_to_host_(place[0], values)
-            place[1].record(current_stream(values.device))
+            place = PinnedPlace.take(values.shape[0], values.dtype, values.device)
+            torch.ops.blitzgs.copy_to_host_(place.memory, values)
+            place.written.record(current_stream(values.device))
             self._place = place
 
     def read(self) -> Tensor:
         """Wait for the copy and return the numbers as a CPU tensor."""
         if self._place is not None:
-            memory, written = self._place
-            written.synchronize()
-            self._host, self._place = memory.clone(), None
-            self._idle.append((memory, written))
+            place = self._place
+            place.written.synchronize()
+            self._host, self._place = place.memory.clone(), None
+            place.give_back()
         return self._host
 
     def __del__(self) -> None:

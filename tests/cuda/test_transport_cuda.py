@@ -8,7 +8,7 @@ from cuda_scenes import Scene, ops
 from blitzgs.distributed.transport import Traffic
 from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, PeerBuffers
 from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.host import HostCopy
+from blitzgs.ops.host import HostCopy, PinnedPlace
 from blitzgs.ops.projection import VIEW_TOTALS, splats_of
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SplatGradients
@@ -162,3 +162,13 @@ def test_copies_to_the_host_need_pinned_memory():
     torch.cuda._sleep(20_000_000)
     HostCopy(values)
     assert torch.cuda.current_stream().query()  # nothing writes to the memory any more
+
+
+def test_pinned_memory_is_used_again_after_it_was_read():
+    device = torch.device("cuda", 0)
+    first, second = (PinnedPlace.take(77, torch.float32, device) for _ in range(2))
+    assert first.memory.is_pinned() and first.memory.data_ptr() != second.memory.data_ptr()
+    first.give_back()
+    for other in ((78, torch.float32), (77, torch.int64)):
+        assert PinnedPlace.take(*other, device).memory is not first.memory
+    assert PinnedPlace.take(77, torch.float32, device).memory is first.memory
