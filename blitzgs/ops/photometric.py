@@ -132,7 +132,7 @@ def photometric_fwd_bwd(
     Returns:
         (sums float64 [B, K, 2] in K parts, v_renders [B, H, W, 3], undefined beyond the owned pixels,
         ``scale_weight / max(visible, 1)`` [B], ``opacity_weight / (B max(visible, 1))`` [B]; the last two
-        are [0] without `visible`).
+        are [0] without `visible`, and zeros if the images have no pixels).
 
     Raises:
         RuntimeError: wrong shapes or dtypes.

@@ -61,6 +61,10 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
     outputs.opacity_reg = make_empty(renders, {visible ? views : 0});
   }
   if (renders.numel() == 0) {
+    if (visible) {
+      torch::stable::zero_(*outputs.scale_reg);
+      torch::stable::zero_(*outputs.opacity_reg);
+    }
     if (sums) outputs.parts = make_empty(renders, {views, 0, 2}, ScalarType::Double);
     return outputs;
   }

@@ -226,6 +226,18 @@ def test_empty_batch(device):
     assert [tuple(t.shape) for t in outputs] == [(0, 0, 2), (0, 8, 8, 3), (0,), (0,)]
 
 
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("size", [(0, 8), (8, 0)])
+def test_images_without_pixels_have_no_weights(device, size):
+    x, weights = torch.zeros(2, *size, 3, device=device), torch.ones(2, device=device)
+    *_, scale_reg, opacity_reg = photometric_fwd_bwd(
+        x, x, None, weights, weights, visible=torch.tensor([0, 5], device=device), scale_weight=0.7,
+        opacity_weight=0.3,
+    )  # fmt: skip
+    assert scale_reg.tolist() == opacity_reg.tolist() == [0, 0]
+    assert photometric_loss(x, x).tolist() == [0, 0]
+
+
 def test_errors_name_the_value():
     x, targets, _ = images()
     with pytest.raises(RuntimeError, match=r"targets must have shape \[2, 53, 70, 3\], got \[1, 53, 70, 3\]"):
