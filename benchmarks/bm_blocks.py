@@ -14,7 +14,7 @@ from torch import Tensor
 
 from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.lazy_adam import schedule_table
+from blitzgs.ops.lazy_adam import AdamSchedule
 from blitzgs.ops.project import project
 from blitzgs.view.blocks import BlockIndex, morton_order
 
@@ -29,7 +29,7 @@ def main() -> None:
     raw = scene.raw()
     table = GaussianTable.create(raw | {"sh": raw["sh"][:, :1].contiguous()})
     views = scene.viewmats[:1].repeat(args.views, 1, 1), scene.Ks[:1].repeat(args.views, 1, 1)
-    schedule = schedule_table(torch.full((100, 6), 1e-3, device=device), 0.9, 0.999)
+    schedule = AdamSchedule(torch.full((100, 6), 1e-3, device=device), 0.9, 0.999, 1e-15).table
     sort = median_ms(lambda means: morton_order(means), [(table["means"],)], 3, 1)
     table.permute(morton_order(table["means"]))
     index = BlockIndex(table, schedule)

@@ -32,7 +32,10 @@ class State:
         self.exp_avg_sqs = [size**2 for size in sizes]
         self.last_step = torch.empty(n, dtype=torch.int32, device=device)
         self.moment_step = torch.empty_like(self.last_step)
-        self.lr_table = torch.full((30_001, 6), 1e-6, device=device)
+        lr_table = torch.full((30_001, 6), 1e-6, device=device)
+        self.dense, self.sparse = (
+            AdamSchedule(lr_table, BETA1, BETA2, EPS, sparse) for sparse in (False, True)
+        )
 
     def state(self) -> AdamState:
         """Return parameters, moments and the steps that they stand at."""
@@ -40,12 +43,11 @@ class State:
 
     def catch_up(self, ids: Tensor) -> None:
         """Bring rows to the step before `STEP`."""
-        lazy_adam_catch_up_(self.state(), AdamSchedule(self.lr_table, BETA1, BETA2, EPS), STEP - 1, ids)
+        lazy_adam_catch_up_(self.state(), self.dense, STEP - 1, ids)
 
     def step(self, ids: Tensor, grads: list[Tensor], sparse: bool) -> None:
         """Take step `STEP`."""
-        schedule = AdamSchedule(self.lr_table, BETA1, BETA2, EPS, sparse)
-        lazy_adam_step_(self.state(), schedule, STEP, grads, ids)
+        lazy_adam_step_(self.state(), self.sparse if sparse else self.dense, STEP, grads, ids)
 
     def time(self, work: Callable[[], None], gaps: Tensor, repeats: int) -> float:
         """Return the median ms of `work` on rows that are `gaps` steps behind `STEP` - 1."""

@@ -72,7 +72,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // project_bwd, then lazy_adam_step_ of the visible Gaussians. splats: (camera_ids, visible_ids,
   // splat_offsets[, places]); with places, v_splats are the tables of the ranks that composited the splats.
   // Groups of the optimiser, as blitzgs/ops/lazy_adam.py names them: state (params, exp_avgs, exp_avg_sqs,
-  // last_step, moment_step); tables (schedule_table, lr_table[, final_rules]); steps (step, explicit_steps,
+  // last_step, moment_step); tables (table, lr_table[, final_rules]); steps (step, explicit_steps,
   // sparse); decays (beta1, beta2, eps).
   m.def(
       "project_bwd_step_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, "

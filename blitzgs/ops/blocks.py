@@ -23,7 +23,7 @@ class PendingSteps(NamedTuple):
         exp_avg_sq_scales: second moment of the log scales, float32 [N, 3].
         last_step: int32 [N], step up to which each row's parameters are current.
         moment_step: int32 [N], step up to which each row's moments are current.
-        table: float64 [S + 1, 30], from `blitzgs.ops.lazy_adam.schedule_table`.
+        table: float64 [S + 1, 30], from `AdamSchedule.table`.
     """
 
     exp_avg_means: Tensor

@@ -4,15 +4,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.weak import WeakTensorKeyDictionary
 
 from blitzgs._library import below_autograd
 
@@ -47,46 +44,56 @@ class AdamState(NamedTuple):
         return [*self.params, *self.exp_avgs, *self.exp_avg_sqs, self.last_step, self.moment_step]
 
 
-@dataclass(frozen=True, eq=False)
 class AdamSchedule:
-    """Adam's constants, its learning rates of every step, and the tables that the ops make of these.
+    """Adam's constants, its learning rates of every step, and the tables that the ops read instead.
+
+    The tables are made once, so that a step computes none of this again.
 
     Attributes:
-        lr_table: float32 [S + 1, 6], learning rates of means, quats, scales, opacities, SH DC and SH rest
-            for every step of the schedule (row 0 unused). Must not change while this object is used.
-        beta1: decay of the first moment, below sqrt(beta2).
-        beta2: decay of the second moment, in (0, 1).
-        eps: added to the root of the second moment.
-        sparse: plain sparse Adam: moments of unlisted rows keep their values and nothing drifts.
+        lr_table: float32 [S + 1, 6], the learning rates of every step.
+        table: float64 [S + 1, 30] on the device of `lr_table`: for each step, the sums that give a row's
+            movement over the steps it misses after that one (csrc/lazy_adam/lazy_adam.h).
+        tables: the group `tables` of the ops: `table`, `lr_table`, and the rules for rows that are
+            `explicit_steps` or more steps behind. A rule applies all missed steps of a row; rules are indexed
+            by the row's last step: uint8 [max(0, S + 1 - explicit_steps), bytes], in a layout that only the
+            ops read.
+        decays: the group `decays` of the ops.
     """
 
-    lr_table: Tensor
-    beta1: float
-    beta2: float
-    eps: float
-    sparse: bool = False
-    _tables: dict[torch.dtype, list[Tensor]] = field(default_factory=dict, init=False, repr=False)
+    def __init__(
+        self,
+        lr_table: Tensor,
+        beta1: float,
+        beta2: float,
+        eps: float,
+        sparse: bool = False,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        """Make the tables.
 
-    @property
-    def decays(self) -> list[float]:
-        """The group `decays` of the ops."""
-        return [self.beta1, self.beta2, self.eps]
+        Args:
+            lr_table: float32 [S + 1, 6], learning rates of means, quats, scales, opacities, SH DC and SH rest
+                for every step of the schedule (row 0 unused). It must not change afterwards.
+            beta1: decay of the first moment, 0 <= beta1 < sqrt(beta2).
+            beta2: decay of the second moment, in (0, 1).
+            eps: added to the root of the second moment.
+            sparse: plain sparse Adam: moments of unlisted rows keep their values and nothing drifts.
+            dtype: of the parameters.
 
-    @cached_property
-    def table(self) -> Tensor:
-        """The `schedule_table`."""
-        return schedule_table(self.lr_table, self.beta1, self.beta2)
+        Raises:
+            ValueError: decay rates outside their range.
+        """
+        self.lr_table, self.decays, self._sparse = lr_table, [beta1, beta2, eps], sparse
+        self.table = _make_table(lr_table, beta1, beta2)
+        self._explicit_steps = explicit_steps(beta1, beta2, dtype)
+        rules = torch.ops.blitzgs.lazy_adam_final_rules(
+            self.table, lr_table.new_empty(0, dtype=dtype), self._explicit_steps, eps
+        )
+        self.tables: list[Tensor] = [self.table, lr_table, rules]
 
-    def tables(self, like: Tensor) -> list[Tensor]:
-        """Return the `schedule_tables` for parameters of the dtype of `like`."""
-        if like.dtype not in self._tables:
-            made = schedule_tables(self.lr_table, self.beta1, self.beta2, self.eps, like)
-            self._tables[like.dtype] = made
-        return self._tables[like.dtype]
-
-    def steps(self, step: int, dtype: torch.dtype) -> list[int]:
-        """Return the group `steps` of the ops: step number `step` of parameters of a dtype."""
-        return [step, explicit_steps(self.beta1, self.beta2, dtype), int(self.sparse)]
+    def steps(self, step: int) -> list[int]:
+        """Return the group `steps` of the ops for step number `step`."""
+        return [step, self._explicit_steps, int(self._sparse)]
 
 
 def lazy_adam_step_(
@@ -100,20 +107,17 @@ def lazy_adam_step_(
 
     Args:
         state: of N rows; `last_step` and `moment_step` become `step` for `ids`.
-        schedule: of S steps.
+        schedule: of S steps, for the dtype of the parameters.
         step: 1 <= step <= S.
         grads: gradients of the listed rows, shaped like the parameters with U rows.
         ids: int32 [U], the rows, each once.
 
     Raises:
-        ValueError: decay rates outside their range.
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
-    like = state.params[0]
-    tables = schedule.tables(like)
     with below_autograd():
         torch.ops.blitzgs.lazy_adam_step_(
-            state.tensors, tables, schedule.steps(step, like.dtype), schedule.decays, list(grads), ids
+            state.tensors, schedule.tables, schedule.steps(step), schedule.decays, list(grads), ids
         )
 
 
@@ -132,24 +136,20 @@ def lazy_adam_catch_up_(
 
     Args:
         state: of N rows.
-        schedule: of S steps.
+        schedule: of S steps, for the dtype of the parameters.
         step: 0 <= step <= S; 0: nothing to do.
         ids: int32 [A], the rows, each once; None: all.
         count: int32 [1], only the first `count` of `ids` are rows; the host does not wait for it. None: all.
 
     Raises:
-        ValueError: decay rates outside their range.
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
-    like = state.params[0]
-    tables = schedule.tables(like)
     with below_autograd():
         torch.ops.blitzgs.lazy_adam_catch_up_(
-            state.tensors, tables, schedule.steps(step, like.dtype), schedule.decays, ids, count
+            state.tensors, schedule.tables, schedule.steps(step), schedule.decays, ids, count
         )
 
 
-@lru_cache(maxsize=16)
 def explicit_steps(beta1: float, beta2: float, dtype: torch.dtype) -> int:
     """Return the number of zero-gradient steps after which a row's remaining movement is below rounding."""
     ratio = beta1 / math.sqrt(beta2)
@@ -157,69 +157,8 @@ def explicit_steps(beta1: float, beta2: float, dtype: torch.dtype) -> int:
     return 1 if ratio == 0 else max(1, math.ceil(math.log(negligible) / math.log(ratio)))
 
 
-# Tables computed from a schedule: for each lr_table, its version at that time and the tables.
-_tables: Any = WeakTensorKeyDictionary()
-
-
-def _cached(lr_table: Tensor, key: tuple[object, ...], make: Callable[[], Tensor]) -> Tensor:
-    """Return the cached result of `make` for `lr_table` and `key`; renew it if `lr_table` has changed."""
-    version, made = _tables.get(lr_table, (None, {}))
-    if version != lr_table._version:
-        made = {}
-        _tables[lr_table] = (lr_table._version, made)
-    if key not in made:
-        made[key] = make()
-    found: Tensor = made[key]
-    return found
-
-
-def schedule_tables(lr_table: Tensor, beta1: float, beta2: float, eps: float, like: Tensor) -> list[Tensor]:
-    """Return the tables of a schedule as the ops take them, made on first use.
-
-    Args:
-        lr_table: float32 [S + 1, 6], learning rates per step (row 0 unused).
-        beta1: decay of the first moment.
-        beta2: decay of the second moment.
-        eps: added to the root of the second moment.
-        like: has the dtype of the parameters.
-
-    Returns:
-        `schedule_table`, `lr_table`, and, for rows that are `explicit_steps` or more steps behind, the rule
-        that applies all their missed steps, indexed by the row's last step: uint8 [max(0, S + 1 -
-        explicit_steps), bytes], in a layout that only the ops read.
-
-    Raises:
-        ValueError: decay rates outside their range.
-    """
-    table = schedule_table(lr_table, beta1, beta2)
-    reach = explicit_steps(beta1, beta2, like.dtype)
-    rules = _cached(
-        lr_table,
-        (beta1, beta2, eps, like.dtype),
-        lambda: torch.ops.blitzgs.lazy_adam_final_rules(table, like, reach, eps),
-    )
-    return [table, lr_table, rules]
-
-
-def schedule_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
-    """Return the table from which the ops compute a row's movement over missed steps; it is cached.
-
-    Args:
-        lr_table: float32 [S + 1, 6], learning rates per step (row 0 unused).
-        beta1: decay of the first moment, 0 <= beta1 < sqrt(beta2).
-        beta2: decay of the second moment, in (0, 1).
-
-    Returns:
-        float64 [S + 1, 30], the table described in csrc/lazy_adam/lazy_adam.h, on the device of `lr_table`.
-
-    Raises:
-        ValueError: decay rates outside their range.
-    """
-    return _cached(lr_table, (beta1, beta2), lambda: _make_table(lr_table, beta1, beta2))
-
-
 def table_without_rates(steps: int, beta1: float, beta2: float, before: int = 0) -> Tensor:
-    """Return `schedule_table` for learning rates of zero: only the columns that do not depend on the rates.
+    """Return `AdamSchedule.table` for learning rates of zero: only the columns that do not depend on them.
 
     Args:
         steps: S + 1.
@@ -252,6 +191,7 @@ def table_without_rates(steps: int, beta1: float, beta2: float, before: int = 0)
 
 
 def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
+    """Return `AdamSchedule.table`."""
     rates = lr_table.double().cpu()
     steps = rates.shape[0]
     table = table_without_rates(steps, beta1, beta2)

@@ -36,7 +36,7 @@ def project_bwd_step_(
     Args:
         state: parameters before their activation, float32 or (CPU) float64, and their moments; `last_step`
             and `moment_step` become `step` for the visible Gaussians.
-        schedule: of S steps.
+        schedule: of S steps, for the dtype of the parameters.
         step: 1 <= step <= S.
         views: the views that the splats were projected into, and the weights of regularisers.
         splats: the P splats that `project` returned for these parameters and views.
@@ -47,7 +47,6 @@ def project_bwd_step_(
         absolute_sums: `means2d_sums` receives the sum over pixels of its absolute values instead.
 
     Raises:
-        ValueError: decay rates outside their range.
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
     of_splats = [splats.camera_ids, splats.visible_ids, splats.splat_offsets]
@@ -57,7 +56,7 @@ def project_bwd_step_(
         torch.ops.blitzgs.project_bwd_step_(
             state.tensors,
             [schedule.table, schedule.lr_table],
-            schedule.steps(step, state.params[0].dtype),
+            schedule.steps(step),
             schedule.decays,
             list(views),
             of_splats,

@@ -26,7 +26,7 @@ class LazyAdam:
 
     Attributes:
         lr_table: float32 [S + 1, 6], the learning rates of every step; see `Schedule.learning_rates`.
-        pending_table: table that bounds the movement by pending steps (`lazy_adam.schedule_table`); None with
+        pending_table: table that bounds the movement by pending steps (`AdamSchedule.table`); None with
             `optimiser.sparse`, which has no pending steps.
     """
 

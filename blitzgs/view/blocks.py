@@ -55,8 +55,8 @@ class BlockIndex:
 
         Args:
             table: the rows.
-            schedule: table of the lazy optimiser's schedule, from `blitzgs.ops.lazy_adam.schedule_table`, if
-                rows may have pending steps; None: they have none.
+            schedule: `AdamSchedule.table` of the lazy optimiser, if rows may have pending steps; None: they
+                have none.
         """
         self._schedule = schedule
         count = -(-len(table) // BLOCK_ROWS)

@@ -10,7 +10,6 @@ from blitzgs.ops.lazy_adam import (
     explicit_steps,
     lazy_adam_catch_up_,
     lazy_adam_step_,
-    schedule_tables,
 )
 from tests.helpers import DEVICES, needs_cuda
 
@@ -41,12 +40,11 @@ class State:
     def tensors(self):
         return self.state().tensors
 
-    def step(self, grads, ids, lr_table, step, sparse=False):
-        schedule = AdamSchedule(lr_table, BETA1, BETA2, EPS, sparse)
+    def step(self, grads, ids, schedule, step):
         lazy_adam_step_(self.state(), schedule, step, grads, ids)
 
-    def catch_up(self, ids, lr_table, step):
-        lazy_adam_catch_up_(self.state(), AdamSchedule(lr_table, BETA1, BETA2, EPS), step, ids)
+    def catch_up(self, ids, schedule, step):
+        lazy_adam_catch_up_(self.state(), schedule, step, ids)
 
     def moments_at(self, step):
         """Return both moments with their pending decay up to `step`, float64."""
@@ -58,10 +56,11 @@ class State:
         ]  # fmt: skip
 
 
-def learning_rates(steps):
+def schedule_of(steps, dtype, device="cpu", sparse=False):
     t = torch.arange(steps + 1) / steps
     base = torch.tensor([1.6e-3, 1e-3, 7e-3, 2e-2, 7.5e-3, 7.5e-3 / 20])
-    return (base * (0.01**t)[:, None]).float()
+    rates = (base * (0.01**t)[:, None]).float().to(device)
+    return AdamSchedule(rates, BETA1, BETA2, EPS, sparse, dtype)
 
 
 class DenseAdam:
@@ -111,20 +110,21 @@ def random_step(n, dtype, generator, k=COEFFICIENTS):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_equals_dense_adam_over_thousands_of_steps(dtype):
     steps, n = 2000, 60
-    lr_table = learning_rates(steps)
+    schedule = schedule_of(steps, dtype)
     state = State(n, dtype)
-    exact, rounded = DenseAdam(state.params, lr_table), DenseAdam(state.params, lr_table, torch.float32)
+    rates = schedule.lr_table
+    exact, rounded = DenseAdam(state.params, rates), DenseAdam(state.params, rates, torch.float32)
     start = [p.clone() for p in exact.params()]
     generator = torch.Generator().manual_seed(3)
     for step in range(1, steps + 1):
         ids, grads = random_step(n, dtype, generator)
-        state.step(grads, ids, lr_table, step)
+        state.step(grads, ids, schedule, step)
         exact.step(grads, ids, step)
         rounded.step(grads, ids, step)
         if step == steps // 2:
-            state.catch_up(None, lr_table, step)
+            state.catch_up(None, schedule, step)
     assert int(state.last_step.min()) < steps  # rows really were left behind
-    state.catch_up(None, lr_table, steps)
+    state.catch_up(None, schedule, steps)
     assert bool((state.last_step == steps).all())
 
     columns = zip(state.params, exact.params(), rounded.params(), start, strict=True)
@@ -144,41 +144,41 @@ def test_equals_dense_adam_over_thousands_of_steps(dtype):
 
 def one_update(n=7, dtype=torch.float64):
     """A state after one step of every row, and its schedule of 4000 steps."""
-    lr_table = learning_rates(4000)
+    schedule = schedule_of(4000, dtype)
     state = State(n, dtype)
     generator = torch.Generator().manual_seed(4)
     ids = torch.arange(n, dtype=torch.int32)
     grads = [torch.randn(s, generator=generator, dtype=torch.float64).to(dtype) for s in shapes(n)]
-    state.step(grads, ids, lr_table, 1)
-    return state, lr_table
+    state.step(grads, ids, schedule, 1)
+    return state, schedule
 
 
 @pytest.mark.parametrize("gap", [1, 2, 30, 200, 3000])
 def test_one_catch_up_equals_many(gap):
-    once, lr_table = one_update()
+    once, schedule = one_update()
     often, _ = one_update()
     for step in range(2, 2 + gap, max(1, gap // 50)):
-        often.catch_up(None, lr_table, step)
-    often.catch_up(None, lr_table, 1 + gap)
-    once.catch_up(None, lr_table, 1 + gap)
+        often.catch_up(None, schedule, step)
+    often.catch_up(None, schedule, 1 + gap)
+    once.catch_up(None, schedule, 1 + gap)
     for a, b in zip(once.params, often.params, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
 
 
 def test_eps_is_exact_where_it_matters():
     """Gradients at and below eps take the explicit path and agree with dense Adam there too."""
-    lr_table = learning_rates(400)
+    schedule = schedule_of(400, torch.float64)
     state = State(40, torch.float64)
-    dense = DenseAdam(state.params, lr_table)
+    dense = DenseAdam(state.params, schedule.lr_table)
     ids = torch.arange(40, dtype=torch.int32)
     size = 10.0 ** torch.linspace(-18, -6, 40, dtype=torch.float64)
     grads = [size.reshape(-1, *[1] * (len(s) - 1)).expand(s).clone() for s in shapes(40)]
-    state.step(grads, ids, lr_table, 1)
+    state.step(grads, ids, schedule, 1)
     dense.step(grads, ids, 1)
     none = torch.zeros(0, dtype=torch.int32)
     for step in range(2, 401):
         dense.step([torch.zeros((0, *s[1:]), dtype=torch.float64) for s in shapes(40)], none, step)
-    state.catch_up(None, lr_table, 400)
+    state.catch_up(None, schedule, 400)
     for ours, exact in zip(state.params, dense.params(), strict=True):
         torch.testing.assert_close(ours, exact, rtol=0, atol=1e-9)
 
@@ -220,12 +220,14 @@ def drift_one_by_one(state, lr_table, begin, end):
 @pytest.mark.parametrize("gap", [1, 2, 40, 700])
 def test_float32_drift_of_any_second_moment(begin, gap, device):
     """Final rules (late) and explicit steps (early) are exact to rounding for every ratio to eps."""
-    lr_table = learning_rates(4000).to(device)
+    schedule = schedule_of(4000, torch.float32, device)
     state = scattered_state(200, torch.float32, begin, device)
     for p in state.params:
         p.zero_()  # so that the parameter is the drift, unrounded
-    state.catch_up(None, lr_table, begin + gap)
-    for ours, exact in zip(state.params, drift_one_by_one(state, lr_table, begin, begin + gap), strict=True):
+    state.catch_up(None, schedule, begin + gap)
+    for ours, exact in zip(
+        state.params, drift_one_by_one(state, schedule.lr_table, begin, begin + gap), strict=True
+    ):
         normal, got = exact.abs() > 1e-30, -ours.double().cpu()
         assert normal.double().mean() > 0.8
         torch.testing.assert_close(got[normal], exact[normal], rtol=4e-6, atol=0)
@@ -235,15 +237,15 @@ def test_float32_drift_of_any_second_moment(begin, gap, device):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_catching_up_in_parts_is_catching_up_at_once(dtype):
     """Moments do not change during a catch-up; long after their last step, rows no longer move."""
-    lr_table = learning_rates(4000)
+    schedule = schedule_of(4000, dtype)
     begin, tolerance = 900, 3e-6 if dtype == torch.float32 else 1e-12
     once, parts = (scattered_state(50, dtype, begin) for _ in range(2))
     moments = [m.clone() for m in (*once.exp_avgs, *once.exp_avg_sqs)]
     for p in (*once.params, *parts.params):
         p.zero_()
     for step in (901, 902, 917, 940, 1300, 3000):
-        parts.catch_up(None, lr_table, step)
-    once.catch_up(None, lr_table, 3000)
+        parts.catch_up(None, schedule, step)
+    once.catch_up(None, schedule, 3000)
     for a, b in zip(once.params, parts.params, strict=True):
         torch.testing.assert_close(a, b, rtol=tolerance, atol=1e-37)
     for before, after in zip(moments, (*parts.exp_avgs, *parts.exp_avg_sqs), strict=True):
@@ -252,15 +254,15 @@ def test_catching_up_in_parts_is_catching_up_at_once(dtype):
 
 
 def test_a_step_after_catching_up_equals_a_step_alone():
-    lr_table = learning_rates(1000)
+    schedule = schedule_of(1000, torch.float64)
     a, b = (scattered_state(40, torch.float64, 500) for _ in range(2))
     ids = torch.arange(40, dtype=torch.int32)
     grads = [
         torch.randn(s, generator=torch.Generator().manual_seed(2), dtype=torch.float64) for s in shapes(40)
     ]
-    a.catch_up(ids, lr_table, 533)
+    a.catch_up(ids, schedule, 533)
     for state in (a, b):
-        state.step(grads, ids, lr_table, 541)
+        state.step(grads, ids, schedule, 541)
         assert bool((state.last_step == 541).all()) and bool((state.moment_step == 541).all())
     for x, y in zip((*a.exp_avgs, *a.exp_avg_sqs), (*b.exp_avgs, *b.exp_avg_sqs), strict=True):
         assert torch.equal(x, y)
@@ -272,59 +274,59 @@ def test_a_step_after_catching_up_equals_a_step_alone():
 @pytest.mark.parametrize("gap", [-1, 0, 1, 5000])
 def test_final_rules_replace_many_pending_steps(gap, dtype):
     """Gaps around the first one for which the table is used, and much larger ones."""
-    lr_table = learning_rates(9000)
+    schedule = schedule_of(9000, dtype)
     reach = explicit_steps(BETA1, BETA2, dtype)
     for begin in (1, 40, 900, 2000):
         state, alone = (scattered_state(40, dtype, begin) for _ in range(2))
         end = begin + reach + gap
-        state.catch_up(None, lr_table, end)
-        tables = schedule_tables(lr_table, BETA1, BETA2, EPS, alone.params[0])
+        state.catch_up(None, schedule, end)
         torch.ops.blitzgs.lazy_adam_catch_up_(
-            alone.tensors(), tables[:2], [end, reach, 0], [BETA1, BETA2, EPS], None,
-        )  # fmt: skip
+            alone.tensors(), schedule.tables[:2], schedule.steps(end), schedule.decays, None
+        )
         for with_rules, without in zip(state.params, alone.params, strict=True):
             assert torch.equal(with_rules, without)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("steps", [1, 60, 100_000])
-def test_tables_belong_to_the_schedule_and_not_to_the_step(steps):
-    lr_table, like = learning_rates(steps), torch.zeros(1)
-    tables = schedule_tables(lr_table, BETA1, BETA2, EPS, like)
-    reach = explicit_steps(BETA1, BETA2, like.dtype)
-    assert [len(table) for table in tables] == [steps + 1, steps + 1, max(0, steps + 1 - reach)]
-    again = schedule_tables(lr_table, BETA1, BETA2, EPS, like)
-    assert all(a is b for a, b in zip(tables, again, strict=True))
-    schedule = AdamSchedule(lr_table, BETA1, BETA2, EPS)
-    assert all(a is b for a, b in zip(tables, schedule.tables(like), strict=True))
-    wide = schedule.tables(like.double())
-    assert wide[0] is tables[0] and wide[2].shape[1] == 2 * tables[2].shape[1]
-    lr_table.mul_(0.5)
-    assert schedule_tables(lr_table, BETA1, BETA2, EPS, like)[2] is not tables[2]
+def test_a_schedule_makes_its_tables_once(steps, dtype):
+    schedule = schedule_of(steps, dtype)
+    reach = explicit_steps(BETA1, BETA2, dtype)
+    assert [len(table) for table in schedule.tables] == [steps + 1, steps + 1, max(0, steps + 1 - reach)]
+    assert schedule.tables[0] is schedule.table and schedule.tables[1] is schedule.lr_table
+    assert schedule.tables[2].shape[1] == 28 * dtype.itemsize
+    assert schedule.steps(7) == [7, reach, 0]
+
+
+def test_a_schedule_of_another_dtype_is_refused():
+    state, _ = one_update(dtype=torch.float64)
+    with pytest.raises(RuntimeError, match="final_rules must have shape"):
+        state.catch_up(None, schedule_of(4000, torch.float32), 5)
 
 
 @pytest.mark.cuda
 @needs_cuda
 def test_catching_up_needs_no_more_memory_late_in_a_schedule():
-    lr_table = learning_rates(100_000).cuda()
+    schedule = schedule_of(100_000, torch.float32, "cuda")
     peaks = []
     for step in (300, 30_000, 100_000):
         state = scattered_state(64, torch.float32, 200, "cuda")
-        state.catch_up(None, lr_table, 201)
+        state.catch_up(None, schedule, 201)
         before = torch.cuda.memory_allocated()
         torch.cuda.reset_peak_memory_stats()
-        state.catch_up(None, lr_table, step)
+        state.catch_up(None, schedule, step)
         peaks.append(torch.cuda.max_memory_allocated() - before)
     assert peaks[0] == peaks[1] == peaks[2]
 
 
 def test_order_of_the_list_does_not_matter():
-    a, lr_table = one_update(50, torch.float32)
+    a, schedule = one_update(50, torch.float32)
     b, _ = one_update(50, torch.float32)
     ids = torch.arange(0, 50, 2, dtype=torch.int32)
     order = torch.randperm(25, generator=torch.Generator().manual_seed(5))
     grads = [torch.randn(s, generator=torch.Generator().manual_seed(6)) for s in shapes(25)]
-    a.step(grads, ids, lr_table, 90)
-    b.step([g[order] for g in grads], ids[order], lr_table, 90)
+    a.step(grads, ids, schedule, 90)
+    b.step([g[order] for g in grads], ids[order], schedule, 90)
     for x, y in zip(
         [*a.params, *a.exp_avgs, *a.exp_avg_sqs], [*b.params, *b.exp_avgs, *b.exp_avg_sqs], strict=True
     ):
@@ -332,10 +334,11 @@ def test_order_of_the_list_does_not_matter():
 
 
 def test_sparse_skips_decay_and_drift():
-    state, lr_table = one_update()
+    state, _ = one_update()
     before = [t.clone() for t in (*state.params, *state.exp_avgs, *state.exp_avg_sqs)]
     grads = [torch.ones(s, dtype=torch.float64) for s in shapes(1)]
-    state.step(grads, torch.tensor([2], dtype=torch.int32), lr_table, 500, sparse=True)
+    schedule = schedule_of(4000, torch.float64, sparse=True)
+    state.step(grads, torch.tensor([2], dtype=torch.int32), schedule, 500)
     after = (*state.params, *state.exp_avgs, *state.exp_avg_sqs)
     for a, b in zip(after, before, strict=True):
         others = torch.arange(7) != 2
@@ -345,43 +348,43 @@ def test_sparse_skips_decay_and_drift():
 
 
 def test_empty_list_and_zero_gradient():
-    state, lr_table = one_update()
+    state, schedule = one_update()
     before = [p.clone() for p in state.params]
     state.step(
         [torch.zeros((0, *s[1:]), dtype=torch.float64) for s in shapes(0)],
         torch.zeros(0, dtype=torch.int32),
-        lr_table,
+        schedule,
         2,
     )
-    state.catch_up(None, lr_table, 1)
+    state.catch_up(None, schedule, 1)
     for a, b in zip(state.params, before, strict=True):
         assert torch.equal(a, b)
     fresh = State(3, torch.float32)
     still = [p.clone() for p in fresh.params]
-    fresh.step([torch.zeros(s) for s in shapes(3)], torch.arange(3, dtype=torch.int32), lr_table, 10)
+    schedule = schedule_of(4000, torch.float32)
+    fresh.step([torch.zeros(s) for s in shapes(3)], torch.arange(3, dtype=torch.int32), schedule, 10)
     for a, b in zip(fresh.params, still, strict=True):
         assert torch.equal(a, b)
 
 
 def test_errors_name_the_value():
-    state, lr_table = one_update()
+    state, schedule = one_update()
     with pytest.raises(ValueError, match=r"beta1=0.9, beta2=0.5"):
-        lazy_adam_catch_up_(state.state(), AdamSchedule(lr_table, 0.9, 0.5, EPS), 5)
+        AdamSchedule(schedule.lr_table, 0.9, 0.5, EPS)
     with pytest.raises(
         RuntimeError, match="step 9999 is outside the learning-rate table, which ends at step 4000"
     ):
-        state.catch_up(None, lr_table, 9999)
+        state.catch_up(None, schedule, 9999)
     bad = [torch.zeros(s, dtype=torch.float64) for s in shapes(2)]
     with pytest.raises(
         RuntimeError, match=r"the gradient of means must have 1 rows of 3 values, got \[2, 3\]"
     ):
-        state.step(bad, torch.zeros(1, dtype=torch.int32), lr_table, 2)
+        state.step(bad, torch.zeros(1, dtype=torch.int32), schedule, 2)
 
 
 def test_opcheck():
-    state, lr_table = one_update(5, torch.float32)
-    tables = schedule_tables(lr_table, BETA1, BETA2, EPS, state.params[0])
-    reach = explicit_steps(BETA1, BETA2, torch.float32)
+    state, schedule = one_update(5, torch.float32)
+    tables, reach = schedule.tables, schedule.steps(0)[1]
     grads = [torch.randn(s) for s in shapes(2)]
     ids = torch.tensor([1, 3], dtype=torch.int32)
     columns, decays = state.tensors(), [BETA1, BETA2, EPS]
@@ -401,15 +404,15 @@ def test_opcheck():
 @needs_cuda
 @pytest.mark.parametrize("k", [1, 4, 9, 16])
 def test_cuda_equals_cpu(k):
-    rates = {device: learning_rates(300).to(device) for device in ("cpu", "cuda")}
-    states = {device: State(1000, torch.float32, device, k) for device in rates}
+    schedules = {device: schedule_of(300, torch.float32, device) for device in ("cpu", "cuda")}
+    states = {device: State(1000, torch.float32, device, k) for device in schedules}
     generator = torch.Generator().manual_seed(8)
     for step in range(1, 301):
         ids, grads = random_step(1000, torch.float32, generator, k)
         for device, state in states.items():
-            state.step([g.to(device) for g in grads], ids.to(device), rates[device], step)
+            state.step([g.to(device) for g in grads], ids.to(device), schedules[device], step)
     for device, state in states.items():
-        state.catch_up(None, rates[device], 300)
+        state.catch_up(None, schedules[device], 300)
     for name in ("params", "exp_avgs", "exp_avg_sqs"):
         for a, b in zip(getattr(states["cpu"], name), getattr(states["cuda"], name), strict=True):
             torch.testing.assert_close(a, b.cpu(), rtol=1e-5, atol=1e-6 * float(a.abs().max()))
@@ -424,4 +427,4 @@ def test_cuda_refuses_what_begins_within_16_bytes(column):
     moment = state.exp_avgs[column]
     state.exp_avgs[column] = moment.new_zeros(moment.numel() + 1)[1:].view(moment.shape)
     with pytest.raises(RuntimeError, match="must be 16-byte aligned on CUDA"):
-        state.catch_up(None, learning_rates(10).cuda(), 5)
+        state.catch_up(None, schedule_of(10, torch.float32, "cuda"), 5)

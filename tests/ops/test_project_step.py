@@ -4,13 +4,7 @@ import math
 import pytest
 import torch
 
-from blitzgs.ops.lazy_adam import (
-    AdamSchedule,
-    AdamState,
-    lazy_adam_catch_up_,
-    lazy_adam_step_,
-    schedule_table,
-)
+from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, lazy_adam_step_
 from blitzgs.ops.project import project
 from blitzgs.ops.project_step import project_bwd_step_
 from blitzgs.ops.projection import ProjectionOptions, WeightedViews
@@ -75,7 +69,7 @@ class Scene:
         return WeightedViews(self.viewmats, self.Ks, self.scale_reg, self.opacity_reg, self.size_reg)
 
     def schedule(self, sparse=False):
-        return AdamSchedule(self.lr_table, BETA1, BETA2, EPS, sparse)
+        return AdamSchedule(self.lr_table, BETA1, BETA2, EPS, sparse, self.params[0].dtype)
 
     def backward_arguments(self, need_viewmats=False):
         return (
@@ -318,10 +312,9 @@ def test_opcheck():
     scene = Scene(20, 16, 1, "cpu", torch.float32)
     scene.render(False)
     state, schedule = scene.state(), scene.schedule()
-    tables = [schedule_table(scene.lr_table, BETA1, BETA2), scene.lr_table]
     torch.library.opcheck(
         torch.ops.blitzgs.project_bwd_step_,
-        (state.tensors, tables, schedule.steps(STEP, torch.float32), schedule.decays, list(scene.views()),
+        (state.tensors, schedule.tables[:2], schedule.steps(STEP), schedule.decays, list(scene.views()),
          scene.splat_ids(), scene.options.ints, scene.options.floats, list(scene.v.parts)),
     )  # fmt: skip
     torch.library.opcheck(torch.ops.blitzgs.project_bwd, scene.backward_arguments(True))

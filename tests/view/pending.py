@@ -5,15 +5,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.model import PARAMETERS, GaussianTable
-from blitzgs.ops.lazy_adam import (
-    AdamSchedule,
-    AdamState,
-    lazy_adam_catch_up_,
-    lazy_adam_step_,
-    schedule_table,
-)
-
-_BETAS, _EPS = (0.9, 0.999), 1e-15
+from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, lazy_adam_step_
 
 
 def _state(table: GaussianTable) -> AdamState:
@@ -21,20 +13,20 @@ def _state(table: GaussianTable) -> AdamState:
     return AdamState(*groups, table["last_step"], table["moment_step"])
 
 
-def schedule_of(rates: Tensor) -> Tensor:
-    """Return the table of the schedule with these learning rates, [S + 1, 6], for a `BlockIndex`."""
-    return schedule_table(rates, *_BETAS)
+def schedule_of(rates: Tensor) -> AdamSchedule:
+    """Return the schedule with these learning rates, [S + 1, 6]."""
+    return AdamSchedule(rates, 0.9, 0.999, 1e-15)
 
 
-def caught_up(table: GaussianTable, rates: Tensor, step: int) -> GaussianTable:
+def caught_up(table: GaussianTable, schedule: AdamSchedule, step: int) -> GaussianTable:
     """Return a copy of a table with no pending steps up to `step`."""
     copy = GaussianTable({name: table[name].clone() for name in table})
-    lazy_adam_catch_up_(_state(copy), AdamSchedule(rates, *_BETAS, _EPS), step)
+    lazy_adam_catch_up_(_state(copy), schedule, step)
     return copy
 
 
 def step_some(
-    table: GaussianTable, ids: Tensor, rates: Tensor, step: int, generator: torch.Generator
+    table: GaussianTable, ids: Tensor, schedule: AdamSchedule, step: int, generator: torch.Generator
 ) -> Tensor:
     """Take a step with random gradients of about half of the rows `ids`; return these rows, int32 [U]."""
     stepped = ids[torch.rand(len(ids), generator=generator).to(ids.device) < 0.5]
@@ -42,5 +34,5 @@ def step_some(
         torch.randn((len(stepped), *table[name].shape[1:]), generator=generator).to(ids.device)
         for name in PARAMETERS
     ]
-    lazy_adam_step_(_state(table), AdamSchedule(rates, *_BETAS, _EPS), step, grads, stepped)
+    lazy_adam_step_(_state(table), schedule, step, grads, stepped)
     return stepped

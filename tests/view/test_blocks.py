@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from blitzgs.ops.blocks import cull_blocks, morton_keys
-from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, schedule_table
+from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_
 from blitzgs.ops.project import project
 from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions
 from blitzgs.view.blocks import BlockIndex, morton_order
@@ -226,7 +226,8 @@ def test_the_active_set_covers_thousands_of_pending_steps(device):
     rates = torch.full((steps + 1, 6), 1e-3, device=device)
     rates[:, 0] = 0.05  # means move far
     rates[:, 2] = 0.02
-    index = BlockIndex(table, schedule_of(rates))
+    schedule = schedule_of(rates)
+    index = BlockIndex(table, schedule.table)
     generator = torch.Generator().manual_seed(5)
     views = [make_views(2, device, seed=seed) for seed in range(20)]
     crossed = 0
@@ -234,12 +235,12 @@ def test_the_active_set_covers_thousands_of_pending_steps(device):
         viewmats, Ks = views[step * 7 % len(views)]
         ids, _ = active_of(index, table, viewmats, Ks)
         if step % 100 == 0:
-            dense = caught_up(table, rates, step - 1)
+            dense = caught_up(table, schedule, step - 1)
             expected = {row for row, _ in seen(dense, viewmats, Ks)}
             assert expected <= set(ids.tolist())
             crossed += len({row for row, _ in seen(table, viewmats, Ks)} ^ expected)
         # The other rows are not visible.
-        index.update(table, step_some(table, ids, rates, step, generator))
+        index.update(table, step_some(table, ids, schedule, step, generator))
     assert crossed > 0  # pending steps moved rows across the borders of views
     assert int(table["last_step"].min()) < steps - 20
 
@@ -312,7 +313,7 @@ def test_opcheck(device):
     table = make_table(600, device)
     viewmats, Ks = make_views(2, device)
     bounds = BlockIndex(table).bounds
-    schedule = schedule_table(torch.ones(5, 6, device=device), 0.9, 0.999)
+    schedule = AdamSchedule(torch.ones(5, 6, device=device), 0.9, 0.999, 1e-15).table
     moments = [
         table[name] for name in ("exp_avg.means", "exp_avg_sq.means", "exp_avg.scales", "exp_avg_sq.scales")
     ]

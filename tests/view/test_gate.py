@@ -212,7 +212,8 @@ def test_the_gated_active_set_covers_pending_steps(device):
     table = make_scene(1500, device)
     rates = torch.full((steps + 1, 6), 1e-3, device=device)
     rates[:, 0] = 0.2  # means move far
-    index = BlockIndex(table, schedule_of(rates))
+    schedule = schedule_of(rates)
+    index = BlockIndex(table, schedule.table)
     gate = ViewGate(GATE.reach(), 0b01, (3, 40))
     generator = torch.Generator().manual_seed(5)
     views = [make_views(2, device, seed=seed) for seed in range(20)]
@@ -222,7 +223,7 @@ def test_the_gated_active_set_covers_pending_steps(device):
         rules, size = gate.rules(table), (WIDTH, HEIGHT, NEAR, FAR)
         found = allowed(index.active(table, viewmats, Ks, *size, rules=rules).listed())
         if step % 20 == 0:
-            dense = caught_up(table, rates, step - 1)
+            dense = caught_up(table, schedule, step - 1)
             kept, close = kept_by_definition(dense, viewmats, GATE, (0,), (3, 40))
             expected = {(r, v) for r, v in seen(dense, viewmats, Ks) if kept[r, v] and not close[r, v]}
             assert expected <= found
@@ -231,7 +232,7 @@ def test_the_gated_active_set_covers_pending_steps(device):
             listed += len(found)
             without += len(allowed(index.active(table, viewmats, Ks, *size).listed()))
         ids = torch.tensor(sorted({r for r, _ in found}), dtype=torch.int32, device=device)
-        index.update(table, step_some(table, ids, rates, step, generator))
+        index.update(table, step_some(table, ids, schedule, step, generator))
     assert crossed > 10  # pending steps move rows across the borders of the gate
     assert listed < 0.5 * without
 
