@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stores what the tiles of each view cost, and divides the tiles of a batch by it, on the host."""
+"""Stores what the tiles of each view cost, and divides the tiles of a batch by it.
+
+Both ops work on the host with numbers that it has read, so torch never traces them and they have no fakes.
+"""
 
 from __future__ import annotations
 
@@ -54,9 +57,3 @@ def divide_tiles(
         RuntimeError: wrong shapes, dtypes or numbers.
     """
     return tuple(torch.ops.blitzgs.divide_tiles(costs, similar, tiles, grain, tile_cost, parts))
-
-
-@torch.library.register_fake("blitzgs::tile_costs")
-def _(sums: Tensor, first: int, views: int, grain: int) -> list[Tensor]:
-    pieces = -(-(len(sums) - first) // (views * grain))
-    return [sums.new_empty(pieces, dtype=torch.float16) for _ in range(views)]
