@@ -62,7 +62,8 @@ def rasterization(
 
     Args:
         means: [..., N, 3] in world units, float32, or float64 on the CPU.
-        quats: [..., N, 4] (w, x, y, z), need not be normalised. Not read, and may be None, with `covars`.
+        quats: [..., N, 4] (w, x, y, z), of any length; zero is rendered as the identity (in gsplat it becomes
+            NaN) and has the gradient zero. Not read, and may be None, with `covars`.
         scales: [..., N, 3] standard deviations (after the exponential); their signs do not matter. Not read,
             and may be None, with `covars`.
         opacities: [..., N] in [0, 1] (after the sigmoid).

@@ -43,7 +43,7 @@ def contributions(
 
     Args:
         means: [N, 3], float32, or (CPU) float64; the other tensors share its dtype and device.
-        quats: [N, 4] (w, x, y, z), need not be normalised.
+        quats: [N, 4] (w, x, y, z), of any length; zero counts as the identity.
         scales: [N, 3] standard deviations (after the exponential).
         opacities: [N] in [0, 1] (after the sigmoid).
         viewmats: [C, 4, 4] world to camera, a rotation and a translation; any number of views.

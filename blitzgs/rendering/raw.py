@@ -87,7 +87,7 @@ def raw_rasterization(
 
     Args:
         means: [N, 3] in world units, float32, or float64 on the CPU.
-        quats: [N, 4] (w, x, y, z), need not be normalised.
+        quats: [N, 4] (w, x, y, z), of any length; zero counts as the identity, with the gradient zero.
         scales: [N, 3] logarithms of standard deviations.
         opacities: [N] logits.
         sh0: [N, 1, 3], the first SH coefficient; or all of them, [N, K, 3], with shN None.
