@@ -63,6 +63,18 @@ def test_a_second_derivative_is_refused(device, differentiate_twice):
             differentiate_twice(scene)
 
 
+@pytest.mark.parametrize("transform", [torch.func.grad, torch.func.jacrev, torch.func.jacfwd, torch.vmap])
+def test_transforms_of_torch_func_are_refused(transform):
+    scene = random_scene(n=6, width=8, height=8)
+
+    def loss(means):
+        return rasterize_scene(replace(scene, means=means))[0].sum()
+
+    means = scene.means[None] if transform is torch.vmap else scene.means
+    with pytest.raises(RuntimeError, match=r"blitzgs does not support the transforms of torch\.func"):
+        transform(loss)(means)
+
+
 def test_a_gradient_with_a_graph_may_be_used_as_a_value():
     scene = random_scene(n=20).leaves()
     expected, created = (

@@ -206,11 +206,17 @@ def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]
         optional: further arguments by name, which may be None.
 
     Raises:
+        RuntimeError: the call is inside a transform of `torch.func`.
         TypeError: an argument is not a tensor, but for example an array of another library, or has a dtype
             that the kernels do not compute in.
         ValueError: an argument has another dtype, or is on another device, whose memory the kernels could not
             read.
     """
+    if torch._C._are_functorch_transforms_active():
+        raise RuntimeError(
+            "blitzgs does not support the transforms of torch.func (grad, vjp, jvp, jacrev, vmap, ...): use "
+            "torch.autograd or backward(), and batch dimensions of the arguments in place of vmap"
+        )
     device, dtype, first = None, None, ""
     for name, value in (*required.items(), *optional.items()):
         if value is None and name in optional:

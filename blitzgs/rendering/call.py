@@ -123,7 +123,7 @@ def rasterization(
             argument; or the tensors are neither float32 nor float64.
         ValueError: an argument is not supported, has a wrong shape or value, or another dtype or device than
             the others; the message names it.
-        RuntimeError: float64 tensors are on a GPU.
+        RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
     """
     check_further("rasterization", further)
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size

@@ -69,7 +69,7 @@ def contributions(
             neither float32 nor float64.
         ValueError: an argument has a wrong shape or value, or another dtype or device than the others; the
             message names it.
-        RuntimeError: float64 tensors are on a GPU.
+        RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
     """
     check_options(
         width, height, near_plane, far_plane, 0.0, eps2d, None, CUDA_TILE_SIZE, "D", rasterize_mode, "pinhole"

@@ -127,7 +127,7 @@ def raw_rasterization(
         ValueError: an argument is not supported, has a wrong shape or value, or another dtype or device than
             the others; a parameter is not a leaf, but would get a sparse gradient; or `direct_grad` is not
             possible. The message names it.
-        RuntimeError: float64 tensors are on a GPU.
+        RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
     """
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
     check_options(
