@@ -19,7 +19,8 @@ from timing import copy_bandwidth, median_ms
 from torch import Tensor
 
 from blitzgs.ops.blocks import BLOCK_ROWS, cull_blocks, update_block_bounds_
-from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions, project_splats
+from blitzgs.ops.project import project_splats
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
 from blitzgs.view.blocks import morton_order
 
 COLUMNS = ("means", "quats", "scales", "opacities", "sh")

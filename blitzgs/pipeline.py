@@ -31,7 +31,7 @@ from blitzgs.distributed.transport import (
 from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.capacity import Attempt
-from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions, Splats
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions, Splats
 from blitzgs.ops.rasterize import RasterizeForward
 from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients, absolute_column
 

@@ -14,7 +14,7 @@ from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport import LocalTransport, Transport, open_transport
 from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.projection import ProjectedSplats
+from blitzgs.ops.projection_types import ProjectedSplats
 from blitzgs.pipeline import RenderOptions, Views, inputs_of, tile_grid
 
 

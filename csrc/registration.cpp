@@ -40,9 +40,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "float[] reach, int lod_views, Tensor? cull, int[] columns) -> ()");
 
   // Projection: parameters to screen-space splats, ordered by (Gaussian, view). Groups of arguments, as
-  // blitzgs/ops/project.py names them: gaussians (means, quats, scales, opacities[, sh]); cameras (viewmats,
-  // Ks); active ([ids[, views[, count[, n_blocks]]]]); rank_tiles (begin and end of each rank); capacity
-  // ([visible, splats]; empty: the op waits for the numbers); splats (camera_ids, visible_ids,
+  // blitzgs/ops/projection_types.py names them: gaussians (means, quats, scales, opacities[, sh]); cameras
+  // (viewmats, Ks); active ([ids[, views[, count[, n_blocks]]]]); rank_tiles (begin and end of each rank);
+  // capacity ([visible, splats]; empty: the op waits for the numbers); splats (camera_ids, visible_ids,
   // splat_offsets); ints (width, height, tile_size, sh_degree, antialiased, raw); floats (near_plane,
   // far_plane, eps2d, radius_clip[, fade_slope, reach of each level]). level: the levels of the Gaussians for
   // smooth levels (csrc/project/project.h).

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from blitzgs._library import below_autograd
-from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs
 
 
 class VisibleRows(NamedTuple):

@@ -1,22 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Projection: Gaussians and pinhole views to screen-space splats, one for each Gaussian that a view sees."""
+"""Projects Gaussians into pinhole views, with gradients: a splat for each Gaussian that a view sees."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from blitzgs._library import below_autograd
+from blitzgs.ops.capacity import CapacityEstimate, Sizes
 from blitzgs.ops.color_rows import VisibleRows
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.gather_rows import split_rows
-from blitzgs.ops.projection import (
+from blitzgs.ops.host import HostCopy
+from blitzgs.ops.projection_types import (
+    VIEW_TOTALS,
     ProjectedSplats,
     ProjectionInputs,
     ProjectionOptions,
-    project_splats,
+    splats_of,
 )
 from blitzgs.ops.sparse_rows import HandOver, full_gradients
 from blitzgs.ops.splat_gradients import packed_table
@@ -89,7 +94,7 @@ def project(
     if active_views is not None and active_ids is None:
         active_ids = torch.arange(len(means), dtype=torch.int32, device=means.device)
     inputs = ProjectionInputs(
-        gaussians_of(means, quats, scales, opacities, sh),
+        gaussian_tensors(means, quats, scales, opacities, sh),
         (viewmats, Ks),
         ProjectionOptions(
             width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw
@@ -99,11 +104,36 @@ def project(
     return differentiable_splats(inputs, sparse_grad)
 
 
-def gaussians_of(
+def gaussian_tensors(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor | None
 ) -> list[Tensor]:
     """Return `ProjectionInputs.gaussians`."""
     return [means, quats, scales, opacities, *([] if sh is None else [sh])]
+
+
+def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
+    """Project as `project` does, with grouped arguments, without gradients. Wait for the number of splats.
+
+    Args:
+        inputs: the inputs of the projection.
+    """
+    with below_autograd():
+        for attempt in capacity_for(inputs).attempts():
+            projected = inputs.run(attempt.sizes)
+            needed = Sizes(*HostCopy(projected.totals).read()[:3].tolist())
+            attempt.end(needed, attempt.sizes is None or attempt.sizes.holds(needed[:2]))
+        return splats_of(projected.splats, needed)
+
+
+def capacity_for(inputs: ProjectionInputs) -> CapacityEstimate:
+    """Return the capacity estimate shared by all calls of this size."""
+    means = inputs.gaussians[0]
+    return _estimate(means.device, means.shape[0], inputs.n_views)
+
+
+@lru_cache(maxsize=16)
+def _estimate(_device: torch.device, _gaussians: int, _views: int) -> CapacityEstimate:
+    return CapacityEstimate()
 
 
 def differentiable_splats(
@@ -345,3 +375,65 @@ def _no_gradient(argument: object) -> list[None] | None:
 
 
 torch.library.register_autograd("blitzgs::project_fwd", _backward, setup_context=_setup_context)
+
+
+@torch.library.register_fake("blitzgs::project_fwd")
+def _(
+    gaussians: Sequence[Tensor],
+    cameras: Sequence[Tensor],
+    active: Sequence[Tensor],
+    ints: Sequence[int],
+    floats: Sequence[float],
+    rank_tiles: Sequence[int],
+    capacity: Sequence[int],
+    ids: Tensor | None,
+    level: Tensor | None,
+) -> tuple[Tensor, ...]:
+    context, means = torch.library.get_ctx(), gaussians[0]
+    U, P = context.new_dynamic_size(), context.new_dynamic_size()
+
+    def ints_of(*shape: Any) -> Tensor:
+        return means.new_empty(shape, dtype=torch.int32)
+
+    return (
+        ints_of(P),
+        ints_of(P),
+        ints_of(U),
+        ints_of(U + 1),
+        means.new_empty(P, 2),
+        means.new_empty(P, 3),
+        means.new_empty(P),
+        means.new_empty(P),
+        means.new_empty(P if len(gaussians) > 4 else 0, 3),
+        ints_of(P, 2),
+        ints_of(P),
+        means.new_empty(P if rank_tiles else 0, dtype=torch.int64),
+        means.new_empty(0 if ids is None else P, dtype=torch.int64),
+        means.new_empty(VIEW_TOTALS + cameras[0].shape[0] + len(rank_tiles), dtype=torch.int64),
+    )
+
+
+@torch.library.register_fake("blitzgs::project_bwd")
+def _(
+    gaussians: Sequence[Tensor],
+    views: Sequence[Tensor | None],
+    splats: Sequence[Tensor],
+    ints: Sequence[int],
+    floats: Sequence[float],
+    v_splats: Sequence[Tensor],
+    v_depths: Tensor | None,
+    need_viewmats: bool,
+    dense: bool = False,
+    level: Tensor | None = None,
+) -> tuple[Tensor, ...]:
+    means, (_, visible_ids, _), viewmats = gaussians[0], splats, views[0]
+    assert viewmats is not None
+    length = (means if dense else visible_ids).shape[0]
+    return (
+        means.new_empty(length, 3),
+        means.new_empty(length, 4),
+        means.new_empty(length, 3),
+        means.new_empty(length),
+        means.new_empty(length, gaussians[4].shape[1] if len(gaussians) > 4 else 0, 3),
+        means.new_empty(viewmats.shape[0] if need_viewmats else 0, 4, 4),
+    )

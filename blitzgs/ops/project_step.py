@@ -10,7 +10,7 @@ from torch import Tensor
 
 from blitzgs._library import below_autograd
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState
-from blitzgs.ops.projection import ProjectedSplats, ProjectionOptions, WeightedViews
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions, WeightedViews
 from blitzgs.ops.splat_gradients import SplatGradients
 
 

@@ -13,13 +13,12 @@ from blitzgs._library import below_autograd
 from blitzgs.ops.capacity import Attempt, Sizes
 from blitzgs.ops.color_rows import VisibleRows, colored_rows
 from blitzgs.ops.host import HostCopy
-from blitzgs.ops.project import TableRows
-from blitzgs.ops.projection import (
+from blitzgs.ops.project import TableRows, capacity_for
+from blitzgs.ops.projection_types import (
     VIEW_TOTALS,
     Projected,
     ProjectedSplats,
     ProjectionInputs,
-    capacity_for,
     first_rows,
     lengths_of,
 )

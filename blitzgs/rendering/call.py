@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from blitzgs.ops.projection import ProjectionOptions
+from blitzgs.ops.projection_types import ProjectionOptions
 from blitzgs.rendering.arguments import (
     DEFAULT_TILE_SIZE,
     Gaussians,

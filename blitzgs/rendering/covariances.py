@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.ops.project import differentiable_splats, gaussians_of
-from blitzgs.ops.projection import MOST_VIEWS, ProjectedSplats, ProjectionInputs, ProjectionOptions
+from blitzgs.ops.project import differentiable_splats, gaussian_tensors
+from blitzgs.ops.projection_types import MOST_VIEWS, ProjectedSplats, ProjectionInputs, ProjectionOptions
 from blitzgs.ops.render import Rendered
 from blitzgs.rendering.arguments import Gaussians, Scene
 from blitzgs.rendering.covariances import Decomposed, shaped_by
@@ -44,7 +44,7 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
         for part, (viewmats, Ks) in enumerate(views):
             means, quats, scales, opacities, *_ = scene
             inputs = ProjectionInputs(
-                gaussians_of(means, quats, scales, opacities, sh[part]), (viewmats, Ks), options
+                gaussian_tensors(means, quats, scales, opacities, sh[part]), (viewmats, Ks), options
             )
             groups.append(Group(inputs, s * gaussians.views + part * most, scene.covariances))
     return groups

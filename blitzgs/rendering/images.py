@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.ops.projection import ProjectedSplats, ProjectionOptions
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import Through, rasterize
 from blitzgs.ops.render import Rendered, ShTables, render_queued
 from blitzgs.rendering.arguments import Gaussians, Scene

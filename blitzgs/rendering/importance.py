@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.importance import UNITS, splat_contributions
-from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions, project_splats
+from blitzgs.ops.project import project_splats
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
 from blitzgs.rendering.arguments import check_options, check_tensors, gaussians_of
 from blitzgs.rendering.finite import warn_of_non_finite
 from blitzgs.rendering.images import CUDA_TILE_SIZE

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.arrange_splats import Places
-from blitzgs.ops.projection import ProjectedSplats
+from blitzgs.ops.projection_types import ProjectedSplats
 
 
 class Layout:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.lazy_dict import LateMapping, Later, LazyDict
-from blitzgs.ops.projection import ProjectedSplats
+from blitzgs.ops.projection_types import ProjectedSplats
 from blitzgs.rendering.arguments import Gaussians
 from blitzgs.rendering.finite import non_finite
 from blitzgs.rendering.layout import Layout

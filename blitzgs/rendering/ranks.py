@@ -18,7 +18,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from blitzgs.ops.projection import ProjectedSplats
+from blitzgs.ops.projection_types import ProjectedSplats
 from blitzgs.rendering.arguments import Gaussians
 
 

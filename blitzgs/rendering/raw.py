@@ -14,7 +14,8 @@ from torch import Tensor
 
 from blitzgs.lazy_dict import LazyDict
 from blitzgs.ops.gather_rows import gather_rows, split_rows
-from blitzgs.ops.projection import ProjectionOptions, project_splats
+from blitzgs.ops.project import project_splats
+from blitzgs.ops.projection_types import ProjectionOptions
 from blitzgs.ops.render import ShTables
 from blitzgs.ops.sparse_rows import HandOver, full_gradients
 from blitzgs.rendering.arguments import (

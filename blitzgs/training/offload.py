@@ -13,7 +13,7 @@ from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.transport import Mark, unmarked
 from blitzgs.ops.host import to_device
-from blitzgs.ops.projection import MOST_VIEWS
+from blitzgs.ops.projection_types import MOST_VIEWS
 from blitzgs.pipeline import Frame, RenderOptions
 from blitzgs.population.position_noise import PositionNoise
 from blitzgs.training.batches import Batch

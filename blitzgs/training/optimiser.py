@@ -10,7 +10,7 @@ from torch import Tensor
 from blitzgs.model import GaussianTable
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_
 from blitzgs.ops.project_step import project_bwd_step_
-from blitzgs.ops.projection import WeightedViews
+from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.ops.splat_gradients import SplatGradients
 from blitzgs.pipeline import Frame
 from blitzgs.training.config import OptimiserConfig

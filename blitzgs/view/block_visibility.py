@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.cull_mask import WORD_BITS
-from blitzgs.ops.projection import MOST_VIEWS
+from blitzgs.ops.projection_types import MOST_VIEWS
 from blitzgs.ops.residence import seen_blocks
 
 _MOST_WORDS = 1 << 26  # words of a mask that are processed together

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The checked groups of arguments that the ops of the projection share. blitzgs/ops/project.py builds these
-// groups.
+// The checked groups of arguments that the ops of the projection share.
+// blitzgs/ops/projection_types.py builds these groups.
 #pragma once
 #include <cfloat>
 #include <limits>

@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions, project_splats
+from blitzgs.ops.project import project_splats
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
 
 ops = torch.ops.blitzgs
 

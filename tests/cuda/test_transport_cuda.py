@@ -9,7 +9,7 @@ from blitzgs.distributed.transport import Traffic
 from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, PeerBuffers
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.host import HostCopy, PinnedPlace
-from blitzgs.ops.projection import VIEW_TOTALS, splats_of
+from blitzgs.ops.projection_types import VIEW_TOTALS, splats_of
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.helpers import sum_of_ranks

@@ -21,7 +21,7 @@ from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, room_for
 from blitzgs.distributed.transport.way_back import PeerWayBack
 from blitzgs.model import GaussianTable
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
-from blitzgs.ops.projection import VIEW_TOTALS
+from blitzgs.ops.projection_types import VIEW_TOTALS
 from blitzgs.ops.scatter import gather_splats, scatter_splats, words_of
 from blitzgs.survey import survey
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras

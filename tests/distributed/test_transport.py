@@ -21,7 +21,8 @@ from blitzgs.distributed.transport.protocol import Traffic
 from blitzgs.distributed.transport.way_back import CollectiveWayBack
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.intersect import intersect
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_splats
+from blitzgs.ops.project import project_splats
+from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
 from blitzgs.ops.scatter import scatter_splats
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.distributed.rank_harness import run_ranks

@@ -10,7 +10,7 @@ from blitzgs.distributed.shared_memory import Shared
 from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport.protocol import Exchange, HostCounts, Mark, Transport, unmarked
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
-from blitzgs.ops.projection import ProjectionInputs
+from blitzgs.ops.projection_types import ProjectionInputs
 
 
 class RecordingTransport:

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from blitzgs.ops.gather_rows import gather_rows, split_rows
-from blitzgs.ops.projection import first_rows
+from blitzgs.ops.projection_types import first_rows
 from tests.helpers import DEVICES
 
 

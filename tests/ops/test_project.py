@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project
-from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, ProjectionOptions
+from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, ProjectionOptions
 from tests.helpers import BACKENDS, PARAMETERS, orbit_camera, random_scene, reference_images, relative_error
 
 FLOATS = ("means2d", "conics", "depths", "opacities", "colors")

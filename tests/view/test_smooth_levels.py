@@ -9,8 +9,8 @@ import torch
 
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
-from blitzgs.ops.project import differentiable_splats, gaussians_of, project
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions
+from blitzgs.ops.project import differentiable_splats, gaussian_tensors, project
+from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
 from blitzgs.pipeline import Views
 from blitzgs.reference.render import render as reference_render
 from blitzgs.view.gate import LodGate, SceneGate, centres_of
@@ -148,7 +148,7 @@ def test_gradients_are_those_of_opacities_that_faded_before(device, antialiased)
 
     first = [leaf.clone().requires_grad_() for leaf in (*leaves, viewmats)]
     options = ProjectionOptions(WIDTH, HEIGHT, fade=SMOOTH.fade(), **flags)
-    inputs = ProjectionInputs(gaussians_of(*first[:5]), (first[5], Ks), options, level=table["level"])
+    inputs = ProjectionInputs(gaussian_tensors(*first[:5]), (first[5], Ks), options, level=table["level"])
     splats = differentiable_splats(inputs, False)
     v = weights_of(splats)
     found = torch.autograd.grad(columns(splats), first, v)
@@ -177,7 +177,7 @@ def test_gradients_are_those_of_opacities_that_faded_before(device, antialiased)
 def test_errors_name_the_value():
     table = faint_scene(13)
     viewmats, Ks = make_views(1)
-    gaussians = gaussians_of(*table.parameters)
+    gaussians = gaussian_tensors(*table.parameters)
 
     def call(level, fade):
         options = ProjectionOptions(WIDTH, HEIGHT, fade=fade)

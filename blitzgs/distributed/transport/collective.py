@@ -13,7 +13,7 @@ from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, Tr
 from blitzgs.distributed.transport.way_back import CollectiveWayBack
 from blitzgs.ops.capacity import Attempt, CapacityEstimate
 from blitzgs.ops.host import to_host
-from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, Splats
+from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Splats
 from blitzgs.ops.scatter import gather_splats, scatter_splats, words_per_splat
 
 

@@ -9,7 +9,7 @@ from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, unmarked
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.host import HostCopy
-from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs
+from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs
 
 
 class LocalTransport:

@@ -49,7 +49,7 @@ from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, Tr
 from blitzgs.distributed.transport.way_back import PeerWayBack
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.host import current_stream
-from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, Splats, splats_of
+from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Splats, splats_of
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
-from blitzgs.ops.projection import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, Splats
+from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, Splats
 from blitzgs.ops.splat_gradients import SplatGradients
 
 # Called at the end of each stage of a step with the stage's name, for benchmarks.

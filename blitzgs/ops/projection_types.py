@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Groups the arguments of a projection as the ops take them, and holds the splats that it returns."""
+"""The arguments of the projection's ops in groups, and the splats that these ops return.
+
+`blitzgs.ops.project` has the functions that project.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from blitzgs._library import below_autograd
-from blitzgs.ops.capacity import CapacityEstimate, Sizes
-from blitzgs.ops.host import HostCopy
+import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs.ops.capacity import Sizes
 
 # Largest number of views of one launch (kMaxViews of csrc/common/kernel.h): an int32 has a bit for each.
 MOST_VIEWS = 32
@@ -233,91 +234,3 @@ class Projected(NamedTuple):
     def first(self, sizes: Sizes) -> Projected:
         """Return only the valid splats, with their `counts`; `sizes` has the numbers in `totals`."""
         return Projected(splats_of(self.splats, sizes), self.ids[: sizes.splats], self.totals)
-
-
-def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
-    """Project without gradients and wait for the number of splats; `project` with grouped arguments."""
-    return splats_of(*_projected(inputs))
-
-
-def _projected(inputs: ProjectionInputs) -> tuple[ProjectedSplats, Sizes]:
-    """Return columns that may be longer than their valid part, and their sizes."""
-    with below_autograd():
-        for attempt in capacity_for(inputs).attempts():
-            projected = inputs.run(attempt.sizes)
-            needed = Sizes(*HostCopy(projected.totals).read()[:3].tolist())
-            attempt.end(needed, attempt.sizes is None or attempt.sizes.holds(needed[:2]))
-        return projected.splats, needed
-
-
-def capacity_for(inputs: ProjectionInputs) -> CapacityEstimate:
-    """Return the capacity estimate shared by all calls of this size."""
-    means = inputs.gaussians[0]
-    return _estimate(means.device, means.shape[0], inputs.n_views)
-
-
-@lru_cache(maxsize=16)
-def _estimate(_device: torch.device, _gaussians: int, _views: int) -> CapacityEstimate:
-    return CapacityEstimate()
-
-
-@torch.library.register_fake("blitzgs::project_fwd")
-def _(
-    gaussians: Sequence[Tensor],
-    cameras: Sequence[Tensor],
-    active: Sequence[Tensor],
-    ints: Sequence[int],
-    floats: Sequence[float],
-    rank_tiles: Sequence[int],
-    capacity: Sequence[int],
-    ids: Tensor | None,
-    level: Tensor | None,
-) -> tuple[Tensor, ...]:
-    context, means = torch.library.get_ctx(), gaussians[0]
-    U, P = context.new_dynamic_size(), context.new_dynamic_size()
-
-    def ints_of(*shape: Any) -> Tensor:
-        return means.new_empty(shape, dtype=torch.int32)
-
-    return (
-        ints_of(P),
-        ints_of(P),
-        ints_of(U),
-        ints_of(U + 1),
-        means.new_empty(P, 2),
-        means.new_empty(P, 3),
-        means.new_empty(P),
-        means.new_empty(P),
-        means.new_empty(P if len(gaussians) > 4 else 0, 3),
-        ints_of(P, 2),
-        ints_of(P),
-        means.new_empty(P if rank_tiles else 0, dtype=torch.int64),
-        means.new_empty(0 if ids is None else P, dtype=torch.int64),
-        means.new_empty(VIEW_TOTALS + cameras[0].shape[0] + len(rank_tiles), dtype=torch.int64),
-    )
-
-
-@torch.library.register_fake("blitzgs::project_bwd")
-def _(
-    gaussians: Sequence[Tensor],
-    views: Sequence[Tensor | None],
-    splats: Sequence[Tensor],
-    ints: Sequence[int],
-    floats: Sequence[float],
-    v_splats: Sequence[Tensor],
-    v_depths: Tensor | None,
-    need_viewmats: bool,
-    dense: bool = False,
-    level: Tensor | None = None,
-) -> tuple[Tensor, ...]:
-    means, (_, visible_ids, _), viewmats = gaussians[0], splats, views[0]
-    assert viewmats is not None
-    length = (means if dense else visible_ids).shape[0]
-    return (
-        means.new_empty(length, 3),
-        means.new_empty(length, 4),
-        means.new_empty(length, 3),
-        means.new_empty(length),
-        means.new_empty(length, gaussians[4].shape[1] if len(gaussians) > 4 else 0, 3),
-        means.new_empty(viewmats.shape[0] if need_viewmats else 0, 4, 4),
-    )
