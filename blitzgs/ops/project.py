@@ -193,6 +193,7 @@ class TableRows(NamedTuple):
 
 
 def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats, rows: TableRows | None = None) -> None:
+    """Save what `_gradients` needs: the rows that were projected, their splats, and the shapes of tables."""
     ctx.set_materialize_grads(False)
     read, visible_ids, ids, ctx.tables, ctx.parts = inputs, splats.visible_ids, None, None, []
     ctx.hand_over = None if rows is None else rows.hand_over
@@ -264,6 +265,7 @@ def _first_gradients(
     sparse: Sequence[bool],
     v: _Differentiable,
 ) -> tuple[Tensor | None, ...]:
+    """Compute what `_gradients` returns; `saved` has the tensors of `ctx`."""
     _, visible_ids, _ = saved.splats
     gathered = ctx.tables is not None
     all_dense = not gathered and not any(sparse)
@@ -328,7 +330,7 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, _viewmats: Tensor, call: _Call, *tables: Tensor) -> Any:
         _save(ctx, call.inputs, call.splats, call.rows)
-        # The first three are leaves, or computed by operations that accept a sparse gradient.
+        # Means, quats and scales are leaves, or come from operations that accept a sparse gradient.
         ctx.sparse = [
             call.sparse_grad and (i < 3 or call.rows is not None or (len(tables) > 4 and table.is_leaf))
             for i, table in enumerate(tables)
@@ -370,6 +372,7 @@ def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
 
 
 def _no_gradient(argument: object) -> list[None] | None:
+    """Return what the backward pass returns for an argument without gradients."""
     tensors = isinstance(argument, (list, tuple)) and all(isinstance(x, Tensor) for x in argument)
     return [None] * len(argument) if tensors else None  # type: ignore[arg-type]
 

@@ -21,8 +21,8 @@ _SH = len(_WIDTHS) - 1
 # Entries of a parameter's state.
 _ENTRIES = ("step", *MOMENTS, *STEPS)
 
-# An optimiser, one of its groups, and the index of a parameter in the group. The group stands for itself,
-# because its index changes if a group before it is removed.
+# An optimiser, one of its groups, and the index of a parameter in the group. A group's index is not stored,
+# because it changes if a group before it is removed.
 Member = tuple[Any, dict[str, Any], int]
 # The table that a parameter belongs to, and its column there.
 Slot = tuple[int, int]

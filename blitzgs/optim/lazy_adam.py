@@ -239,8 +239,8 @@ class LazyAdam(torch.optim.Optimizer):
             state = self.state.get(param)
             if state:
                 state["step"] = torch.tensor(float(state["step"]), dtype=torch.float32)
-                stand = torch.zeros(len(param), dtype=torch.int32, device=param.device)
-                state.update({name: stand.clone() for name in STEPS})
+                steps = torch.zeros(len(param), dtype=torch.int32, device=param.device)
+                state.update({name: steps.clone() for name in STEPS})
 
     def append(self, rows: Mapping[str, Tensor]) -> dict[str, Parameter]:
         """Add rows at the end of every parameter; their moments are zero.

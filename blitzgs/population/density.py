@@ -153,6 +153,8 @@ def densify(
 def cap_opacities(table: GaussianTable, opacity: float) -> None:
     """Cap the opacities of all rows and set the moments of all opacities to zero; no step may be pending.
 
+    This is the opacity reset of 3DGS (Kerbl et al. 2023, section 5.2).
+
     Args:
         table: changed in place.
         opacity: the cap, in (0, 1).

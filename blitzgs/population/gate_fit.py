@@ -164,7 +164,14 @@ def feature_columns(columns: Mapping[str, NDArray[Any]], count: int) -> NDArray[
 
 
 def auc(scores: NDArray[Any], positive: NDArray[np.bool_]) -> float:
-    """Return the area under the ROC curve: the probability that a positive scores higher; ties count half."""
+    """Return the area under the ROC curve, from the sum of ranks (Mann and Whitney 1947).
+
+    It is the probability that a positive scores higher than a negative; ties count half.
+
+    Args:
+        scores: [K].
+        positive: bool [K], some true and some false.
+    """
     _, inverse, counts = np.unique(scores, return_inverse=True, return_counts=True)
     ends = counts.cumsum()
     ranks = (ends - (counts - 1) / 2)[inverse]
@@ -268,6 +275,7 @@ def _check_same_schedule(runs: Sequence[Spawns]) -> None:
 
 
 def _train(xgboost: ModuleType, runs: Sequence[Spawns], rows: Sequence[NDArray[np.bool_]], seed: int) -> Any:
+    """Return a booster that is trained on the chosen rows of each run."""
     generator = np.random.default_rng(seed)
     features, labels = [], []
     for run, mine in zip(runs, rows, strict=True):
@@ -283,13 +291,14 @@ def _train(xgboost: ModuleType, runs: Sequence[Spawns], rows: Sequence[NDArray[n
 
 
 def _predict(xgboost: ModuleType, booster: Any, features: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the log odds of survival, [K], that a booster predicts."""
     data = xgboost.DMatrix(features, feature_names=list(FEATURES))
     scores: NDArray[np.float32] = booster.predict(data, output_margin=True)
     return scores
 
 
 def _hash_uniform(ids: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Map ids to [0, 1), so that the children of a parent stay together."""
+    """Map the ids of parents [K] to numbers in [0, 1); the children of a parent have the same number."""
     mixed = (ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(11)
     return mixed / 2.0**53
 

@@ -183,7 +183,7 @@ class _Sums:
             splats.camera_ids.to(home),
             splats.radii.to(home),
         )
-        # The squares need no division either.
+        # The rule "energy" adds up the squares as the rule "weight" adds up the weights, without a divisor.
         terms, rule = (found.weights, self._rule) if found.squares is None else (found.squares, "weight")
         view_sums_(
             self._sums, lists, terms.to(home), found.pixels.to(home), counts.to(home), columns,

@@ -31,6 +31,9 @@ def octree_gaussians(
 ) -> GaussianTable:
     """Make one Gaussian per occupied voxel of every level that enough cameras can resolve.
 
+    Voxels of several sizes are those of Octree-GS (Ren et al. 2024); the size of a Gaussian is that of 3DGS
+    (Kerbl et al. 2023).
+
     A Gaussian sits at its voxel's centre with the mean colour of the points inside, an identity rotation and
     the mean distance of its 3 nearest neighbours as its size on all axes. Ids count from 0.
 

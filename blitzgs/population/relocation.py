@@ -84,7 +84,7 @@ def relocate(
     features = None
     if lineage is not None:
         features = spawn_features(table, parents, torch.zeros_like(parents).bool(), time, extent, level_count)
-    _share(table, sources, draws[sources] + 1, rules.min_opacity)
+    _set_shares(table, sources, draws[sources] + 1, rules.min_opacity)
     new = _copies(table, parents, draws[sources], time, step)
     if lineage is not None and features is not None:
         lineage.born(Births(new["id"], new["parent"], new["means"], features), step)
@@ -133,8 +133,9 @@ def draw(weights: Tensor, count: int, ids: Tensor, seed: int, time: int, ranks: 
     """Draw `count` times in proportion to weights, over all ranks.
 
     The expectation for each row is count w / sum(w), as in a multinomial draw. A row gets the integer part of
-    this number for certain; the fractional parts are drawn without replacement. This has the least variance,
-    and exactly `count` draws in all, except that no row is drawn `MOST_COPIES` times.
+    this number for certain; the fractional parts are drawn without replacement (residual resampling, Liu and
+    Chen 1998). This has the least variance, and exactly `count` draws in all, except that no row is drawn
+    `MOST_COPIES` times.
 
     Args:
         weights: int64 [N_rank], 0 to 2^31, fewer than 2^31 over all ranks.
@@ -158,7 +159,7 @@ def draw(weights: Tensor, count: int, ids: Tensor, seed: int, time: int, ranks: 
     return (whole + smallest(keys, ids, rest, ranks)).clamp(max=MOST_COPIES - 1)
 
 
-def _share(table: GaussianTable, sources: Tensor, copies: Tensor, min_opacity: float) -> None:
+def _set_shares(table: GaussianTable, sources: Tensor, copies: Tensor, min_opacity: float) -> None:
     """Set opacities and scales of the rows `sources` to their shares, and their moments to zero."""
     opacities, scales = shared(table["opacities"][sources], table["scales"][sources], copies)
     # Sharing must not reduce the opacity below the limit, or the Gaussian would count as dead.

@@ -53,10 +53,10 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole views; the argument names, shapes and meta keys are gsplat's.
 
-    The image differs from gsplat 1.5.3's where BlitzGS defines it otherwise: alpha is capped at 0.99 (there:
-    0.999). Differentiable, once, in means, quats, scales, covars, opacities, colors, viewmats and
-    backgrounds; a second derivative is an error. Works under `torch.compile(fullgraph=True)`, except with
-    sparse_grad, absgrad or distributed.
+    docs/image.md defines the image (EWA splatting, Zwicker et al. 2001; 3DGS, Kerbl et al. 2023). It differs
+    from gsplat 1.5.3's in the cap of alpha, which is 0.99 here and 0.999 there. Differentiable, once, in
+    means, quats, scales, covars, opacities, colors, viewmats and backgrounds; a second derivative is an
+    error. Works under `torch.compile(fullgraph=True)`, except with sparse_grad, absgrad or distributed.
 
     Leading dimensions `...`, the same for all, are a batch of independent scenes.
 

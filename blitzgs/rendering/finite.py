@@ -92,9 +92,10 @@ def find_bad_cameras(gaussians: Gaussians) -> HostCopy:
 def watch_for_non_finite(
     gaussians: Gaussians, layout: Layout, function: str, colours: Sequence[Tensor], suspects_cameras: bool
 ) -> None:
-    """Warn about arguments of a renderer with values that are not finite; on CUDA see `EVERY_CUDA_CALLS`.
+    """Warn about arguments of a renderer with values that are not finite, after a cheap check for any.
 
-    SH coefficients, the largest part of a Gaussian, are only checked for visible Gaussians.
+    On CUDA most calls check the cameras alone, see `EVERY_CUDA_CALLS`. SH coefficients, the largest part of a
+    Gaussian, are only checked for visible Gaussians.
 
     Args:
         gaussians: the arguments of a call.
@@ -123,7 +124,7 @@ def watch_for_non_finite(
 
 
 def warn_of_non_finite(gaussians: Gaussians, function: str, stacklevel: int) -> None:
-    """Warn about arguments with values that are not finite, and name the first of them.
+    """Check all arguments, warn of values that are not finite, and name the first Gaussians or views.
 
     Args:
         gaussians: the arguments of a call, without colours.

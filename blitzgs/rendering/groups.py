@@ -22,7 +22,7 @@ class Group(NamedTuple):
     Attributes:
         inputs: of the projection.
         first_image: number of its first view among the images of the call.
-        covariances: covariances, if the caller gave them instead of quats and scales.
+        covariances: the covariances that the caller gave instead of quats and scales; None: none.
     """
 
     inputs: ProjectionInputs
@@ -63,7 +63,7 @@ def project_groups(groups: Sequence[Group], sparse_grad: bool, ready: Rendered |
     Args:
         groups: the groups to project.
         sparse_grad: see `blitzgs.ops.project.project`.
-        ready: what was rendered without gradients, of the only group.
+        ready: what `render_queued` returned for the only group; None: project the groups.
 
     Returns:
         Splats whose camera_ids number all images of the call. Of several groups, visible_ids and

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -92,7 +92,8 @@ def render(
     channels, lead = _channels(rendered, gaussians, image.render_mode), gaussians.lead
     if job is not None:
         (rendered, channels), lead = send_splats(rendered, channels, job), (job.views,)
-    # Conics of covariances differ by rounding from those whose tiles the projection counted.
+    # The projection counts the tiles of the splats that it returns. Ranks exchange splats, and the conics of
+    # covariances differ from the projection's by rounding, so their tiles have to be counted again.
     uncounted = compiling or job is not None or ready is not None or groups[0].covariances is not None
     count = -1 if uncounted else int(splats.counts[2])
     lists, composited_lists = _lists(rendered, math.prod(lead), project, ready, count)
@@ -104,15 +105,15 @@ def render(
         composited=None if ready is None else ready.composited, through=through,
     )  # fmt: skip
     if not compiling:
-        # A view with a bad camera sees nothing. The check of the cameras came before the projection, whose
-        # end the host has waited for.
+        # A view with a bad camera sees no Gaussian. Reading `bad_cameras` does not wait: the host has waited
+        # for the projection, which was queued after the check of the cameras.
         suspects_cameras = ready is not None and ready.has_blank_view
         suspects_cameras |= bad_cameras is not None and bool(bad_cameras.read()[0])
         watch_for_non_finite(gaussians, layout, function, colours, suspects_cameras)
     size = (*lead, project.height, project.width)
     alphas = alphas.unsqueeze(-1)
     if image.render_mode.endswith("ED"):
-        # Of a copy, which autograd saves, so that the caller may change alphas in place.
+        # Autograd saves the divisor. It is a copy, so that the caller may change alphas in place.
         covered = alphas.clone().clamp_(min=1e-10)
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / covered], dim=-1)
     if len(lead) > 1:
@@ -164,7 +165,15 @@ def _arranged(
 def _lists(
     splats: ProjectedSplats, images: int, project: ProjectionOptions, ready: Rendered | None, count: int
 ) -> tuple[Lists, Lists]:
-    """Return the tile lists for meta and those to composite; `count`: number of entries, -1: unknown."""
+    """Return the tile lists for meta, and those to composite.
+
+    Args:
+        splats: the splats of all images.
+        images: number of images I.
+        project: the size of the images, and the caller's tile size.
+        ready: what `render_queued` returned, which has the lists; None: they must be made.
+        count: number of entries of the lists for meta; -1: unknown.
+    """
     width, height, tile_size = project.width, project.height, project.tile_size
     if ready is not None:
         lists = Lists(ready.isect_splats, ready.tile_offsets, width, height, tile_size)
@@ -231,7 +240,9 @@ def _with_depth(values: Tensor, splats: ProjectedSplats, render_mode: str) -> Te
     return values if render_mode == "RGB" else torch.cat([values, splats.depths[:, None]], dim=1)
 
 
-def _absgrad_teller(layout: Layout, means2d: Tensor) -> Any:
+def _absgrad_teller(layout: Layout, means2d: Tensor) -> Callable[[Tensor], None]:
+    """Return a function that sets `means2d.absgrad` to the absolute gradient of the splats, [P, 2]."""
+
     def tell(gradient: Tensor) -> None:
         means2d.absgrad = layout.arrange(gradient)[0]  # type: ignore[attr-defined]
 

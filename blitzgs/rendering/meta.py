@@ -48,7 +48,7 @@ class Lists:
 
     def listed(self) -> Tensor:
         """Return `splats` without the undefined entries, which exist if splats are hidden."""
-        if torch.compiler.is_compiling():  # they were counted
+        if torch.compiler.is_compiling():  # `intersect` has counted the entries: none are undefined
             return self.splats
         if self._listed is None:  # once, because it waits for the device
             self._listed = self.splats[: int(self.offsets[-1])]

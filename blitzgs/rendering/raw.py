@@ -167,17 +167,17 @@ def raw_rasterization(
         render_mode, background_rows(backgrounds, gaussians, render_mode), True, sparse_grad, absgrad
     )
 
-    def before(rows: Tensor, count: Tensor | None) -> None:
+    def catch_up_sh(rows: Tensor, count: Tensor | None) -> None:
         for optimizer in lazy:
             optimizer.catch_up(harmonics, rows, count)
 
     groups = groups_of(gaussians, project)
     if may_queue(groups):
-        tables = ShTables(harmonics if shaded else (), before, hand_over)
+        tables = ShTables(harmonics if shaded else (), catch_up_sh, hand_over)
         return render("raw_rasterization", gaussians, project, image, tables=tables, groups=groups)
-    # Several groups, or none of Gaussians: gather the rows that any of them sees, and render these.
+    # Several groups, no Gaussians, or another tile size: gather the visible rows of all groups, render these.
     ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
-    before(ids, None)
+    catch_up_sh(ids, None)
     read = (*geometry, *(harmonics if shaded else ()))
     if hand_over is not None:
         read = tuple(table.detach() for table in read)
