@@ -31,7 +31,7 @@ class Survey(NamedTuple):
     splats: ProjectedSplats
     weights: Tensor
     pixels: Tensor
-    squares: Tensor | None
+    squares: Tensor | None = None
 
 
 def survey(
@@ -53,7 +53,7 @@ def survey(
             composites all tiles.
         transport: as for `forward`, but not in half precision, which would change the contributions.
         active: as for `forward`.
-        squares: whether to sum the squares as well, in a second rasterisation.
+        squares: whether to sum the squares as well.
 
     Returns:
         The splats of this rank's Gaussians with the sums over the tiles of all ranks; the bits do not depend
@@ -72,13 +72,12 @@ def survey(
             lists = torch.ops.blitzgs.intersect(
                 *geometry, splats.depths, splats.camera_ids, splats.ids, grid, n_isects, n_splats, True
             )
-            sums = torch.ops.blitzgs.contributions(*geometry, *lists, grid, n_splats)
-            if squares:
-                sums = (*sums, torch.ops.blitzgs.contributions(*geometry, *lists, grid, n_splats, True)[0])
+            sums = torch.ops.blitzgs.contributions(*geometry, *lists, grid, n_splats, squares)
             counts = exchange.finish()
     assert counts is not None  # or there would be another attempt
-    columns = [column[: len(counts.splats.depths)].long() for column in sums]
+    columns = [column[: len(counts.splats.depths)] for column in (sums if squares else sums[:2])]
     if counts.way_back is not None:
-        returned = counts.way_back.return_sums(torch.stack(columns, 1))
-        columns = [column.contiguous() for column in returned.unbind(1)]
-    return Survey(counts.projected, columns[0], columns[1].int(), columns[2] if squares else None)
+        returned = counts.way_back.return_sums(torch.stack([column.long() for column in columns], 1))
+        weights, pixels, *rest = (column.contiguous() for column in returned.unbind(1))
+        columns = [weights, pixels.int(), *rest]
+    return Survey(counts.projected, *columns)

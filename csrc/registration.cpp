@@ -145,12 +145,12 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "rasterize_bwd_packed_(Tensor[] splats, Tensor? backgrounds, Tensor[] lists, Tensor[] composited, "
       "Tensor v_renders, int[] grid, bool deterministic, Tensor(a!) packed, bool absgrad=False) -> ()");
 
-  // The contributions of the splats to the image: their weights alpha T (or the squares of these) and pixels,
-  // without colours.
+  // The contributions of the splats to the image, without colours: the sums of their weights alpha T, their
+  // pixels and, if asked for, the sums of the squares of the weights (otherwise [0]).
   m.def(
       "contributions(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor isect_splats, "
       "Tensor tile_offsets, int[] grid, Tensor? n_splats=None, bool squares=False) -> (Tensor weights, "
-      "Tensor pixels)");
+      "Tensor pixels, Tensor squares)");
 
   // For each segment, the fewest items that hold a share of its weight. Runs the steps `first_step` to
   // `last_step` - 1 of the search; between calls the sums may be added up over ranks.

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -27,7 +29,7 @@ def splat_contributions(
     tile_end: int = -1,
     n_splats: Tensor | None = None,
     squares: bool = False,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Sum alpha T over the pixels at which each splat is composited, and count these pixels.
 
     Alpha and T have the same bits as in :func:`blitzgs.ops.rasterize.rasterize`. The sums are integers, so
@@ -48,23 +50,36 @@ def splat_contributions(
         tile_end: end of the tiles to composite, -1 for all.
         n_splats: int64 [1] on the device of the splats: only the first `n_splats` splats are valid. None:
             all.
-        squares: sum (alpha T)^2 instead.
+        squares: sum (alpha T)^2 too.
 
     Returns:
-        Weights int64 [P], in units of 2^-32 (each alpha T rounded to the nearest, and its square down), and
-        pixels int32 [P].
+        Weights int64 [P], in units of 2^-32 (each alpha T rounded to the nearest); pixels int32 [P]; and the
+        sums of the squares int64 [P], in the same units (each square rounded down), or [0] if not asked for.
 
     Raises:
         RuntimeError: wrong shapes or dtypes, a tile range outside the images, or a tile size that CUDA lacks.
     """
-    weights, pixels = torch.ops.blitzgs.contributions(
+    sums: tuple[Tensor, Tensor, Tensor] = torch.ops.blitzgs.contributions(
         means2d, conics, splat_opacities, isect_splats, tile_offsets,
         [n_cameras, width, height, tile_size, tile_begin, tile_end], n_splats, squares,
     )  # fmt: skip
-    return weights, pixels
+    return sums
 
 
 @torch.library.register_fake("blitzgs::contributions")
-def _(means2d: Tensor, *_rest: object, **_flags: object) -> tuple[Tensor, Tensor]:
-    n_splats = means2d.shape[0]
-    return means2d.new_empty(n_splats, dtype=torch.int64), means2d.new_empty(n_splats, dtype=torch.int32)
+def _(
+    means2d: Tensor,
+    conics: Tensor,
+    splat_opacities: Tensor,
+    isect_splats: Tensor,
+    tile_offsets: Tensor,
+    grid: Sequence[int],
+    n_splats: Tensor | None = None,
+    squares: bool = False,
+) -> tuple[Tensor, Tensor, Tensor]:
+    count = means2d.shape[0]
+    return (
+        means2d.new_empty(count, dtype=torch.int64),
+        means2d.new_empty(count, dtype=torch.int32),
+        means2d.new_empty(count if squares else 0, dtype=torch.int64),
+    )

@@ -111,4 +111,4 @@ def _contributions_of_splats(
     lists = torch.ops.blitzgs.intersect(
         *geometry, splats.depths, splats.camera_ids, None, grid, int(splats.counts[2]), None, True
     )
-    return splat_contributions(*geometry, *lists, n_cameras=n_views, width=width, height=height)
+    return splat_contributions(*geometry, *lists, n_cameras=n_views, width=width, height=height)[:2]

@@ -2,9 +2,9 @@
 // The contributions of splats to the image, for the importance pass (paper: w = sum of alpha T, a = number of
 // pixels). Compositing is that of rasterize/rasterize.h, without colours. The sums of a splat are over the
 // pixels at which it is composited:
-//   weights = sum of u, u = round(2^32 alpha T)   int64 [P], u to the nearest integer, ties to even; or, for
-//             the score "energy", the sum of floor(u^2 / 2^32), which is (alpha T)^2 in the same units
+//   weights = sum of u, u = round(2^32 alpha T)   int64 [P], u to the nearest integer, ties to even
 //   pixels  = number of these pixels              int32 [P]
+//   squares = sum of floor(u^2 / 2^32)            int64 [P], which is (alpha T)^2 in the same units; optional
 //
 //   means2d [P, 2], conics [P, 3], opacities [P], isect_splats and tile_offsets from intersect  ->  the sums
 //   over the tiles [tile_begin, tile_end). Splats in no list get zeros.
@@ -39,7 +39,7 @@ struct ContributionInput {
 struct ContributionSums {
   std::int64_t* weights;
   std::int32_t* pixels;
-  bool squares;  // whether weights are sums of (alpha T)^2
+  std::int64_t* squares;  // null: not wanted
 };
 
 namespace BLITZGS_BACKEND {

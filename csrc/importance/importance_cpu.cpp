@@ -12,6 +12,7 @@ void contributions(const ContributionInput<T>& in, const ContributionSums& sums,
                    CudaStream) {
   std::fill_n(sums.weights, in.n_splats, 0);
   std::fill_n(sums.pixels, in.n_splats, 0);
+  if (sums.squares) std::fill_n(sums.squares, in.n_splats, 0);
   const RasterizeInput<T> input{in.means2d,      in.conics,       in.opacities, nullptr, nullptr,
                                 in.isect_splats, in.tile_offsets, in.n_splats,  0,       in.grid};
   const PreparedSplat<T>* splats = pack_splats(input, allocate_splats<T>(in.n_splats, workspace));

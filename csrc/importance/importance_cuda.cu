@@ -2,6 +2,7 @@
 #include "importance/importance.h"
 
 #include <string>
+#include <type_traits>
 
 #include "common/cuda.cuh"
 #include "rasterize/forward.cuh"
@@ -18,35 +19,50 @@ constexpr int kEntryStride =
 // The 16 words of padding make the two half-warps of a warp write to different banks.
 constexpr int kGroupWords = kGroup * kEntryStride + 16;
 
-// Replaces copy_color(): an entry gets no colour. The memory of the colour holds the TileSum of the entry.
+// A sum of numbers below 2^32, one for each of at most 2^10 pixels of a tile, and the number of these pixels.
+// They are two words, to which subtiles add atomically in shared memory. `low` is the sum of the low kLowBits
+// bits of the subtiles' sums. `high` has the sum of the other bits in its low kPixelShift bits, and the
+// number of pixels in its high bits.
+struct __align__(8) TileSum {
+  static constexpr int kLowBits = 22, kPixelShift = 20;
+  std::uint32_t low, high;
+
+  __device__ __forceinline__ void add(std::uint64_t sum, std::uint32_t pixels) {
+    atomicAdd(&low, static_cast<std::uint32_t>(sum) & ((1u << kLowBits) - 1));
+    atomicAdd(&high, static_cast<std::uint32_t>(sum >> kLowBits) | pixels << kPixelShift);
+  }
+  __device__ __forceinline__ unsigned long long sum() const {
+    const unsigned long long rest = high & ((1u << kPixelShift) - 1);
+    return (rest << kLowBits) + low;
+  }
+  __device__ __forceinline__ std::uint32_t pixels() const { return high >> kPixelShift; }
+};
+
+// Finds the sums of an entry over a tile, which take the place of its colour: the TileSum of its weights and,
+// with kSquares, that of their squares, which counts no pixels.
+__device__ __forceinline__ TileSum* sums_of(Entry& entry) { return reinterpret_cast<TileSum*>(entry.color); }
+
+// Replaces copy_color(): an entry gets no colour. Its sums begin at zero.
+template <bool kSquares>
 struct NoColors {};
-__device__ __forceinline__ void copy_color(float* shared, NoColors, std::int32_t) {
-  *reinterpret_cast<uint2*>(shared) = {0u, 0u};
+template <bool kSquares>
+__device__ __forceinline__ void copy_color(float* shared, NoColors<kSquares>, std::int32_t) {
+  using Sums = std::conditional_t<kSquares, uint4, uint2>;
+  *reinterpret_cast<Sums*>(shared) = Sums{};
 }
 
-// The sums of an entry over a tile: the weight, from at most 2^10 pixels with less than 2^32 units each, and
-// the number of pixels. They are two words, to which subtiles add atomically in shared memory. The first word
-// is the sum of the low kLowBits bits of the subtiles' weights. The second word has the sum of the other bits
-// in its low kPixelShift bits, and the number of pixels in its high bits.
-struct TileSum {
-  static constexpr int kLowBits = 22, kPixelShift = 20;
-
-  __device__ __forceinline__ static void add(Entry& entry, std::uint64_t weight, std::uint32_t pixels) {
-    auto* words = reinterpret_cast<std::uint32_t*>(entry.color);
-    atomicAdd(words, static_cast<std::uint32_t>(weight) & ((1u << kLowBits) - 1));
-    atomicAdd(words + 1, static_cast<std::uint32_t>(weight >> kLowBits) | pixels << kPixelShift);
-  }
-
-  __device__ __forceinline__ static void send(const Entry& entry, std::int32_t splat,
-                                              const ContributionSums& sums) {
-    const uint2 words = *reinterpret_cast<const uint2*>(entry.color);
-    if (words.y == 0) return;  // no pixel composited the entry
-    const std::uint64_t high = words.y & ((1u << kPixelShift) - 1);
-    atomicAdd(reinterpret_cast<unsigned long long*>(sums.weights + splat),
-              static_cast<unsigned long long>((high << kLowBits) + words.x));
-    atomicAdd(sums.pixels + splat, static_cast<std::int32_t>(words.y >> kPixelShift));
-  }
-};
+// Adds the sums of an entry over a tile to those of its splat.
+template <bool kSquares>
+__device__ __forceinline__ void send_sums(Entry& entry, std::int32_t splat, const ContributionSums& sums) {
+  const auto add = [splat](std::int64_t* all, const TileSum& one) {
+    atomicAdd(reinterpret_cast<unsigned long long*>(all + splat), one.sum());
+  };
+  const TileSum weights = sums_of(entry)[0];
+  if (weights.pixels() == 0) return;  // no pixel composited the entry
+  add(sums.weights, weights);
+  atomicAdd(sums.pixels + splat, static_cast<std::int32_t>(weights.pixels()));
+  if constexpr (kSquares) add(sums.squares, sums_of(entry)[1]);
+}
 
 struct ContributionShared {
   EntryBatch<kForwardBatch> batch;
@@ -62,26 +78,29 @@ struct ContributionArguments {
   ContributionSums sums;
 };
 
-// Sums an entry's weights, or their squares, over the 16 pixels of a subtile, and adds the sum to the entry's
-// TileSum.
+// Sums an entry's weights, and with kSquares their squares, over the 16 pixels of a subtile, and adds the
+// sums to those of the entry.
 template <bool kSquares>
 __device__ __forceinline__ void sum_pixels(const std::uint32_t* words, Entry& entry) {
-  std::uint64_t weight = 0;
+  std::uint64_t weight = 0, squares = 0;
   std::uint32_t pixels = 0;
 #pragma unroll
   for (int i = 0; i < kHalfWarp / 4; ++i) {
     const uint4 four = reinterpret_cast<const uint4*>(words)[i];
     for (const std::uint32_t units : {four.x, four.y, four.z, four.w}) {
-      weight += kSquares ? __umulhi(units, units) : units;
+      weight += units;
+      if constexpr (kSquares) squares += __umulhi(units, units);
       pixels += units != 0;
     }
   }
-  if (pixels > 0) TileSum::add(entry, weight, pixels);
+  if (pixels == 0) return;
+  sums_of(entry)[0].add(weight, pixels);
+  if constexpr (kSquares) sums_of(entry)[1].add(squares, 0);
 }
 
 // The contributions of the splats (importance.h). One block of 256 threads per tile, one thread per pixel, as
 // in forward_kernel (rasterize_fwd_cuda.cu). Reads the tile's list and the packed splats; adds to
-// sums.weights and sums.pixels [P] atomically, once per entry and tile.
+// sums.weights, sums.pixels and, with kSquares, sums.squares [P] atomically, once per entry and tile.
 template <bool kSquares>
 __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const ContributionArguments args) {
   constexpr int kBatch = kForwardBatch;
@@ -106,19 +125,19 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const 
   // barrier.
   std::int32_t splat = splat_at(thread), next_splat = splat_at(thread + kBatch), summed = -1;
   int buffer = 0;
-  const auto send_sums = [&] {
-    if (summed >= 0) TileSum::send(batch.entries[buffer ^ 1][thread], summed, args.sums);
+  const auto send_summed = [&] {
+    if (summed >= 0) send_sums<kSquares>(batch.entries[buffer ^ 1][thread], summed, args.sums);
     summed = -1;
   };
-  batch.fetch(0, args.splats, NoColors{}, splat, thread);
+  batch.fetch(0, args.splats, NoColors<kSquares>{}, splat, thread);
   for (int base = 0; base < count; base += kBatch, buffer ^= 1) {
     if (thread < kBatch) batch.place(buffer, splat >= 0, tile, thread);
     const bool all_done = __syncthreads_and(state.done());
-    send_sums();
+    send_summed();
     if (all_done) break;
     summed = splat;
     splat = next_splat;
-    batch.fetch(buffer ^ 1, args.splats, NoColors{}, splat, thread);
+    batch.fetch(buffer ^ 1, args.splats, NoColors<kSquares>{}, splat, thread);
     next_splat = splat_at(base + 2 * kBatch + thread);
     const unsigned done = __ballot_sync(kFullWarp, state.done()) >> (thread & kHalfWarp) & 0xffffu;
     const int quads =
@@ -144,7 +163,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const 
     }
   }
   __syncthreads();
-  send_sums();
+  send_summed();
 }
 
 }  // namespace
@@ -155,6 +174,9 @@ void contributions<float>(const ContributionInput<float>& in, const Contribution
   check_tile_size("contributions", in.grid);
   check(cudaMemsetAsync(sums.weights, 0, in.n_splats * sizeof(*sums.weights), stream), "contributions");
   check(cudaMemsetAsync(sums.pixels, 0, in.n_splats * sizeof(*sums.pixels), stream), "contributions");
+  if (sums.squares) {
+    check(cudaMemsetAsync(sums.squares, 0, in.n_splats * sizeof(*sums.squares), stream), "contributions");
+  }
   const std::int64_t owned = in.grid.tile_end - in.grid.tile_begin;
   if (owned == 0 || in.n_splats == 0) return;
   const RasterizeInput<float> input{in.means2d, in.conics,       in.opacities,    nullptr,

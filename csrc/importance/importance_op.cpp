@@ -10,11 +10,11 @@ namespace {
 
 constexpr const char* kOp = "contributions";
 
-std::tuple<Tensor, Tensor> contributions(const Tensor& means2d_in, const Tensor& conics_in,
-                                         const Tensor& opacities_in, const Tensor& isect_splats_in,
-                                         const Tensor& tile_offsets_in,
-                                         const std::vector<std::int64_t>& grid_numbers,
-                                         const std::optional<Tensor>& n_splats, bool squares) {
+std::tuple<Tensor, Tensor, Tensor> contributions(const Tensor& means2d_in, const Tensor& conics_in,
+                                                 const Tensor& opacities_in, const Tensor& isect_splats_in,
+                                                 const Tensor& tile_offsets_in,
+                                                 const std::vector<std::int64_t>& grid_numbers,
+                                                 const std::optional<Tensor>& n_splats, bool with_squares) {
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   const std::int64_t splats = means2d_in.size(0);
   check_floating(kOp, "means2d", means2d_in);
@@ -28,6 +28,7 @@ std::tuple<Tensor, Tensor> contributions(const Tensor& means2d_in, const Tensor&
   const SplatCount splat_count = checked_splat_count(kOp, n_splats, means2d);
   Tensor weights = make_empty(means2d, {splats}, ScalarType::Long);
   Tensor pixels = make_empty(means2d, {splats}, ScalarType::Int);
+  Tensor squares = make_empty(means2d, {with_squares ? splats : 0}, ScalarType::Long);
   DeviceScope scope(means2d);
   dispatch_floating(means2d, [&](auto zero) {
     using T = decltype(zero);
@@ -40,10 +41,10 @@ std::tuple<Tensor, Tensor> contributions(const Tensor& means2d_in, const Tensor&
                                   grid,
                                   splat_count.known_splats};
     const ContributionSums sums{mutable_data<std::int64_t>(weights), mutable_data<std::int32_t>(pixels),
-                                squares};
+                                with_squares ? mutable_data<std::int64_t>(squares) : nullptr};
     backend::contributions(in, sums, scope.workspace, scope.stream);
   });
-  return {weights, pixels};
+  return {weights, pixels, squares};
 }
 
 }  // namespace

@@ -18,15 +18,15 @@ struct Pair {
   std::vector<T> means2d{T(9.5), T(6.5), T(12), T(6)}, conics{T(0.1), T(0), T(0.1), T(0.05), T(0), T(0.05)};
   std::vector<T> opacities{T(0.999), T(0.7)};
   std::vector<std::int32_t> splats{0, 1, 0, 1};
-  std::vector<std::int64_t> offsets{0, 2, 4}, weights{7, 7};
+  std::vector<std::int64_t> offsets{0, 2, 4}, weights{7, 7}, squares{7, 7};
   std::vector<std::int32_t> pixels{7, 7};
   TestWorkspace workspace;
 
-  void survey(std::int64_t tile_begin, std::int64_t tile_end, bool squares = false) {
+  void survey(std::int64_t tile_begin, std::int64_t tile_end, bool with_squares = true) {
     const TileGrid grid = make_tile_grid(1, 20, 12, 16, tile_begin, tile_end);
     cpu::contributions<T>(
         {means2d.data(), conics.data(), opacities.data(), splats.data(), offsets.data(), 2, grid},
-        {weights.data(), pixels.data(), squares}, workspace, nullptr);
+        {weights.data(), pixels.data(), with_squares ? squares.data() : nullptr}, workspace, nullptr);
   }
 };
 
@@ -62,7 +62,7 @@ TEST_CASE("contributions are alpha T, summed over pixels in units of 2^-32") {
 
 TEST_CASE("squares are rounded down for each pixel") {
   Pair<double> pair;
-  pair.survey(0, -1, true);
+  pair.survey(0, -1);
   std::int64_t squares = 0;
   std::int32_t pixels = 0;
   for (int y = 0; y < 12; ++y) {
@@ -74,24 +74,35 @@ TEST_CASE("squares are rounded down for each pixel") {
   }
   REQUIRE(pair.pixels[0] == pixels);
   // A weight that is one unit off changes its square by at most two.
-  REQUIRE(std::abs(pair.weights[0] - squares) <= 2 * pixels);
+  REQUIRE(std::abs(pair.squares[0] - squares) <= 2 * pixels);
+}
+
+TEST_CASE("squares are optional and change no other sum") {
+  Pair<float> with, without;
+  with.survey(0, -1);
+  without.survey(0, -1, false);
+  REQUIRE(without.weights == with.weights);
+  REQUIRE(without.pixels == with.pixels);
+  REQUIRE(without.squares == std::vector<std::int64_t>{7, 7});
 }
 
 TEST_CASE("contributions of tile ranges add up") {
   Pair<float> pair;
   pair.survey(0, -1);
-  const std::vector<std::int64_t> weights = pair.weights;
+  const std::vector<std::int64_t> weights = pair.weights, squares = pair.squares;
   const std::vector<std::int32_t> pixels = pair.pixels;
   pair.survey(0, 1);
-  const std::vector<std::int64_t> left_weights = pair.weights;
+  const std::vector<std::int64_t> left_weights = pair.weights, left_squares = pair.squares;
   const std::vector<std::int32_t> left_pixels = pair.pixels;
   pair.survey(1, 2);
   for (int splat = 0; splat < 2; ++splat) {
     REQUIRE(left_weights[splat] + pair.weights[splat] == weights[splat]);
+    REQUIRE(left_squares[splat] + pair.squares[splat] == squares[splat]);
     REQUIRE(left_pixels[splat] + pair.pixels[splat] == pixels[splat]);
     REQUIRE(left_pixels[splat] > 0);
     REQUIRE(pair.pixels[splat] > 0);
   }
   pair.survey(1, 1);
   REQUIRE(pair.weights == std::vector<std::int64_t>{0, 0});
+  REQUIRE(pair.squares == std::vector<std::int64_t>{0, 0});
 }

@@ -226,21 +226,22 @@ std::int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
   return entries;
 }
 
-// Sums the weights alpha T (or their squares) and the pixels of each splat. The weights are integers in units
-// of 2^-32, so that the order of the tiles does not change the sums.
+// Sums the weights alpha T, their squares if these are wanted, and the pixels of each splat. The summands are
+// integers in units of 2^-32, so that the order of the tiles does not change the sums.
 template <class Lanes, class T>
 struct ContributionSink {
   const ContributionSums& sums;
-  std::int64_t weight = 0;
+  std::int64_t weight = 0, squares = 0;
   std::int32_t pixels = 0;
 
-  void begin(std::int32_t) { weight = pixels = 0; }
+  void begin(std::int32_t) { weight = squares = pixels = 0; }
   void add(Lanes share, int) {
     alignas(64) T shares[kLanes];
     share.store(shares);
     for (const T alpha_t : shares) {
       const auto units = static_cast<std::uint64_t>(std::llrint(alpha_t * T(kContributionScale)));
-      weight += static_cast<std::int64_t>(sums.squares ? units * units >> 32 : units);
+      weight += static_cast<std::int64_t>(units);
+      if (sums.squares) squares += static_cast<std::int64_t>(units * units >> 32);
       pixels += alpha_t > T(0);
     }
   }
@@ -248,6 +249,7 @@ struct ContributionSink {
     if (pixels == 0) return;
     std::atomic_ref(sums.weights[index]).fetch_add(weight, std::memory_order_relaxed);
     std::atomic_ref(sums.pixels[index]).fetch_add(pixels, std::memory_order_relaxed);
+    if (sums.squares) std::atomic_ref(sums.squares[index]).fetch_add(squares, std::memory_order_relaxed);
   }
 };
 

@@ -14,14 +14,16 @@ def survey(scene, device="cuda", dtype=torch.float32, tile_size=16, begin=0, end
     lists = ops.intersect(*splats, projected.depths, projected.camera_ids, None, grid, -1)
     moved = [t.to(device, dtype) for t in splats]
     lists = [t.to(device) for t in lists]
-    return moved, lists, grid, ops.contributions(*moved, *lists, grid)
+    return moved, lists, grid, ops.contributions(*moved, *lists, grid, squares=True)
 
 
 def test_a_crowded_scene_has_the_bits_of_its_image():
     """Each chosen splat has its own channel, four splats per image."""
     scene = Scene(5000, width=170, height=110)
-    splats, lists, grid, (weights, pixels) = survey(scene)
+    splats, lists, grid, (weights, pixels, squares) = survey(scene)
     count = len(splats[0])
+    without = ops.contributions(*splats, *lists, grid)
+    assert torch.equal(without[0], weights) and torch.equal(without[1], pixels) and not len(without[2])
     chosen = torch.randperm(count, generator=torch.Generator().manual_seed(1))[:64]
     assert pixels.max() > 256
     for four in chosen.view(-1, 4):
@@ -31,7 +33,6 @@ def test_a_crowded_scene_has_the_bits_of_its_image():
         units = (images.double() * 2.0**32).round().long().sum((0, 1, 2))
         assert torch.equal(weights[four.cuda()], units)
         assert torch.equal(pixels[four.cuda()], (images > 0).sum((0, 1, 2)).int())
-        squares = ops.contributions(*splats, *lists, grid, squares=True)[0]
         # A float64 holds the square of the 24 bits of a float32 exactly.
         exact = ((images.double() * 2.0**32).round() ** 2 / 2.0**32).floor().long().sum((0, 1, 2))
         assert torch.equal(squares[four.cuda()], exact)
@@ -44,31 +45,31 @@ def test_close_to_float64():
     # A pixel on a cut changes a weight by about 1/255, and a count by one.
     assert relative_error(ours[0], exact[0]) < 1e-3
     assert relative_error(ours[1], exact[1]) < 5e-3
+    assert relative_error(ours[2], exact[2]) < 1e-3
 
 
 def test_repeats_and_adds_up():
     scene = Scene(20_000, views=4, width=500, height=300)
-    splats, lists, grid, (weights, pixels) = survey(scene)
+    splats, lists, grid, sums = survey(scene)
     for _ in range(20):
-        again = ops.contributions(*splats, *lists, grid)
-        assert torch.equal(again[0], weights) and torch.equal(again[1], pixels)
+        again = ops.contributions(*splats, *lists, grid, squares=True)
+        assert all(torch.equal(a, b) for a, b in zip(again, sums, strict=True))
     tiles = len(lists[1]) - 1
     cuts = [0, 1, 1, 90, tiles // 2, tiles]
     parts = [
-        ops.contributions(*splats, *lists, [*grid[:4], a, b]) for a, b in zip(cuts, cuts[1:], strict=False)
+        ops.contributions(*splats, *lists, [*grid[:4], a, b], squares=True)
+        for a, b in zip(cuts, cuts[1:], strict=False)
     ]
-    assert torch.equal(sum(part[0] for part in parts), weights)
-    assert torch.equal(sum(part[1] for part in parts), pixels)
+    assert all(torch.equal(sum(pieces), whole) for *pieces, whole in zip(*parts, sums, strict=True))
 
 
 def test_entries_after_the_last_splat_are_not_read():
-    splats, lists, grid, (weights, pixels) = survey(Scene(500))
+    splats, lists, grid, sums = survey(Scene(500))
     count = len(splats[0])
     padded = [torch.cat((t, torch.full_like(t, float("nan")))) for t in splats]
     known = torch.tensor([count], device="cuda")
-    got = ops.contributions(*padded, *lists, grid, known)
-    assert torch.equal(got[0][:count], weights) and torch.equal(got[1][:count], pixels)
-    assert not got[0][count:].any() and not got[1][count:].any()
+    got = ops.contributions(*padded, *lists, grid, known, squares=True)
+    assert all(torch.equal(a[:count], b) and not a[count:].any() for a, b in zip(got, sums, strict=True))
 
 
 def test_a_splat_over_every_pixel_fits():
@@ -80,11 +81,14 @@ def test_a_splat_over_every_pixel_fits():
     tiles = (128 // 16) ** 2
     entries = torch.arange(3, dtype=torch.int32, device="cuda").repeat(tiles)
     offsets = torch.arange(0, 3 * tiles + 1, 3, device="cuda")
-    weights, pixels = ops.contributions(means2d, conics, opacities, entries, offsets, grid)
+    weights, pixels, squares = ops.contributions(
+        means2d, conics, opacities, entries, offsets, grid, squares=True
+    )
     assert pixels.tolist() == [128 * 128, 128 * 128, 0]  # the third would take T below 1e-4
     alpha = torch.tensor(0.99)
-    units = (alpha.double() * 2.0**32).round().long().item() * 128 * 128
-    assert weights[0].item() == units
+    units = (alpha.double() * 2.0**32).round().long().item()
+    assert weights[0].item() == units * 128 * 128
+    assert squares[0].item() == (units**2 >> 32) * 128 * 128
     assert abs(weights[1].item() / 2.0**32 / (128 * 128) - 0.9 * 0.01) < 1e-5
 
 

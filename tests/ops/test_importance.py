@@ -47,35 +47,42 @@ def test_sees_what_the_renderer_composites_bit_for_bit(backend, tile_size):
     count = len(splats[0])
     channels = torch.eye(count, device=backend[0], dtype=backend[1])
     images, _ = rasterize(*splats, channels, *lists, **grid)
-    weights, pixels = splat_contributions(*splats, *lists, **grid)
+    weights, pixels, squares = splat_contributions(*splats, *lists, **grid, squares=True)
     shares = images.double() * UNITS
     assert torch.equal(weights, shares.round().long().sum((0, 1, 2)))
     assert torch.equal(pixels, (images > 0).sum((0, 1, 2)).int())
-    squares, same_pixels = splat_contributions(*splats, *lists, **grid, squares=True)
     high, low = shares.round().long() >> 16, shares.round().long() & 0xFFFF
     exact = high**2 + (
         (high * low << 17) + low**2 >> 32
     )  # of 64 bits, of which neither int64 nor float64 holds all
     assert torch.equal(squares, exact.sum((0, 1, 2)))
-    assert torch.equal(same_pixels, pixels)
     assert pixels.max() > 100 and (pixels == 0).any()
+    without = splat_contributions(*splats, *lists, **grid)
+    assert torch.equal(without[0], weights) and torch.equal(without[1], pixels) and not len(without[2])
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_parts_add_up_and_repeat(backend):
     splats, lists, grid = lists_of(crowded(*backend))
-    weights, pixels = splat_contributions(*splats, *lists, **grid)
+    sums = splat_contributions(*splats, *lists, **grid, squares=True)
     tiles = len(lists[1]) - 1
     cuts = [0, 1, 1, 7, 20, tiles]
     parts = [
-        splat_contributions(*splats, *lists, **grid, tile_begin=begin, tile_end=end)
+        splat_contributions(*splats, *lists, **grid, tile_begin=begin, tile_end=end, squares=True)
         for begin, end in zip(cuts, cuts[1:], strict=False)
     ]
-    assert torch.equal(sum(part[0] for part in parts), weights)
-    assert torch.equal(sum(part[1] for part in parts), pixels)
+    assert all(torch.equal(sum(pieces), whole) for *pieces, whole in zip(*parts, sums, strict=True))
     for _ in range(3):
-        again = splat_contributions(*splats, *lists, **grid)
-        assert torch.equal(again[0], weights) and torch.equal(again[1], pixels)
+        again = splat_contributions(*splats, *lists, **grid, squares=True)
+        assert all(torch.equal(a, b) for a, b in zip(again, sums, strict=True))
+
+
+@pytest.mark.parametrize("squares", [False, True])
+def test_opcheck(squares):
+    splats, lists, _ = lists_of(random_scene(20, 1, 40, 32))
+    torch.library.opcheck(
+        torch.ops.blitzgs.contributions, (*splats, *lists, [1, 40, 32, 16, 0, -1], None, squares)
+    )
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
