@@ -5,9 +5,10 @@
 
 The views advance over one synthetic square kilometre (`scenes.aerial`). "renders": `pipeline.forward` of all
 views in batches, with colours of degree 3; "survey": the contribution of each Gaussian to the views; "sweep":
-the survey, the exact 99 % cut of each view, scores, phi and the cull matrix. The last rows are the
-compositing kernels alone, for the first batch. Times are medians of wall time with the device idle before and
-after; the sweep should take no longer than the renders.
+the survey, the exact 99 % cut of each view, scores, phi and the cull matrix. "density" and "energy" are the
+scores; only "energy" needs the sums of squares. The last rows are the compositing kernels alone, for the
+first batch. Times are medians of wall time with the device idle before and after; the sweep should take no
+longer than the renders.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -26,7 +28,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.transport import LocalTransport
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views
-from blitzgs.population.importance import ViewBatch, sweep
+from blitzgs.population.importance import ScoreRule, ViewBatch, sweep
 from blitzgs.survey import survey
 
 OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e6)
@@ -80,8 +82,8 @@ def measure(scene: BenchmarkScene, length: int, repeats: int) -> list[dict[str, 
         for batch in batches:
             survey(table, batch.views, OPTIONS, transport=transport)
 
-    def sweeps() -> None:
-        sweep(table, batches, n_views, OPTIONS, ranks)
+    def sweeps(rule: ScoreRule) -> None:
+        sweep(table, batches, n_views, OPTIONS, ranks, rule=rule)
 
     frame = pipeline.forward(table, batches[0].views, OPTIONS, transport=transport)
     splats = frame.splats
@@ -92,11 +94,20 @@ def measure(scene: BenchmarkScene, length: int, repeats: int) -> list[dict[str, 
     def composite() -> None:
         torch.ops.blitzgs.rasterize_fwd(*shapes, splats.colors, None, *lists, grid, False, False, None)
 
-    def contribute() -> None:
-        torch.ops.blitzgs.contributions(*shapes, *lists, grid)
+    def contribute(squares: bool) -> None:
+        torch.ops.blitzgs.contributions(*shapes, *lists, grid, None, squares)
 
-    works = {"renders": renders, "survey": surveys, "sweep": sweeps}
-    kernels = {"rasterize_fwd, one batch": composite, "contributions, one batch": contribute}
+    works = {
+        "renders": renders,
+        "survey": surveys,
+        "sweep, density": partial(sweeps, "density"),
+        "sweep, energy": partial(sweeps, "energy"),
+    }
+    kernels = {
+        "rasterize_fwd, one batch": composite,
+        "contributions, one batch": partial(contribute, False),
+        "contributions with squares, one batch": partial(contribute, True),
+    }
     times = {name: median_ms(work, repeats, table.device) for name, work in (works | kernels).items()}
     rows = []
     for name, ms in times.items():
