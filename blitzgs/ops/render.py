@@ -29,7 +29,7 @@ class Rendered(NamedTuple):
     """The outputs of the ops; see each op for its fields.
 
     Attributes:
-        splats: the splats.
+        splats: the splats; their `counts` is None.
         isect_splats: the tiles' lists.
         tile_offsets: where they begin.
         composited: what `rasterize_fwd` returned, and alphas.
@@ -93,8 +93,8 @@ def render_queued(
             if tables is not None:
                 splats, rows = _colored(projected, inputs, tables, spare=capacity is not None)
             if capacity is None:
-                totals = copy.read()
-                sizes, n_splats = Sizes(*totals[:3].tolist()), None
+                totals = copy.read().tolist()
+                sizes, n_splats = Sizes(*totals[:3]), None
             else:
                 sizes, n_splats = capacity, projected.n_splats
             isect_splats, tile_offsets, *composited = torch.ops.blitzgs.list_and_rasterize(
@@ -102,16 +102,15 @@ def render_queued(
                 splats.camera_ids, backgrounds, grid, sizes.isects, backward_follows, n_splats,
             )  # fmt: skip
             if capacity is not None:
-                totals = copy.read()
-                sizes = Sizes(*totals[:3].tolist())
+                totals = copy.read().tolist()
+                sizes = Sizes(*totals[:3])
             attempt.end(sizes[:3], capacity is None or capacity.holds(sizes))
-        splats = splats._replace(counts=totals[:3])
         if capacity is not None:
             splats, isect_splats, rows = _without_spare(splats, isect_splats, rows, sizes)
         of_tables = None
         if tables is not None and rows is not None:
             of_tables = TableRows(rows, tables.parts, tables.hand_over)
-        in_views = totals[VIEW_TOTALS : VIEW_TOTALS + inputs.n_views].tolist()
+        in_views = totals[VIEW_TOTALS : VIEW_TOTALS + inputs.n_views]
         return Rendered(splats, isect_splats, tile_offsets, composited, of_tables, 0 in in_views)
 
 
