@@ -7,13 +7,12 @@ import operator
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from blitzgs.ops.sparse_rows import distinct_rows
 from blitzgs.optim.drift import GROUPS, Drift
 from blitzgs.optim.handed import Handed, only_handed
-from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of
+from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of, steps_of
 
 # Values in a row of the op's first four columns, and of the parameter that takes the place of SH beside them.
 _WIDTHS = (3, 4, 3, 1, 3)
@@ -30,6 +29,9 @@ Slot = tuple[int, int]
 
 class Joint:
     """Parameters of `LazyAdam` optimisers that have been stepped together since step `drift.begin`.
+
+    Once all rows are up to date (`bring_up_to_date`), parameters and moments may be replaced by others, as
+    density strategies do; `follow` then takes these.
 
     Five parameters with 3, 4, 3, 1 and 3 values a row (gsplat's means, quats, scales, opacities and sh0)
     share a table, and with it one column of steps. Each further parameter (shN) has a table of its own,
@@ -48,12 +50,14 @@ class Joint:
             optimizer.bring_up_to_date()
             optimizer.drifts.clear()
             optimizer.joint = self
-        params = [group["params"][place] for _, group, place in members]
-        states = [member[0].state[param] for member, param in zip(members, params, strict=True)]
-        betas, eps = _options_of(members[0][1])
+        params, states = self._present()
+        self._options = betas, _ = _options_of(members[0][1])
         self._step, self._step_tensor = int(states[0]["step"]), states[0]["step"]
         # The same number for NumPy, which changes it in a tenth of the time that an operation of torch takes.
         self._step_number = self._step_tensor.numpy()
+        for state in states:
+            state["step"] = self._step_tensor
+        self._likes = [(param.shape[1:], param.dtype, param.device) for param in params]
         like, count = params[0], 1 + max(table for table, _ in slots)
         self.drift = Drift(betas, like.dtype, like.device, self._step, count)
         # The members of each table, in the order of its columns.
@@ -61,29 +65,70 @@ class Joint:
             [index for _, index in sorted((c, i) for i, (t, c) in enumerate(slots) if t == number)]
             for number in range(count)
         ]
+        self._take(params, states)
+
+    def _present(self) -> tuple[list[Tensor], list[dict[str, Any]]]:
+        """Return the present parameters and states of the members."""
+        params = [group["params"][place] for _, group, place in self.members]
+        states = [member[0].state_of(param) for member, param in zip(self.members, params, strict=True)]
+        return params, states
+
+    def _take(self, params: Sequence[Tensor], states: Sequence[dict[str, Any]]) -> None:
+        """Make tables of parameters whose rows are up to date."""
+        like = params[0]
         self.tables = []
         for number, inside in enumerate(self._inside):
-            steps = [torch.zeros(len(like), dtype=torch.int32, device=like.device) for _ in STEPS]
+            steps = [steps_of(like, self._step - self.drift.begin) for _ in STEPS]
             for index in inside:
-                states[index].update(zip(STEPS, steps, strict=True), step=self._step_tensor)
+                states[index].update(zip(STEPS, steps, strict=True))
             own = [params[index] for index in inside], [states[index] for index in inside]
-            self.tables.append(Table(*own, self.drift, number, eps))
+            self.tables.append(Table(*own, self.drift, number, self._options[1]))
         self._states = [tensor for table in self.tables for tensor in table.tensors]
         # The step up to which all rows of each table are known to be current.
-        self._current = [self._step] * count
+        self._current = [self._step] * len(self.tables)
+        # What `_is_current` compares; empty: the rows were brought up to date, and may be others.
         self._known = [
-            (*member, param, state, [state[name] for name in _ENTRIES], _options_of(member[1]))
-            for member, param, state in zip(members, params, states, strict=True)
+            (*member, param, state, [state[name] for name in _ENTRIES])
+            for member, param, state in zip(self.members, params, states, strict=True)
         ]
         # The parameters of each table, which `_known` keeps alive.
         self._ids = [{id(params[index]) for index in inside} for inside in self._inside]
         self._all_ids = set().union(*self._ids)
-        self._eps = eps
 
-    def is_current(self) -> bool:
+    def follow(self) -> bool:
+        """Take parameters and state that replaced those of the members, or dissolve if they do not fit.
+
+        Returns:
+            Whether the members are still joined.
+        """
+        if self._is_current():
+            return True
+        if self._may_take():
+            self._take(*self._present())
+            return True
+        self.dissolve()
+        return False
+
+    def _may_take(self) -> bool:
+        """Tell whether the members' present parameters are up to date and like those before them."""
+        counts = set()
+        for (optimizer, group, place), like in zip(self.members, self._likes, strict=True):
+            if place >= len(group["params"]) or _options_of(group) != self._options:
+                return False
+            param = group["params"][place]
+            state = optimizer.state.get(param)
+            if not state or state.get("step") is not self._step_tensor or STEPS[0] in state:
+                return False
+            if (param.shape[1:], param.dtype, param.device) != like:
+                return False
+            counts.add(len(param))
+        return len(counts) == 1 and 0 not in counts
+
+    def _is_current(self) -> bool:
         """Tell whether the members still have the parameters, state and options that were joined."""
         # Each training step asks this twice, so it is one loop with few calls.
-        for optimizer, group, place, param, state, entries, options in self._known:
+        options = self._options
+        for optimizer, group, place, param, state, entries in self._known:
             params = group["params"]
             if place >= len(params) or params[place] is not param or optimizer.state.get(param) is not state:
                 return False
@@ -91,7 +136,7 @@ class Joint:
                 return False
             if (group["betas"], group["eps"]) != options and _options_of(group) != options:
                 return False
-        return True
+        return bool(self._known)
 
     def param_ids(self) -> set[int]:
         """Return the `id` of every parameter."""
@@ -132,7 +177,8 @@ class Joint:
                 rates[GROUPS * number + column + 1] = rest
         for table, inside in zip(self.tables, self._inside, strict=True):
             columns += table.columns([gradients[index] for index in inside])
-        self.drift.step(self._step, rates, self._eps, self._states, columns, indices, current)
+        eps = self._options[1]
+        self.drift.step(self._step, rates, eps, self._states, columns, indices, current)
 
     def catch_up(
         self, params: Collection[Tensor], rows: Tensor | None = None, count: Tensor | None = None
@@ -148,6 +194,18 @@ class Joint:
                 if rows is None:
                     self._current[number] = self._step
 
+    def bring_up_to_date(self) -> None:
+        """Bring all rows and their moments up to date, and leave the states of `torch.optim.Adam`.
+
+        Until `follow` is called, nothing here keeps the parameters and their state alive.
+        """
+        for table in self.tables:
+            table.bring_up_to_date(self._step)
+        for _, _, _, _, state, _ in self._known:
+            for name in STEPS:
+                del state[name]
+        self.tables, self._states, self._known = [], [], []
+
     def dissolve(self) -> None:
         """Give each member columns and tables of its own, so that its optimiser steps it alone.
 
@@ -158,10 +216,11 @@ class Joint:
             index = optimizer.index_of(group)
             if index is None or place >= len(group["params"]):
                 continue
-            optimizer.drifts[index, place] = self.drift.alone(table, column)
             state = optimizer.state.get(group["params"][place])
             if state:
-                state["step"] = self._step_tensor.clone()
+                state["step"] = state["step"].clone()
+            if state and STEPS[0] in state:
+                optimizer.drifts[index, place] = self.drift.alone(table, column)
                 state.update({name: state[name].clone() for name in STEPS})
 
 
@@ -191,7 +250,7 @@ def step_jointly(optimizers: Sequence[Any]) -> bool:
     if gradients is None:
         return False
     joint: Joint | None = optimizers[0].joint
-    if joint is None or not joint.has_members(members) or not joint.is_current():
+    if joint is None or not joint.has_members(members) or not joint.follow():
         for optimizer in optimizers:
             optimizer.leave_joint()
         slots = _slots_of(members)

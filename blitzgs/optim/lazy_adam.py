@@ -14,7 +14,7 @@ from blitzgs.ops.sparse_rows import distinct_rows
 from blitzgs.optim.drift import Drift
 from blitzgs.optim.handed import Handed, move_to_grad
 from blitzgs.optim.joint import Joint, step_jointly
-from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of
+from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of, steps_of
 
 
 class LazyAdam(torch.optim.Optimizer):
@@ -23,9 +23,9 @@ class LazyAdam(torch.optim.Optimizer):
     Rows that are missing in a sparse gradient (`rasterization(..., sparse_grad=True)`) have the gradient
     zero. `step` does not touch them, so they fall behind. `catch_up` applies the steps that they missed, in
     closed form whatever their number, and gives them the values of `torch.optim.Adam` to rounding
-    (csrc/lazy_adam/lazy_adam.h). Call it before the parameters are read: before a view is rendered, before a
-    strategy reads the parameters, and before evaluation. With a dense gradient, `step` is a step of plain
-    Adam.
+    (csrc/lazy_adam/lazy_adam.h). Call it before the parameters are read: before a view is rendered and before
+    evaluation. Call `bring_up_to_date` before a strategy replaces parameters and their state. With a dense
+    gradient, `step` is a step of plain Adam.
 
     Parameters are [N, ...], contiguous, float32, or float64 on the CPU. Learning rates are rounded to
     float32. A parameter of SH coefficients may give its first coefficient (three values a row) another
@@ -181,24 +181,38 @@ class LazyAdam(torch.optim.Optimizer):
         if isinstance(params, Tensor):
             params = [params]
         chosen = None if params is None else {id(param) for param in params}
-        wanted = [entry for entry in self._placed() if chosen is None or id(entry[2]) in chosen]
-        if self.joint is not None and self.joint.is_current():
+        wanted = [entry for entry in self._behind() if chosen is None or id(entry[2]) in chosen]
+        if not wanted:
+            return
+        if self.joint is not None and self.joint.follow():
             self.joint.catch_up([param for _, _, param in wanted], rows, count)
             return
-        self.leave_joint()
         for place, group, param in wanted:
-            if self.state.get(param):
-                state, table = self._table_of(place, group, param)
-                table.catch_up(int(state["step"]), rows, count)
+            state, table = self._table_of(place, group, param)
+            table.catch_up(int(state["step"]), rows, count)
 
     @torch.no_grad()
     def bring_up_to_date(self) -> None:
-        """Bring all rows and their moments up to date; afterwards the state is that of `torch.optim.Adam`."""
-        self.leave_joint()
-        for place, group, param in self._placed():
-            if self.state.get(param):
-                state, table = self._table_of(place, group, param)
-                table.bring_up_to_date(int(state["step"]))
+        """Bring all rows and their moments up to date; afterwards the state is that of `torch.optim.Adam`.
+
+        Call it before a density strategy that knows `torch.optim.Adam` replaces parameters and state. It also
+        brings up to date the optimisers that are stepped together with this one.
+        """
+        behind = self._behind()
+        if not behind:
+            return
+        if self.joint is not None and self.joint.follow():
+            self.joint.bring_up_to_date()
+            return
+        for place, group, param in behind:
+            state, table = self._table_of(place, group, param)
+            table.bring_up_to_date(int(state["step"]))
+            for name in STEPS:
+                del state[name]
+
+    def _behind(self) -> list[tuple[tuple[int, int], dict[str, Any], Tensor]]:
+        """Return the entries of `_placed` whose parameters may have rows or moments that are behind."""
+        return [entry for entry in self._placed() if STEPS[0] in self.state.get(entry[2], ())]
 
     def leave_joint(self) -> None:
         """Step each parameter by itself again, see `step_together`."""
@@ -209,8 +223,9 @@ class LazyAdam(torch.optim.Optimizer):
         """Bring all rows up to date and return the state of `torch.optim.Adam`: step, exp_avg, exp_avg_sq."""
         self.bring_up_to_date()
         packed = super().state_dict()
+        # Optimisers that are stepped together share the number of steps.
         packed["state"] = {
-            index: {name: value for name, value in state.items() if name not in STEPS}
+            index: {**state, "step": state["step"].clone()} if state else state
             for index, state in packed["state"].items()
         }
         return packed
@@ -239,8 +254,6 @@ class LazyAdam(torch.optim.Optimizer):
             state = self.state.get(param)
             if state:
                 state["step"] = torch.tensor(float(state["step"]), dtype=torch.float32)
-                steps = torch.zeros(len(param), dtype=torch.int32, device=param.device)
-                state.update({name: steps.clone() for name in STEPS})
 
     def append(self, rows: Mapping[str, Tensor]) -> dict[str, Parameter]:
         """Add rows at the end of every parameter; their moments are zero.
@@ -294,7 +307,9 @@ class LazyAdam(torch.optim.Optimizer):
 
     def permute(self, order: Tensor) -> dict[str, Parameter]:
         """Make row i the old row `order[i]` (int64 [N'], each at most once); return as `append` does."""
-        return self._renew(self._named(), lambda _, old: old[order], lambda old: old[order])
+        return self._renew(
+            self._named(), lambda _, old: old.index_select(0, order), lambda old: old.index_select(0, order)
+        )
 
     @torch.no_grad()
     def _renew(
@@ -303,15 +318,14 @@ class LazyAdam(torch.optim.Optimizer):
         of_param: Callable[[str, Tensor], Tensor],
         of_state: Callable[[Tensor], Tensor],
     ) -> dict[str, Parameter]:
-        self.leave_joint()
-        self.catch_up()
+        self.bring_up_to_date()
         renewed = {}
         for name, group in named.items():
             old = group["params"][0]
             new = Parameter(of_param(name, old.detach()), requires_grad=old.requires_grad)
             state = self.state.pop(old, None)
             if state:
-                for key in (*MOMENTS, *STEPS):
+                for key in MOMENTS:
                     state[key] = of_state(state[key])
                 self.state[new] = state
             group["params"] = [new]
@@ -368,6 +382,8 @@ class LazyAdam(torch.optim.Optimizer):
             drift = self.drifts[place] = Drift(betas, param.dtype, param.device, int(state["step"]))
         if drift.betas != betas:
             raise ValueError(f"LazyAdam: betas cannot change from {drift.betas} to {betas} after a step")
+        if STEPS[0] not in state:
+            state.update({name: steps_of(param, int(state["step"]) - drift.begin) for name in STEPS})
         return state, Table([param], [state], drift, 0, group["eps"])
 
     def state_of(self, param: Tensor) -> dict[str, Any]:
@@ -385,13 +401,12 @@ class LazyAdam(torch.optim.Optimizer):
         if not state:
             state["step"] = torch.tensor(0.0, dtype=torch.float32)
             state.update({name: torch.zeros_like(param) for name in MOMENTS})
-            steps = torch.zeros(len(param), dtype=torch.int32, device=param.device)
-            state.update({name: steps.clone() for name in STEPS})
-        for name in STEPS:
+        columns = [name for name in STEPS if name in state]
+        for name in columns:
             # gsplat's strategies append float zeros. The value is right for rows whose moments are zero.
             if state[name].dtype != torch.int32:
                 state[name] = state[name].int()
-        for name in (*MOMENTS, *STEPS):
+        for name in (*MOMENTS, *columns):
             if state[name].shape[0] != param.shape[0]:
                 raise ValueError(
                     f"LazyAdam: a parameter has {len(param)} rows and its {name} {len(state[name])}; change "

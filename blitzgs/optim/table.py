@@ -15,7 +15,7 @@ from blitzgs._library import below_autograd
 from blitzgs.optim.drift import Drift
 
 # Entries of a parameter's state: the step up to which each row's values, and its moments, are current,
-# counted from `Drift.begin`.
+# counted from `Drift.begin`. A state without them, as `torch.optim.Adam` has it, is up to date.
 STEPS = ("last_step", "moment_step")
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -72,8 +72,9 @@ class Table:
         place = step - self.drift.begin
         behind = (place - self._steps[1]).double()
         for moments, beta in zip(self._moments, self.drift.betas, strict=True):
+            decay = (beta**behind).to(moments[0].dtype)
             for values in moments:
-                values *= (beta**behind).to(values.dtype).view(-1, *(1,) * (values.dim() - 1))
+                values *= decay.view(-1, *(1,) * (values.dim() - 1))
         for steps in self._steps:
             steps.fill_(place)
 
@@ -96,3 +97,8 @@ def rates_of(group: dict[str, Any]) -> tuple[float, float]:
     """Return the learning rates of a group for the first three values of a row and for the rest."""
     rest = group["lr"] if group["lr_rest"] is None else group["lr_rest"]
     return float(group["lr"]), float(rest)
+
+
+def steps_of(param: Tensor, step: int) -> Tensor:
+    """Return a column of steps, int32 [N], for a parameter whose rows are all current at `step`."""
+    return torch.full((len(param),), step, dtype=torch.int32, device=param.device)

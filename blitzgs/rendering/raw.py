@@ -214,13 +214,11 @@ def _lazy(optimizers: Any) -> list[CatchesUp]:
         )
     given = optimizers.values() if isinstance(optimizers, Mapping) else optimizers
     found: list[CatchesUp] = []
-    joints: list[Any] = []
     for optimizer in given:
         joint = getattr(optimizer, "joint", None)
-        if joint is not None and any(joint is other for other in joints):
+        if joint in found:
             continue
-        if joint is not None and joint.is_current():
-            joints.append(joint)
+        if joint is not None and joint.follow():
             found.append(joint)
         elif hasattr(optimizer, "catch_up"):
             found.append(optimizer)
