@@ -17,8 +17,9 @@ The loop, learning rates and density strategy are those of gsplat's `simple_trai
 Times are of the whole training, of the two steps around each time at which the strategy may change the
 population, and of the steps between two such times at the end; PSNR is the mean over held-out views.
 `--one-thread` calls `torch.autograd.set_multithreading_enabled(False)` for all arms, as the guide recommends:
-autograd then runs the backward pass in the loop's own thread. `--profile` then times the parts of a step of
-each arm, on the host and on the device, and prints the ops and kernels that take most time.
+autograd then runs the backward pass in the loop's own thread. `--profile` also prints the times of each part
+of the training. Then it times the parts of a step of each arm, on the host and on the device, counts their
+ops, launches and waits, and prints the ops and kernels that take most time.
 """
 
 from __future__ import annotations
@@ -26,13 +27,14 @@ from __future__ import annotations
 import argparse
 import time
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from harness import make_parser, report
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer
-from step_parts import Parts, trace
+from step_parts import Parts, TracedParts, trace
 from torch import Tensor
 
 import blitzgs
@@ -90,6 +92,7 @@ class OneImport(GsplatTrainer):
             loss.backward()
         with self.part("optimisers"):
             self.move()
+        with self.part("learning rates"):
             self._decay.step()
         with self.part("strategy, after"):
             self.change_population(info)
@@ -134,8 +137,9 @@ class FourSwaps(OneImport):
     def change_population(self, info: Any) -> None:
         """Bring all rows up to date before the strategy reads them, and sort them afterwards."""
         refines = self.step % self._strategy.refine_every == 0
-        if refines:  # the strategy then reads parameters
-            self.catch_up()
+        if refines:  # the strategy then reads and replaces parameters and their state
+            for optimiser in self._optimisers.values():
+                optimiser.bring_up_to_date()
         super().change_population(info)
         if refines:
             order = blitzgs.morton_order(self.params["means"].detach())
@@ -144,11 +148,6 @@ class FourSwaps(OneImport):
             for key, value in self._state.items():
                 if isinstance(value, Tensor) and len(value) == len(order):
                     self._state[key] = value[order]
-
-    def catch_up(self) -> None:
-        """Bring all parameters up to date."""
-        for optimiser in self._optimisers.values():
-            optimiser.catch_up()
 
 
 class FourGrad(FourSwaps):
@@ -180,25 +179,60 @@ def seconds_of(trainer: GsplatTrainer, until: int) -> float:
     return time.perf_counter() - start
 
 
-def refined_seconds(trainer: GsplatTrainer, until: int) -> tuple[float, float]:
-    """Continue the training; return the seconds of all steps, and of those around changes of the population.
+class Interval(NamedTuple):
+    """Steps of a training up to a change of the population, and the two around the change.
 
-    The step after a change counts as well, because optimisers and estimates of sizes begin anew in it.
+    The step after a change counts as well, because estimates of sizes begin anew in it.
+
+    Attributes:
+        begin: the first step.
+        count: number of steps up to the change.
+        seconds: of these.
+        change: seconds of the two steps around the change.
+        gaussians: their number after the change.
     """
-    every = trainer._strategy.refine_every
-    rest = changes = 0.0
+
+    begin: int
+    count: int
+    seconds: float
+    change: float
+    gaussians: int
+
+
+def intervals_of(trainer: GsplatTrainer, until: int) -> list[Interval]:
+    """Continue the training; return the times between changes of the population, and around them."""
+    every, found = trainer._strategy.refine_every, []
     while trainer.step < until:
-        change = -(-trainer.step // every) * every
-        rest += seconds_of(trainer, min(change, until))
-        changes += seconds_of(trainer, min(change + 2, until))
-    return rest + changes, changes
+        begin, end = trainer.step, min(-(-trainer.step // every) * every, until)
+        seconds = seconds_of(trainer, end)
+        change = seconds_of(trainer, min(end + 2, until))
+        found.append(Interval(begin, end - begin, seconds, change, len(trainer.params["means"])))
+    return found
+
+
+def by_part(intervals: list[Interval]) -> list[dict[str, Any]]:
+    """Return a row for each ten intervals."""
+    rows = []
+    for first in range(0, len(intervals), 10):
+        own = intervals[first : first + 10]
+        steps = sum(interval.count for interval in own)
+        rows.append(
+            {
+                "from step": own[0].begin,
+                "Gaussians at the end": own[-1].gaussians,
+                "ms each": 1e3 * sum(interval.seconds for interval in own) / max(1, steps),
+                "around a refinement, ms": 1e3 * sum(interval.change for interval in own) / len(own),
+            }
+        )
+    return rows
 
 
 @torch.no_grad()
 def psnr(trainer: OneImport, capture: Any, images: ImageStore) -> float:
     """Return the mean PSNR of the held-out views, in dB."""
     if isinstance(trainer, FourSwaps):
-        trainer.catch_up()
+        for optimiser in trainer._optimisers.values():
+            optimiser.catch_up()
     found = []
     for index in capture.test:
         image, _ = trainer.render(trainer.views.pick([index]))
@@ -210,20 +244,22 @@ def psnr(trainer: OneImport, capture: Any, images: ImageStore) -> float:
 def measure(name: str, capture: Any, images: ImageStore, options: argparse.Namespace) -> dict[str, Any]:
     """Train with one arm; returns a row of the report."""
     device = torch.device(options.device)
-    changes = {"steps": options.steps, "packed": issubclass(ARMS[name], FourSwaps)}
-    trainer = ARMS[name]("default", GsplatOptions.of("default", changes), capture, images, device, 0)
+    choices = {"steps": options.steps, "packed": issubclass(ARMS[name], FourSwaps)}
+    trainer = ARMS[name]("default", GsplatOptions.of("default", choices), capture, images, device, 0)
     last = min(99, options.steps // 10)  # between two densifications
-    first, changes = refined_seconds(trainer, options.steps - last)
+    intervals = intervals_of(trainer, options.steps - last)
     rest = seconds_of(trainer, options.steps)
+    changes = sum(interval.change for interval in intervals)
     found = {
         "arm": name,
-        "training, s": first + rest,
+        "training, s": sum(interval.seconds for interval in intervals) + changes + rest,
         "of it around refinements, s": changes,
         "last steps, ms each": rest / last * 1e3,
         "Gaussians": len(trainer.params["means"]),
         "PSNR, dB": psnr(trainer, capture, images),
     }
     if options.profile:
+        report(f"{name}: steps by part of the training", by_part(intervals), None, options.device)
         profile(name, trainer, options)
     return found
 
@@ -236,9 +272,11 @@ def profile(name: str, trainer: OneImport, options: argparse.Namespace) -> None:
     seconds = seconds_of(trainer, trainer.step + steps)
     title = f"{name}: a step at {len(trainer.params['means'])} Gaussians, {seconds / steps * 1e3:.2f} ms"
     report(title, parts.rows(steps), None, options.device)
+    trainer.part = parts = TracedParts()
+    run = partial(trainer.train_to, trainer.step + trace_steps)
+    counts, kernel_ms, table = trace(run, trace_steps, trainer.device, parts)
     trainer.part = nullcontext
-    counts, table = trace(lambda: trainer.train_to(trainer.step + trace_steps), trace_steps, trainer.device)
-    report(f"{name}: work of a step", [counts], None, options.device)
+    report(f"{name}: work of a step, kernels {kernel_ms:.2f} ms", counts, None, options.device)
     print(table)
 
 
