@@ -71,8 +71,8 @@ COMMANDS |= {
     "offload": "python benchmarks/bm_offload.py --ratios 2 4",
     "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 2 --popping",
     "city_ranks": (
-        "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 2 --arms all_off "
-        "--batch-sizes 4 8"
+        "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 2 --arms all_off "
+        "--batch-sizes 4 8 16"
     ),
     "city_exchange": (
         "python benchmarks/bm_exchange.py --data CITY --downscale 1 --visible-threshold 0 --ranks 1 2"

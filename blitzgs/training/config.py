@@ -30,7 +30,8 @@ class DataConfig:
         allow_missing: drop views whose image is missing instead of failing.
         cache_bytes: memory for compressed images, of all ranks of a host together, at most half of the host's
             memory; decoded images take what these leave, and up to a quarter of it in addition.
-        threads: decoder threads.
+        threads: decoder threads of each rank. 0: the cores that the process may use, shared by the ranks of
+            the host, less two for each rank; at least 2, at most 32.
         prefetch: number of batches to upload ahead; photographs are decoded for more batches ahead.
     """
 
@@ -43,7 +44,7 @@ class DataConfig:
     exif: str = "auto"
     allow_missing: bool = False
     cache_bytes: int = 8_000_000_000
-    threads: int = 4
+    threads: int = 0
     prefetch: int = 3
 
 

@@ -50,7 +50,7 @@ _LENGTH = Range(0, 1e6)
 RANGES: Mapping[str, Range] = {
     "data.downscale": Range(1, 1000),
     "data.cache_bytes": Range(0, 2**50),
-    "data.threads": Range(1, 1024),
+    "data.threads": Range(0, 1024),
     "data.prefetch": Range(0, 1000),
     "model.sh_degree": Range(0, 3),
     "model.background": Range(0, 1),

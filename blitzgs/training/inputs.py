@@ -56,7 +56,13 @@ def open_capture(
     except MissingImagesError as error:
         raise MissingImagesError(f"{error} ({remedy})") from error
     budget = min(data.cache_bytes, _host_memory() // 2) // ranks.local_world_size
-    return capture, ImageStore(capture, budget, data.threads, background=config.model.background)
+    threads = data.threads or _decoder_threads(ranks.local_world_size)
+    return capture, ImageStore(capture, budget, threads, background=config.model.background)
+
+
+def _decoder_threads(local_ranks: int) -> int:
+    """Return how many threads each rank of this host decodes with, see `DataConfig.threads`."""
+    return min(max(len(os.sched_getaffinity(0)) // local_ranks - 2, 2), 32)
 
 
 def _host_memory() -> int:
