@@ -109,7 +109,9 @@ ColmapPoints read_points_text(std::istream& in, const std::string& name, bool wi
 
 void write_cameras_text(std::ostream& out, const std::vector<ColmapCamera>& cameras) {
   check_columns(cameras);
-  out << "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n# Number of cameras: " << cameras.size() << "\n";
+  out << "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n# Number of cameras: ";
+  put(out, cameras.size());
+  out << '\n';
   for (const ColmapCamera& camera : cameras) {
     put(out, camera.id);
     out << ' ' << find_camera_model(camera.model)->name;
@@ -123,7 +125,9 @@ void write_cameras_text(std::ostream& out, const std::vector<ColmapCamera>& came
 void write_images_text(std::ostream& out, const ColmapImages& images) {
   check_columns(images);
   out << "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
-      << "# Number of images: " << images.ids.size() << "\n";
+      << "# Number of images: ";
+  put(out, images.ids.size());
+  out << '\n';
   for (std::size_t i = 0; i < images.ids.size(); ++i) {
     put(out, images.ids[i]);
     for (int k = 0; k < 4; ++k) put_after_blank(out, images.quats[4 * i + k]);
@@ -142,8 +146,9 @@ void write_images_text(std::ostream& out, const ColmapImages& images) {
 
 void write_points_text(std::ostream& out, const ColmapPoints& points) {
   check_columns(points);
-  out << "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n# Number of points: "
-      << points.ids.size() << "\n";
+  out << "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n# Number of points: ";
+  put(out, points.ids.size());
+  out << '\n';
   for (std::size_t i = 0; i < points.ids.size(); ++i) {
     put(out, points.ids[i]);
     for (int k = 0; k < 3; ++k) put_after_blank(out, points.positions[3 * i + k]);

@@ -7,6 +7,7 @@
 #include <optional>
 #include <ostream>
 #include <sstream>
+#include <string>
 
 namespace blitzgs::io {
 
@@ -275,7 +276,8 @@ void write_ply(std::ostream& out, const PlyTable& table) {
   check_writable(table);
   out << "ply\nformat binary_little_endian 1.0\n";
   for (const std::string& line : table.comments) out << line << '\n';
-  out << "element vertex " << table.count << '\n';
+  // A stream would group the digits of a number where the program's locale does.
+  out << "element vertex " << std::to_string(table.count) << '\n';
   for (const PlyProperty& p : table.properties) {
     out << "property " << ply_type_name(p.type) << ' ' << p.name << '\n';
   }

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "io/ply.h"
 
+#include <locale>
 #include <sstream>
 
 #include "common/catch.h"
@@ -45,6 +46,18 @@ TEST_CASE("a PLY table survives, and so do its bytes") {
   REQUIRE(found.comments == some_table().comments);
   REQUIRE(found.properties[1].name == "n");
   REQUIRE(written(found) == bytes);
+}
+
+TEST_CASE("a locale that groups digits changes no count") {
+  struct Grouped : std::numpunct<char> {
+    std::string do_grouping() const override { return "\3"; }
+  };
+  PlyTable table{{}, {{"n", PlyType::kUint8}}, 1234, std::vector<std::uint8_t>(1234)};
+  const std::string bytes = written(table);
+  const std::locale before = std::locale::global(std::locale(std::locale(), new Grouped));
+  const std::string grouped = written(table);
+  std::locale::global(before);
+  REQUIRE(grouped == bytes);
 }
 
 TEST_CASE("ASCII and big-endian PLY give the rows of the little-endian one") {
