@@ -82,29 +82,6 @@ def octree_gaussians(
     )
 
 
-def isolated_points(points: Tensor, track_lengths: Tensor, factor: float) -> Tensor:
-    """Find SfM points that are probably wrong matches: seen by two images only, and far from all others.
-
-    "Far" means that the mean distance to the 3 nearest neighbours is more than `factor` times its median over
-    all points.
-
-    Args:
-        points: float64 [M, 3]; their device measures the distances.
-        track_lengths: number of images that saw each point, int64 [M] on the CPU.
-        factor: above 0.
-
-    Returns:
-        bool [M] on the CPU.
-    """
-    short = track_lengths <= 2
-    if not bool(short.any()):
-        return short
-    centred = points - points.mean(dim=0)
-    # On CUDA distances are float32, whose rounding does not matter for points that are far from others.
-    spacing = _spacing(centred.float() if points.is_cuda else centred).cpu()
-    return short & (spacing > factor * spacing.median())
-
-
 def _grid_origin(points: Tensor, levels: Levels) -> Tensor:
     """Return the lower corner of the grids: below all points, unless outliers overflow the finest grid."""
     reach = levels.voxel_size_of(levels.count - 1) * 2 ** (_CELL_BITS - 1)

@@ -65,9 +65,6 @@ class ModelConfig:
         scale_floor: smallest standard deviation of a Gaussian, in pixels of the training view that samples it
             most finely, which is found anew at every tenth density event; 0: none. Mip-Splatting's 3D filter
             has 0.447.
-        isolated_points: leave out SfM points that only two images saw and whose nearest neighbours are more
-            than this many times as far away as usual (`isolated_points`); 0: none. They are mostly wrong
-            matches, and their Gaussians begin as large as they are isolated.
     """
 
     sh_degree: int = 3
@@ -79,7 +76,6 @@ class ModelConfig:
     deterministic: bool = False
     initial_opacity: float = 0.1
     scale_floor: float = 0.0
-    isolated_points: float = 0.0
 
 
 @dataclass(frozen=True)

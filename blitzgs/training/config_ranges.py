@@ -59,7 +59,6 @@ RANGES: Mapping[str, Range] = {
     "model.eps2d": Range(0, 100),
     "model.initial_opacity": Range(1e-4, 0.9999),
     "model.scale_floor": Range(0, 100),
-    "model.isolated_points": Range(0, 1e6),
     "lod.fork": Range(1.01, 100),
     "lod.visible_threshold": Range(0, 1, high_open=True),
     "lod.base_resolution": Range(1e-6, 1),

@@ -12,7 +12,7 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
-from blitzgs.population.initialisation import isolated_points, octree_gaussians
+from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.population.lineage import Lineage, initial_births, ledger_of
 from blitzgs.population.position_noise import PositionNoise
 from blitzgs.scene.capture import Capture
@@ -217,16 +217,12 @@ def first_gaussians(
 ) -> tuple[GaussianTable, Progress]:
     """Make the first Gaussians from the capture's points; each rank keeps its share of them at `home`."""
     lod, device = config.lod, ranks.device
-    points, colors = torch.from_numpy(capture.points) / space.unit, torch.from_numpy(capture.colors)
-    if config.model.isolated_points > 0 and capture.track_lengths is not None:
-        tracks = torch.from_numpy(capture.track_lengths)
-        usable = ~isolated_points(points.to(device), tracks, config.model.isolated_points)
-        points, colors = points[usable], colors[usable]
+    points = torch.from_numpy(capture.points) / space.unit
     centres = trained_centres([capture.cameras[i] for i in capture.train], space).to(device)
     levels = measure_levels(points.to(device), centres, lod.fork, lod.base_resolution)
     table = octree_gaussians(
         points,
-        colors,
+        torch.from_numpy(capture.colors),
         centres,
         levels,
         visible_threshold=lod.visible_threshold,

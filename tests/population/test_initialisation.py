@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs.population.initialisation import isolated_points, octree_gaussians
+from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.view.levels import Levels, measure_levels
-from tests.helpers import DEVICES
 
 
 def scene(scale=1.0):
@@ -102,16 +101,3 @@ def test_one_point():
         opacity=0.1,
     )
     assert len(one) == 1 and bool(one["scales"].isfinite().all())
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_isolated_points_are_those_that_two_images_saw_far_from_all_others(device):
-    grid = torch.cartesian_prod(*[torch.arange(10.0, dtype=torch.float64)] * 3)  # spacing 1
-    far = torch.tensor([[30.0, 0.0, 0.0], [0.0, 30.0, 0.0], [0.0, 0.0, 12.0]]).double()
-    points = torch.cat((grid, far)) + torch.tensor([1e6, -1e6, 0.0])
-    tracks = torch.cat((torch.arange(1000) % 4 + 2, torch.tensor([2, 3, 2])))
-    found = isolated_points(points.to(device), tracks, 10.0)
-    # The second far point was seen three times, and the third is 3 to 4 spacings away.
-    assert found.nonzero().squeeze(1).tolist() == [1000]
-    assert not isolated_points(points.to(device), tracks.clamp(min=3), 10.0).any()
-    assert isolated_points(points.to(device), tracks, 3.0).nonzero().squeeze(1).tolist() == [1000, 1002]
