@@ -63,6 +63,10 @@ COMMANDS |= {
         "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/compact "
         '--capture "NAME=CAPTURE --schedule.scale=0.5"'
     ),
+    "compact_later": (
+        "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/compact_later "
+        '--capture "NAME=CAPTURE --schedule.scale=0.5"'
+    ),
     "adaptive": (
         "python benchmarks/bm_quality.py --plan benchmarks/adaptive.yaml --out runs/adaptive "
         "--capture NAME=CAPTURE --per-gpu 3"
@@ -86,8 +90,10 @@ GROUPS = (
     ("ablation", "oracle"),
     ("energy",),
     ("compact",),
+    ("compact_later",),
     ("adaptive",),
     ("offload",),
+    ("importance",),
     ("call",),
     ("drop_in", "drop_in_1"),
     ("exchange", "training", "training_2"),
@@ -100,6 +106,7 @@ COPIED = {
     "ablation": "cp runs/ablation/quality.json benchmarks/results/ablation.json",
     "energy": "cp runs/energy/quality.json benchmarks/results/energy.json",
     "compact": "cp runs/compact/quality.json benchmarks/results/compact.json",
+    "compact_later": "cp runs/compact_later/quality.json benchmarks/results/compact_later.json",
     "adaptive": "cp runs/adaptive/quality.json benchmarks/results/adaptive.json",
 }
 QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
@@ -421,6 +428,7 @@ SECTIONS = {
     "onset": Section(("ablation",), gate_lines("onset")),
     "oracle": Section(("oracle",), row_lines),
     "compact": Section(("compact",), compact_lines),
+    "compact_later": Section(("compact_later",), compact_lines),
     "adaptive": Section(("adaptive",), adaptive_lines),
     "offload": Section(("offload",), offload_lines),
     "summary": Section(("render", "step_1", "step_4"), summary_lines),
