@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Numbers the rows that are gathered for the visible Gaussians of a projection (project.h): row u is the
 // Gaussian visible_ids[u].
-//   rows[u] = u;   indices[u] = visible_ids[u];   row_of_splat[i] = u for the splats i of this Gaussian,
-//   splat_offsets[u] .. splat_offsets[u
-//   + 1] - 1.
+//   rows[u] = u;   indices[u] = visible_ids[u];
+//   row_of_splat[i] = u for the splats i of this Gaussian, splat_offsets[u] <= i < splat_offsets[u + 1].
 // On CUDA nothing is written if there are more splats than the capacity. On the CPU the sizes of the capacity
 // are the actual numbers.
 #pragma once

@@ -181,12 +181,12 @@ __device__ double block_sum(double value) {
   return total;
 }
 
-// A prefix sum over the blocks of a launch while they run, without a second launch (decoupled look-back).
-// Each block has a sum in [0, 2^62) and gets the sum over all blocks before it. A block first publishes its
-// own sum. It then adds up the sums of its predecessors, from the nearest to the farthest, until it finds a
-// predecessor that has published the sum up to and including itself. At last the block publishes its own such
-// sum. Blocks are numbered in the order in which they start, so all predecessors of a waiting block run or
-// have run.
+// A prefix sum over the blocks of a launch while they run, without a second launch (decoupled look-back,
+// Merrill & Garland 2016). Each block has a sum in [0, 2^62) and gets the sum over all blocks before it. A
+// block first publishes its own sum. It then adds up the sums of its predecessors, from the nearest to the
+// farthest, until it finds a predecessor that has published the sum up to and including itself. At last the
+// block publishes its own such sum. Blocks are numbered in the order in which they start, so all predecessors
+// of a waiting block run or have run.
 class RunningSum {
  public:
   // zeros: one word for each block and one more, all zero.

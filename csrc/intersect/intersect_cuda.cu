@@ -9,6 +9,8 @@
 // 3. Passes of sweep_kernel, a stable radix sort, order the entries by tile and keep their order otherwise.
 // 4. tile_offsets_kernel finds where each tile's list begins.
 //
+// (The renderer of 3DGS sorts the entries once, by tile and depth; Kerbl et al. 2023, section 6.)
+//
 // Step 1 finds the tiles of a splat in splat order and keeps them in 16 bytes. The data of all splats then
 // fit into the L2 cache when step 2 gathers them in depth order. This file is compiled without FMA
 // contraction (cmake/cuda.cmake), like the projection, because both must count the same tiles.

@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // One pass of a stable radix sort in one launch: it sorts pairs of a key and a value by one digit of the key.
 // The kernel that wrote the keys has counted how often each digit occurs. Each block adds up the counts of
-// each digit in the blocks before it while these run (decoupled look-back). It reads the states of several
-// predecessors at a time, because a pass has only a few hundred blocks, which all run at once, and would
-// otherwise spend most of its time on the look-back. The number of pairs is read from device memory.
+// each digit in the blocks before it while these run (decoupled look-back, Merrill & Garland 2016; for a
+// radix sort, Adinets & Merrill 2022). It reads the states of several predecessors at a time, because a pass
+// has only a few hundred blocks, which all run at once, and would otherwise spend most of its time on the
+// look-back. The number of pairs is read from device memory.
 #pragma once
 #include <algorithm>
 #include <cstdint>

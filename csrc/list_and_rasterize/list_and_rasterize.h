@@ -1,4 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
+// The op list_and_rasterize is intersect (intersect.h), then rasterize_fwd (rasterize.h), then this kernel:
 // alphas[i] = 1 - transmittances[i], 0 <= i < n.
 #pragma once
 #include <cstdint>

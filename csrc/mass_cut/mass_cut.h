@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // The mass cut: for each segment, the smallest set of items by descending weight (ties by ascending id) whose
 // weights sum to at least a share of the segment's total. One search serves all segments, without sorting and
-// without waiting on the host. The importance pass cuts each view's contributions at 99 % in this way.
+// without waiting on the host. The importance pass cuts each view's contributions at 99 % in this way
+// (BlitzGS, section 3.2).
 //
 //   weights [P] int64 in [0, 2^62), segments [P] int32, owners [P] int32 and ids [N] int64: item i has the id
 //   ids[owners[i]], unique within its segment  ->  chosen [P]
@@ -38,7 +39,7 @@ inline constexpr int kFirstDigits = 1 << 10;  // 1 + 63 exponents x 16
 inline constexpr int kRounds = 1 + (58 + kDigitBits - 1) / kDigitBits;
 // The steps of the whole search: scan and descent of each round for weights, then of each round for ids, then
 // the choice.
-inline constexpr int kTiesStep = 2 * kRounds, kChoiceStep = 4 * kRounds, kSteps = kChoiceStep + 1;
+inline constexpr int kChoiceStep = 4 * kRounds, kSteps = kChoiceStep + 1;
 
 // The state of the search in a segment. It is done when shift is 0.
 struct MassSearch {

@@ -1,8 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-// EWA projection of one Gaussian into one pinhole camera (docs/image.md, section 2), and its derivative. W is
-// the world-to-camera rotation. The covariance is kept as its 2x3 factor M = J W A with rows m0 and m1, so
-// Sigma' = M M^T + eps I. The determinant |m0 x m1|^2 + eps tr(M M^T) + eps^2 is then a sum of non-negative
-// terms, while the usual ac - b^2 cancels for elongated splats.
+// EWA projection (Zwicker et al. 2001; Kerbl et al. 2023, Eq. 5) of one Gaussian into one pinhole camera
+// (docs/image.md, section 2), and its derivative. viewmat = [W | t], Sigma = A A^T (gaussian.h):
+//   p = W mean + t,   mean2d = (fx p.x / p.z + cx, fy p.y / p.z + cy),   depth = p.z
+//   J = d mean2d / dp at the clamped slopes p.x / p.z and p.y / p.z
+//   Sigma' = J W Sigma W^T J^T + eps I,   eps = eps2d,   conic (a, b, c) = Sigma'^-1
+//   compensation = sqrt(det(Sigma' - eps I) / det Sigma')   (the 2D filter of Mip-Splatting, Yu et al. 2024)
+// The covariance is kept as its 2x3 factor M = J W A with rows m0 and m1, so Sigma' = M M^T + eps I. The
+// determinant |m0 x m1|^2 + eps tr(M M^T) + eps^2 is then a sum of non-negative terms, while the usual
+// ac - b^2 cancels for elongated splats.
 #pragma once
 #include "math/gaussian.h"
 
@@ -159,7 +164,7 @@ BLITZGS_HD void store_conic(const Footprint<T>& s, T* conic) {
   }
 }
 
-// sqrt(det Sigma / det Sigma'): in antialiased mode, the factor by which the blur lowers the peak of a splat.
+// In antialiased mode, the factor by which the blur lowers the peak of a splat.
 template <class T>
 BLITZGS_HD T compensation(const Footprint<T>& s) {
   return s.normal_length / s.root_det;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The photometric loss (docs/image.md, Loss): fused L1 and SSIM of rendered views against their images, and
-// the gradient by the renders.
+// The photometric loss (docs/image.md, Loss; Kerbl et al. 2023, Eq. 7): fused L1 and SSIM of rendered views
+// against their images, and the gradient by the renders.
 //
 //   l1[b]   = sum over owned, unmasked pixels and channels of |x - y|
 //   ssim[b] = sum over the same of SSIM(x, y), Wang et al. 2004: 11 x 11 Gaussian window, sigma 1.5, zero

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Projection (docs/image.md, sections 1, 2 and 4): turns N Gaussians and B views into splats, one for each
-// pair of a Gaussian and a view that sees it. project_splat.h holds the arithmetic of one splat.
+// pair of a Gaussian and a view that sees it. project_splat.h holds the arithmetic of one splat, and
+// math/projection.h the equations (EWA).
 //
 // A splat exists iff near < z <= far, its opacity (compensated when antialiased) is >= 1/255, the box around
 // alpha >= 1/255 overlaps the image and reaches beyond radius_clip, its view is in the candidate's mask, and
@@ -250,9 +251,9 @@ struct ZeroedArrays {
 };
 
 // The terms of the training loss that do not depend on pixels, as weights per view, [B] each, or null (zero).
-// For each Gaussian that has a splat in view b, the loss has scale[b] times the smallest axis of the Gaussian
-// (the paper's L_scale), opacity[b] times its opacity and size[b] times the mean of its three axes as
-// summands (the last two are those of 3DGS-MCMC).
+// For each Gaussian that has a splat in view b, the loss has these summands: scale[b] times the smallest axis
+// of the Gaussian (BlitzGS, L_scale), and opacity[b] times its opacity and size[b] times the mean of its
+// three axes (3DGS-MCMC, Kheradmand et al. 2024).
 template <class T>
 struct Regularisers {
   const T *scale, *opacity, *size;

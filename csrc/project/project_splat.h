@@ -242,8 +242,7 @@ BLITZGS_HD void project_splat_vjp(const Camera<T>& camera, const ActivatedGaussi
   camera_point_vjp(camera, gaussian.mean, v_p, &gradient->mean, pose);
 }
 
-// Adds the gradient of the paper's scale regulariser, weight * min_j s_j. Of equal axes the first one gets
-// it.
+// Adds the gradient of weight * min_j s_j (BlitzGS, L_scale). Of equal axes the first one gets it.
 template <class T>
 BLITZGS_HD void smallest_axis_vjp(const Vec3<T>& scale, T weight, Vec3<T>* v_scale) {
   if (scale.x <= scale.y && scale.x <= scale.z) {

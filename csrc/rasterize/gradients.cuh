@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // The steps of the CUDA backward pass from the gradient of a pixel to the gradients of splats: per entry and
 // pixel (BackwardPixel), per entry (sum_pixels, finish), per splat (sum_entries_kernel for deterministic
-// gradients), and from the packed table to one array per input (unpack_kernel).
+// gradients), and from the packed table to one array per input (unpack_kernel). rasterize.h has the formulas.
+// BackwardPixel leaves w and g of each pair of an entry and a pixel in shared memory. The sums over g dx,
+// g dx^2 and so on are moments of g over the pixel grid.
 #pragma once
 #include <cub/device/device_radix_sort.cuh>
 #include <stdexcept>
@@ -9,11 +11,6 @@
 
 #include "common/cuda.cuh"
 #include "rasterize/tile_batch.cuh"
-
-// For each pair of an entry and a pixel the backward pass leaves two numbers in shared memory: the weight
-// alpha T and g = dL/d(ln alpha). The gradients of the entry follow from these: the colour's gradient is the
-// sum of the weight times the pixel's gradient, and the gradients of mean and conic follow from the moments
-// of g over the pixel grid.
 
 namespace blitzgs::cuda {
 

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rasterisation (docs/image.md, sections 3 and 5): alpha compositing of each tile's list, front to back, and
-// its gradient. The kernels are forward_kernel (rasterize_fwd_cuda.cu) and backward_kernel
-// (rasterize_bwd_cuda.cu) on CUDA, forward_tile (tile_forward.h) and backward_tile (tile_kernels.h) on the
-// CPU.
+// Rasterisation (docs/image.md, sections 3 and 5): alpha compositing of each tile's list, front to back
+// (Kerbl et al. 2023, Eq. 3), and its gradient. The kernels are forward_kernel (rasterize_fwd_cuda.cu) and
+// backward_kernel (rasterize_bwd_cuda.cu) on CUDA, forward_tile (tile_forward.h) and backward_tile
+// (tile_kernels.h) on the CPU.
 //
 // Per pixel with centre (i + 0.5, j + 0.5), over the tile's list in order, T = 1 at the start:
 //   q     = a dx^2 + 2 b dx dy + c dy^2,  (dx, dy) = pixel centre - mean2d,  conic = (a, b, c)
@@ -26,10 +26,18 @@
 //
 // Gradients, given v_renders [B, H, W, D] and optionally v_alphas [B, H, W]: per splat v_means2d [P, 2],
 // v_conics [P, 3] (of a, b, c as three independent numbers), v_opacities [P], v_colors [P, D], and with
-// absgrad v_means2d_abs [P, 2] = sum over pixels of |that pixel's gradient of mean2d| per axis. Zero where
-// min(0.99, .) clips; the order, the cut at 1/255 and the end of a pixel count as constants. The caller
-// computes the gradient of the background, the sum over pixels of v_renders * T. Splats in no list get zeros.
-// v_renders of unowned tiles are not read.
+// absgrad v_means2d_abs [P, 2]. They are sums over the pixels at which the splat is composited:
+//   w = alpha T,   g = dL/d(ln alpha) = w (v . color - behind),   v = v_renders of the pixel
+//   behind = v . (colour of all that is behind the splat, as seen with T = 1), with v_alpha subtracted from
+//            v . background
+//   v_colors      = sum of w v
+//   v_opacities   = sum of g / opacity
+//   v_means2d     = sum of g (a dx + b dy, b dx + c dy)
+//   v_means2d_abs = sum of the absolute values of these terms (AbsGS, Ye et al. 2024)
+//   v_conics      = -sum of g (dx^2 / 2, dx dy, dy^2 / 2)
+// g is 0 where min(0.99, .) clips; the order, the cut at 1/255 and the end of a pixel count as constants. The
+// caller computes the gradient of the background, the sum over pixels of v_renders * T. Splats in no list get
+// zeros. v_renders of unowned tiles are not read.
 //
 // On CUDA, the forward pass may be queued with a capacity n_splats before the number of splats is known. The
 // kernels then read the number from known_splats (common/kernel.h). They pack so many splats and set the

@@ -1,10 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // The gradient of compositing (docs/image.md, sections 3 and 5). A half-warp visits the list of its 4x4
 // subtile from the last entry to the first, one lane per pixel. The state of a pixel is its transmittance and
-// one number, the dot product of the colour behind the entry with the pixel's gradient, so the backward pass
-// needs only the final transmittance and last_ids from the forward pass. For each entry and pixel this gives
-// two numbers: the weight alpha T and g = dL/d(ln alpha). The half-warp writes these for sixteen entries to
-// shared memory. Each lane then sums over the sixteen pixels for one of the entries (gradients.cuh).
+// one number, `behind` of rasterize.h, so the backward pass needs only the final transmittance and last_ids
+// from the forward pass. The half-warp writes w and g (rasterize.h) of sixteen entries to shared memory. Each
+// lane then sums over the sixteen pixels for one of the entries (gradients.cuh).
 
 #include "common/cuda.cuh"
 #include "rasterize/gradients.cuh"

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// The exchange of splats between ranks: packing and unpacking. Bit m of masks[p] sends splat p to rank m; the
-// splats for one rank are a group. All data are 32-bit words: a column with w words per splat is int32
-// [P, w].
+// The exchange of splats between ranks (BlitzGS, section 3.1; Grendel-GS, Zhao et al. 2024): packing and
+// unpacking. Bit m of masks[p] sends splat p to rank m; the splats for one rank are a group. All data are
+// 32-bit words: a column with w words per splat is int32 [P, w].
 //
 //   scatter: columns, masks -> one group per rank, in which each column is contiguous; and places [runs, M]:
 //            the positions in each group of the splats of each run of kPlaceSplats splats. The splats of a

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The view level (paper, Section 3.3): drops pairs of a row and a view from the active set before the
-// projection.
+// The view level (BlitzGS, section 3.3; levels as in Octree-GS, Ren et al. 2024): drops pairs of a row and a
+// view from the active set before the projection.
 //
 // LOD gate (Eq. 1 and 2): view v keeps row i iff level_i <= L_v(|mean_i - centre_v|). Eq. 1 rounds
 // log_f(d_0 / d) to the nearest integer, so level l is kept up to the distance reach_l = d_0 f^(1/2 - l);

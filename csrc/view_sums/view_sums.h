@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// The sums of the importance sweep (paper: the score s, c_rad, c_vis and the cull matrix) for a batch of at
-// most kMaxViews views. For each visible Gaussian g the op adds over its consecutive splats i (g in the view
-// v_i):
+// The sums of the importance sweep (BlitzGS, section 3.2: the score s, c_rad, c_vis and the cull matrix) for
+// a batch of at most kMaxViews views. For each visible Gaussian g the op adds over its consecutive splats i
+// (g in the view v_i):
 //
 //   score[g]   += round(w / (a + eps)^p / unit)   w = weights[i] / 2^32, a = pixels[i]; p is 1, 1/2 or 0; in
 //                                                 float64, to the nearest integer, ties to even
