@@ -18,12 +18,13 @@ from blitzgs.ops.report import report_
 class _Side:
     """A second stream of a device, for work that the step does not wait for.
 
-    One thread uses it at a time: another one might record `ready` anew before the first has waited for it.
+    Only one thread at a time may use it: a second thread could record `ready` again before the first one has
+    made the stream wait for it.
 
     Attributes:
         stream: the second stream.
-        ready: event that is recorded on the step's stream before each use of the second one. It can be
-            recorded again at once: what a stream waits for is fixed when it is told to wait.
+        ready: event that is recorded on the step's stream before each use of the second one. It may be
+            recorded again after a stream was told to wait for it: the wait is for the earlier record.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -32,10 +33,11 @@ class _Side:
 
 
 class _Queued:
-    """What the second stream uses for sums that the host has not read yet.
+    """The memory that the second stream uses for sums that the host has not read yet.
 
-    Torch knows that the tensors of the step are used on the step's stream alone. It would give their memory
-    to new tensors as soon as nothing refers to them, so they are kept until the second stream has read them.
+    Torch assumes that the tensors of the step are used on the step's stream alone, and gives their memory to
+    new tensors as soon as no variable refers to them. They are kept here until the second stream has read
+    them.
 
     Attributes:
         memory: float32 [words], pinned.
@@ -44,22 +46,23 @@ class _Queued:
 
     def __init__(self, side: _Side, words: int, tensors: tuple[Tensor | None, ...]) -> None:
         self._side: _Side = side
-        self._tensors: tuple[Tensor | None, ...] = ()  # in case there is no memory for a place
-        # Powers of two, so that images of many sizes need few places.
+        self._tensors: tuple[Tensor | None, ...] = ()  # for __del__, if `take` raises an error
+        # Powers of two, so that images of many sizes share few pieces of pinned memory.
         length = 1 << (words - 1).bit_length()
         self._place = PinnedPlace.take(length, torch.float32, side.stream.device)
         self._tensors = tensors
         self.memory, self.written = self._place.memory[:words], self._place.written
 
     def has_ended(self) -> None:
-        """Let later work use all this again: the host has waited for `written` and copied the numbers."""
+        """Release the memory: the host has waited for `written` and copied the numbers."""
         self._place.give_back()
         self._tensors = ()
 
     def __del__(self) -> None:
-        # If nothing has waited for the sums, torch makes the next use of the tensors' memory wait for the
-        # second stream, and that of the place for the copy. The host does not wait here, because the sums of
-        # a rank that has failed may never come.
+        # If the host never read the sums, the second stream may still use the tensors, so torch must not
+        # reuse their memory before that stream has passed this point. (Torch delays the reuse of the pinned
+        # memory itself, because it queued the copy.) The host does not wait here: if a rank has failed, the
+        # sums never arrive.
         for tensor in self._tensors:
             if tensor is not None:
                 tensor.record_stream(self._side.stream)

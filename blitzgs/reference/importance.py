@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The importance pass by definition (paper §3.2): every Gaussian at every pixel, cuts by plain sorting."""
+"""The importance pass by definition: every Gaussian at every pixel, plain sorting (BlitzGS, section 3.2)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The trained world: a capture in a unit of length near its extent, with views in the form of the kernels."""
+"""Scales a capture so that its extent is in [1, 2), and turns its cameras into viewmats and Ks."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class CollectiveExchange:
     ) -> None:
         """Project, exchange the numbers of splats, and send the splats."""
         sizes, tiles, n_views = attempt.sizes, assignment.all_composited, assignment.ranges.n_views
-        # The host may have to wait for the collectives of other ranks that are queued before the projection.
+        # Without sizes the projection waits for the device, which may still wait for other ranks.
         with ranks.watchdog.waiting("project"):
             projected = inputs.run(sizes, tiles)
         everyone = projected.totals.repeat(ranks.world_size, 1)

@@ -2,8 +2,8 @@
 """The interface of transports, which send splats to the ranks that composite them, and gradients back.
 
 Every rank projects the Gaussians that it owns. Each splat (a Gaussian in a view) is then sent to the ranks
-that composite tiles which it touches, and its gradient is returned (paper §3.1). The calls of one frame, on
-every rank::
+that composite tiles which it touches, and its gradient is returned (BlitzGS, section 3.1). The calls of one
+frame, on every rank::
 
     exchange = transport.start(inputs, assignment, attempt, mark)  # project; send splats to other ranks
     exchange.arrived, exchange.gradient_table                      # for compositing
