@@ -91,9 +91,9 @@ class TileOwners:
 
         Returns:
             views int64 [V], tiles int64 [V] and costs float16 [sum of pieces]: the measured views, their
-            numbers of tiles and their costs; ages int64 [V]: 0 for costs that divisions use, else the number
-            of the batch, from 1, among the latest; steps int64 [S] and bounds int64 [S, M + 1]: the stored
-            divisions. Keys must be integers.
+            numbers of tiles and their costs; ages int64 [V]: 0 if divisions already use the costs, k if they
+            are from the k-th of the latest batches, whose costs are not used yet; steps int64 [S] and bounds
+            int64 [S, M + 1]: the stored divisions. Keys must be integers.
         """
         batches = [list(self._costs.values()), *(measured() for measured in self._late)]
         ages = [age for age, batch in enumerate(batches) for _ in batch]

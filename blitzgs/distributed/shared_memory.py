@@ -10,11 +10,11 @@ Each rank owns memory that all others have mapped (NVLink or PCIe peer access):
   barriers.
 
 A barrier delays streams, not hosts: work that any rank queues after a barrier begins when all work that the
-ranks queued before it has ended. The numbers of a barrier have two places, which are used in turn: a rank
-that has left a barrier may not have read its numbers yet when another rank writes those of the next barrier.
-A rank must queue the reading of the numbers before it queues the next barrier with numbers. The same holds
-for the board and its barriers. The sums of the numbers are stored where no other rank writes; the rank's own
-second barrier with numbers after this one overwrites them.
+ranks queued before it has ended. The numbers of barriers are double-buffered: a rank that has left a barrier
+may not have read its numbers yet when another rank writes those of the next barrier. A rank must queue its
+reads of the numbers before it queues the next barrier with numbers. The same holds for the board and its
+barriers. Each rank stores the sums of the numbers for itself; its second barrier with numbers after this one
+overwrites them.
 """
 
 from __future__ import annotations

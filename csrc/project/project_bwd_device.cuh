@@ -75,7 +75,7 @@ class SplatGradientReader<RankSplatGradients> {
   // this lane are [lane_begin, lane_end).
   __device__ __forceinline__ void pull(std::int32_t lane_begin, std::int32_t lane_end) {
     const std::int32_t begin = first_of(lane_begin), end = last_of(lane_end);
-    if (lane() < kPieces) reinterpret_cast<float4*>(stage() + nothing())[lane()] = {0.f, 0.f, 0.f, 0.f};
+    if (lane() < kPieces) reinterpret_cast<float4*>(stage() + zero_slot())[lane()] = {0.f, 0.f, 0.f, 0.f};
     bool fits = end - begin <= 32 * n_runs_;
     const int segments = fits ? n_segments(begin, end) : 0, n_ranks = source_.n_ranks;
     int total = 0;
@@ -98,7 +98,7 @@ class SplatGradientReader<RankSplatGradients> {
       if (s < segments) segment_list()[s].to += until - count;
       total += __shfl_sync(kFullWarp, until, 31);
     }
-    fits_ = __all_sync(kFullWarp, fits) && total <= nothing();
+    fits_ = __all_sync(kFullWarp, fits) && total <= zero_slot();
     __syncwarp();
     if (fits_) {
       int m = 0;
@@ -132,21 +132,21 @@ class SplatGradientReader<RankSplatGradients> {
         const Segment* segments =
             segment_list() + (r / kPlaceSplats - first / kPlaceSplats) * source_.n_ranks;
         const std::uint32_t bit = 1u << r % kPlaceSplats;
-        int found = nothing();
+        int found = zero_slot();
         for (int m = 0; m < source_.n_ranks; ++m) {
           const Segment segment = segments[m];
           if ((segment.bits & bit) == 0) continue;
           const int at = segment.to + count_bits(segment.bits & (bit - 1));
-          if (found == nothing()) {
+          if (found == zero_slot()) {
             found = at;
           } else {
             stage()[found].add(stage()[at]);
           }
         }
         index()[r - first] = static_cast<std::uint8_t>(found);
-        mean2d = kept_of(stage()[found]);
+        mean2d = mean2d_of(stage()[found]);
       } else if (source_.means2d) {
-        mean2d = kept_of(source_.sum(r));
+        mean2d = mean2d_of(source_.sum(r));
       }
       if (source_.means2d) reinterpret_cast<float2*>(source_.means2d)[r] = mean2d;
     }
@@ -173,7 +173,7 @@ class SplatGradientReader<RankSplatGradients> {
     }
   };
 
-  __device__ __forceinline__ float2 kept_of(const SplatGradient& v) const {
+  __device__ __forceinline__ float2 mean2d_of(const SplatGradient& v) const {
     // Returns values: with a pointer to one of the two members, the compiler would keep `v` on the stack.
     return source_.absolute ? float2{v.mean2d_abs[0], v.mean2d_abs[1]} : float2{v.mean2d[0], v.mean2d[1]};
   }
@@ -192,14 +192,14 @@ class SplatGradientReader<RankSplatGradients> {
     return __reduce_max_sync(kFullWarp, end);
   }
 
-  // The last slot of the stage holds zeros, the gradient of every splat that no rank composited.
-  __device__ __forceinline__ int nothing() const { return 32 * n_runs_ + kSpare; }
+  // The last slot of the stage holds zeros: the gradient of a splat that no rank composited.
+  __device__ __forceinline__ int zero_slot() const { return 32 * n_runs_ + kSpare; }
   __device__ __forceinline__ Gradient* stage() const {
     return reinterpret_cast<Gradient*>(memory_ + threadIdx.x / 32 * warp_bytes(n_runs_, source_.n_ranks));
   }
   // For each splat of the warp, its slot in the stage.
   __device__ __forceinline__ std::uint8_t* index() const {
-    return reinterpret_cast<std::uint8_t*>(stage() + nothing() + 1);
+    return reinterpret_cast<std::uint8_t*>(stage() + zero_slot() + 1);
   }
   __device__ __forceinline__ Segment* segment_list() const {
     return reinterpret_cast<Segment*>(index() + 32 * n_runs_);

@@ -12,8 +12,8 @@ namespace {
 // searched tile by tile.
 constexpr std::int64_t kStretch = 128;
 
-// Conversions of values >= 0, by bits: the compiler makes vector instructions of them, and none of the
-// instructions that only some processors have.
+// Conversions between float and float16 of values >= 0. They use integer operations, which the compiler
+// vectorises for every processor; not all have instructions for float16.
 
 std::uint16_t to_half(float value) {
   value = value < 65504.0f ? value : 65504.0f;
@@ -70,7 +70,7 @@ void write_costs(const BatchCosts& costs, Workspace& workspace, float* out) {
   }
 }
 
-// Several running sums, because an addition takes as long as several that do not wait for each other.
+// Several partial sums, so that additions need not wait for each other.
 double sum_of(const float* values, std::int64_t count) {
   constexpr int kLanes = 8;
   double lanes[kLanes] = {};
