@@ -101,7 +101,9 @@ class Agreement:
         self._ranks, self._stop, self._clock = ranks, stop, clock
         self._next = 0
         self._last: tuple[int, float] | None = None
-        self._asked: HostCopy | None = None  # the requests of all ranks, until they are read
+        # The requests of all ranks and the step after which they were collected, until they are read.
+        self._asked: tuple[int, HostCopy] | None = None
+        self._reads_late = ranks.device.type == "cuda"
         self._agreed_to_stop = False
 
     def after(self, step: int, lost: bool = False) -> Decision:
@@ -115,18 +117,18 @@ class Agreement:
             if step < self._next:
                 return Decision(None, False)
             self._asked = self._ask(step, lost)
-            if self._ranks.device.type == "cuda":
+            if self._reads_late:
                 return Decision(None, False)
-        return self._answer(step, self._asked)
+        return self._answer(step, *self._asked)
 
     def now(self, step: int, lost: bool = False) -> Decision:
         """Return a decision at once, whatever the step; every rank calls this."""
         if self._ranks.world_size == 1:
             return self._decision(self._stop.number, self._clock.is_due, lost)
-        return self._answer(step, self._ask(step, lost))
+        return self._answer(step, *self._ask(step, lost))
 
-    def _ask(self, step: int, lost: bool) -> HostCopy:
-        """Collect the requests of all ranks."""
+    def _ask(self, step: int, lost: bool) -> tuple[int, HostCopy]:
+        """Collect the requests of all ranks after `step`."""
         now = time.monotonic()
         # The duration of a step is not known at first, so the ranks agree again after the next one.
         seconds = MOST_SECONDS
@@ -134,15 +136,15 @@ class Agreement:
             seconds = (now - self._last[1]) / (step - self._last[0])
         requests = [self._stop.number, self._clock.is_due, seconds, lost]
         values = to_device(torch.tensor(requests, dtype=torch.float64), self._ranks.device)
-        return HostCopy(self._ranks.all_reduce(values, "max").view(torch.int64))
+        return step, HostCopy(self._ranks.all_reduce(values, "max").view(torch.int64))
 
-    def _answer(self, step: int, asked: HostCopy) -> Decision:
-        """Decide by the requests of all ranks; wait for them."""
+    def _answer(self, step: int, asked: int, requests: HostCopy) -> Decision:
+        """Decide after `step` by the requests of all ranks after step `asked`; wait for them."""
         with self._ranks.watchdog.waiting("agree"):
-            number, due, slowest, any_lost = asked.read().view(torch.float64).tolist()
+            number, due, slowest, any_lost = requests.read().view(torch.float64).tolist()
         self._asked = None
         interval = max(1, min(MOST_STEPS, int(MOST_SECONDS / max(slowest, 1e-9))))
-        self._next, self._last = (step // interval + 1) * interval, (step, time.monotonic())
+        self._next, self._last = (asked // interval + 1) * interval, (step, time.monotonic())
         self._agreed_to_stop = number > 0
         return self._decision(int(number), due > 0, any_lost > 0)
 

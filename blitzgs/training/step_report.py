@@ -62,7 +62,8 @@ def log_step(state: TrainingState, record: StepRecord) -> None:
     Raises:
         NonFiniteError: a parameter is not finite.
     """
-    figures = record.figures.read().view(torch.float64)
+    with state.ranks.watchdog.waiting("read_figures"):
+        figures = record.figures.read().view(torch.float64)
     bad, active, visible, population, scale, opacity, size, psnr = figures[:8].tolist()
     if bad:
         check_table(state.stepper.table, state.progress.step)

@@ -68,6 +68,8 @@ class Trainer:
         )
         self._guard = LossGuard()
         self._unwritten: StepRecord | None = None  # the record of the last step
+        # On CUDA a record is written one step later, so that the host does not wait for its figures.
+        self._writes_late = ranks.device.type == "cuda"
         self.memory = MemoryMeter()
 
     @torch.no_grad()
@@ -104,7 +106,7 @@ class Trainer:
                 while (step := state.progress.step + 1) <= state.schedule.steps:
                     self._step_or_save(step, is_first=step == done + 1)
                     events = state.schedule.events((step - 1) * size, step * size)
-                    if events or step == state.schedule.steps:
+                    if events:
                         self._write_record()
                     if not handle_all(state, events):
                         self._stop_for(agreement.now(step).signal)
@@ -120,9 +122,11 @@ class Trainer:
                         break
                     if decision.save:
                         save.run(state)
+                self._write_record()
                 self._check_photographs()
                 return self.finish(agreement)
         except PhotographError as error:  # on every rank
+            self._write_record()
             self._stop(f"saved after {state.images_seen:,} images, before a photograph that cannot be read")
             raise PhotographError(
                 f"{error}. The model so far is saved: put the photograph back and continue with --resume"
@@ -139,6 +143,7 @@ class Trainer:
         except ResidenceError as error:
             if is_first or state.ranks.world_size > 1:
                 raise  # all is saved, or the other ranks are in the middle of the step
+            self._write_record()
             self._stop(f"saved after {state.images_seen:,} images, before a step that lacks room")
             raise ResidenceError(
                 f"{error}. The model so far is saved: continue with --resume and a larger memory.resident_gb"
@@ -207,11 +212,11 @@ class Trainer:
         state.stepped(step, degree)
         if is_logged:
             self.memory.sample(state.ranks.device)
-            if state.ranks.device.type != "cuda":
+            if not self._writes_late:
                 self._write_record()
 
     def _write_record(self) -> None:
-        """Write the log record of the last step, if any; on CUDA the host may wait for its figures."""
+        """Write the log record of the last step, if it is not written yet; wait for its figures."""
         if self._unwritten is not None:
             log_step(self.state, self._unwritten)
             self._unwritten = None

@@ -2,6 +2,7 @@
 """Runs keep their model when they are interrupted or disturbed, and resume from a valid checkpoint."""
 
 import errno
+import itertools
 import json
 import os
 import signal
@@ -16,7 +17,7 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.lineage_parts import read_lineage
 from blitzgs.training import checkpoint, run
-from blitzgs.training.agreement import Agreement, SaveClock, StopRequest
+from blitzgs.training.agreement import MOST_STEPS, Agreement, SaveClock, StopRequest
 from blitzgs.training.batches import PhotographError
 from blitzgs.training.events import save
 from blitzgs.training.guard import NonFiniteError
@@ -121,9 +122,10 @@ def test_nohup_is_respected_and_a_second_signal_does_not_interrupt_the_save():
         signal.signal(signal.SIGHUP, before)
 
 
-def _agreements(ranks, seconds):
+def _agreements(ranks, seconds, late):
     stop, clock = StopRequest(), SaveClock(0)
     agreement = Agreement(ranks, stop, clock)
+    agreement._reads_late = late
     decisions = []
     for step in range(1, 60):
         time.sleep(seconds)
@@ -141,20 +143,82 @@ def _agreements(ranks, seconds):
 
 
 @pytest.mark.parametrize(
-    ("seconds", "most", "stop_at", "save_at"), [(0.001, 4.0, 32, 16), (0.1, 0.25, 20, 4)]
+    ("seconds", "most", "late", "stop_at", "save_at"),
+    [
+        (0.001, 4.0, False, 32, 16),
+        (0.1, 0.25, False, 20, 4),
+        (0.001, 4.0, True, 33, 4),
+        (0.1, 0.25, True, 22, 4),
+    ],
 )
-def test_ranks_agree_after_the_same_step_and_slow_steps_do_not_wait(seconds, most, stop_at, save_at):
-    first, second = run_ranks(_agreements_within, 2, seconds, most)
+def test_ranks_agree_after_the_same_step_and_slow_steps_do_not_wait(seconds, most, late, stop_at, save_at):
+    first, second = run_ranks(_agreements_within, 2, seconds, most, late)
     assert first == second
     assert [step for step, (_, saves) in enumerate(first, 1) if saves] == [save_at]
     assert len(first) == stop_at and first[-1][0] == "SIGTERM"
 
 
-def _agreements_within(ranks, seconds, most):
+def _agreements_within(ranks, seconds, most, late):
     from blitzgs.training import agreement
 
     agreement.MOST_SECONDS = most
-    return _agreements(ranks, seconds)
+    return _agreements(ranks, seconds, late)
+
+
+class TwoRanks(Ranks):
+    """Ranks of which the other one requests nothing."""
+
+    def all_reduce(self, tensor, op="sum"):
+        return tensor
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_lost_photograph_ends_the_run_in_time(monkeypatch, late):
+    """The first steps are slow, so that the ranks agree after steps of any remainder."""
+    for slow, at in itertools.product(range(2, 20), range(20, 60)):
+        now = [0.0]
+        monkeypatch.setattr(time, "monotonic", lambda now=now: now[0])
+        agreement = Agreement(TwoRanks(world_size=2), StopRequest(), SaveClock(0))
+        agreement._reads_late = late
+        for step in range(1, 100):
+            now[0] += 1.0 if step < slow else 0.001
+            if agreement.after(step, lost=step >= at).lost:
+                break
+        assert at <= step < at + MOST_STEPS + late
+
+
+# What is written a step later on CUDA.
+
+
+@pytest.mark.parametrize("end", ["schedule", "signal", "photograph"])
+def test_records_that_are_written_a_step_later_are_the_same(tmp_path, monkeypatch, end):
+    found = []
+    for late in (False, True):
+        capture, images = tiny_scene()
+        running = trainer(tmp_path / str(late), "schedule.iterations=50", "log.every=1", images=images)
+        running._writes_late = late
+        with monkeypatch.context() as patch:
+            if end == "signal":
+                at_step(patch, 33, lambda self: os.kill(os.getpid(), signal.SIGTERM))
+            elif end == "photograph":
+                get = running.loader.get
+
+                def lost(place, steps, get=get):
+                    if place == 33:
+                        raise FileNotFoundError(errno.ENOENT, "No such file or directory", "/photos/00.png")
+                    return get(place, steps)
+
+                patch.setattr(running.loader, "get", lost)
+            if end == "photograph":
+                with pytest.raises(PhotographError):
+                    running.train()
+            else:
+                running.train()
+        found.append(steps_of(tmp_path / str(late)))
+        assert [record["t"] for record in found[-1]] == list(range(1, 51 if end == "schedule" else 34))
+        for record in found[-1]:
+            del record["run"], record["images_per_second"]
+    assert found[0] == found[1]
 
 
 # Photographs, disks and terminals that disappear.
