@@ -39,17 +39,25 @@ class PinnedPlace(NamedTuple):
         """Let others use the place: the host has waited for `written` and read the numbers."""
         self.idle.append(self)
 
+    def leave(self) -> None:
+        """Keep the memory until the device has written it, without a wait; nobody reads the numbers."""
+        _left[id(self)] = self
+        for key, place in list(_left.items()):
+            if place.written.query():
+                _left.pop(key, None)
+
 
 # Idle places by number of values, dtype and index of the device.
 _idle: defaultdict[tuple[int, torch.dtype, int], list[PinnedPlace]] = defaultdict(list)
+# Places that nobody reads, by their `id`, until the device has written them.
+_left: dict[int, PinnedPlace] = {}
 
 
 class HostCopy:
     """Copies a few numbers to the host while the device runs the work that is queued before `read`.
 
     On CUDA a kernel writes the numbers into pinned host memory, because an ordinary copy delays the stream by
-    15 us (it waits for the copy engine). The memory must exist until the kernel has written it, so deleting a
-    copy that was not read waits for the kernel too.
+    15 us (it waits for the copy engine).
     """
 
     def __init__(self, values: Tensor) -> None:
@@ -72,7 +80,10 @@ class HostCopy:
         return self._host
 
     def __del__(self) -> None:
-        self.read()
+        # The memory must exist until the kernel has written it. The host does not wait for that, because the
+        # numbers may depend on a rank that has failed, and then never come.
+        if self._place is not None:
+            self._place.leave()
 
 
 @torch.library.register_fake("blitzgs::copy_to_host_")

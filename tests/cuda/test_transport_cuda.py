@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Splats are written to other ranks' memory and gradients are read there; ranks take turns on one GPU."""
 
+import weakref
+
 import pytest
 import torch
 from cuda_scenes import Scene, ops
@@ -159,9 +161,6 @@ def test_copies_to_the_host_need_pinned_memory():
         assert torch.equal(copy.read(), values.cpu())
     with pytest.raises(RuntimeError, match="must be pinned memory"):
         ops.copy_to_host_(torch.zeros(300, dtype=torch.int64), values)
-    torch.cuda._sleep(20_000_000)
-    HostCopy(values)
-    assert torch.cuda.current_stream().query()  # nothing writes to the memory any more
 
 
 def test_pinned_memory_is_used_again_after_it_was_read():
@@ -172,3 +171,16 @@ def test_pinned_memory_is_used_again_after_it_was_read():
     for other in ((78, torch.float32), (77, torch.int64)):
         assert PinnedPlace.take(*other, device).memory is not first.memory
     assert PinnedPlace.take(77, torch.float32, device).memory is first.memory
+
+
+def test_a_copy_that_nobody_reads_does_not_wait():
+    values = torch.arange(300, device="cuda")
+    HostCopy(values).read()
+    torch.cuda._sleep(1_000_000_000)
+    copy = HostCopy(values)
+    memory = weakref.ref(copy._place.memory)
+    del copy
+    assert memory() is not None and not torch.cuda.current_stream().query()
+    torch.cuda.synchronize()
+    HostCopy(values)  # when it is deleted, it looks for memory that has been written
+    assert memory() is None
