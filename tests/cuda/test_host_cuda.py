@@ -20,7 +20,7 @@ def test_an_event_on_the_current_stream_waits_for_its_work():
     values = torch.zeros(1 << 20, device="cuda")
     torch.cuda.synchronize()
     with torch.cuda.stream(side):
-        torch.cuda._sleep(20_000_000)
+        torch.cuda._sleep(1_000_000_000)  # longer than a busy host needs for the next lines
         values += 1
         event.record(current_stream(values.device))
     assert not event.query()
