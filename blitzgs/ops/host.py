@@ -40,7 +40,7 @@ class PinnedPlace(NamedTuple):
         self.idle.append(self)
 
     def leave(self) -> None:
-        """Keep the memory until the device has written it, without a wait; nobody reads the numbers."""
+        """Keep the memory until the device has written numbers that are not read; does not wait."""
         _left[id(self)] = self
         for key, place in list(_left.items()):
             if place.written.query():
@@ -49,7 +49,7 @@ class PinnedPlace(NamedTuple):
 
 # Idle places by number of values, dtype and index of the device.
 _idle: defaultdict[tuple[int, torch.dtype, int], list[PinnedPlace]] = defaultdict(list)
-# Places that nobody reads, by their `id`, until the device has written them.
+# Places whose numbers are not read, by their `id`, until the device has written them.
 _left: dict[int, PinnedPlace] = {}
 
 

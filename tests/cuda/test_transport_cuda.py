@@ -173,7 +173,7 @@ def test_pinned_memory_is_used_again_after_it_was_read():
     assert PinnedPlace.take(77, torch.float32, device).memory is first.memory
 
 
-def test_a_copy_that_nobody_reads_does_not_wait():
+def test_deleting_a_copy_that_was_not_read_does_not_wait():
     values = torch.arange(300, device="cuda")
     HostCopy(values).read()
     torch.cuda._sleep(1_000_000_000)

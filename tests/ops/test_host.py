@@ -14,7 +14,7 @@ class Event:
         return self.is_recorded
 
 
-def test_memory_that_nobody_reads_is_kept_until_it_is_written(monkeypatch):
+def test_memory_of_a_copy_that_is_not_read_is_kept_until_it_is_written(monkeypatch):
     monkeypatch.setattr(host, "_left", {})
     events = [Event() for _ in range(3)]
     places = [PinnedPlace(torch.zeros(1), event, []) for event in events]
