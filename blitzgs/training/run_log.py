@@ -21,11 +21,16 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from blitzgs.output import write_file
+from blitzgs.progress import Report
 
 LOG = "log.jsonl"
 BOARD = "tensorboard"
 # Largest number of records that are kept while the disk is full; then the oldest are dropped.
 _MOST_WAITING = 10_000
+
+# Least seconds between two moves of a terminal's bar and, without one, between two lines about long work.
+_BAR_SECONDS = 0.5
+_LINE_SECONDS = 30.0
 
 # Events after the last image, which a run that is resumed there logs again.
 _AT_THE_END = ("population", "image_memory", "evaluation")
@@ -66,6 +71,7 @@ class RunLog:
         self._board: _Board | None = None
         self._progress: Progress | None = None
         self._task = TaskID(0)
+        self._moved = 0.0
         self._run_id = run_id
         self._first, self._started = done, time.monotonic()
         self.total = total
@@ -88,6 +94,43 @@ class RunLog:
             )
             self._task = self._progress.add_task("", total=total, completed=done)
             self._progress.start()
+
+    def advance(self, t: int) -> None:
+        """Move the terminal's bar to time `t` (images): every half second at most, and at the end."""
+        if self._progress is None:
+            return
+        now = time.monotonic()
+        if now >= self._moved + _BAR_SECONDS or t >= self.total:
+            self._moved = now
+            self._progress.update(self._task, completed=t, total=self.total)
+
+    @contextlib.contextmanager
+    def work(self, what: str) -> Iterator[Report]:
+        """Show how far other work is while the context lasts: a bar on a terminal, else a line now and then.
+
+        Args:
+            what: what is counted, for example "views measured".
+
+        Yields:
+            A function to call with (number done, number of all).
+        """
+        if self._progress is not None:
+            bar = self._progress
+            task = bar.add_task(what, total=0)
+            try:
+                yield lambda done, total: bar.update(task, completed=done, total=total)
+            finally:
+                bar.remove_task(task)
+            return
+        printed = time.monotonic()
+
+        def report(done: int, total: int) -> None:
+            nonlocal printed
+            if self._file is not None and time.monotonic() >= printed + _LINE_SECONDS:
+                printed = time.monotonic()
+                self._print(f"        {done:,} of {total:,} {what}")
+
+        yield report
 
     def scalars(self, t: int, values: Mapping[str, float]) -> None:
         """Record numbers at time `t` (images)."""

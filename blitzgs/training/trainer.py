@@ -210,6 +210,7 @@ class Trainer:
         if v_means2d is not None:
             self._gather(frame, v_means2d)
         state.stepped(step, degree)
+        state.log.advance(end)
         if is_logged:
             self.memory.sample(state.ranks.device)
             if not self._writes_late:

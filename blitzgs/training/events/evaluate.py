@@ -49,18 +49,20 @@ def measure(state: TrainingState, indices: Sequence[int], folder: Path | None) -
         folder: folder for the metrics and the pictures; None: nothing is written.
     """
     state.catch_up()
-    return evaluate(
-        state.stepper.scene,
-        state.views,
-        state.capture.cameras,
-        state.images,
-        indices,
-        state.render_options,
-        folder,
-        TileOwners(state.ranks),
-        pictures=state.config.log.pictures,
-        lpips=state.lpips,
-        optional_files=True,
-        lod=scene_gate(state.config, state.progress, state.table, state.ranks),
-        stops=state.stops,
-    )
+    with state.log.work("views measured") as report:
+        return evaluate(
+            state.stepper.scene,
+            state.views,
+            state.capture.cameras,
+            state.images,
+            indices,
+            state.render_options,
+            folder,
+            TileOwners(state.ranks),
+            pictures=state.config.log.pictures,
+            lpips=state.lpips,
+            report=report,
+            optional_files=True,
+            lod=scene_gate(state.config, state.progress, state.table, state.ranks),
+            stops=state.stops,
+        )
