@@ -7,6 +7,7 @@ import argparse
 import dataclasses
 import json
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import cast
@@ -78,12 +79,13 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train; returns the exit status."""
+    if args.out is None and not args.show_config:
+        needed = "--out" if args.data or args.config else "--data, --out"
+        args.parser.error(f"the following arguments are required: {needed}")
     config = _config(args)
     if args.show_config:
         print(json.dumps(to_dict(config), indent=1))
         return 0
-    if args.out is None:
-        args.parser.error("the following arguments are required: --out")
     job = config.ranks
     with Ranks.from_environment(
         args.device,
@@ -139,3 +141,10 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
         if isinstance(value, (int, float)):
             table.add_row(name, f"{value:,.4f}" if isinstance(value, float) else f"{value:,}")
     console.print(table)
+    # Quoted, so that the commands can be copied.
+    name = shlex.quote(str(folder))
+    for text in (
+        f"pictures: {folder / run_folder.EVALUATION}",
+        f"for viewers: blitzgs export {name} --ply FILE.ply",
+    ):
+        console.print(text, markup=False, highlight=False, soft_wrap=True)

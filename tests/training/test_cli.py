@@ -105,6 +105,7 @@ def test_torchrun_entry(trained, tmp_path):
             "unrecognized arguments: --log.every 5 (",
         ),
         (["train", "--data", "d"], 2, "required: --out"),
+        (["train"], 2, "required: --data, --out"),
         (["train", "--config", "missing.yaml", "--out", "x"], 1, "missing.yaml: no such file or recipe"),
         (["train", "--config", "missing.yaml", "--out", "x"], 1, "recipes are aerial, aerial_cpu, city"),
         (["eval", "/nowhere"], 1, "/nowhere is not a run"),
