@@ -72,9 +72,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_format(path: Path) -> None:
-    """Check that no file of another format is replaced.
+    """Check that no file of another format is replaced, and that the name promises no other format.
 
     Raises:
+        ValueError: the name does not end in .ply.
         FileExistsError: the file is not empty and no PLY.
         OSError: it is no regular file.
     """
@@ -84,6 +85,10 @@ def _check_format(path: Path) -> None:
             start = file.read(3)
         if start not in (b"", b"ply"):
             raise FileExistsError(f"{path} exists and is not a PLY file: choose another --ply")
+    if path.suffix.lower() != ".ply":
+        raise ValueError(
+            f"{path}: the file will be a PLY, whatever its name: choose a --ply that ends in .ply"
+        )
 
 
 def _explain(exported: Exported, antialiased: bool, args: argparse.Namespace) -> None:

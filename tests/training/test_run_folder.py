@@ -327,6 +327,13 @@ def test_export_replaces_no_file_of_another_format(trained, tmp_path, capsys):
     assert path.read_text() == "precious"
 
 
+def test_export_refuses_a_name_that_promises_another_format(trained, tmp_path, capsys):
+    path = tmp_path / "model.spz"
+    assert main(["export", str(trained[1]), "--ply", str(path)]) == 1
+    assert "model.spz: the file will be a PLY" in capsys.readouterr().err
+    assert not path.exists()
+
+
 # Paths may have any characters.
 
 
