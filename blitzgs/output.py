@@ -42,7 +42,11 @@ def new_file(path: Path, sync: bool = True) -> Iterator[Path]:
     """
     check_replaceable(path)
     partial = path.with_name(f".{secrets.token_hex(6)}.partial")
-    os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+    try:
+        os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+    except OSError as error:
+        error.filename = str(path)  # the name that the caller knows
+        raise
     try:
         yield partial
         if sync:

@@ -122,3 +122,10 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
     assert (tmp_path / "file").read_text() == "old" and len(list(tmp_path.iterdir())) == 1
     write_file(tmp_path / "file", "new")
     assert (tmp_path / "file").read_text() == "new" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_an_error_names_the_file_that_was_asked_for(tmp_path):
+    path = tmp_path / "missing" / "figures.json"
+    with pytest.raises(FileNotFoundError) as caught:
+        write_file(path, "{}")
+    assert caught.value.filename == str(path)

@@ -145,7 +145,7 @@ def load_capture(
     _check_masks(cameras, mask_folder)
     points = _finite_points(points)
     if len(points.positions) == 0:
-        points = _random_points(cameras, offset)
+        points = _random_points(root, cameras, offset)
     points.positions = points.positions - offset
     _warn_of_blind_views(cameras, points.positions)
     return Capture(
@@ -344,9 +344,15 @@ def _finite_points(points: SourcePoints) -> SourcePoints:
     )
 
 
-def _random_points(cameras: Sequence[Camera], offset: Float64, count: int = 100_000) -> SourcePoints:
+def _random_points(
+    root: Path, cameras: Sequence[Camera], offset: Float64, count: int = 100_000
+) -> SourcePoints:
     """Return uniform points of random colours in the region that the cameras look at."""
-    warnings.warn(f"the capture has no points; {count} random ones take their place", stacklevel=3)
+    warnings.warn(
+        f"{root}: the capture has no points; {count:,} random ones take their place. Points of the "
+        "reconstruction give a better start",
+        stacklevel=3,
+    )
     poses = np.stack([camera.world_to_camera for camera in cameras])
     centres, axes = camera_centres(poses), poses[:, 2, :3]
     # The point nearest to all optical axes by least squares; the tiny term keeps parallel axes solvable.
@@ -358,7 +364,7 @@ def _random_points(cameras: Sequence[Camera], offset: Float64, count: int = 100_
     half = 0.35 * float(np.linalg.norm(centres - target, axis=1).mean())
     if half <= _LEAST_SPREAD * (1 + float(np.abs(offset).max())):
         raise ValueError(
-            "the capture has no points and all its cameras are in one place, so the position of the scene is "
+            f"{root}: the capture has no points and all its cameras are in one place, so the position of the scene is "
             "unknown: add points to the capture"
         )
     random = np.random.default_rng(0)

@@ -294,7 +294,7 @@ def test_a_model_without_points_starts_from_random_ones_where_the_cameras_look(t
     folder = tmp_path / "sparse" / "0"
     model = colmap.read_model(folder)
     colmap.write_model(folder, colmap.ColmapModel(model.cameras, model.images))
-    with pytest.warns(UserWarning, match="no points; 100000 random ones take their place"):
+    with pytest.warns(UserWarning, match="no points; 100,000 random ones take their place"):
         capture = load_capture(tmp_path)
     points = capture.points + capture.offset  # the cameras look at the origin from a distance of 4
     assert np.abs(points.mean(axis=0)).max() < 0.05 and 1.2 < np.abs(points).max() < 1.6
