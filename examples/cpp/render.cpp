@@ -85,6 +85,11 @@ int main(int argc, char** argv) {
   const Tensor& image = images[0];
   std::ofstream file(argv[1], std::ios::binary);
   file.write(static_cast<const char*>(image.const_data_ptr()), image.numel() * sizeof(float));
+  file.close();
+  if (!file) {
+    std::fprintf(stderr, "%s cannot be written\n", argv[1]);
+    return 1;
+  }
   std::printf("%lld of 3 Gaussians visible\n", static_cast<long long>(visible_ids.size(0)));
-  return file ? 0 : 1;
+  return 0;
 }

@@ -26,6 +26,10 @@ def test_the_ops_are_called_from_cpp(tmp_path):
     subprocess.run(["cmake", "--build", str(build)], check=True)
     done = subprocess.run([str(build / "render"), str(image)], check=True, capture_output=True, text=True)
     assert done.stdout == "3 of 3 Gaussians visible\n"
+    failed = subprocess.run(
+        [str(build / "render"), str(tmp_path / "no" / "image")], capture_output=True, text=True
+    )
+    assert failed.returncode == 1 and "image cannot be written" in failed.stderr and not failed.stdout
     found = torch.from_numpy(np.fromfile(image, dtype=np.float32)).view(1, 96, 128, 3)
     expected, _, _ = blitzgs.rasterization(
         torch.tensor([[-0.5, 0, 3], [0.4, 0.1, 4], [0, -0.3, 5]]),
