@@ -364,8 +364,8 @@ def _random_points(
     half = 0.35 * float(np.linalg.norm(centres - target, axis=1).mean())
     if half <= _LEAST_SPREAD * (1 + float(np.abs(offset).max())):
         raise ValueError(
-            f"{root}: the capture has no points and all its cameras are in one place, so the position of the scene is "
-            "unknown: add points to the capture"
+            f"{root}: the capture has no points and all its cameras are in one place, so the position of the "
+            "scene is unknown: add points to the capture"
         )
     random = np.random.default_rng(0)
     positions = target + offset + random.uniform(-half, half, (count, 3))

@@ -151,11 +151,22 @@ def _build(kind: type, values: Any, where: str) -> Any:
     for name, value in values.items():
         path = f"{where}.{name}" if where else str(name)
         if name not in hints:
-            close = difflib.get_close_matches(str(name), hints, n=1)
-            hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(hints)}"
-            raise ConfigError(f"{path}: unknown field; {hint}")
+            raise ConfigError(f"{path}: unknown field; {_hint(str(name), list(hints))}")
         arguments[name] = _convert(hints[name], value, path)
     return kind(**arguments)
+
+
+def _hint(name: str, known: list[str]) -> str:
+    """Return what may have been meant by an unknown name: a similar one, else a field of another section."""
+    if close := difflib.get_close_matches(name, known, n=1):
+        return f"did you mean '{close[0]}'?"
+    sections = typing.get_type_hints(Config)
+    fields = [
+        f"{section}.{name}"
+        for section, kind in sections.items()
+        if dataclasses.is_dataclass(kind) and name in typing.get_type_hints(kind)
+    ]
+    return f"did you mean '{fields[0]}'?" if fields else f"known: {', '.join(known)}"
 
 
 def _convert(hint: Any, value: Any, path: str) -> Any:

@@ -43,6 +43,12 @@ def test_saved_configuration_reads_back_to_the_same(tmp_path):
     [
         ("--schedule.iteratons=3", "schedule.iteratons: unknown field; did you mean 'iterations'"),
         ("--shedule.iterations=3", "shedule: unknown field; did you mean 'schedule'"),
+        ("--max_gaussians=3", "max_gaussians: unknown field; did you mean 'population.max_gaussians'"),
+        (
+            "--schedule.max_gaussians=3",
+            "max_gaussians: unknown field; did you mean 'population.max_gaussians'",
+        ),
+        ("--nonsense=3", "nonsense: unknown field; known: data, model"),
         ("--schedule.iterations=many", r"schedule.iterations: must be an integer, got 'many' \(str\)"),
         ("--schedule.iterations=25e-1", "schedule.iterations: must be an integer, got 2.5"),
         ("--schedule.iterations=3.5", "schedule.iterations: must be an integer, got 3.5"),
