@@ -24,6 +24,12 @@ _HELP = {
 }
 
 
+def _sizes() -> str:
+    return "; ".join(
+        f"{name}, {city.views:,} views of {city.width} x {city.height}" for name, city in PRESETS.items()
+    )
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of `blitzgs synth` to a parser."""
     parser.add_argument(
@@ -36,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--preset",
         choices=PRESETS,
         default="demo",
-        help="values of the flags that are not given (default: %(default)s)",
+        help=f"values of the flags that are not given (default: %(default)s): {_sizes()}",
     )
     for field in fields(CityOptions):
         parser.add_argument(
