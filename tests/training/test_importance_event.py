@@ -20,7 +20,7 @@ from blitzgs.population.importance import PHI, is_culled
 from blitzgs.population.lineage import ABOUT, Cause
 from blitzgs.population.lineage_parts import read_lineage
 from blitzgs.population.spawn_gate import GateError, GateInfo, RandomVeto, info_path
-from blitzgs.training import run
+from blitzgs.training import run, run_log
 from blitzgs.training.events import importance
 from blitzgs.training.gate import life_fields, reasons_against
 from blitzgs.training.guard import ModelLostError
@@ -67,6 +67,14 @@ def test_how_many_gaussians_the_importance_passes_keep(whole_run):
         "before_pass_2": second["before"],
         "after_pass_2": second["gaussians"],
     }
+
+
+def test_a_pass_says_how_many_views_are_done(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(run_log, "_LINE_SECONDS", 0.0)
+    train(tmp_path)
+    shown = capsys.readouterr().out
+    views = len(tiny_scene()[0].train)
+    assert shown.count(f"{views} of {views} views surveyed") == 2
 
 
 def test_the_cull_mask_is_kept_where_views_use_it(tmp_path, monkeypatch):

@@ -15,6 +15,7 @@ from blitzgs.population.importance import Importance, ScoreRule, ViewBatch, swee
 from blitzgs.population.lineage import Cause
 from blitzgs.population.pruning import sample_by_score, top_by_score
 from blitzgs.population.redistribution import redistribute
+from blitzgs.progress import Report
 from blitzgs.training import view_level
 from blitzgs.training.guard import ModelLostError, check_table
 from blitzgs.training.lod import scene_gate
@@ -37,17 +38,19 @@ def run(state: TrainingState, event: Event) -> None:
         return
     state.catch_up()
     check_table(state.table, state.progress.step)
-    found = sweep(
-        state.stepper.scene,
-        view_batches(state),
-        len(state.capture.train),
-        state.render_options,
-        state.ranks,
-        state.owners,
-        cast(ScoreRule, state.config.population.score),
-        scene_gate(state.config, state.progress, state.table, state.ranks),
-        state.stops,
-    )
+    views = len(state.capture.train)
+    with state.log.work("views surveyed") as report:
+        found = sweep(
+            state.stepper.scene,
+            _reported(view_batches(state), report, views),
+            views,
+            state.render_options,
+            state.ranks,
+            state.owners,
+            cast(ScoreRule, state.config.population.score),
+            scene_gate(state.config, state.progress, state.table, state.ranks),
+            state.stops,
+        )
     found.store(state.table, state.config.view.cull)
     before = state.population()
     causes = causes_of_death(state, event, found)
@@ -65,7 +68,7 @@ def run(state: TrainingState, event: Event) -> None:
     milestones = progress.milestones | {f"before_{event.kind}": before, f"after_{event.kind}": after}
     state.progress = dataclasses.replace(progress, milestones=milestones)
     view_level.choose_views(state)
-    counts = {"before": before, "gaussians": after, "views": len(state.capture.train)}
+    counts = {"before": before, "gaussians": after, "views": views}
     state.log.event(event.time, event.kind, counts)
 
 
@@ -94,6 +97,15 @@ def view_batches(state: TrainingState) -> Iterator[ViewBatch]:
             some = columns[begin : begin + length]
             indices = [state.capture.train[column] for column in some]
             yield ViewBatch(some, state.views.pick(indices), indices)
+
+
+def _reported(batches: Iterator[ViewBatch], report: Report, total: int) -> Iterator[ViewBatch]:
+    """Yield the batches; report the views of each when the next one is asked for."""
+    done = 0
+    for batch in batches:
+        yield batch
+        done += len(batch.columns)
+        report(done, total)
 
 
 def causes_of_death(state: TrainingState, event: Event, found: Importance) -> Tensor:
