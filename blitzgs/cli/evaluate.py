@@ -54,7 +54,12 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         metavar="N",
         help="number of pictures that show a render, its photograph and its error (default: %(default)s)",
     )
-    parser.add_argument("--lpips", metavar="FILE", help="also measure LPIPS, with this TorchScript module")
+    parser.add_argument(
+        "--lpips",
+        metavar="FILE",
+        help="also measure LPIPS, with this TorchScript module: (render, photograph) to distance, "
+        "images [1, 3, H, W] in [-1, 1]",
+    )
     parser.add_argument(
         "--allow-missing", action="store_true", help="leave out views whose photograph is missing"
     )
