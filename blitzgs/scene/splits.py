@@ -81,7 +81,10 @@ def split_views(
             candidates = [root / spec, Path(spec)]
             found = next((path for path in candidates if path.is_file()), None)
             if found is None:
-                raise ValueError(f"split '{spec}': neither a number, 'auto', 'val' nor a file in {root}")
+                raise ValueError(
+                    f"split '{spec}': must be a whole number n (every n-th view is held out; 0: none), "
+                    f"'auto', 'val' or a file in {root}"
+                )
             test = from_list(names, found)
     held_out = set(test)
     train = [i for i in range(len(names)) if i not in held_out]

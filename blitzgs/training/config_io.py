@@ -194,7 +194,7 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
             return float(value)
         except OverflowError:
             raise ConfigError(f"{path}: {value} is too large") from None
-    if hint is str and isinstance(value, int) and not isinstance(value, bool):
+    if hint is str and isinstance(value, (int, float)) and not isinstance(value, bool):
         return str(value)
     if hint is int and isinstance(value, float) and value.is_integer():
         return int(value)

@@ -54,7 +54,7 @@ def test_invalid_splits_are_refused(tmp_path):
         message = f"data.split: must be 0 .no view is held out. or at least 2, got {number}"
         with pytest.raises(ValueError, match=message):
             split_views(NAMES, PATHS, ROOT, number)
-    with pytest.raises(ValueError, match="neither a number, 'auto', 'val' nor a file"):
+    with pytest.raises(ValueError, match=r"must be a whole number n .*, 'auto', 'val' or a file"):
         split_views(NAMES, PATHS, ROOT, "missing.txt")
     (tmp_path / "all.txt").write_text("\n".join(NAMES))
     with pytest.raises(ValueError, match="leaves no training view of 4"):
