@@ -10,7 +10,7 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu' 'examples/*.cpp')
 DEMO ?= runs/demo
 
-.PHONY: venv venv-test build io demo test test-python test-cxx test-slow sanitize fuzz lint format clean
+.PHONY: venv venv-test build io demo test test-python test-cxx test-cuda test-slow sanitize fuzz lint format clean
 
 venv: $(VENV)/.installed
 venv-test: $(VENV)/.installed-test
@@ -72,6 +72,10 @@ test-cxx:
 	  -DBLITZGS_IO=OFF -DCMAKE_BUILD_TYPE=None -DCMAKE_CXX_FLAGS=-O1 -DPython3_EXECUTABLE="$(abspath $(PYTHON))" >/dev/null
 	$(RUN) cmake --build build-tests --target blitzgs_tests
 	./build-tests/blitzgs_tests
+
+# The tests that need a GPU. Each name is printed as its test ends, so that a run that is cut off tells what failed.
+test-cuda: venv-test build
+	$(RUN) $(PYTHON) -m pytest -v -rf --tb short -m cuda tests
 
 test-slow: venv-test build
 	$(RUN) $(PYTHON) -m pytest -q -m slow --timeout 3600 tests
