@@ -261,14 +261,17 @@ def forward_once(
 
 
 def inputs_of(
-    table: GaussianTable, views: Views, options: RenderOptions, active: ActiveRows | None = None
+    table: GaussianTable,
+    views: Views,
+    options: RenderOptions,
+    active: ActiveRows | None = None,
+    colored: bool = True,
 ) -> ProjectionInputs:
-    """Return the inputs of the projection of a table."""
+    """Return the inputs of the projection of a table; `colored`: with SH, from which colours are computed."""
     cameras = (views.viewmats, views.Ks)
+    gaussians = table.parameters if colored else table.parameters[:4]
     level = table["level"] if options.fade else None
-    return ProjectionInputs(
-        table.parameters, cameras, options.projection(views), active or (), table["id"], level
-    )
+    return ProjectionInputs(gaussians, cameras, options.projection(views), active or (), table["id"], level)
 
 
 def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> list[int]:

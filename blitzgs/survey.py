@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -48,7 +47,7 @@ def survey(
     Args:
         table: the Gaussians.
         views: at most 32 views.
-        options: how to render; colours of degree 0 are computed and not used.
+        options: how to render; no colour is computed.
         assignment: the tiles of each rank; every rank of the job calls this with its table. None: this rank
             composites all tiles.
         transport: as for `forward`, but not in half precision, which would change the contributions.
@@ -61,8 +60,8 @@ def survey(
     """
     if transport is None:
         transport = LocalTransport() if assignment is None else open_transport(assignment.ranks)
-    options = replace(options, sh_degree=0)
-    inputs, grid = inputs_of(table, views, options, active), tile_grid(views, options, assignment)
+    inputs = inputs_of(table, views, options, active, colored=False)
+    grid = tile_grid(views, options, assignment)
 
     with below_autograd():
         for attempt in transport.capacity.attempts():

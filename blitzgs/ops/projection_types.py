@@ -227,9 +227,13 @@ class Projected(NamedTuple):
 
     @property
     def composited(self) -> Splats:
-        """Return the columns that compositing reads."""
+        """Return the columns that compositing reads; without SH, the conics stand in for the colours.
+
+        A transport sends every column, so each needs a row for every splat.
+        """
         s = self.splats
-        return Splats(s.means2d, s.conics, s.opacities, s.colors, s.depths, s.camera_ids, self.ids)
+        colors = s.colors if s.colors.shape[0] == s.conics.shape[0] else s.conics
+        return Splats(s.means2d, s.conics, s.opacities, colors, s.depths, s.camera_ids, self.ids)
 
     def first(self, sizes: Sizes) -> Projected:
         """Return only the valid splats, with their `counts`; `sizes` has the numbers in `totals`."""

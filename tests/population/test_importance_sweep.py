@@ -149,6 +149,17 @@ def test_survey_equals_contributions(device):
             assert difference.abs().max() <= 1e-5 * counts[k].max() + 0.02
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_survey_reads_no_colours(device):
+    table = population(Ranks(device=torch.device(device)))
+    views = cameras(3, device)
+    before = survey(table, views, OPTIONS)
+    table["sh"].fill_(float("nan"))
+    after = survey(table, views, OPTIONS)
+    assert before.weights.any() and len(after.splats.colors) == 0
+    assert torch.equal(before.weights, after.weights) and torch.equal(before.pixels, after.pixels)
+
+
 def layouts(world_size):
     return {1: [0], 2: [0, 0, 0, 1], 3: [0, 2, 2], 4: [0, 3, 1, 0, 0, 3]}[world_size]
 
