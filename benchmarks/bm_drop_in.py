@@ -136,7 +136,8 @@ class FourSwaps(OneImport):
 
     def change_population(self, info: Any) -> None:
         """Bring all rows up to date before the strategy reads them, and sort them afterwards."""
-        refines = self.step % self._strategy.refine_every == 0
+        strategy = self._strategy
+        refines = self.step < strategy.refine_stop_iter and self.step % strategy.refine_every == 0
         if refines:  # the strategy then reads and replaces parameters and their state
             for optimiser in self._optimisers.values():
                 optimiser.bring_up_to_date()
