@@ -161,9 +161,9 @@ def measure_pool(
             result["failed"] = str(error)
             at += 2 * steps
             continue
-        before = residence.traffic
+        before = residence.moved
         seconds = over.steps(stepper, order, at + steps, steps)
-        moved = residence.traffic.since(before)
+        moved = residence.moved.since(before)
         at += 2 * steps
         result |= {"step_ms": 1e3 * seconds} | moved.values()
         result |= {

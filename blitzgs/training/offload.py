@@ -93,7 +93,7 @@ class OffloadingStepper(Stepper):
             noise: noise on the means after each step; None: none.
         """
         self._residence, self._upcoming = residence, upcoming
-        self._reported = residence.traffic
+        self._reported = residence.moved
         self._up_to_date_at: int | None = None
         super().__init__(residence.pool, optimiser, owners, loss, extent, half_exchange, noise)
         self.scene = residence
@@ -117,10 +117,10 @@ class OffloadingStepper(Stepper):
     def report(self, whole: bool = False) -> dict[str, float]:
         """See `Stepper.report`: the share of blocks that were on the device, and megabytes moved per step."""
         if whole:
-            return self._residence.traffic.values()
-        traffic = self._residence.traffic.since(self._reported)
-        self._reported = self._residence.traffic
-        return traffic.values()
+            return self._residence.moved.values()
+        moved = self._residence.moved.since(self._reported)
+        self._reported = self._residence.moved
+        return moved.values()
 
     def forward(
         self,

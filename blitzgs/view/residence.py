@@ -43,7 +43,7 @@ class ResidenceError(RuntimeError):
     """The blocks that views see do not fit into the pool; the message names the sizes and a remedy."""
 
 
-class Traffic(NamedTuple):
+class Moved(NamedTuple):
     """Counts of what moved between host and device.
 
     Attributes:
@@ -60,9 +60,9 @@ class Traffic(NamedTuple):
     bytes_in: int = 0
     bytes_out: int = 0
 
-    def since(self, earlier: Traffic) -> Traffic:
+    def since(self, earlier: Moved) -> Moved:
         """Return the difference from an earlier count."""
-        return Traffic(*(now - then for now, then in zip(self, earlier, strict=True)))
+        return Moved(*(now - then for now, then in zip(self, earlier, strict=True)))
 
     def values(self) -> dict[str, float]:
         """Return, for the log, the share of needed blocks that were on the device, and megabytes per step."""
@@ -81,7 +81,7 @@ class Residence:
     Attributes:
         table: the table on the host.
         pool: the table on the device; rows outside the blocks of `load_for_step`'s index are undefined.
-        traffic: counts since the beginning.
+        moved: counts since the beginning.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Residence:
             ResidenceError: the budget is less than two blocks.
         """
         self.table, self._device, self._budget = table, device, budget_bytes
-        self.traffic = Traffic()
+        self.moved = Moved()
         # High priority: its kernels need few multiprocessors, and the next step waits for them.
         self._stream = torch.cuda.Stream(device, priority=-1) if device.type == "cuda" else None
         self._storage: dict[str, Tensor] = {}
@@ -352,8 +352,8 @@ class Residence:
         )
 
     def _count(self, **more: int) -> None:
-        counts = {name: getattr(self.traffic, name) + count for name, count in more.items()}
-        self.traffic = self.traffic._replace(**counts)
+        counts = {name: getattr(self.moved, name) + count for name, count in more.items()}
+        self.moved = self.moved._replace(**counts)
 
     def _mark(self) -> torch.cuda.Event | None:
         """Record an event after all work queued so far; None on the CPU."""

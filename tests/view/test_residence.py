@@ -15,7 +15,7 @@ from blitzgs.view import host_table
 from blitzgs.view.block_visibility import BlockVisibility, Cameras, culled_blocks
 from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.host_table import HostMemoryError, HostTable
-from blitzgs.view.residence import Residence, ResidenceError, Traffic
+from blitzgs.view.residence import Residence, ResidenceError, Moved
 from tests.helpers import DEVICES
 from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
 
@@ -79,10 +79,10 @@ def test_steps_change_the_rows_that_they_would_change_in_the_whole_table(device,
         residence.store_bounds(index)
     residence.write_back()
     assert_same(residence.table, table)
-    traffic = residence.traffic
-    assert traffic.steps == steps and 0 < traffic.loaded <= traffic.needed
+    moved = residence.moved
+    assert moved.steps == steps and 0 < moved.loaded <= moved.needed
     residence.write_back()  # nothing is left to write back
-    assert residence.traffic == traffic
+    assert residence.moved == moved
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -107,9 +107,9 @@ def test_the_blocks_that_are_needed_last_go_first():
     residence.prefetch(1)
     residence.load_for_step(1, first(views, 1), 1)
     residence.prefetch(2)
-    loaded = residence.traffic.loaded
+    loaded = residence.moved.loaded
     residence.load_for_step(2, first(views, 2), 1)
-    assert residence.traffic.loaded == loaded  # all of them were loaded ahead
+    assert residence.moved.loaded == loaded  # all of them were loaded ahead
     slots = torch.arange(0, len(residence.pool), BLOCK_ROWS, dtype=torch.int32)
     here = set((residence.rows_of(slots) // BLOCK_ROWS).tolist()) & set(range(78))  # the full blocks
     assert seen[1] | seen[2] <= here
@@ -157,7 +157,7 @@ def test_large_batches_do_without_a_look_ahead():
         found = index.active(residence.pool, *first(views, 20 * step, 20)[:2], WIDTH, HEIGHT, *LIMITS)
         assert int(found.length) > 0
         residence.prefetch(step + 1)
-    assert residence.traffic.needed > residence.traffic.loaded
+    assert residence.moved.needed > residence.moved.loaded
 
 
 def test_a_budget_below_two_blocks_is_refused():
@@ -171,8 +171,8 @@ def test_a_table_that_fits_is_loaded_once():
     for step in range(12):
         residence.load_for_step(step, first(views, step), 1)
         residence.prefetch(step + 1)
-    assert residence.traffic.loaded <= 5000 // BLOCK_ROWS
-    assert residence.traffic.bytes_out == 0
+    assert residence.moved.loaded <= 5000 // BLOCK_ROWS
+    assert residence.moved.bytes_out == 0
     assert len(residence.pool) == 5000
 
 
@@ -199,7 +199,7 @@ def test_changes_of_the_table_reach_the_pool():
 
 
 def test_traffic_between_two_counts():
-    later, earlier = Traffic(10, 100, 25, 3_000_000, 2_000_000), Traffic(5, 50, 20, 1_000_000, 0)
+    later, earlier = Moved(10, 100, 25, 3_000_000, 2_000_000), Moved(5, 50, 20, 1_000_000, 0)
     assert later.since(earlier).values() == {"resident_hits": 0.9, "moved_mb_per_step": 0.8}
 
 
