@@ -15,7 +15,7 @@ from blitzgs.view import host_table
 from blitzgs.view.block_visibility import BlockVisibility, Cameras, culled_blocks
 from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.host_table import HostMemoryError, HostTable
-from blitzgs.view.residence import Residence, ResidenceError, Moved
+from blitzgs.view.residence import Moved, Residence, ResidenceError
 from tests.helpers import DEVICES
 from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
 
