@@ -8,7 +8,7 @@ The loop, learning rates and density strategy are those of gsplat's `simple_trai
 (`opponents/gsplat_training.py`), with photographs on the device. Arms:
 
 - gsplat: `gsplat.rasterization`, `torch.optim.Adam(fused=True)`, and L1 and SSIM by fused_ssim, or by our
-  kernel where fused_ssim is not installed;
+  kernel where fused_ssim is not installed (the column "loss" says which);
 - import: the same with `blitzgs.rasterization` in place of gsplat's function;
 - four: `blitzgs.raw_rasterization`, `blitzgs.optim.LazyAdam`, `blitzgs.l1_ssim` and Morton order, with
   gradients that go straight to the optimisers (`direct_grad=True`);
@@ -28,6 +28,7 @@ import argparse
 import time
 from contextlib import nullcontext
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,17 +49,20 @@ class OneImport(GsplatTrainer):
 
     Attributes:
         part: `Parts`, where the parts of a step are timed.
+        loss_name: whose kernels compute the loss.
     """
+
+    loss_name = "fused_ssim" if find_spec("fused_ssim") else "blitzgs.l1_ssim"
 
     part: Any = staticmethod(nullcontext)
     rasterization: Any = staticmethod(blitzgs.rasterization)
 
     def loss(self, renders: Tensor, target: Tensor) -> Tensor:
         """Return L1 and SSIM, with the kernels that gsplat's trainer uses where they are installed."""
-        try:
-            from fused_ssim import fused_ssim
-        except ImportError:
+        if self.loss_name != "fused_ssim":
             return blitzgs.l1_ssim(renders, target)
+        from fused_ssim import fused_ssim
+
         target = target / 255.0
         l1 = torch.nn.functional.l1_loss(renders, target)
         similar = fused_ssim(renders.permute(0, 3, 1, 2), target.permute(0, 3, 1, 2), padding="valid")
@@ -105,6 +109,7 @@ class FourSwaps(OneImport):
         direct_grad: of the renderer.
     """
 
+    loss_name = "blitzgs.l1_ssim"
     direct_grad = True
 
     def initialise(self, capture: Any) -> Any:
@@ -253,6 +258,7 @@ def measure(name: str, capture: Any, images: ImageStore, options: argparse.Names
     changes = sum(interval.change for interval in intervals)
     found = {
         "arm": name,
+        "loss": trainer.loss_name,
         "training, s": sum(interval.seconds for interval in intervals) + changes + rest,
         "of it around refinements, s": changes,
         "last steps, ms each": rest / last * 1e3,

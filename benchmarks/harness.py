@@ -33,9 +33,21 @@ def environment(device: torch.device | str = "cpu") -> dict[str, Any]:
     if torch.device(device).type == "cuda":
         info["device"] = torch.cuda.get_device_name(device)
         info["cuda"] = str(torch.version.cuda)
-    with contextlib.suppress(metadata.PackageNotFoundError):
-        info["gsplat"] = metadata.version("gsplat")
+    if (version := gsplat_version()) is not None:
+        info["gsplat"] = version
     return info
+
+
+def gsplat_version() -> str | None:
+    """Return the version of gsplat; None if this process has not imported it."""
+    module = sys.modules.get("gsplat")
+    if module is None:
+        return None
+    with contextlib.suppress(
+        metadata.PackageNotFoundError
+    ):  # sources on PYTHONPATH are in no list of packages
+        return metadata.version("gsplat")
+    return str(getattr(module, "__version__", "of unknown version"))
 
 
 def commit() -> str:
