@@ -48,7 +48,8 @@ COMMANDS = {
     "lineage": "python benchmarks/bm_lineage.py",
     "quality": (
         "python benchmarks/bm_quality.py --out runs/quality --capture NAME=CAPTURE "
-        "--recipe aerial=configs/aerial.yaml --seeds 0 1 2"
+        '--recipe aerial=configs/aerial.yaml --recipe "aerial_half=configs/aerial.yaml --schedule.scale=0.5" '
+        "--seeds 0 1 2"
     ),
     "ablation": (
         "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/ablation "
