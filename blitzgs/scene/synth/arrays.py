@@ -17,6 +17,6 @@ Bytes = NDArray[np.uint8]
 
 
 def dot(a: Floats, b: Floats) -> Floats:
-    """Return the inner products [R] of rows [R, 3]."""
-    product: Floats = np.einsum("ij,ij->i", a, b)
+    """Return the inner products [R] of columns [3, R]."""
+    product: Floats = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     return product

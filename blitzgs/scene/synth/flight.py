@@ -44,10 +44,11 @@ class View:
 
     def directions(self, pixels: Floats) -> Floats:
         """Return unit world directions [N, 3] through pixel positions [N, 2], in the precision of these."""
-        camera = np.ones((len(pixels), 3), pixels.dtype)
-        camera[:, :2] = (pixels - np.array([self.width, self.height], pixels.dtype) / 2) / self.focal
-        camera /= np.sqrt(dot(camera, camera))[:, None]
-        world: Floats = camera @ self.rotation.astype(pixels.dtype)
+        camera = np.ones((3, len(pixels)), pixels.dtype)
+        camera[0] = (pixels[:, 0] - self.width / 2) / self.focal
+        camera[1] = (pixels[:, 1] - self.height / 2) / self.focal
+        camera /= np.sqrt(dot(camera, camera))
+        world: Floats = camera.T @ self.rotation.astype(pixels.dtype)
         return world
 
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from blitzgs.scene.synth.arrays import Bools, Floats, Ints
-from blitzgs.scene.synth.materials import mix
+from blitzgs.scene.synth.materials import mix, rgb
 from blitzgs.scene.synth.noise import Noise, cell_random, inside, resolved, stripes
 from blitzgs.scene.synth.plan import HOUSES, PARK, PLAZA, RETAIL, SIDEWALK, TOWERS, Plan, Streets
 
@@ -16,9 +16,9 @@ _WHITE: Final = (0.74, 0.74, 0.70)
 
 
 def ground_color(plan: Plan, noise: Noise, position: Floats, footprint: Floats) -> Floats:
-    """Return linear RGB [R, 3] of ground points at world positions [R, 3]."""
-    x, y = plan.unbend(position[:, 0], position[:, 1])
-    color = np.empty((len(x), 3), np.float32)
+    """Return linear RGB [3, R] of ground points at world positions [3, R]."""
+    x, y = plan.unbend(position[0], position[1])
+    color = np.empty((3, len(x)), np.float32)
     dx, i = plan.along_y.nearest(x)
     dy, j = plan.along_x.nearest(y)
     in_city_x = (x > plan.along_y.centres[0] - 8) & (x < plan.along_y.centres[-1] + 8)
@@ -36,14 +36,14 @@ def ground_color(plan: Plan, noise: Noise, position: Floats, footprint: Floats) 
         chosen = np.flatnonzero(mask)
         if len(chosen):
             rows = [a[chosen] if isinstance(a, np.ndarray) else a for a in arguments]
-            color[chosen] = paint(noise, *rows)  # type: ignore[operator]
+            color[:, chosen] = paint(noise, *rows)  # type: ignore[operator]
 
     street = edge < 0
     fill(street, _street, plan, x, y, dx, dy, edge_x, edge_y, i, j, footprint)
     fill(~street & inside_city & (edge < SIDEWALK), _pavement, x, y, edge, footprint)
     interior = ~street & inside_city & (edge >= SIDEWALK)
-    block_i = np.clip(np.searchsorted(plan.along_y.centres, x) - 1, 0, plan.kinds.shape[0] - 1)
-    block_j = np.clip(np.searchsorted(plan.along_x.centres, y) - 1, 0, plan.kinds.shape[1] - 1)
+    block_i = np.clip(i - (dx <= 0), 0, plan.kinds.shape[0] - 1)
+    block_j = np.clip(j - (dy <= 0), 0, plan.kinds.shape[1] - 1)
     kind = plan.kinds[block_i, block_j]
     beyond = (np.abs(x) > plan.half) | (np.abs(y) > plan.half)
     park, houses, square = kind == PARK, kind == HOUSES, (kind == PLAZA) | (kind == TOWERS)
@@ -60,7 +60,7 @@ def ground_color(plan: Plan, noise: Noise, position: Floats, footprint: Floats) 
 def _asphalt(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
     tone = noise.layers(x, y, footprint, (11.0, 0.09), (2.3, 0.07), (0.5, 0.07), (0.2, 0.06))
     repair = (cell_random(np.floor(x / 7), np.floor(y / 5), 3) > 0.88) * np.float32(-0.22)
-    color: Floats = np.array([0.155, 0.155, 0.16], np.float32) * (1 + tone + repair)[:, None]
+    color: Floats = rgb(0.155, 0.155, 0.16) * (1 + tone + repair)
     return color
 
 
@@ -88,9 +88,8 @@ def _street(
         (dy, x, edge_x, plan.along_x, j, edge_y < 0),
     ):
         alone = own & (edge_other > 0)
-        color = mix(
-            color, _WHITE, 0.85 * alone * _markings(across, along, edge_other, streets, index, footprint)
-        )
+        markings = _markings(across, along, edge_other, streets, index, footprint)
+        color = mix(color, _WHITE, 0.85 * markings * alone)
         tracks = np.exp(-((np.abs(np.abs(across) - 1.9) - 0.75) ** 2) / 0.12) * alone
         color = mix(color, color * 0.8, 0.6 * tracks * resolved(1.0, footprint))
     return color
@@ -121,7 +120,7 @@ def _pavement(noise: Noise, x: Floats, y: Floats, edge: Floats, footprint: Float
     """Return paving slabs behind a lighter kerb, with a dark gutter."""
     tone = noise.layers(x, y, footprint, (5.0, 0.06), (1.2, 0.06), (0.3, 0.04))
     slab = (cell_random(np.floor(x / 0.8), np.floor(y / 0.8), 5) - 0.5) * 0.2 * resolved(0.8, footprint)
-    color = np.array([0.40, 0.385, 0.36], np.float32) * (1 + tone + slab)[:, None]
+    color = rgb(0.40, 0.385, 0.36) * (1 + tone + slab)
     joints = stripes(x, 0.8, 0.0, 0.07, footprint) + stripes(y, 0.8, 0.0, 0.07, footprint)
     color = mix(color, color * 0.6, np.clip(joints, 0, 1))
     color = mix(color, (0.56, 0.55, 0.52), inside(edge, 0.0, 0.28, footprint))
@@ -131,7 +130,7 @@ def _pavement(noise: Noise, x: Floats, y: Floats, edge: Floats, footprint: Float
 def _grass(noise: Noise, x: Floats, y: Floats, footprint: Floats, mown: float) -> Floats:
     tone = noise.layers(x, y, footprint, (8.0, 0.12), (2.0, 0.12), (0.6, 0.12), (0.22, 0.14))
     bands = (stripes(x + 0.3 * y, 2.4, 0.0, 0.5, footprint) - 0.5) * mown
-    color = np.array([0.125, 0.205, 0.055], np.float32) * np.clip(1 + tone + bands, 0.3, 2)[:, None]
+    color = rgb(0.125, 0.205, 0.055) * np.clip(1 + tone + bands, 0.3, 2)
     dry = np.clip(noise(x / 5.5 + 9, y / 5.5) - 0.5, 0, 1)
     return mix(color, (0.25, 0.22, 0.10), 0.45 * dry)
 
@@ -155,17 +154,17 @@ def _park(
     color = _grass(noise, x, y, footprint, 0.12)
     beds = inside(distance, 0.215 * reach, 0.245 * reach, footprint) * (noise(x / 2, y / 2) > 0)
     hue = cell_random(np.floor(x / 0.9), np.floor(y / 0.9), 11)
-    flowers = np.stack([0.35 + 0.4 * hue, 0.12 + 0.3 * hue**2, 0.15 + 0.2 * (1 - hue)], 1).astype(np.float32)
+    flowers = np.stack([0.35 + 0.4 * hue, 0.12 + 0.3 * hue**2, 0.15 + 0.2 * (1 - hue)])
     color = mix(color, flowers, 0.7 * beds)
     ring = inside(distance, 0.255 * reach, 0.255 * reach + 2.0, footprint)
     crossing = np.maximum(_line(px + 0.8 * wobble, 2.0, footprint), _line(py + 0.8 * wobble, 2.0, footprint))
     path = np.maximum(ring, crossing * (distance > 0.255 * reach))
     pebbles = noise.layers(x, y, footprint, (2.0, 0.05), (0.4, 0.09))
-    color = mix(color, np.array([0.50, 0.43, 0.32], np.float32) * (1 + pebbles)[:, None], path)
+    color = mix(color, rgb(0.50, 0.43, 0.32) * (1 + pebbles), path)
     pond = distance - 0.14 * reach * (1 + 0.12 * noise(px / 6 + 40, py / 6))
-    water = np.array([0.045, 0.085, 0.095], np.float32) * (1 + 0.2 * noise(x / 3, y / 3))[:, None]
+    water = rgb(0.045, 0.085, 0.095) * (1 + 0.2 * noise(x / 3, y / 3))
     color = mix(color, (0.42, 0.40, 0.36), inside(pond, -0.2, 0.5, footprint))
-    return mix(color, water.astype(np.float32), inside(pond, -1e3, 0.0, footprint))
+    return mix(color, water, inside(pond, -1e3, 0.0, footprint))
 
 
 def _garden(noise: Noise, x: Floats, y: Floats, edge: Floats, footprint: Floats) -> Floats:
@@ -175,20 +174,14 @@ def _garden(noise: Noise, x: Floats, y: Floats, edge: Floats, footprint: Floats)
     chance = cell_random(cell_x, cell_y, 17)
     du, dv = x - (cell_x + 0.5) * 7.3, y - (cell_y + 0.5) * 6.1
     patch = inside(du, -1.9, 1.9, footprint) * inside(dv, -1.5, 1.5, footprint)
-    slabs = (
-        np.array([0.42, 0.37, 0.31], np.float32)
-        * (1 - 0.3 * np.clip(stripes(x, 0.5, 0, 0.1, footprint) + stripes(y, 0.5, 0, 0.1, footprint), 0, 1))[
-            :, None
-        ]
-    )
-    soil = (
-        np.array([0.17, 0.115, 0.07], np.float32) * (1 - 0.45 * stripes(x, 0.6, 0, 0.5, footprint))[:, None]
-    )
+    joints = np.clip(stripes(x, 0.5, 0, 0.1, footprint) + stripes(y, 0.5, 0, 0.1, footprint), 0, 1)
+    slabs = rgb(0.42, 0.37, 0.31) * (1 - 0.3 * joints)
+    soil = rgb(0.17, 0.115, 0.07) * (1 - 0.45 * stripes(x, 0.6, 0, 0.5, footprint))
     color = mix(color, slabs, patch * (chance > 0.72))
     color = mix(color, soil, patch * (chance < 0.12))
     drive = stripes(x, 7.5, 0.25, 0.62, footprint) * (edge < SIDEWALK + 5)
     pebbles = noise.layers(x, y, footprint, (1.5, 0.06), (0.35, 0.1))
-    return mix(color, np.array([0.40, 0.37, 0.33], np.float32) * (1 + pebbles)[:, None], 0.85 * drive)
+    return mix(color, rgb(0.40, 0.37, 0.33) * (1 + pebbles), 0.85 * drive)
 
 
 def _square(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
@@ -196,7 +189,7 @@ def _square(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
     slab = cell_random(np.floor(x / 1.25), np.floor(y / 1.25), 23)
     tone = noise.layers(x, y, footprint, (7.0, 0.06), (1.0, 0.05), (0.3, 0.05))
     shade = (slab - 0.5) * 0.3 * resolved(1.25, footprint)
-    color = np.array([0.44, 0.39, 0.33], np.float32) * (1 + tone + shade)[:, None]
+    color = rgb(0.44, 0.39, 0.33) * (1 + tone + shade)
     joints = np.clip(stripes(x, 1.25, 0, 0.06, footprint) + stripes(y, 1.25, 0, 0.06, footprint), 0, 1)
     color = mix(color, color * 0.6, joints)
     bands = np.clip(stripes(x, 5.0, 0, 0.1, footprint) + stripes(y, 5.0, 0, 0.1, footprint), 0, 1)
@@ -207,7 +200,7 @@ def _courtyard(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
     """Return yards between houses: concrete and cobbles with overgrown corners."""
     tone = noise.layers(x, y, footprint, (4.0, 0.12), (1.0, 0.08), (0.3, 0.08))
     cobble = (cell_random(np.floor(x / 0.5), np.floor(y / 0.5), 29) - 0.5) * 0.35 * resolved(0.5, footprint)
-    color = np.array([0.31, 0.29, 0.26], np.float32) * (1 + tone + cobble)[:, None]
+    color = rgb(0.31, 0.29, 0.26) * (1 + tone + cobble)
     green = np.clip(2.5 * noise(x / 6.5, y / 6.5) - 0.4, 0, 1)
     return mix(color, _grass(noise, x, y, footprint, 0.0), green)
 
@@ -249,10 +242,10 @@ def _fields(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
         ],
         np.float32,
     )
-    color: Floats = palette[np.minimum((crop * 5).astype(np.int64), 4)]
+    color: Floats = palette.T.take(np.minimum((crop * 5).astype(np.int64), 4), axis=1)
     turned = cell_random(column, row, 41) > 0.5
     furrows = (stripes(np.where(turned, u, v), 2.6, 0.0, 0.5, footprint) - 0.5) * 0.22
     tone = noise.layers(x, y, footprint, (40.0, 0.08), (9.0, 0.09), (2.0, 0.09), (0.6, 0.10))
-    color = color * (1 + furrows + tone)[:, None]
+    color = color * (1 + furrows + tone)
     border = np.abs(v / 62 - np.round(v / 62)) < 0.03
     return mix(color, _grass(noise, x, y, footprint, 0.0), border * np.float32(1))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Final
 
 import cv2
@@ -13,7 +14,7 @@ from blitzgs.scene.synth.arrays import Bytes, Doubles, Floats, Ints, dot
 from blitzgs.scene.synth.city import build_city
 from blitzgs.scene.synth.flight import View
 from blitzgs.scene.synth.ground import ground_color
-from blitzgs.scene.synth.materials import Points
+from blitzgs.scene.synth.materials import Points, rgb
 from blitzgs.scene.synth.noise import Noise
 from blitzgs.scene.synth.plan import Plan
 from blitzgs.scene.synth.raycast import Hits, RayCaster
@@ -24,10 +25,14 @@ _RAYS_AT_ONCE: Final = 60_000  # their arrays stay in the processor's caches
 _OFFSET: Final = 0.02  # distance from the surface, in metres, at which a shadow ray starts
 
 _SUN: Final = np.array([-0.52, -0.42, 0.74], np.float32) / np.float32(np.linalg.norm([-0.52, -0.42, 0.74]))
-_SUNLIGHT: Final = np.array([2.35, 2.16, 1.82], np.float32)
-_SKYLIGHT: Final = np.array([0.50, 0.60, 0.76], np.float32)
-_BOUNCE: Final = np.array([0.24, 0.22, 0.19], np.float32)
-_HAZE: Final = np.array([0.66, 0.73, 0.80], np.float32)
+_SUNLIGHT: Final = rgb(2.35, 2.16, 1.82)
+_SKYLIGHT: Final = rgb(0.50, 0.60, 0.76)
+_BOUNCE: Final = rgb(0.24, 0.22, 0.19)
+_HAZE: Final = rgb(0.66, 0.73, 0.80)
+_ZENITH: Final = rgb(0.22, 0.42, 0.80)
+# Surface of a ray that meets nothing: shaded as the last surface, then painted over.
+_SKY: Final = -1
+_SKY_DISTANCE: Final = np.float32(1e6)  # metres, beyond the horizon
 
 _PAINTERS: Final = {
     mesh.FACADE: materials.facade,
@@ -61,190 +66,181 @@ class City:
         for top in range(0, view.height, rows):
             bottom = min(top + rows, view.height)
             y, x = np.mgrid[top:bottom, 0 : view.width].astype(np.float32)
-            corners = np.stack([x, y], -1).reshape(-1, 1, 2)
-            display = self._shade(view, (corners + _SAMPLES).reshape(-1, 2))
-            image[top:bottom] = (display * 255 + 0.5).reshape(bottom - top, view.width, 3)
+            corners = np.stack([x.ravel(), y.ravel()], -1)
+            display = self._shade(view, (_SAMPLES[:, None] + corners).reshape(-1, 2))
+            image[top:bottom] = (display * 255 + 0.5).T.reshape(bottom - top, view.width, 3)
         return image
 
     def hit(self, view: View, pixels: Doubles) -> Hits:
         """Return what the view sees at pixel positions [R, 2]."""
         directions = view.directions(pixels).astype(np.float32)
-        origins = np.broadcast_to(view.centre.astype(np.float32), directions.shape)
-        return self.caster.hit(np.ascontiguousarray(origins), directions)
+        return self.caster.hit(np.broadcast_to(view.centre.astype(np.float32), directions.shape), directions)
 
     def _shade(self, view: View, pixels: Floats) -> Floats:
-        """Return display values [P, 3] of P pixels from the positions of their samples [4 P, 2].
+        """Return display values [3, P] of P pixels from the positions of their samples [4 P, 2], P by P.
 
         Samples of a pixel that meet the same surface are shaded once, at their mean and for the area
         that they cover, because materials filter their own patterns. Shadows have edges within a surface, so
         every sample casts a shadow ray.
         """
-        directions = view.directions(pixels)
-        origins = np.ascontiguousarray(np.broadcast_to(view.centre.astype(np.float32), directions.shape))
-        hits = self.caster.hit(origins, directions)
-        seen, missed = np.flatnonzero(hits.triangle >= 0), np.flatnonzero(hits.triangle < 0)
-        display = np.empty_like(directions)
-        # Tone mapping each sample keeps edges against bright surfaces smooth.
-        display[missed] = _tone(self._sky(directions[missed]))
-        if len(seen):
-            position = origins[seen] + hits.distance[seen, None] * directions[seen]
-            surface = np.full(len(pixels), -1, np.int32)
-            surface[seen] = self.mesh.surface[hits.triangle[seen]]
-            first, group = self._share(surface, seen)
-            display[seen] = _tone(self._color(view, surface[first], position, group))[group]
-        samples = display.reshape(-1, len(_SAMPLES), 3)
-        mean: Floats = (samples[:, 0] + samples[:, 1] + samples[:, 2] + samples[:, 3]) / np.float32(4)
-        return mean
+        samples = view.directions(pixels)
+        centre = view.centre.astype(np.float32)
+        hits = self.caster.hit(np.broadcast_to(centre, samples.shape), samples)
+        surface = self.mesh.surface[hits.triangle]
+        surface[hits.triangle < 0] = _SKY
+        samples *= np.minimum(hits.distance, _SKY_DISTANCE)[:, None]
+        samples += centre
+        first, group = self._share(surface)
+        count = np.bincount(group, minlength=len(first)).astype(np.float32)
+        # Tone mapping each group keeps edges against bright surfaces smooth.
+        display = _tone(self._color(view, surface[first], samples, group, count))
+        display *= count / np.float32(len(_SAMPLES))
+        size = len(pixels) // len(_SAMPLES)
+        return np.stack([np.bincount(first % size, channel, size) for channel in display])
 
-    def _share(self, surface: Ints, seen: Ints) -> tuple[Ints, Ints]:
-        """Return a sample for each group, [G], and the group of each sample that meets a surface, [S].
+    def _share(self, surface: Ints) -> tuple[Ints, Ints]:
+        """Return a sample for each group, [G], and the group of each sample, [4 P]; sorted by material.
 
-        A group has the samples of a pixel that see the same surface; surfaces [4 P], -1 for none. The ground
+        A group has the samples of a pixel that see the same surface; surfaces [4 P]. The ground
         is one surface with hard edges between its parts, so its upper and lower two samples stay apart.
         """
-        keys = surface.reshape(-1, len(_SAMPLES)).copy()
-        lower = keys[:, 2:]
-        lower[(lower >= 0) & (self.mesh.material[lower] == mesh.GROUND)] = -2
+        keys = surface.reshape(len(_SAMPLES), -1).copy()
+        lower = keys[2:]
+        lower[self.mesh.material[lower] == mesh.GROUND] = -2
         leader = np.arange(keys.size, dtype=np.int32).reshape(keys.shape)
         for k in range(1, len(_SAMPLES)):
             for earlier in reversed(range(k)):
-                np.copyto(leader[:, k], leader[:, earlier], where=keys[:, k] == keys[:, earlier])
-        leaders = leader.ravel()[seen]
-        is_first = leaders == seen
+                np.copyto(leader[k], leader[earlier], where=keys[k] == keys[earlier])
+        leaders = leader.ravel()
+        first = np.flatnonzero(leaders == np.arange(keys.size, dtype=np.int32))
+        first = first[np.argsort(self.mesh.material[surface[first]], kind="stable")]
         number = np.empty(keys.size, np.int32)
-        first = seen[is_first]
         number[first] = np.arange(len(first), dtype=np.int32)
         return first, number[leaders]
 
-    def _color(self, view: View, surface: Ints, samples: Floats, group: Ints) -> Floats:
-        """Return the scene-linear RGB [G, 3] of groups of samples.
+    def _color(self, view: View, surface: Ints, samples: Floats, group: Ints, count: Floats) -> Floats:
+        """Return the scene-linear RGB [3, G] of groups of samples.
 
         Args:
             view: the camera.
-            surface: of each of G groups.
+            surface: of each of G groups, sorted by material.
             samples: positions [S, 3] of the samples.
             group: of each sample [S].
+            count: samples of each group [G].
         """
-        count = np.bincount(group).astype(np.float32)
-        sums = np.stack([np.bincount(group, samples[:, k]) for k in range(3)], 1)
-        position = (sums / count[:, None]).astype(np.float32)
-        direction = position - view.centre.astype(np.float32)
+        sums = np.stack([np.bincount(group, channel) for channel in samples.T])
+        position = (sums / count).astype(np.float32)
+        direction = position - view.centre.astype(np.float32)[:, None]
         distance = np.sqrt(dot(direction, direction))
-        direction /= distance[:, None]
-        pixel = (
-            distance * np.float32(0.5 / view.focal) * np.sqrt(count)
-        )  # a sample covers half a pixel's width
+        direction /= distance
+        # A sample covers half a pixel's width.
+        pixel = distance * np.float32(0.5 / view.focal) * np.sqrt(count)
         material = self.mesh.material[surface]
-        normal = self.mesh.normal[surface]
-        round_ = np.flatnonzero(material == mesh.LEAVES)
-        outward = position[round_] - self.mesh.origin[surface[round_]]
-        outward /= np.square(self.mesh.size[surface[round_]][:, [0, 0, 1]])
-        outward /= np.sqrt(dot(outward, outward))[:, None]
-        outward += self._ruffle(position[round_], pixel[round_])
-        normal[round_] = outward / np.sqrt(dot(outward, outward))[:, None]
+        edges = np.searchsorted(material, np.arange(mesh.MATERIALS + 1, dtype=material.dtype))
+        parts = [slice(a, b) for a, b in itertools.pairwise(edges)]
+        normal = self.mesh.normal.take(surface, 1)
+        crowns = parts[mesh.LEAVES]
+        outward = position[:, crowns] - self.mesh.origin.take(surface[crowns], 1)
+        outward /= np.square(self.mesh.size.take(surface[crowns], 1)[[0, 0, 1]])
+        outward /= np.sqrt(dot(outward, outward))
+        outward += self._ruffle(position[:, crowns], pixel[crowns])
+        normal[:, crowns] = outward / np.sqrt(dot(outward, outward))
         slant = dot(normal, direction)
-        normal[slant > 0] *= -1
+        normal *= np.where(slant > 0, np.float32(-1), np.float32(1))
         # On a slanted surface the footprint is longer one way, taken as the mean of both axes.
         footprint = pixel / np.sqrt(np.maximum(np.abs(slant), 0.15))
 
-        albedo = self._albedo(surface, material, position, normal, footprint)
+        albedo = self._albedo(surface, parts, position, normal, footprint)
         sunny = self._sunny(samples, group, count, normal, material)
-        lit = self._light(position, normal, sunny) * albedo
-        lit = self._reflect(lit, albedo, material, direction, normal)
-        haze = np.exp(-distance / np.float32(self._haze_length))[:, None]
-        color: Floats = lit * haze + _HAZE * (1 - haze)
-        return color
+        lit = self._light(position, normal, sunny)
+        lit *= albedo
+        for part in (parts[mesh.CURTAIN], parts[mesh.SOLAR]):
+            self._reflect(lit[:, part], albedo[:, part], direction[:, part], normal[:, part])
+        lit -= _HAZE
+        lit *= np.exp(-distance / np.float32(self._haze_length))
+        lit += _HAZE
+        sky = np.flatnonzero(surface == _SKY)
+        lit[:, sky] = self._sky(direction[:, sky])
+        return lit
 
     def _ruffle(self, position: Floats, footprint: Floats) -> Floats:
-        """Return offsets for the smooth normals of foliage [R, 3], which make crowns look like leaves."""
-        x, y, z = position.T
+        """Return offsets for the smooth normals of foliage [3, R], which make crowns look like leaves."""
+        x, y, z = position
         bands = ((1.1, 0.30), (0.45, 0.30))
         turns = [
             self.noise.layers(a, b, footprint, *bands)
             for a, b in ((x + z, y - z), (y + z, z - x), (z + y, x + y))
         ]
-        return np.stack(turns, 1)
+        return np.stack(turns)
 
     def _albedo(
-        self,
-        surface: Ints,
-        material: Ints,
-        position: Floats,
-        normal: Floats,
-        footprint: Floats,
+        self, surface: Ints, parts: list[slice], position: Floats, normal: Floats, footprint: Floats
     ) -> Floats:
-        albedo = np.empty((len(surface), 3), np.float32)
-        ground = np.flatnonzero(material == mesh.GROUND)
-        if len(ground):
-            albedo[ground] = ground_color(self.plan, self.noise, position[ground], footprint[ground])
-        for kind, painter in _PAINTERS.items():
-            index = np.flatnonzero(material == kind)
-            if len(index) == 0:
+        albedo = np.empty((3, len(surface)), np.float32)
+        for kind, part in enumerate(parts):
+            s = surface[part]
+            if len(s) == 0:
                 continue
-            s = surface[index]
-            offset = position[index] - self.mesh.origin[s]
+            if kind == mesh.GROUND:
+                albedo[:, part] = ground_color(self.plan, self.noise, position[:, part], footprint[part])
+                continue
+            offset = position[:, part] - self.mesh.origin.take(s, 1)
             points = Points(
-                u=dot(offset, self.mesh.axis_u[s]),
-                v=dot(offset, self.mesh.axis_v[s]),
-                size=self.mesh.size[s],
-                position=position[index],
-                normal=normal[index],
-                footprint=footprint[index],
-                color=self.mesh.color[s],
-                numbers=self.mesh.numbers[s],
+                u=dot(offset, self.mesh.axis_u.take(s, 1)),
+                v=dot(offset, self.mesh.axis_v.take(s, 1)),
+                size=self.mesh.size.take(s, 1),
+                position=position[:, part],
+                normal=normal[:, part],
+                footprint=footprint[part],
+                color=self.mesh.color.take(s, 1),
+                numbers=self.mesh.numbers.take(s, 1),
             )
-            albedo[index] = painter(points, self.noise)
-        return np.clip(albedo, 0.005, 0.92)
+            albedo[:, part] = _PAINTERS[kind](points, self.noise)
+        return np.clip(albedo, 0.005, 0.92, out=albedo)
 
     def _sunny(self, samples: Floats, group: Ints, count: Floats, normal: Floats, material: Ints) -> Floats:
         """Return the cosine at which the sun shines on each group, times its samples without shadow, [G]."""
-        facing = normal @ _SUN
+        facing = _SUN @ normal
         # Light passes through leaves, so crowns are lit a little past their terminator.
         facing = np.where(material == mesh.LEAVES, 0.75 * facing + 0.25, facing)
         towards = np.flatnonzero((facing > 0)[group])
         lit = group[towards]
         # Rays of foliage start further out; otherwise each crown would shade itself.
-        lift = np.where(material == mesh.LEAVES, np.float32(0.35), np.float32(_OFFSET))[:, None] * normal
-        origins = samples[towards] + lift[lit]
-        rays = np.ascontiguousarray(np.broadcast_to(_SUN, origins.shape))
-        dark = np.bincount(lit, self.caster.occluded(origins, rays), len(count))
-        sunny: Floats = (np.clip(facing, 0, 1) * (1 - dark / count)).astype(np.float32)
+        lift = normal * np.where(material == mesh.LEAVES, np.float32(0.35), np.float32(_OFFSET))
+        origins = samples.take(towards, 0)
+        origins += np.ascontiguousarray(lift.T).take(lit, 0)
+        dark = self.caster.occluded(origins, np.broadcast_to(_SUN, origins.shape))
+        share = np.bincount(lit[dark], minlength=len(count)).astype(np.float32) / count
+        sunny: Floats = np.clip(facing, 0, 1) * (1 - share)
         return sunny
 
     def _light(self, position: Floats, normal: Floats, sunny: Floats) -> Floats:
-        """Return the irradiance [G, 3]: sun outside shadows, sky by openness, light from the ground."""
+        """Return the irradiance [3, G]: sun outside shadows, sky by openness, light from the ground."""
         openness = self._openness(position + np.float32(1.5) * normal)
-        sky = openness * (0.55 + 0.45 * normal[:, 2])
-        bounce = (0.5 - 0.5 * normal[:, 2]) * (0.4 + 0.6 * openness)
-        light: Floats = sunny[:, None] * _SUNLIGHT + sky[:, None] * _SKYLIGHT + bounce[:, None] * _BOUNCE
+        sky = openness * (0.55 + 0.45 * normal[2])
+        bounce = (0.5 - 0.5 * normal[2]) * (0.4 + 0.6 * openness)
+        light: Floats = sunny * _SUNLIGHT
+        light += sky * _SKYLIGHT
+        light += bounce * _BOUNCE
         return light
 
-    def _reflect(
-        self, lit: Floats, albedo: Floats, material: Ints, direction: Floats, normal: Floats
-    ) -> Floats:
-        """Return `lit` with the sky mirrored in curtain walls and solar panels (Schlick's approximation)."""
-        index = np.flatnonzero((material == mesh.CURTAIN) | (material == mesh.SOLAR))
-        if len(index) == 0:
-            return lit
-        d, n = direction[index], normal[index]
-        cosine = np.clip(-dot(d, n), 0, 1)
+    def _reflect(self, lit: Floats, albedo: Floats, direction: Floats, normal: Floats) -> None:
+        """Add to `lit` the sky mirrored in glass (Schlick's approximation)."""
+        cosine = np.clip(-dot(direction, normal), 0, 1)
         fresnel = 0.08 + 0.92 * (1 - cosine) ** 5
-        mirrored = d + 2 * cosine[:, None] * n
+        mirrored = direction + 2 * cosine * normal
         # A mirrored ray that points down meets other buildings.
-        seen = np.where(mirrored[:, 2:] > 0, self._sky(mirrored), np.float32(0.22))
-        glass = albedo[index].max(1) < 0.45
-        lit[index] += (fresnel * glass)[:, None] * (seen - lit[index])
-        return lit
+        seen = np.where(mirrored[2] > 0, self._sky(mirrored), np.float32(0.22))
+        glass = albedo.max(0) < 0.45
+        lit += fresnel * glass * (seen - lit)
 
     def _sky(self, direction: Floats) -> Floats:
-        up = np.clip(direction[:, 2], 0, 1)
-        zenith = np.array([0.22, 0.42, 0.80], np.float32)
-        color: Floats = _HAZE + (zenith - _HAZE) * (1 - (1 - up) ** 3)[:, None]
-        high = np.maximum(up, 0.03)
-        x, y = direction[:, 0] / high, direction[:, 1] / high
+        up = np.clip(direction[2], 0, 1)
+        color: Floats = _HAZE + (_ZENITH - _HAZE) * (1 - (1 - up) ** 3)
+        x, y = direction[:2] / np.maximum(up, 0.03)
         cloud = np.clip(0.7 * self.noise(x * 0.9, y * 0.9) + 0.4 * self.noise(x * 2.3, y * 2.3) - 0.2, 0, 1)
         cloud *= np.clip(up * 6, 0, 1)
-        return color + 0.6 * cloud[:, None] * (np.float32(0.95) - color)
+        return color + 0.6 * cloud * (np.float32(0.95) - color)
 
     def _bake_open_sky(self) -> Floats:
         """Return a square map of the sky seen from the ground (cosine-weighted, 0 to 1) over the city."""
@@ -269,12 +265,10 @@ class City:
         """Return how much sky is seen [R]: the baked map near the ground, more with height."""
         side = len(self._open_sky)
         scale = np.float32(side / 2) / self._map_half
-        i = ((position[:, :2] + self._map_half) * scale).astype(np.int32)
-        x, y = i[:, 0], i[:, 1]
+        x, y = ((position[:2] + self._map_half) * scale).astype(np.int32)
         inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
-        low = np.ones(len(i), np.float32)
-        low[inside] = self._open_sky[y[inside], x[inside]]
-        raised = np.clip(position[:, 2] / 16, 0, 1)
+        low = np.where(inside, self._open_sky.take(y * side + x, mode="clip"), np.float32(1))
+        raised = np.clip(position[2] / 16, 0, 1)
         openness: Floats = np.maximum(low, 0.35) * (1 - raised) + raised
         return openness
 
