@@ -39,8 +39,9 @@ class Noise:
         rows = -(-count // _ROW)
         maps = np.zeros((2, rows * _ROW), np.float32)
         for plane, coordinate in zip(maps, (x, y), strict=True):
-            scaled = coordinate * np.float32(1 / _LATTICE)
-            plane[:count] = (scaled - np.floor(scaled)) * np.float32(_LATTICE * _TEXELS)
+            periods = np.multiply(coordinate, np.float32(1 / _LATTICE), out=plane[:count])
+            periods -= np.floor(periods)
+            periods *= np.float32(_LATTICE * _TEXELS)
         u, v = maps.reshape(2, rows, _ROW)
         sampled = cv2.remap(self._texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         values: Floats = sampled.reshape(-1)[:count]
