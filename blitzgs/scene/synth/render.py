@@ -21,7 +21,7 @@ from blitzgs.scene.synth.raycast import Hits, RayCaster
 
 # Four samples per pixel on a rotated grid: every row and column of the 4 x 4 subpixels is met once.
 _SAMPLES: Final = np.array([[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]], np.float32)
-# So many that numpy's calls cost little beside their work; more are not faster and leave the caches.
+# So many that numpy's calls cost little beside their work; more gain nothing and take memory.
 _RAYS_AT_ONCE: Final = 240_000
 _OFFSET: Final = 0.02  # distance from the surface, in metres, at which a shadow ray starts
 
@@ -66,9 +66,10 @@ class City:
         rows = max(1, _RAYS_AT_ONCE // (view.width * len(_SAMPLES)))
         for top in range(0, view.height, rows):
             bottom = min(top + rows, view.height)
-            y, x = np.mgrid[top:bottom, 0 : view.width].astype(np.float32)
-            corners = np.stack([x.ravel(), y.ravel()], -1)
-            display = self._shade(view, (_SAMPLES[:, None] + corners).reshape(-1, 2))
+            pixels = np.empty((len(_SAMPLES), bottom - top, view.width, 2), np.float32)
+            pixels[..., 0] = np.arange(view.width) + _SAMPLES[:, None, None, 0]
+            pixels[..., 1] = np.arange(top, bottom)[:, None] + _SAMPLES[:, None, None, 1]
+            display = self._shade(view, pixels.reshape(-1, 2))
             image[top:bottom] = (display * 255 + 0.5).T.reshape(bottom - top, view.width, 3)
         return image
 
@@ -89,8 +90,10 @@ class City:
         hits = self.caster.hit(np.broadcast_to(centre, samples.shape), samples)
         surface = self.mesh.surface[hits.triangle]
         surface[hits.triangle < 0] = _SKY
-        samples *= np.minimum(hits.distance, _SKY_DISTANCE)[:, None]
-        samples += centre
+        distance = np.minimum(hits.distance, _SKY_DISTANCE)
+        for k in range(3):  # one column at a time: numpy is slow along an axis of three
+            samples[:, k] *= distance
+            samples[:, k] += centre[k]
         first, group = self._share(surface)
         count = np.bincount(group, minlength=len(first)).astype(np.float32)
         # Tone mapping each group keeps edges against bright surfaces smooth.
@@ -115,8 +118,8 @@ class City:
         leaders = leader.ravel()
         first = np.flatnonzero(leaders == np.arange(keys.size, dtype=np.int32))
         first = first[np.argsort(self.mesh.material[surface[first]], kind="stable")]
-        number = np.empty(keys.size, np.int32)
-        number[first] = np.arange(len(first), dtype=np.int32)
+        number = np.empty(keys.size, np.intp)
+        number[first] = np.arange(len(first))
         return first, number[leaders]
 
     def _color(self, view: View, surface: Ints, samples: Floats, group: Ints, count: Floats) -> Floats:
