@@ -28,7 +28,7 @@ from blitzgs.rendering.arguments import (
     check_tensors,
     gaussians_of,
 )
-from blitzgs.rendering.groups import groups_of
+from blitzgs.rendering.groups import Group, groups_of
 from blitzgs.rendering.images import ImageOptions, may_queue, render
 
 
@@ -140,14 +140,14 @@ def raw_rasterization(
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     harmonics = [sh0] if shN is None else [sh0, shN]
-    sh_degree = _checked_degree(harmonics, len(means), sh_degree, "RGB" in render_mode)
+    shaded = "RGB" in render_mode
+    sh_degree = _checked_degree(harmonics, len(means), sh_degree, shaded)
     antialiased = rasterize_mode == "antialiased"
     project = ProjectionOptions(
         width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, True
     )
     geometry = (means, quats, scales, opacities)
     whole = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, False, raw=True)
-    shaded = "RGB" in render_mode
     if sparse_grad and torch.is_grad_enabled():
         sh = {"sh0": sh0, "shN": shN} if shaded else {}
         _check_leaves({"means": means, "quats": quats, "scales": scales, "opacities": opacities, **sh})
@@ -172,25 +172,40 @@ def raw_rasterization(
             optimizer.catch_up(harmonics, rows, count)
 
     groups = groups_of(gaussians, project)
+    tables = ShTables(harmonics if shaded else (), catch_up_sh, hand_over)
     if may_queue(groups):
-        tables = ShTables(harmonics if shaded else (), catch_up_sh, hand_over)
         return render("raw_rasterization", gaussians, project, image, tables=tables, groups=groups)
-    # Several groups, no Gaussians, or another tile size: gather the visible rows of all groups, render these.
-    ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
-    catch_up_sh(ids, None)
-    read = (*geometry, *(harmonics if shaded else ()))
-    if hand_over is not None:
-        read = tuple(table.detach() for table in read)
-    ticket = None if hand_over is None else hand_over.ticket
-    means, quats, scales, opacities, sh = _Visible.apply(  # type: ignore[no-untyped-call]
-        ids, sparse_grad, hand_over, ticket, *read
-    )
-    scene = Scene(means, quats, scales, opacities, sh, viewmats, Ks)
-    gaussians = replace(gaussians, scenes=(scene,), colors=sh, opacities=opacities)
-    renders, alphas, meta = render("raw_rasterization", gaussians, project, image._replace(sparse_grad=False))
+    # Several groups, no Gaussians, or another tile size.
+    ids, visible = _gather_visible(gaussians, groups, tables, sparse_grad)
+    renders, alphas, meta = render("raw_rasterization", visible, project, image._replace(sparse_grad=False))
     assert isinstance(meta, LazyDict)
     meta.change("gaussian_ids", lambda index_in_visible: ids.long()[index_in_visible])
     return renders, alphas, meta
+
+
+def _gather_visible(
+    gaussians: Gaussians, groups: Sequence[Group], tables: ShTables, sparse_grad: bool
+) -> tuple[Tensor, Gaussians]:
+    """Return the Gaussians that a view of any group sees, int32 [U], and these Gaussians alone.
+
+    Args:
+        gaussians: all Gaussians, one scene.
+        groups: `groups_of` the Gaussians.
+        tables: the SH.
+        sparse_grad: whether the gradients of the parameters are sparse.
+    """
+    ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
+    tables.before(ids, None)
+    (scene,) = gaussians.scenes
+    read = (scene.means, scene.quats, scene.scales, scene.opacities, *tables.parts)
+    hand_over, ticket = tables.hand_over, None
+    if hand_over is not None:
+        read, ticket = tuple(table.detach() for table in read), hand_over.ticket
+    means, quats, scales, opacities, sh = _Visible.apply(  # type: ignore[no-untyped-call]
+        ids, sparse_grad, hand_over, ticket, *read
+    )
+    scene = Scene(means, quats, scales, opacities, sh, scene.viewmats, scene.Ks)
+    return ids, replace(gaussians, scenes=(scene,), colors=sh, opacities=opacities)
 
 
 def _check_leaves(params: Mapping[str, Tensor | None]) -> None:
