@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parts of gsplat that need no GPU work with our renderer: its strategies, and its projection in torch."""
 
+import inspect
 import math
 
 import pytest
@@ -56,6 +57,20 @@ class Trainer:
                 optimizer.catch_up()
         packed = self.lazy or self.packed
         self.strategy.step_post_backward(self.splats, self.optimizers, self.state, step, info, packed=packed)
+
+
+@pytest.mark.parametrize("function", [blitzgs.rasterization, blitzgs.raw_rasterization])
+def test_the_renderers_take_the_defaults_of_all_gsplats_arguments(function):
+    scene = random_scene(n=20)
+    parameters = inspect.signature(gsplat.rasterization).parameters.values()
+    defaults = {p.name: p.default for p in parameters if p.default is not p.empty}
+    if function is blitzgs.rasterization:
+        expected, actual = (
+            rasterize_scene(scene, **options) for options in ({}, {**defaults, "sh_degree": 3})
+        )
+    else:
+        expected, actual = (raw(raw_parameters(scene), scene, **options) for options in ({}, defaults))
+    assert torch.equal(actual[0], expected[0])
 
 
 @pytest.fixture

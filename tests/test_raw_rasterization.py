@@ -193,6 +193,32 @@ def test_gsplats_default_of_the_tile_size_is_accepted():
     assert torch.equal(raw(p, scene, tile_size=None)[0], raw(p, scene)[0])
 
 
+def test_what_gsplats_trainer_passes_is_accepted_where_it_has_no_effect():
+    scene = random_scene(n=20)
+    p = raw_parameters(scene)
+    passed = {
+        "packed": True, "absgrad": False, "sparse_grad": True, "rasterize_mode": "classic", "covars": None,
+        "distributed": False, "camera_model": "".join(["pin", "hole"]), "with_ut": False,
+        "with_eval3d": False, "channel_chunk": 8, "segmented": True,
+    }  # fmt: skip
+    assert torch.equal(raw(p, scene, **passed)[0], raw(p, scene)[0])
+
+
+@pytest.mark.parametrize(
+    "option",
+    [{"packed": False}, {"distributed": True}, {"camera_model": "fisheye"}, {"covars": 3}, {"with_ut": True}],
+    ids=str,
+)
+def test_what_only_rasterization_or_gsplat_supports_is_refused(option):
+    ((name, value),) = option.items()
+    scene = random_scene(n=20)
+    message = f"blitzgs.raw_rasterization does not support {name}={value!r}; leave it out"
+    with pytest.raises(ValueError, match=message):
+        raw(raw_parameters(scene), scene, **option)
+    with pytest.raises(TypeError, match=r"raw_rasterization\(\) got an unexpected keyword argument 'packd'"):
+        raw(raw_parameters(scene), scene, packd=value)
+
+
 def test_optimizers_may_be_one_of_any_class():
     scene = random_scene(n=20)
     p = raw_parameters(scene)

@@ -57,6 +57,9 @@ class LazyAdam(torch.optim.Optimizer):
         lr: float = 1e-3,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
+        *,
+        foreach: bool | None = None,
+        fused: bool | None = None,
     ) -> None:
         """Take parameters, or groups of them, as any optimiser of torch.
 
@@ -66,6 +69,8 @@ class LazyAdam(torch.optim.Optimizer):
             lr: learning rate; a scheduler may change it from step to step.
             betas: decay rates of the moments, 0 <= beta1 < sqrt(beta2) < 1; fixed once a step was taken.
             eps: added to the root of the second moment.
+            foreach: accepted and not needed: it selects how `torch.optim.Adam` computes, never the result.
+            fused: accepted and not needed, as `foreach`: a step is always a fused kernel.
 
         Raises:
             ValueError: an option is outside its range.

@@ -42,6 +42,17 @@ GSPLAT_DEFAULTS: dict[str, Any] = {
     "extra_signals_sh_degree": None,
     "renderer_config": None,
 }
+_ANY = object()  # in place of a default: no value changes the result
+# The same for `blitzgs.raw_rasterization`, which has fewer of gsplat's arguments.
+RAW_DEFAULTS: dict[str, Any] = {
+    **GSPLAT_DEFAULTS,
+    "packed": True,
+    "distributed": False,
+    "camera_model": "pinhole",
+    "covars": None,
+    "channel_chunk": _ANY,
+    "segmented": _ANY,
+}
 
 
 class Scene(NamedTuple):
@@ -118,20 +129,28 @@ class Gaussians:
         return self.opacities.shape[-1]
 
 
-def check_further(function: str, further: dict[str, Any]) -> None:
+def check_further(
+    function: str, further: Mapping[str, Any], defaults: Mapping[str, Any] = GSPLAT_DEFAULTS
+) -> None:
     """Check further keyword arguments: only gsplat's names with gsplat's default values are accepted.
+
+    Args:
+        function: name of the public function.
+        further: the arguments by name.
+        defaults: the names and the only values that the function takes.
 
     Raises:
         TypeError: gsplat has no such argument.
         ValueError: the value is not gsplat's default.
     """
     for name, value in further.items():
-        if name not in GSPLAT_DEFAULTS:
+        if name not in defaults:
             raise TypeError(f"{function}() got an unexpected keyword argument {name!r}")
-        default = GSPLAT_DEFAULTS[name]
+        default = defaults[name]
         # gsplat's RollingShutterType.GLOBAL, an enumeration that only gsplat has.
         shutter_is_global = name == "rolling_shutter" and getattr(value, "name", value) == "GLOBAL"
-        if value is not None and value is not default and not shutter_is_global:
+        is_default = value is default or (isinstance(value, str) and value == default)
+        if not (value is None or is_default or default is _ANY or shutter_is_global):
             raise ValueError(f"blitzgs.{function} does not support {name}={value!r}; leave it out")
 
 

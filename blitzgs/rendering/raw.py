@@ -21,9 +21,11 @@ from blitzgs.ops.sparse_rows import HandOver, full_gradients
 from blitzgs.rendering.arguments import (
     DEFAULT_TILE_SIZE,
     MAX_SH_DEGREE,
+    RAW_DEFAULTS,
     Gaussians,
     Scene,
     background_rows,
+    check_further,
     check_options,
     check_tensors,
     gaussians_of,
@@ -78,6 +80,7 @@ def raw_rasterization(
     rasterize_mode: str = "classic",
     optimizers: CatchesUp | Iterable[Any] | Mapping[str, Any] = (),
     direct_grad: bool = False,
+    **further: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render Gaussians from the parameters that gsplat's trainer learns, before their activation.
 
@@ -118,18 +121,21 @@ def raw_rasterization(
             not see the gradients, `torch.autograd.grad` does not return them, and `p.grad = None` does not
             remove them (`zero_grad` of the optimisers does). It needs `sparse_grad`, and a `LazyAdam` for
             each parameter that requires a gradient.
+        further: gsplat's other arguments; only those values are accepted that do not change the result
+            (`packed=True`, `distributed=False`, `camera_model="pinhole"`, `covars=None`, ...).
 
     Returns:
         As `blitzgs.rasterization(..., packed=True)`.
 
     Raises:
-        TypeError: an argument is not a tensor, or not the kind of number it should be; or the tensors are
-            neither float32 nor float64.
+        TypeError: an argument is not a tensor, or not the kind of number it should be, or gsplat has no such
+            argument; or the tensors are neither float32 nor float64.
         ValueError: an argument is not supported, has a wrong shape or value, or another dtype or device than
             the others; a parameter is not a leaf, but would get a sparse gradient; or `direct_grad` is not
             possible. The message names it.
         RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
     """
+    check_further("raw_rasterization", further, RAW_DEFAULTS)
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
     check_options(
         width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, render_mode,

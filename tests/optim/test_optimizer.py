@@ -248,6 +248,15 @@ def test_wrong_use_is_refused():
         optimizer.step()
 
 
+def test_the_call_of_gsplats_trainer_needs_no_change():
+    """Torch's Adam has options that choose an implementation, never the result."""
+    param = torch.ones(4, 3, requires_grad=True)
+    for options in ({"fused": True}, {"fused": False, "foreach": None}, {"fused": None, "foreach": False}):
+        assert LazyAdam([param], eps=1e-15, **options).param_groups[0].keys().isdisjoint(options)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'capturable'"):
+        LazyAdam([param], capturable=False)
+
+
 def test_rows_that_do_not_fit_change_nothing():
     """A mask that is too short loses no row, and no parameter becomes longer than the others."""
     means, sh = torch.ones(4, 3, requires_grad=True), torch.ones(4, 16, 3, requires_grad=True)
