@@ -10,7 +10,13 @@ import torch.utils.checkpoint
 
 from blitzgs.ops.photometric import photometric_loss
 from blitzgs.reference.gaussians import covariance_factors
+from blitzgs.rendering.arguments import _warn_of_intrinsics
 from tests.helpers import DEVICES, PARAMETERS, random_scene, rasterize_scene, relative_error
+from tests.test_raw_rasterization import raw, raw_parameters
+
+
+def render_raw(scene):
+    return raw(raw_parameters(scene), scene)
 
 
 def second_derivative_of_a_gradient(scene):
@@ -167,6 +173,22 @@ def test_an_argument_may_have_the_negative_bit(device, name):
         results.append([getattr(leaves, parameter).grad for parameter in PARAMETERS])
     for parameter, expected, actual in zip(PARAMETERS, *results, strict=True):
         assert relative_error(actual, expected) < 1e-5, parameter
+
+
+@pytest.mark.parametrize("render", [rasterize_scene, render_raw], ids=["rasterization", "raw_rasterization"])
+def test_intrinsics_that_require_a_gradient_are_named_once(render, recwarn):
+    _warn_of_intrinsics.cache_clear()
+    scene = random_scene(n=20)
+    for tensor in (scene.means, scene.Ks):
+        tensor.requires_grad_()
+    with torch.no_grad():
+        render(scene)
+    assert not recwarn.list
+    with pytest.warns(RuntimeWarning, match="Ks requires a gradient and gets none, as in gsplat") as found:
+        render(scene)[0].sum().backward()
+    assert found[0].filename.endswith(("helpers.py", "test_raw_rasterization.py")) and scene.Ks.grad is None
+    render(scene)
+    assert not recwarn.list
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -16,6 +16,7 @@ from blitzgs.rendering.arguments import (
     check_options,
     check_tensors,
     gaussians_of,
+    warn_of_intrinsics,
     with_covariances,
 )
 from blitzgs.rendering.images import ImageOptions, render
@@ -71,7 +72,7 @@ def rasterization(
             slower; otherwise values of 1 to 4096 channels (a rendered depth counts), [..., N, D] or per view
             [..., C, N, D]. May be None for the render modes D and ED.
         viewmats: [..., C, 4, 4] world to camera, a rotation and a translation.
-        Ks: [..., C, 3, 3] intrinsics in px, without skew.
+        Ks: [..., C, 3, 3] intrinsics in px, without skew. They get no gradient.
         width: image width in px.
         height: image height in px.
         near_plane: Gaussians have z > near_plane, world units; less than far_plane.
@@ -116,7 +117,7 @@ def rasterization(
 
     Warns:
         RuntimeWarning: an argument has values that are NaN or infinite. On CUDA every call looks for them in
-            the cameras, and every 32nd call in the Gaussians.
+            the cameras, and every 32nd call in the Gaussians. Or Ks requires a gradient (once).
 
     Raises:
         TypeError: an argument is not a tensor, or not the kind of number it should be, or gsplat has no such
@@ -135,6 +136,7 @@ def rasterization(
     if covars is None:
         required |= {"quats": quats, "scales": scales}
     check_tensors(required, {"colors": colors, "backgrounds": backgrounds, "covars": covars})
+    warn_of_intrinsics("rasterization", Ks)
     if covars is not None:
         # Placeholders, which the decomposition of the covariances replaces.
         quats, scales = (means.new_zeros(()).expand(*means.shape[:-1], length) for length in (4, 3))

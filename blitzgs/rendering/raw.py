@@ -29,6 +29,7 @@ from blitzgs.rendering.arguments import (
     check_options,
     check_tensors,
     gaussians_of,
+    warn_of_intrinsics,
 )
 from blitzgs.rendering.groups import Group, groups_of
 from blitzgs.rendering.images import ImageOptions, may_queue, render
@@ -97,7 +98,7 @@ def raw_rasterization(
         sh0: [N, 1, 3], the first SH coefficient; or all of them, [N, K, 3], with shN None.
         shN: [N, K - 1, 3], the other SH coefficients.
         viewmats: [C, 4, 4] world to camera, a rotation and a translation.
-        Ks: [C, 3, 3] intrinsics in px, without skew.
+        Ks: [C, 3, 3] intrinsics in px, without skew. They get no gradient.
         width: image width in px.
         height: image height in px.
         near_plane: Gaussians have z > near_plane, world units; less than far_plane.
@@ -127,6 +128,9 @@ def raw_rasterization(
     Returns:
         As `blitzgs.rasterization(..., packed=True)`.
 
+    Warns:
+        RuntimeWarning: as `blitzgs.rasterization`.
+
     Raises:
         TypeError: an argument is not a tensor, or not the kind of number it should be, or gsplat has no such
             argument; or the tensors are neither float32 nor float64.
@@ -143,6 +147,7 @@ def raw_rasterization(
     )  # fmt: skip
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {"shN": shN, "backgrounds": backgrounds})
+    warn_of_intrinsics("raw_rasterization", Ks)
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     harmonics = [sh0] if shN is None else [sh0, shN]
