@@ -24,17 +24,18 @@ def l1_ssim(
     Args:
         renders: x [..., H, W, 3], float32 (CPU also float64), nominal range [0, 1]: what
             `blitzgs.rasterization` returns.
-        targets: y of the same shape, uint8 (value / 255) or the dtype of `renders`.
+        targets: y of the same shape, uint8 (value / 255) or the dtype of `renders`. They get no gradient.
         masks: [..., H, W], bool or uint8, 0 = excluded; SSIM windows centred at other pixels still read such
             a pixel. A view whose pixels are all excluded has loss 0.
         ssim_weight: w in [0, 1].
 
     Returns:
-        A scalar, dtype of `renders`.
+        A scalar, dtype of `renders`; 0 without views or pixels.
 
     Raises:
         TypeError: an argument is not a tensor, or has a dtype that is not listed above.
-        ValueError: shapes or devices do not fit, or the weight is outside [0, 1].
+        ValueError: shapes or devices do not fit, the weight is outside [0, 1], or the targets require a
+            gradient.
         RuntimeError: float64 images are on a GPU.
     """
     _check_types(renders, targets, masks)
@@ -49,6 +50,10 @@ def l1_ssim(
             raise ValueError(f"{name} is on {tensor.device} and renders on {renders.device}; move one")
     if not 0 <= ssim_weight <= 1:
         raise ValueError(f"ssim_weight must be in [0, 1], got {ssim_weight}")
+    if targets.requires_grad and torch.is_grad_enabled():
+        raise ValueError("targets require a gradient, which l1_ssim does not compute; pass targets.detach()")
+    if renders.numel() == 0:
+        return renders.sum()  # zero with a gradient; the mean over no views is NaN
     x, y = renders, targets
     if renders.dim() != 4:  # else leave the images as they are: a view would be a node of autograd's graph
         x, y = renders.reshape(-1, *renders.shape[-3:]), targets.reshape(-1, *targets.shape[-3:])
@@ -80,7 +85,7 @@ class _L1Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, renders: Tensor, targets: Tensor, masks: Tensor | None, weight: float) -> Tensor:
         # Constants of a fake tensor (FakeTensorMode) would be stored and break later calls.
-        constant = masks is None and renders.numel() > 0 and type(renders) is Tensor
+        constant = masks is None and type(renders) is Tensor
         ctx.renders = renders  # not saved, as its values are not needed and may change
         if constant:
             views, height, width, _ = renders.shape

@@ -48,6 +48,19 @@ def test_leading_dimensions_and_floating_targets():
     assert relative_error(single, blitzgs.l1_ssim(renders[:1, 0], targets[:1, 0], masks[:1, 0])) < 1e-12
 
 
+@pytest.mark.parametrize("shape", [(0, 8, 8), (2, 0, 8), (2, 2, 0, 8), (0, 8)], ids=str)
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("learned", [False, True])
+def test_no_views_and_no_pixels_have_loss_zero(shape, masked, learned):
+    renders = torch.rand(*shape, 3, requires_grad=learned)
+    masks = torch.ones(shape, dtype=torch.bool) if masked else None
+    loss = blitzgs.l1_ssim(renders, torch.zeros(*shape, 3), masks)
+    assert loss.shape == () and loss.item() == 0
+    if learned:
+        loss.backward()
+        assert renders.grad.shape == renders.shape
+
+
 def test_renders_may_change_after_the_loss():
     renders, targets, _ = images("cpu", torch.float32, 1)
     x = renders.clone().requires_grad_()
@@ -105,3 +118,9 @@ def test_wrong_use_is_refused():
         blitzgs.l1_ssim(x, x.int())
     with pytest.raises(TypeError, match="masks must be bool or uint8, got torch.float32; pass masks != 0"):
         blitzgs.l1_ssim(x, x, torch.ones(1, 8, 8))
+    learned = torch.rand(1, 8, 8, 3, requires_grad=True)
+    for renders in (x, learned):
+        with pytest.raises(ValueError, match=r"targets require a gradient, .*; pass targets.detach\(\)"):
+            blitzgs.l1_ssim(renders, learned)
+    with torch.no_grad():
+        blitzgs.l1_ssim(x, learned)
