@@ -24,19 +24,48 @@ _PENDING_OF = itemgetter(
     "exp_avg.means", "exp_avg_sq.means", "exp_avg.scales", "exp_avg_sq.scales", "last_step", "moment_step"
 )
 
+# `morton_order` takes the span of a cloud between the quantiles `_SHARE` and 1 - `_SHARE` of at most `_SAMPLE`
+# rows, and its grid reaches `_REACH` spans beyond them. So the span has at least 2^21 / 65 cells a side.
+_SAMPLE, _SHARE, _REACH = 1 << 16, 0.05, 32.0
 
+
+@torch.no_grad()
 def morton_order(means: Tensor) -> Tensor:
     """Return the permutation (int64 [N]) that puts neighbours in space next to each other.
 
-    Rows with the same Morton key keep their order; rows that are not finite come last.
+    Rows with the same Morton key keep their order; rows that are not finite come last. Rows far outside the
+    cloud count as if they lay at its border, so that they do not coarsen the grid of all others. The result
+    is the same on all devices.
 
     Args:
         means: [N, 3], float32; other dtypes are rounded to it.
 
     Raises:
-        RuntimeError: a wrong shape.
+        TypeError: `means` is not a tensor.
+        ValueError: it has a wrong shape.
     """
-    return torch.sort(morton_keys(means.float()), stable=True).indices
+    if not isinstance(means, Tensor):
+        raise TypeError(f"means must be a torch.Tensor, got {type(means).__name__}")
+    if means.dim() != 2 or means.shape[1] != 3:
+        raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
+    return torch.sort(morton_keys(_without_far(means.float())), stable=True).indices
+
+
+def _without_far(points: Tensor) -> Tensor:
+    """Return points [N, 3] whose finite coordinates lie at most `_REACH` spans outside the quantiles.
+
+    The span is the largest distance of the quantiles on an axis. If it is 0 or unknown, no point moves.
+    """
+    if len(points) == 0:
+        return points
+    sample = points[:: -(-len(points) // _SAMPLE)]
+    sample = sample.where(sample.isfinite(), torch.nan)
+    # Quantiles that are values of the sample are the same on all devices.
+    low, high = (sample.nanquantile(q, dim=0, interpolation="nearest") for q in (_SHARE, 1 - _SHARE))
+    reach = _REACH * (high - low).amax()
+    known = reach > 0
+    low, high = (low - reach).where(known, -torch.inf), (high + reach).where(known, torch.inf)
+    return points.where(~points.isfinite(), points.clamp(low, high))
 
 
 class BlockIndex:

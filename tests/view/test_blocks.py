@@ -287,6 +287,38 @@ def test_morton_order_keeps_neighbours_together(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_points_far_away_leave_the_morton_order_of_the_others(device):
+    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(0)).to(device)
+    assert torch.equal(morton_order(points), morton_keys(points).sort(stable=True).indices)
+    far = points.clone()
+    far[::50] = torch.tensor([1e8, -3e38, 1e5], device=device)
+    far[7] = torch.inf
+    order = morton_order(far)
+    near = points[order[:-1]][far[order[:-1], 0] < 1e8]
+    assert int(order[-1]) == 7 and len(near) == 489
+    assert near.diff(dim=0).norm(dim=1).median() < 0.4 * points.diff(dim=0).norm(dim=1).median()
+    assert torch.equal(morton_order(far.cpu()), order.cpu())
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_morton_order_without_a_span_is_that_of_the_keys(device):
+    """Most points lie in one place, or few are finite."""
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)).to(device)
+    points[10:] = 0.5
+    assert torch.equal(morton_order(points), morton_keys(points).sort(stable=True).indices)
+    points[1:] = torch.nan
+    assert morton_order(points).tolist() == list(range(200))
+
+
+def test_a_morton_order_needs_points():
+    with pytest.raises(TypeError, match=r"means must be a torch\.Tensor, got list"):
+        morton_order([[0.0, 1.0, 2.0]])
+    with pytest.raises(ValueError, match=r"means must be \[N, 3\], got \[5, 2\]"):
+        morton_order(torch.zeros(5, 2))
+    assert morton_order(torch.zeros(5, 3, requires_grad=True)).tolist() == list(range(5))
+
+
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [0, 1, 256, 257])
 def test_odd_sizes(device, n):
     table = make_table(3000, device)
