@@ -264,27 +264,30 @@ class LazyAdam(torch.optim.Optimizer):
         """Add rows at the end of every parameter; their moments are zero.
 
         Args:
-            rows: [M, ...] for the `name` of every group.
+            rows: [M, ...] for the `name` of every group; converted to the dtype and device of the parameter.
 
         Returns:
             The new parameters by name. They replace the old ones in this optimiser.
 
         Raises:
+            TypeError: rows are not a tensor.
             ValueError: names or shapes do not fit.
         """
         named = self._named()
         if rows.keys() != named.keys():
             raise ValueError(f"LazyAdam.append: rows for {sorted(named)} are needed, got {sorted(rows)}")
+        for name, group in named.items():
+            new, old = rows[name], group["params"][0]
+            _check_tensor(f"append: new rows of {name}", new)
+            if new.dim() == 0 or new.shape[1:] != old.shape[1:]:
+                wanted = ", ".join(("M", *map(str, old.shape[1:])))
+                raise ValueError(
+                    f"LazyAdam.append: new rows of {name} must be [{wanted}], got {list(new.shape)}"
+                )
         counts = {len(new) for new in rows.values()}
         if len(counts) != 1:
             raise ValueError(f"LazyAdam.append: the numbers of new rows differ: {sorted(counts)}")
         (count,) = counts
-        for name, group in named.items():
-            new, old = rows[name].shape, group["params"][0].shape
-            if new[1:] != old[1:]:
-                raise ValueError(
-                    f"LazyAdam.append: new rows of {name} must be {[count, *old[1:]]}, got {list(new)}"
-                )
 
         def grow(name: str, old: Tensor) -> Tensor:
             return torch.cat([old, rows[name].to(old)])
@@ -298,22 +301,63 @@ class LazyAdam(torch.optim.Optimizer):
         """Keep the rows where `mask`, bool [N], is true; return the new parameters as `append` does.
 
         Raises:
-            ValueError: the mask has another dtype, or not one entry for each row.
+            TypeError: the mask is not a tensor.
+            ValueError: the mask has another dtype or device, or not one entry for each row.
         """
+        _check_tensor("keep: mask", mask)
         if mask.dtype != torch.bool:
             raise ValueError(f"LazyAdam.keep: mask must be bool, got {mask.dtype}")
         for name, group in self._named().items():
-            if mask.shape != group["params"][0].shape[:1]:
+            param = group["params"][0]
+            if mask.shape != param.shape[:1]:
                 raise ValueError(
-                    f"LazyAdam.keep: mask must be [{len(group['params'][0])}], a value for each row of "
-                    f"{name}, got {list(mask.shape)}"
+                    f"LazyAdam.keep: mask must be [{len(param)}], a value for each row of {name}, got "
+                    f"{list(mask.shape)}"
                 )
-        return self.permute(mask.nonzero()[:, 0])
+            _check_device("keep: mask", mask, name, param)
+        return self._select(mask.nonzero()[:, 0])
 
     def permute(self, order: Tensor) -> dict[str, Parameter]:
-        """Make row i the old row `order[i]` (int64 [N'], each at most once); return as `append` does."""
+        """Make row i the old row `order[i]`; return the new parameters as `append` does.
+
+        Args:
+            order: int64 [N'], each row at most once; rows that are missing are dropped.
+
+        Raises:
+            TypeError: the order is not a tensor.
+            ValueError: the order has another shape, dtype or device, or has a row twice or one that does not
+                exist.
+        """
+        _check_tensor("permute: order", order)
+        if order.dtype != torch.int64 or order.dim() != 1:
+            raise ValueError(
+                f"LazyAdam.permute: order must be int64 [N'], the old rows, got {order.dtype} "
+                f"{list(order.shape)}; `keep` takes a mask"
+            )
+        named = self._named()
+        for name, group in named.items():
+            _check_device("permute: order", order, name, group["params"][0])
+        name, count = min(
+            ((name, len(group["params"][0])) for name, group in named.items()), key=lambda pair: pair[1]
+        )
+        absent = order[(order < 0) | (order >= count)]
+        if len(absent) > 0:
+            raise ValueError(
+                f"LazyAdam.permute: order must have rows 0 to {count - 1}, as {name} has {count}, got "
+                f"{int(absent[0])}"
+            )
+        twice = (order.bincount() > 1).nonzero()[:, 0]
+        if len(twice) > 0:
+            raise ValueError(
+                f"LazyAdam.permute: order must have each row at most once, got row {int(twice[0])} again; "
+                "`append` adds copies"
+            )
+        return self._select(order)
+
+    def _select(self, rows: Tensor) -> dict[str, Parameter]:
+        """Make the parameters of some of their rows, int64 [N']."""
         return self._renew(
-            self._named(), lambda _, old: old.index_select(0, order), lambda old: old.index_select(0, order)
+            self._named(), lambda _, old: old.index_select(0, rows), lambda old: old.index_select(0, rows)
         )
 
     @torch.no_grad()
@@ -418,6 +462,16 @@ class LazyAdam(torch.optim.Optimizer):
                     "both together (append, keep, permute)"
                 )
         return state
+
+
+def _check_tensor(argument: str, value: object) -> None:
+    if not isinstance(value, Tensor):
+        raise TypeError(f"LazyAdam.{argument} must be a torch.Tensor, got {type(value).__name__}")
+
+
+def _check_device(argument: str, value: Tensor, name: str, param: Tensor) -> None:
+    if value.device != param.device:
+        raise ValueError(f"LazyAdam.{argument} is on {value.device} and {name} on {param.device}; move one")
 
 
 def _check_group(group: dict[str, Any]) -> None:

@@ -24,7 +24,7 @@ _PENDING_OF = itemgetter(
     "exp_avg.means", "exp_avg_sq.means", "exp_avg.scales", "exp_avg_sq.scales", "last_step", "moment_step"
 )
 
-# `morton_order` takes the span of a cloud between the quantiles `_SHARE` and 1 - `_SHARE` of at most `_SAMPLE`
+# `morton_order` takes the span of a cloud between the quantiles `_SHARE` and 1 - `_SHARE` of up to `_SAMPLE`
 # rows, and its grid reaches `_REACH` spans beyond them. So the span has at least 2^21 / 65 cells a side.
 _SAMPLE, _SHARE, _REACH = 1 << 16, 0.05, 32.0
 

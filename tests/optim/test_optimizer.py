@@ -264,10 +264,43 @@ def test_rows_that_do_not_fit_change_nothing():
     for length in (3, 5):
         with pytest.raises(ValueError, match=rf"mask must be \[4\], .* of means, got \[{length}\]"):
             optimizer.keep(torch.arange(length) < 2)
-    with pytest.raises(ValueError, match=r"new rows of sh must be \[2, 16, 3\], got \[2, 9, 3\]"):
+    with pytest.raises(ValueError, match=r"new rows of sh must be \[M, 16, 3\], got \[2, 9, 3\]"):
         optimizer.append({"means": torch.ones(2, 3), "sh": torch.ones(2, 9, 3)})
+    with pytest.raises(TypeError, match=r"new rows of sh must be a torch\.Tensor, got list"):
+        optimizer.append({"means": torch.ones(2, 3), "sh": [1.0, 2.0]})
+    with pytest.raises(ValueError, match=r"new rows of means must be \[M, 3\], got \[\]"):
+        optimizer.append({"means": torch.tensor(1.0), "sh": torch.ones(1, 16, 3)})
+    with pytest.raises(ValueError, match=r"the numbers of new rows differ: \[1, 2\]"):
+        optimizer.append({"means": torch.ones(2, 3), "sh": torch.ones(1, 16, 3)})
+    with pytest.raises(TypeError, match=r"keep: mask must be a torch\.Tensor, got list"):
+        optimizer.keep([True] * 4)
+    with pytest.raises(ValueError, match="keep: mask is on meta and means on cpu; move one"):
+        optimizer.keep(torch.ones(4, dtype=torch.bool, device="meta"))
     assert optimizer.param_groups[0]["params"][0] is means and optimizer.param_groups[1]["params"][0] is sh
     assert all(len(new) == 2 for new in optimizer.keep(torch.arange(4) < 2).values())
+
+
+@pytest.mark.parametrize(
+    ("order", "error", "message"),
+    [
+        ([0, 1], TypeError, r"order must be a torch\.Tensor, got list"),
+        (torch.ones(4, dtype=torch.bool), ValueError, r"got torch.bool \[4\]; `keep` takes a mask"),
+        (torch.zeros(4), ValueError, r"order must be int64 \[N'\], the old rows, got torch.float32 \[4\]"),
+        (torch.arange(4)[None], ValueError, r"got torch.int64 \[1, 4\]"),
+        (torch.tensor([0, -1]), ValueError, "order must have rows 0 to 3, as means has 4, got -1"),
+        (torch.tensor([0, 4]), ValueError, "order must have rows 0 to 3, as means has 4, got 4"),
+        (torch.tensor([2, 0, 3, 2]), ValueError, "each row at most once, got row 2 again"),
+        (torch.arange(4, device="meta"), ValueError, "order is on meta and means on cpu; move one"),
+    ],
+    ids=str,
+)
+def test_an_order_that_is_none_changes_nothing(order, error, message):
+    means = torch.ones(4, 3, requires_grad=True)
+    optimizer = LazyAdam([{"params": [means], "name": "means"}])
+    with pytest.raises(error, match=f"LazyAdam.permute: .*{message}"):
+        optimizer.permute(order)
+    assert optimizer.param_groups[0]["params"][0] is means
+    assert len(optimizer.permute(torch.arange(0))["means"]) == 0
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
