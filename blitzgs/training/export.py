@@ -138,7 +138,7 @@ def without_antialiasing(model: Model, cameras: Sequence[CameraLike]) -> Model:
     areas = torch.zeros_like(opacities, dtype=torch.float64)
     compensated = torch.zeros_like(areas)
     for camera in cameras:
-        _, meta = model.splat([camera], antialiased=True)
+        _, _, meta = model.splat([camera], antialiased=True)
         ids = meta["gaussian_ids"].long()
         a, b, c = meta["conics"].double().unbind(-1)
         area = (a * c - b * b).clamp_min(1e-12).rsqrt()

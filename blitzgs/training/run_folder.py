@@ -31,7 +31,7 @@ from blitzgs.training.views import CameraLike, Space, render_options, viewmat
 from blitzgs.view.gate import SceneGate, centres_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Model:
     """N trained Gaussians before activation, without optimiser state; lengths in trained units.
 
@@ -66,19 +66,35 @@ class Model:
     def __len__(self) -> int:
         return len(self.means)
 
+    def __repr__(self) -> str:
+        return (
+            f"Model({len(self):,} Gaussians of SH degree {self.sh_degree} on {self.means.device}, "
+            f"{self.images_seen:,} images seen)"
+        )
+
     @torch.no_grad()
-    def render(self, camera: CameraLike) -> Tensor:
+    def render(self, camera: CameraLike, render_mode: str = "RGB", alpha: bool = False) -> Tensor:
         """Render a view as the run's own evaluation does.
 
         Args:
             camera: any pinhole camera with a pose in the re-centred world, for example from
                 `RunFolder.cameras` or `camera`.
+            render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED", as for `blitzgs.rasterization`; depths are in
+                the capture's unit.
+            alpha: whether the opacity of each pixel follows as the last channel.
 
         Returns:
-            float32 [H, W, 3] on the model's device, not clamped.
+            float32 [H, W, channels] on the model's device: colours (not clamped), depth, alpha.
+
+        Raises:
+            ValueError: there is no such mode.
         """
-        images, _ = self._kept(camera).splat([camera], antialiased=self.config.model.antialiased)
-        return images[0]
+        images, alphas, _ = self._kept(camera).splat(
+            [camera], antialiased=self.config.model.antialiased, render_mode=render_mode
+        )
+        if "D" in render_mode:
+            images[..., -1] *= self.space.unit
+        return torch.cat([images[0], alphas[0]], dim=-1) if alpha else images[0]
 
     def _kept(self, camera: CameraLike) -> Model:
         """Return the Gaussians that the LOD gate keeps for a view, faded if levels are smooth."""
@@ -93,13 +109,15 @@ class Model:
             columns["opacities"] = faded.logit().float()
         return dataclasses.replace(self, **columns)
 
-    def splat(self, cameras: list[CameraLike], antialiased: bool) -> tuple[Tensor, Any]:
-        """Call `blitzgs.rasterization` for cameras of one size; return its images and meta."""
+    def splat(
+        self, cameras: list[CameraLike], antialiased: bool, render_mode: str = "RGB"
+    ) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        """Call `blitzgs.rasterization` for cameras of one size; return its images, alphas and meta."""
         options = render_options(self.config, self.space, self.sh_degree)
         device = self.means.device
         poses = np.stack([viewmat(camera, self.space) for camera in cameras])
         background = torch.tensor([options.background] * len(cameras), device=device)
-        images, _, meta = rasterization(
+        return rasterization(
             self.means,
             self.quats,
             self.scales.exp(),
@@ -114,9 +132,9 @@ class Model:
             eps2d=options.eps2d,
             sh_degree=self.sh_degree,
             backgrounds=background,
+            render_mode=render_mode,
             rasterize_mode="antialiased" if antialiased else "classic",
         )
-        return images, meta
 
     def camera(
         self, K: np.ndarray, world_to_camera: np.ndarray, width: int, height: int, name: str = "view"
@@ -150,6 +168,10 @@ class RunFolder:
         """
         self.path = Path(path)
         run.check_is_run(self.path)
+
+    def __repr__(self) -> str:
+        state = "finished" if (self.path / run.SUMMARY).exists() else "not finished"
+        return f"RunFolder({str(self.path)!r}, {state})"
 
     def config(self) -> Config:
         """Return the configuration in the folder."""

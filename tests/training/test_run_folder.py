@@ -79,6 +79,37 @@ def test_what_a_run_folder_holds(trained, tmp_path):
         blitzgs.open_run(tmp_path)
 
 
+def test_a_model_renders_depth_and_alpha_too(trained):
+    folder = blitzgs.open_run(trained[1])
+    model, camera = folder.model(), folder.cameras().cameras[0]
+    both = model.render(camera, "RGB+ED", alpha=True)
+    assert both.shape == (32, 48, 5)
+    torch.testing.assert_close(both[..., :3], model.render(camera))
+    torch.testing.assert_close(both[..., 3:4], model.render(camera, render_mode="ED"))
+    # Depths are lengths in the capture: they do not depend on the unit of the training.
+    plain = dataclasses.replace(model, lod=None)
+    other = dataclasses.replace(
+        plain,
+        means=model.means / 2,
+        scales=model.scales - math.log(2),
+        space=dataclasses.replace(model.space, unit=2 * model.space.unit),
+    )
+    torch.testing.assert_close(other.render(camera, "RGB+ED", True), plain.render(camera, "RGB+ED", True))
+    covered = both[..., 4] > 0.9
+    assert covered.any() and both[..., 3][covered].median() > 0
+    with pytest.raises(ValueError, match="render_mode must be one of .*, got 'depth'"):
+        model.render(camera, "depth")
+
+
+def test_a_run_and_its_model_print_in_a_line(trained, copy):
+    model = blitzgs.open_run(trained[1]).model()
+    assert repr(model) == f"Model({len(model):,} Gaussians of SH degree 3 on cpu, 40 images seen)"
+    folder = blitzgs.open_run(copy[1])
+    assert repr(folder) == f"RunFolder({str(copy[1])!r}, finished)"
+    (copy[1] / "summary.json").unlink()
+    assert repr(folder).endswith(", not finished)")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
