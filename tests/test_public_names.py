@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The public names of `blitzgs` exist after `import blitzgs`, which loads no kernels."""
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import blitzgs
+
+ROOT = Path(__file__).resolve().parents[1]
+IMPORT = re.compile(r"^from (blitzgs[\w.]*) import ([\w, ]+)", re.MULTILINE)
 
 CODE = """
 import sys
@@ -18,6 +23,15 @@ assert issubclass(blitzgs.optim.LazyAdam, object)
 
 def test_public_names_are_loaded_when_they_are_asked_for():
     subprocess.run([sys.executable, "-c", CODE], check=True)
+
+
+def test_every_name_that_the_examples_import_is_said_to_be_public():
+    pages = [ROOT / "README.md", *(ROOT / "docs" / "guide").glob("*.md"), *(ROOT / "examples").glob("*.py")]
+    imports = [found for page in pages for found in IMPORT.findall(page.read_text())]
+    used = {f"{module}.{name.strip()}" for module, names in imports for name in names.split(",")}
+    used -= {f"blitzgs.{name}" for name in blitzgs.__all__}
+    section = (ROOT / "docs/guide/own-trainer.md").read_text().split("## Public names")[1].split("\n## ")[0]
+    assert used and used <= set(re.findall(r"`([^`]+)`", section))
 
 
 def test_an_unknown_public_name_is_an_error():
