@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blitzgs.scene.synth.arrays import Doubles, Floats, dot
+from blitzgs.scene.synth.arrays import Doubles, Floats, dot, transformed
 from blitzgs.scene.synth.options import CityOptions
 
 FIELD_OF_VIEW = math.radians(62)  # horizontal
@@ -36,7 +36,7 @@ class View:
 
     def project(self, points: Doubles) -> tuple[Doubles, Doubles]:
         """Return pixels [N, 2] and depths [N] of world points [N, 3]; pixels mean nothing at depth <= 0."""
-        camera = (points - self.centre) @ self.rotation.T
+        camera = transformed(self.rotation, (points - self.centre).T)
         depth = camera[:, 2]
         safe = np.where(depth > 1e-6, depth, 1.0)
         pixels = camera[:, :2] / safe[:, None] * self.focal + np.array([self.width, self.height]) / 2
@@ -48,8 +48,7 @@ class View:
         camera[0] = (pixels[:, 0] - self.width / 2) / self.focal
         camera[1] = (pixels[:, 1] - self.height / 2) / self.focal
         camera /= np.sqrt(dot(camera, camera))
-        world: Floats = camera.T @ self.rotation.astype(pixels.dtype)
-        return world
+        return transformed(self.rotation.T.astype(pixels.dtype), camera)
 
 
 def flight_height(options: CityOptions) -> float:

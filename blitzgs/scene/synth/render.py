@@ -204,7 +204,7 @@ class City:
 
     def _sunny(self, samples: Floats, group: Ints, count: Floats, normal: Floats, material: Ints) -> Floats:
         """Return the cosine at which the sun shines on each group, times its samples without shadow, [G]."""
-        facing = _SUN @ normal
+        facing = dot(_SUN, normal)
         # Light passes through leaves, so crowns are lit a little past their terminator.
         facing = np.where(material == mesh.LEAVES, 0.75 * facing + 0.25, facing)
         towards = np.flatnonzero((facing > 0)[group])

@@ -17,7 +17,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from blitzgs.scene.synth.arrays import Bools, Bytes, Doubles, Ints
+from blitzgs.scene.synth.arrays import Bools, Bytes, Doubles, Ints, transformed
 from blitzgs.scene.synth.flight import View
 from blitzgs.scene.synth.mesh import LEAVES
 from blitzgs.scene.synth.render import City
@@ -140,7 +140,7 @@ def ball(points: Doubles) -> Doubles:
 
 def may_see(view: View, balls: Doubles) -> Bools:
     """Return which balls [B, 4] reach into the pyramid of a view; conservative near its corners."""
-    x, y, z = ((balls[:, :3] - view.centre) @ view.rotation.T).T
+    x, y, z = transformed(view.rotation, (balls[:, :3] - view.centre).T).T
     half = np.array([view.width, view.height]) / (2 * view.focal)
     outside = np.stack([np.abs(x) - half[0] * z, np.abs(y) - half[1] * z]) / np.hypot(half, 1)[:, None]
     reached: Bools = np.maximum(outside.max(0), -z) < balls[:, 3]
