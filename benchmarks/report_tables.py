@@ -39,7 +39,6 @@ COMMANDS = {
     "training_2": f"torchrun --nproc-per-node=2 {TRAINING}",
     "drop_in": "python benchmarks/bm_drop_in.py CAPTURE",
     "drop_in_1": "python benchmarks/bm_drop_in.py CAPTURE --one-thread",
-    "drop_in_full": "python benchmarks/bm_drop_in.py CAPTURE --steps 30000 --one-thread",
     "importance": "python benchmarks/bm_importance.py",
     "gate": "python benchmarks/bm_gate.py",
     "scratch": "python benchmarks/bm_scratch.py",
@@ -69,6 +68,15 @@ COMMANDS |= {
         "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/compact_later "
         '--capture "NAME=CAPTURE --schedule.scale=0.5"'
     ),
+    "gate_random": (
+        'python benchmarks/bm_quality.py --out runs/gate_random --capture "NAME=CAPTURE --schedule.scale=0.5" '
+        '--recipe "learned_NAME=$ARM --population.gate=gates/without_NAME.json" '
+        '--recipe "random=$ARM --population.gate=random" --per-gpu 2'
+    ),
+    "town": (
+        "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/town "
+        "--capture town=DATA/town --seeds 0 1"
+    ),
     "adaptive": (
         "python benchmarks/bm_quality.py --plan benchmarks/adaptive.yaml --out runs/adaptive "
         "--capture NAME=CAPTURE --per-gpu 3"
@@ -93,12 +101,13 @@ GROUPS = (
     ("energy",),
     ("compact",),
     ("compact_later",),
+    ("gate_random",),
+    ("town",),
     ("adaptive",),
     ("offload",),
     ("importance",),
     ("call",),
     ("drop_in", "drop_in_1"),
-    ("drop_in_full",),
     ("exchange", "training", "training_2"),
     ("city", "city_exchange"),
     ("city_ranks",),
@@ -110,6 +119,8 @@ COPIED = {
     "energy": "cp runs/energy/quality.json benchmarks/results/energy.json",
     "compact": "cp runs/compact/quality.json benchmarks/results/compact.json",
     "compact_later": "cp runs/compact_later/quality.json benchmarks/results/compact_later.json",
+    "gate_random": "cp runs/gate_random/quality.json benchmarks/results/gate_random.json",
+    "town": "cp runs/town/quality.json benchmarks/results/town.json",
     "adaptive": "cp runs/adaptive/quality.json benchmarks/results/adaptive.json",
 }
 QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
@@ -322,6 +333,18 @@ def compact_lines(compact: Json) -> list[str]:
     return arm_lines(compact, arms, columns)
 
 
+def town_lines(town: Json) -> list[str]:
+    """Tabulate compact.yaml, the whole model level and none of it; without times, as runs shared the host."""
+    arms = {"half": "compact.yaml", "full_60": OUR_ARMS["full_60"], "all_off": "all off"}
+    return arm_lines(town, {name: {"title": title} for name, title in arms.items()}, ABLATION_COLUMNS)
+
+
+def gate_random_lines(gates: Json) -> list[str]:
+    """Tabulate the learned gate of each capture against a random veto."""
+    learned = {run["recipe"]: {"title": "learned gate"} for run in gates["runs"] if run["recipe"] != "random"}
+    return arm_lines(gates, learned | {"random": {"title": "random veto"}}, ABLATION_COLUMNS)
+
+
 def adaptive_lines(adaptive: Json) -> list[str]:
     """Tabulate the fixed and the adaptive schedule."""
     arms = {name: {"title": title} for name, title in ADAPTIVE_ARMS.items()}
@@ -418,7 +441,6 @@ SECTIONS = {
     "training_2": Section(("training_2",), row_lines),
     "drop_in": Section(("drop_in",), row_lines),
     "drop_in_1": Section(("drop_in_1",), row_lines),
-    "drop_in_full": Section(("drop_in_full",), row_lines),
     "importance": Section(("importance",), row_lines),
     "gate": Section(("gate",), row_lines),
     "lineage": Section(("lineage",), row_lines),
@@ -433,6 +455,8 @@ SECTIONS = {
     "oracle": Section(("oracle",), row_lines),
     "compact": Section(("compact",), compact_lines),
     "compact_later": Section(("compact_later",), compact_lines),
+    "gate_random": Section(("gate_random",), gate_random_lines),
+    "town": Section(("town",), town_lines),
     "adaptive": Section(("adaptive",), adaptive_lines),
     "offload": Section(("offload",), offload_lines),
     "summary": Section(("render", "step_1", "step_4"), summary_lines),
