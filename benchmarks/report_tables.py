@@ -29,6 +29,10 @@ class Section:
 # File in benchmarks/results (without .json) -> the command that writes it.
 EXCHANGE = "python benchmarks/bm_exchange.py --gaussians 16000000 --device cuda --batch 4 --batches 4"
 TRAINING = "benchmarks/bm_training.py --data CAPTURE --config configs/aerial.yaml --images 3000"
+EARLY_GATE = (
+    "configs/compact.yaml --schedule.t1=8999 --population.pass1_keep=1 --schedule.gate_from=2000 "
+    "--population.pass2_keep=0.7"
+)
 COMMANDS = {
     "render": "python benchmarks/bm_render.py",
     "call": "python benchmarks/bm_render.py --scenes aerial1 aerial4",
@@ -69,9 +73,10 @@ COMMANDS |= {
         '--capture "NAME=CAPTURE --schedule.scale=0.5"'
     ),
     "gate_random": (
-        'python benchmarks/bm_quality.py --out runs/gate_random --capture "NAME=CAPTURE --schedule.scale=0.5" '
-        '--recipe "learned_NAME=$ARM --population.gate=gates/without_NAME.json" '
-        '--recipe "random=$ARM --population.gate=random" --per-gpu 2'
+        "python benchmarks/bm_quality.py --out runs/gate_random "
+        '--capture "NAME=CAPTURE --schedule.scale=0.5" '
+        f'--recipe "learned_NAME={EARLY_GATE} --population.gate=GATE" '
+        f'--recipe "random={EARLY_GATE} --population.gate=random" --per-gpu 2'
     ),
     "town": (
         "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/town "
