@@ -25,6 +25,8 @@ from blitzgs.training.views import VIEW_NUMBERS, ViewSet, unpack_views
 # For every batch that is prepared ahead, the photographs of this number of later batches are decoded, too.
 # Decoding one takes as long as several steps on a fast GPU.
 _DECODED = 4
+# A view of which masks exclude a larger share is counted in `BatchLoader.masked`.
+MOST_MASKED = 0.95
 
 
 class PhotographError(RuntimeError):
@@ -177,6 +179,7 @@ class BatchLoader:
         lost: on several ranks, why this rank could not read a photograph (the first one, if there are
             several). The rank cannot stop alone in the middle of a step, so it continues and treats all
             pixels of such photographs as masked. None: it has read all photographs.
+        masked: number of views, among the `read` ones, of which a mask excludes more than `MOST_MASKED`.
         waited: seconds that the caller has waited for batches so far.
     """
 
@@ -208,6 +211,7 @@ class BatchLoader:
         self._owners = owners
         self._counts: dict[int, float] = {}
         self.lost: str | None = None
+        self.masked = 0
         self.waited = 0.0
         self._train = train
         self._sampler = sampler
@@ -251,6 +255,11 @@ class BatchLoader:
             stream.wait_event(slot.uploaded)
         self._used = slot
         return batch
+
+    @property
+    def read(self) -> int:
+        """The number of views that have been read so far, each counted once."""
+        return len(self._counts)
 
     def close(self) -> None:
         """Stop the thread."""
@@ -355,6 +364,7 @@ class BatchLoader:
         if index not in self._counts:
             width, height = self._views.size([index])
             counted = width * height if mask is None else int((mask != 0).sum())
+            self.masked += counted < (1.0 - MOST_MASKED) * width * height
             self._counts[index] = float(max(1, 3 * counted))
         return self._counts[index]
 

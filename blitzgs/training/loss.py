@@ -142,7 +142,7 @@ def _mean_over_visible(frame: Frame, values: Tensor) -> Tensor:
 
 
 def batch_psnr(frame: Frame, batch: Batch) -> Tensor:
-    """Return the PSNR of a batch in dB, over all pixels that are not masked."""
+    """Return the PSNR of a batch in dB, over all pixels that are not masked; nan if all are masked."""
     error = ((frame.renders.clamp(0, 1) - batch.targets.float() / 255.0) ** 2).sum(-1)
     if batch.masks is not None:
         error *= batch.masks != 0
@@ -152,4 +152,6 @@ def batch_psnr(frame: Frame, batch: Batch) -> Tensor:
     total = error.sum()
     if frame.assignment is not None:
         frame.assignment.ranks.all_reduce(total)
-    return -10.0 * (total / batch.samples.sum()).clamp(min=1e-12).log10()
+    psnr = -10.0 * (total / batch.samples.sum()).clamp(min=1e-12).log10()
+    # A view without a pixel that counts has 1 sample, and any other has at least 3.
+    return psnr.where(batch.samples.amax() > 1, torch.nan)

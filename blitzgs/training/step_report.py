@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -22,8 +23,8 @@ class StepRecord(NamedTuple):
     Attributes:
         figures: float64 as int64 [8 + B]. Of all ranks: the number of ranks with parameters that are not
             finite, the Gaussians that the step projected, those of them that are visible in a view, and all
-            Gaussians. Of the batch: L_scale, L_opacity and L_size (0 if their weights are), PSNR, and
-            `Batch.samples` [B].
+            Gaussians. Of the batch: L_scale, L_opacity and L_size (0 if their weights are), PSNR (nan if all
+            pixels are masked), and `Batch.samples` [B].
         sums: `LossTerms.parts` over all ranks.
     """
 
@@ -71,7 +72,8 @@ def log_step(state: TrainingState, record: StepRecord) -> None:
     losses = photometric(record.sums.read()[: 2 * len(samples)], samples, loss)
     values = {
         "loss": losses.mean().item() + loss.scale * scale + loss.opacity * opacity + loss.size * size,
-        "psnr": psnr,
+        # Without a pixel that counts there is no PSNR, and JSON has no nan.
+        **({} if math.isnan(psnr) else {"psnr": psnr}),
         "active": active,
         "visible": visible,
         "gaussians": int(population),

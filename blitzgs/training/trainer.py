@@ -20,7 +20,7 @@ from blitzgs.population.importance import PHI
 from blitzgs.scene.capture import Capture
 from blitzgs.training import run, view_level
 from blitzgs.training.agreement import MOST_STEPS, Agreement, StopRequest
-from blitzgs.training.batches import BatchLoader, Images, PhotographError
+from blitzgs.training.batches import MOST_MASKED, BatchLoader, Images, PhotographError
 from blitzgs.training.budget import Budget
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import config_hash, save_config
@@ -70,6 +70,7 @@ class Trainer:
         self._unwritten: StepRecord | None = None  # the record of the last step
         # On CUDA a record is written one step later, so that the host does not wait for its figures.
         self._writes_late = ranks.device.type == "cuda"
+        self._warned_of_masks = False
         self.memory = MemoryMeter()
 
     @torch.no_grad()
@@ -215,6 +216,22 @@ class Trainer:
             self.memory.sample(state.ranks.device)
             if not self._writes_late:
                 self._write_record()
+        if is_logged or step == schedule.steps:
+            self._check_masks()
+
+    def _check_masks(self) -> None:
+        """Warn once if masks exclude nearly all of some training views, as inverted masks do."""
+        masked, read = self.loader.masked, self.loader.read
+        if not masked or self._warned_of_masks:
+            return
+        self._warned_of_masks = True
+        if self.state.ranks.rank == 0:
+            warnings.warn(
+                f"{masked} of the first {read} training views are masked by more than {MOST_MASKED:.0%}: "
+                "black excludes a pixel and white counts. Invert the masks if they mean the opposite, or train "
+                "without them (--data.masks=false)",
+                stacklevel=2,
+            )
 
     def _write_record(self) -> None:
         """Write the log record of the last step, if it is not written yet; wait for its figures."""

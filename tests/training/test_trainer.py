@@ -148,6 +148,32 @@ def test_batches_masks_background_and_sparse_adam(tmp_path):
     assert max(start, 420) >= trainer.state.progress.peak_gaussians
 
 
+@pytest.mark.parametrize("white", [0, 1], ids=["black", "inverted"])
+def test_training_views_that_are_masked_almost_as_a_whole_are_counted(tmp_path, white):
+    """Masks whose meaning is inverted exclude all or almost all of a view; the run says so, once."""
+    capture, images = tiny_scene()
+    images.masks = [torch.zeros(32, 48, dtype=torch.uint8) for _ in images.images]
+    for mask in images.masks:
+        mask[:8, :8] = white  # 4 % of the pixels
+    images.masks[capture.test[0]] = None
+    config = tiny_config("schedule.iterations=40")
+    with pytest.warns(UserWarning, match="7 of the first 7 training views are masked by more than") as found:
+        Trainer(config, capture, images, tmp_path, Ranks()).train()
+    assert len(found) == 1 and "95%: black excludes a pixel and white counts" in str(found[0].message)
+    # A step without a pixel that counts has no PSNR.
+    assert ["psnr" in record for record in steps_of(tmp_path)] == [bool(white)] * 2
+
+
+def test_a_short_run_and_only_some_masks(tmp_path):
+    capture, images = tiny_scene()
+    images.masks = [None] * 8
+    images.masks[capture.train[0]] = torch.zeros(32, 48, dtype=torch.uint8)
+    images.masks[capture.train[1]] = torch.ones(32, 48, dtype=torch.uint8)
+    config = tiny_config("schedule.iterations=10", "log.every=100")
+    with pytest.warns(UserWarning, match="1 of the first 7 training views are masked"):
+        Trainer(config, capture, images, tmp_path, Ranks()).train()
+
+
 def test_views_that_see_nothing(tmp_path):
     capture, images = tiny_scene()
     for camera in capture.cameras:
