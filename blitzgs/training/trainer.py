@@ -31,10 +31,13 @@ from blitzgs.training.lod import lod_gate
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.setup import set_up
-from blitzgs.training.state import never
+from blitzgs.training.state import TrainingState, never
 from blitzgs.training.step_report import StepRecord, log_step, measure_step
 from blitzgs.training.views import render_options
 from blitzgs.view.residence import ResidenceError
+
+# With fewer views for each rank, a step takes a rank's host longer than its GPU (docs/city.md).
+VIEWS_PER_RANK = 4
 
 
 class Trainer:
@@ -228,8 +231,8 @@ class Trainer:
         if self.state.ranks.rank == 0:
             warnings.warn(
                 f"{masked} of the first {read} training views are masked by more than {MOST_MASKED:.0%}: "
-                "black excludes a pixel and white counts. Invert the masks if they mean the opposite, or train "
-                "without them (--data.masks=false)",
+                "black excludes a pixel and white counts. Invert the masks if they mean the opposite, or "
+                "train without them (--data.masks=false)",
                 stacklevel=2,
             )
 
@@ -266,6 +269,9 @@ class Trainer:
             f"{views['train']} training views, {views['test']} held out; "
             f"{images:,} images, {images / views['train']:,.0f} per view"
         )
+        if state.config.data.downscale > 1:
+            factor = f"data.downscale={state.config.data.downscale:g}"
+            text += f"; images of {_largest_size(state)} ({factor})"
         if ranks.world_size > 1:
             text += f"; {ranks.world_size} ranks, transport {ranks.transport}"
         if state.config.schedule.minutes > 0:
@@ -274,6 +280,9 @@ class Trainer:
         state.log.event(
             state.images_seen, "start", {"origin": state.origin} | values, f"{state.origin}; {text}"
         )
+        hint = small_batch_hint(state.schedule.batch_size, ranks.world_size)
+        if hint and state.progress.step == 0:  # a resumed run keeps its batches
+            state.log.event(state.images_seen, "hint", {"hint": hint}, hint)
 
     def finish(self, agreement: Agreement) -> dict[str, Any] | None:
         """Save and evaluate the trained model; return and write the summary.
@@ -331,6 +340,25 @@ class Trainer:
         if state.signals is not None:
             figures["placed"] = state.placed_times
         return figures
+
+
+def small_batch_hint(batch_size: int, world_size: int) -> str | None:
+    """Return what to do if a step has too few views for several ranks; None if it has enough."""
+    enough = VIEWS_PER_RANK * world_size
+    if world_size == 1 or batch_size >= enough:
+        return None
+    return (
+        f"a step of {batch_size} views gains little from {world_size} ranks: try "
+        f"--schedule.batch_size={enough}, which also scales the learning rates"
+    )
+
+
+def _largest_size(state: TrainingState) -> str:
+    """Return the size of the training images, of the largest if they differ, as text."""
+    cameras = [state.capture.cameras[index] for index in state.capture.train]
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    width, height = max(sizes, key=lambda size: size[0] * size[1])
+    return f"{'at most ' if len(sizes) > 1 else ''}{width} x {height}"
 
 
 def _stopped_by(signal: str | None) -> str:

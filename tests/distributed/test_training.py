@@ -246,6 +246,7 @@ def test_a_signal_within_an_evaluation_does_not_wait_for_its_end(tmp_path, world
     assert run.restore(tmp_path, Ranks()).progress.step == step
     events = [record.get("event") for record in read_log(tmp_path)]
     assert "evaluation stopped" in events and "evaluation" not in events and events[-1] == "stopped"
+    assert ("hint" in events) == (world_size > 1)  # a batch of 2 views
     for summary, _ in run_ranks(_train, world_size, tmp_path, f"schedule.evaluate_every={every}"):
         assert summary["images"] == 60 and "psnr" in summary
 

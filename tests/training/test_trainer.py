@@ -10,7 +10,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.training import run
 from blitzgs.training.config_io import ConfigError
 from blitzgs.training.guard import NonFiniteError
-from blitzgs.training.trainer import Trainer
+from blitzgs.training.trainer import Trainer, small_batch_hint
 from tests.helpers import DEVICES, needs_cuda
 from tests.training.tiny import tiny_config, tiny_scene
 from tests.training.tiny_runs import assert_same_table, events_of, steps_of, stop_at, train
@@ -172,6 +172,29 @@ def test_a_short_run_and_only_some_masks(tmp_path):
     config = tiny_config("schedule.iterations=10", "log.every=100")
     with pytest.warns(UserWarning, match="1 of the first 7 training views are masked"):
         Trainer(config, capture, images, tmp_path, Ranks()).train()
+
+
+def test_the_start_line_names_the_size_of_downscaled_images(tmp_path, capsys):
+    for factor, name in ((1, "whole"), (4, "quarter")):
+        train(tmp_path / name, f"data.downscale={factor}", "schedule.iterations=1")
+        printed = capsys.readouterr().out
+        assert ("; images of 48 x 32 (data.downscale=4)" in printed) == (factor == 4)
+        assert not events_of(tmp_path / name, "hint")  # one rank needs no larger batch
+    capture, images = tiny_scene()
+    capture.cameras[0].width, images.images[0] = 40, images.images[0][:, :40]
+    config = tiny_config("data.downscale=2", "schedule.iterations=1")
+    Trainer(config, capture, images, tmp_path / "sizes", Ranks()).train()
+    assert "; images of at most 48 x 32 (data.downscale=2)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("batch", "ranks", "enough"), [(4, 4, 16), (7, 2, 8), (8, 2, None), (1, 1, None)])
+def test_a_batch_that_is_small_for_its_ranks_gets_a_hint(batch, ranks, enough):
+    hint = small_batch_hint(batch, ranks)
+    if enough is None:
+        assert hint is None
+    else:
+        assert hint.startswith(f"a step of {batch} views gains little from {ranks} ranks: ")
+        assert f"try --schedule.batch_size={enough}," in hint
 
 
 def test_views_that_see_nothing(tmp_path):
