@@ -12,7 +12,8 @@ All arms continue the same checkpoint, from before the gate's onset:
 If training repeats bit for bit (on the CPU, or with model.deterministic), the oracle's first event has the
 same candidates as the reference's. Later events may differ, because each veto changes the rest of the run. An
 oracle never vetoes a candidate that the reference did not have; `matched` is the share of candidates that it
-did have.
+did have. These include the candidates that the limit of the population held back in the reference, which have
+no label, because they never became Gaussians.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -46,6 +48,22 @@ REFERENCE = "reference"
 FIGURES, TABLE = "replay.json", "replay.md"
 
 
+class CandidateRecord:
+    """Vetoes nothing, and records the candidates of a run before the limit of the population applies."""
+
+    def __init__(self) -> None:
+        self._keys: list[Tensor] = []
+
+    def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
+        """Record candidates, and return that none is vetoed, bool [M]."""
+        self._keys.append(event_keys(candidates.parents, candidates.time, candidates.is_split).cpu())
+        return torch.zeros_like(candidates.is_split)
+
+    def of_all_ranks(self, ranks: Ranks) -> Tensor:
+        """Return the `event_keys` of all candidates, int64 [K] on the CPU. Collective."""
+        return torch.cat(ranks.all_gather_object(torch.cat([torch.empty(0, dtype=torch.int64), *self._keys])))
+
+
 class OracleVeto:
     """Vetoes candidates whose children did not survive in a reference run.
 
@@ -55,10 +73,10 @@ class OracleVeto:
     """
 
     def __init__(self, known: Tensor, dead: Tensor, rate: float | None, seed: int) -> None:
-        """Store the reference run's events.
+        """Store the reference run's candidates and events.
 
         Args:
-            known: int64 [K], `event_keys` of its spawn events.
+            known: int64 [K], `event_keys` of its candidates.
             dead: int64 [D], `event_keys` of its non-surviving spawn events.
             rate: veto at most this share of the clones and of the splits; None: no limit.
             seed: seed of the draw among non-surviving candidates if there are more.
@@ -159,8 +177,9 @@ def replay(
 
     Yields:
         For each arm, when it is trained: its name, psnr, ssim, peak and final Gaussians, the seconds of
-        training since the branch, the reference's share of non-surviving events (`dead`), and of an oracle
-        the share of the candidates that it knew (`matched`).
+        training since the branch, the reference's share of non-surviving events (`dead`) and of candidates
+        that the limit of the population held back (`held_back`), and of an oracle the share of the candidates
+        that it knew (`matched`).
 
     Raises:
         ValueError: the run logged no lineage, was trained by the clock, ends before the gate's onset, or all
@@ -195,9 +214,19 @@ def replay(
             "seconds": summary["seconds"] - began,
         }
 
-    reference = train(REFERENCE, None)
-    known, dead = label_events(out / REFERENCE / run.LINEAGE)
-    yield reference | {"dead": len(dead) / max(1, len(known))}
+    record = CandidateRecord()
+    reference = train(REFERENCE, record)
+    known = record.of_all_ranks(ranks)
+    spawned, dead = label_events(out / REFERENCE / run.LINEAGE)
+    held_back = int(torch.isin(known, spawned, invert=True).sum()) / max(1, len(known))
+    if held_back > 0.5 and ranks.rank == 0:
+        warnings.warn(
+            f"the limit of the population held back {held_back:.0%} of the reference's candidates, so all "
+            "arms may end alike: replay a run with a higher limit (population.max_gaussians, "
+            "pixels_per_gaussian, gaussians_per_point)",
+            stacklevel=2,
+        )
+    yield reference | {"dead": len(dead) / max(1, len(spawned)), "held_back": held_back}
     for name, cap in (("oracle", None), ("oracle_rate", rate)):
         oracle = OracleVeto(known, dead, cap, config.seed)
         result = train(name, oracle)

@@ -84,7 +84,7 @@ def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
     assert arms["reference"]["psnr"] == summary["psnr"]
     assert arms["reference"]["final"] == summary["gaussians"]
     assert 0 < arms["reference"]["dead"] < 1
-    assert arms["oracle"]["matched"] > 0.5
+    assert arms["oracle"]["matched"] > 0.5 and arms["reference"]["held_back"] == 0
     for name in ("oracle", "oracle_rate", "gate", "random"):
         assert arms[name]["peak"] < arms["reference"]["peak"]
     table = (tmp_path / "replay" / "replay.md").read_text()
@@ -95,6 +95,30 @@ def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
     assert [r["t"] for r in events_of(tmp_path / "replay" / "oracle", "densify")] == [60, 80]
     assert main(["gate", "replay", gate, run, "--out", str(tmp_path / "replay")]) == 1
     assert "already holds a replay: choose another --out" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_replay_that_repeats_the_reference_matches_it_though_the_population_is_limited(
+    lineage_run, tmp_path
+):
+    """Candidates that the limit held back are candidates of both continuations."""
+    capture, gate = str(lineage_run / "capture"), str(tmp_path / "g.json")
+    limited, out = str(tmp_path / "run"), tmp_path / "replay"
+    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, *SETTINGS)]
+    flags.append("--population.max_gaussians=420")
+    assert main(["gate", "fit", str(lineage_run / "run"), "--out", gate]) == 0
+    assert main(["train", "--data", capture, "--out", limited, *flags]) == 0
+    # At a rate of 0, an oracle vetoes nothing.
+    arguments = ["gate", "replay", gate, limited, "--out", str(out), "--rate", "0"]
+    with pytest.warns(UserWarning, match="the limit of the population held back 82% of the reference's"):
+        assert main(arguments) == 0
+    arms = {row["arm"]: row for row in json.loads((out / "replay.json").read_text())}
+    for name in ("psnr", "final"):
+        assert arms["oracle_rate"][name] == arms["reference"][name]
+    assert arms["oracle_rate"]["matched"] == 1.0
+    events = events_of(out / "reference", "densify")
+    held = sum(event["held_back"] for event in events)
+    born = sum(event["cloned"] + event["split"] for event in events)
+    assert arms["reference"]["held_back"] == pytest.approx(held / (born + held)) and born > 0
 
 
 def test_a_gate_can_be_fitted_on_samples(lineage_run, tmp_path, capsys):
