@@ -50,7 +50,7 @@ from blitzgs.training.batches import Batch
 from blitzgs.training.config import Config
 from blitzgs.training.guard import LossGuard
 from blitzgs.training.loss import loss_terms
-from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.step import Stepper
 from blitzgs.training.views import Space, ViewSet, render_options, trained_centres
@@ -155,7 +155,7 @@ class Workload:
         self.table = GaussianTable(table)
         self.owners, self.guard, self.steps = TileOwners(ranks), LossGuard(), 0
         self.loss = config.loss
-        optimiser = LazyAdam(config.optimiser, Schedule(config.schedule), inputs.extent, ranks.device)
+        optimiser = TableAdam(config.optimiser, Schedule(config.schedule), inputs.extent, ranks.device)
         self.stepper = Stepper(self.table, optimiser, self.owners, config.loss, 1.0)
         views = self.batches[0][1]
         shape = (len(views), views.height, views.width, 3)

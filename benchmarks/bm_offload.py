@@ -33,7 +33,7 @@ from blitzgs.model import GaussianTable
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
-from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.step import Stepper
@@ -93,7 +93,7 @@ class Survey:
         self.targets = torch.randint(0, 256, shape, dtype=torch.uint8, device=device)
         self.samples = torch.full((batch_size,), float(self.targets[0].numel()), device=device)
         schedule = Schedule(ScheduleConfig(batch_size=batch_size))
-        self.optimiser = LazyAdam(OptimiserConfig(*[RATE] * 7), schedule, 1.0, device)
+        self.optimiser = TableAdam(OptimiserConfig(*[RATE] * 7), schedule, 1.0, device)
 
     def batch(self, indices: list[int]) -> Batch:
         """Return views with photographs."""

@@ -31,7 +31,7 @@ from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.pipeline import Views
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig, OptimiserConfig, ScheduleConfig
-from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.step import Stepper
 from blitzgs.view.blocks import morton_order
@@ -82,7 +82,7 @@ class OurStep:
         self.table = make_table(scene)
         self.batch = random_photographs(scene)
         schedule = Schedule(ScheduleConfig(batch_size=len(self.batch.views)))
-        optimiser = LazyAdam(OptimiserConfig(*[RATE] * 7), schedule, 1.0, "cuda")
+        optimiser = TableAdam(OptimiserConfig(*[RATE] * 7), schedule, 1.0, "cuda")
         owners = TileOwners(Ranks(device=torch.device("cuda", torch.cuda.current_device())))
         self.behind = torch.arange(n, device="cuda", dtype=torch.int32) % BEHIND
         self.step = STEP

@@ -15,8 +15,8 @@ from blitzgs._library import below_autograd
 
 # Columns of the schedule's table, as in csrc/lazy_adam/lazy_adam.h: tails of 4 orders for 6 groups, powers of
 # the decay rates, bias corrections.
-_ORDERS, _GROUPS = 4, 6
-_TAILS, _POWERS, _CORRECTION1, _CORRECTION2, _COLUMNS = slice(0, _ORDERS * _GROUPS), 24, 28, 29, 30
+ORDERS, GROUPS = 4, 6
+_TAILS, _POWERS, CORRECTION1, CORRECTION2, _COLUMNS = slice(0, ORDERS * GROUPS), 24, 28, 29, 30
 # Drift terms below this fraction of their sum are lost in rounding.
 _NEGLIGIBLE = {torch.float32: 2.0**-27, torch.float64: 2.0**-56}
 
@@ -186,7 +186,7 @@ def table_without_rates(steps: int, beta1: float, beta2: float, before: int = 0)
     # -expm1(t log beta) keeps the digits that 1 - beta^t loses while t is small.
     first = 1 / (-torch.expm1(t[1:] * math.log(beta1)) if beta1 > 0 else torch.ones(steps - 1))
     second = (-torch.expm1(t[1:] * math.log(beta2))).rsqrt()
-    table[1:, _CORRECTION1], table[1:, _CORRECTION2] = first, second
+    table[1:, CORRECTION1], table[1:, CORRECTION2] = first, second
     return table
 
 
@@ -196,11 +196,11 @@ def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
     steps = rates.shape[0]
     table = table_without_rates(steps, beta1, beta2)
     ratio, root = beta1 / math.sqrt(beta2), math.sqrt(beta2)
-    first, second = table[1:, _CORRECTION1], table[1:, _CORRECTION2]
-    orders = range(_ORDERS)
+    first, second = table[1:, CORRECTION1], table[1:, CORRECTION2]
+    orders = range(ORDERS)
     terms = torch.stack([(first * second ** (k - 1))[:, None] * rates[1:] for k in orders], 1).numpy()
     ratios = np.array([ratio * root**k for k in orders])[:, None]
-    tails = table.numpy()[:, _TAILS].reshape(steps, _ORDERS, _GROUPS)
+    tails = table.numpy()[:, _TAILS].reshape(steps, ORDERS, GROUPS)
     for step in range(steps - 2, -1, -1):
         tails[step] = ratios * (terms[step] + tails[step + 1])
     return table.to(lr_table.device)

@@ -12,10 +12,15 @@ import torch
 from torch import Tensor
 
 from blitzgs._library import below_autograd
-from blitzgs.ops.lazy_adam import explicit_steps, table_without_rates
+from blitzgs.ops.lazy_adam import (
+    CORRECTION1,
+    CORRECTION2,
+    GROUPS,
+    ORDERS,
+    explicit_steps,
+    table_without_rates,
+)
 
-# csrc/lazy_adam/lazy_adam.h: a row has 4 orders of 6 groups, then powers and corrections.
-_ORDERS, GROUPS = 4, 6
 # Number of steps that the tables hold. When they are full, all rows are brought up to date and the tables
 # begin again, so that they do not grow.
 CAPACITY = 4096
@@ -63,7 +68,7 @@ class Drift:
         self._set_rates(lr_tables)
         ratio, root = betas[0] / math.sqrt(betas[1]), math.sqrt(betas[1])
         distances = np.arange(self.reach, 0, -1)[:, None]
-        decays = (ratio * root ** np.arange(_ORDERS)) ** distances
+        decays = (ratio * root ** np.arange(ORDERS)) ** distances
         self._decays = torch.from_numpy(decays).to(device)
         self.restart(begin)
 
@@ -89,9 +94,9 @@ class Drift:
         """Empty the tables at step `begin`, with which all rows and their moments must be up to date."""
         self.begin = begin
         table = table_without_rates(CAPACITY + 1, *self.betas, begin)
-        first, second = table[:, 28], table[:, 29]
+        first, second = table[:, CORRECTION1], table[:, CORRECTION2]
         # The terms that a step with learning rate 1 adds to the rows of earlier steps.
-        shares = torch.stack([first * second ** (order - 1) for order in range(_ORDERS)], dim=1)
+        shares = torch.stack([first * second ** (order - 1) for order in range(ORDERS)], dim=1)
         shares[0] = 0
         device = self._lr_tables.device
         self._shares = shares.to(device)
@@ -149,7 +154,7 @@ class Drift:
         own = [*range(4), *((4, 5) if group >= 4 else (group, group))]
         copied._set_rates(self._lr_tables[table][None, :, own])
         tables = self._tables[table][None].clone()
-        tails = tables[:, :, : _ORDERS * GROUPS].unflatten(2, (_ORDERS, GROUPS))
+        tails = tables[:, :, : ORDERS * GROUPS].unflatten(2, (ORDERS, GROUPS))
         tails.copy_(tails[:, :, :, own])
         copied._set_tables(tables)
         return copied

@@ -9,8 +9,9 @@ from typing import Any
 
 from torch import Tensor
 
+from blitzgs.ops.lazy_adam import GROUPS
 from blitzgs.ops.sparse_rows import distinct_rows
-from blitzgs.optim.drift import GROUPS, Drift
+from blitzgs.optim.drift import Drift
 from blitzgs.optim.handed import Handed, only_handed
 from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of, steps_of
 

@@ -20,6 +20,9 @@ from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of, steps_of
 class LazyAdam(torch.optim.Optimizer):
     """`torch.optim.Adam` for tables of rows, whose cost follows the rows that have a gradient.
 
+    Use it in a training loop of your own, whose learning rates may follow any scheduler; the trainer, which
+    has a `GaussianTable` and knows its schedule in advance, uses `blitzgs.training.optimiser.TableAdam`.
+
     Rows that are missing in a sparse gradient (`rasterization(..., sparse_grad=True)`) have the gradient
     zero. `step` does not touch them, so they fall behind. `catch_up` applies the steps that they missed, in
     closed form whatever their number, and gives them the values of `torch.optim.Adam` to rounding

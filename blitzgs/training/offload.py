@@ -19,7 +19,7 @@ from blitzgs.population.position_noise import PositionNoise
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import LossTerms
-from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
 from blitzgs.training.views import ViewSet
@@ -73,7 +73,7 @@ class OffloadingStepper(Stepper):
         self,
         residence: Residence,
         upcoming: UpcomingCameras,
-        optimiser: LazyAdam,
+        optimiser: TableAdam,
         owners: TileOwners,
         loss: LossConfig,
         extent: float,

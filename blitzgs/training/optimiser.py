@@ -17,12 +17,13 @@ from blitzgs.training.config import OptimiserConfig
 from blitzgs.training.schedule import Schedule
 
 
-class LazyAdam:
+class TableAdam:
     """Adam over the rows of a table, batch-scaled as Grendel does: lr sqrt(B), beta^B, eps / sqrt(B).
 
     The batch scaling is that of Grendel-GS (Zhao et al. 2024). A step does not touch rows that it does not
     update; the columns `last_step` and `moment_step` note how far each row is current. `catch_up` must be
-    called before the parameters of such rows are read.
+    called before the parameters of such rows are read. Use this class for a `GaussianTable` and a `Schedule`
+    that is known in advance, as the trainer does, and `blitzgs.optim.LazyAdam` in a loop of your own.
 
     Attributes:
         lr_table: float32 [S + 1, 6], the learning rates of every step; see `Schedule.learning_rates`.

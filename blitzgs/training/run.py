@@ -22,7 +22,7 @@ from blitzgs.training.checkpoint import CheckpointError
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import ConfigError, from_dict, load_config, to_dict
 from blitzgs.training.guard import bad_column, check_before_saving
-from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.views import Space
 from blitzgs.view.host_table import HostTable
@@ -251,7 +251,7 @@ def open_model(
         _compare_with_file(config, folder / CONFIG)
     if data is not None:
         config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
-    optimiser = LazyAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
+    optimiser = TableAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
     optimiser.catch_up(table, None, progress.step)
     return TrainedModel(config, progress, restored.space, table, pool_bytes)
 

@@ -28,7 +28,7 @@ from blitzgs.training.gate import lineage_subject, open_gate
 from blitzgs.training.inputs import check_alike, check_capture, train_views_fingerprint
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
-from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.population_report import PICTURE
 from blitzgs.training.run import Progress
 from blitzgs.training.run_cameras import CAMERAS, save_cameras
@@ -95,7 +95,7 @@ def set_up(
         if restored is None or not (folder / CAMERAS).exists():
             save_cameras(folder, capture)
     run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
-    optimiser = LazyAdam(config.optimiser, schedule, space.extent, ranks.device)
+    optimiser = TableAdam(config.optimiser, schedule, space.extent, ranks.device)
     owners = _tile_owners(ranks, progress, restored)
     views = ViewSet(list(capture.cameras), space, ranks.device)
     sizes = [(capture.cameras[i].width, capture.cameras[i].height) for i in capture.train]
@@ -163,7 +163,7 @@ def _tile_owners(ranks: Ranks, progress: Progress, restored: run.Restored | None
 def _stepper(
     config: Config,
     table: GaussianTable,
-    optimiser: LazyAdam,
+    optimiser: TableAdam,
     owners: TileOwners,
     extent: float,
     upcoming: UpcomingCameras,

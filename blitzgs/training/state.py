@@ -26,7 +26,7 @@ from blitzgs.training.batches import Images
 from blitzgs.training.config import Config
 from blitzgs.training.evaluation import Lpips
 from blitzgs.training.lod import lod_gate
-from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.run import Progress
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.sampler import BatchSampler
@@ -85,7 +85,7 @@ class TrainingState:
     progress: Progress
     views: ViewSet
     sampler: BatchSampler
-    optimiser: LazyAdam
+    optimiser: TableAdam
     stepper: Stepper
     owners: TileOwners
     lpips: Lpips | None

@@ -19,7 +19,7 @@ from blitzgs.population.scale_floor import FLOOR, raise_scales
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import LossTerms, loss_terms
-from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.optimiser import TableAdam
 from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.gate import ViewGate
 from blitzgs.view.visible_scene import Scene
@@ -40,7 +40,7 @@ class Stepper:
     def __init__(
         self,
         table: GaussianTable,
-        optimiser: LazyAdam,
+        optimiser: TableAdam,
         owners: TileOwners,
         loss: LossConfig,
         extent: float,

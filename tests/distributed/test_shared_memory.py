@@ -20,7 +20,7 @@ from blitzgs.model import GaussianTable
 from blitzgs.ops.capacity import CapacityEstimate
 from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
-from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.schedule import Schedule
 from tests.distributed.rank_harness import RankError, on_cuda, run_ranks
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
@@ -97,7 +97,7 @@ def test_peer_and_collective_transports_deliver_the_same(world_size, device):
 def _gradients(ranks):
     """Gradients read in the ranks' tables are those that collectives carry, also of tiny shards."""
     options = dataclasses.replace(OPTIONS, sh_degree=3, deterministic=True)
-    optimiser = LazyAdam(OptimiserConfig(), Schedule(ScheduleConfig()), 1.0, ranks.device)
+    optimiser = TableAdam(OptimiserConfig(), Schedule(ScheduleConfig()), 1.0, ranks.device)
     views, assignment = _assignment(ranks)
     transports, stepped = (CollectiveTransport(ranks), PeerTransport(ranks)), []
     for count, absolute in ((3, False), (700, True), (100_000, False), (100_000, True), (0, False)):

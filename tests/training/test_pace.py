@@ -11,7 +11,7 @@ import torch
 
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
 from blitzgs.training.config_io import ConfigError, from_dict, load_config, save_config, to_dict
-from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.pace import Pace
 from blitzgs.training.schedule import Schedule
 from tests.training.tiny import random_gaussians
@@ -127,7 +127,7 @@ def test_pending_steps_are_the_same_after_a_change_of_pace(factor):
         corrected = first / (1 - config.beta1**step)
         root = (second / (1 - config.beta2**step)).sqrt() + config.eps
         means[rows] -= (rates[step, 0] * corrected / root)[rows]
-    optimiser = LazyAdam(config, Schedule(before), 3.0, "cpu")
+    optimiser = TableAdam(config, Schedule(before), 3.0, "cpu")
     # Some rows are caught up in between, the others are not.
     optimiser.catch_up(table, torch.arange(0, 200, 3, dtype=torch.int32), changed_at - 5)
     optimiser.follow(Schedule(after))

@@ -10,7 +10,7 @@ from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.training.batches import Batch
-from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.step import Stepper
 from blitzgs.view.blocks import morton_order
@@ -53,7 +53,7 @@ def peak_bytes(run, device: str) -> int:
 
 def scratch_of_a_step(unseen: int, device: str) -> int:
     config, table = tiny_config(), table_of(unseen, device)
-    optimiser = LazyAdam(config.optimiser, Schedule(config.schedule), 1.0, device)
+    optimiser = TableAdam(config.optimiser, Schedule(config.schedule), 1.0, device)
     stepper = Stepper(table, optimiser, TileOwners(Ranks(device=torch.device(device))), config.loss, 1.0)
     viewmat = torch.from_numpy(look_at_origin(np.array([3.0, 0.0, 1.5]))).float()[None].to(device)
     K = torch.tensor([[[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]], device=device)

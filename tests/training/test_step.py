@@ -7,7 +7,7 @@ from blitzgs.distributed.ownership import TileOwners
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.training.batches import Batch
 from blitzgs.training.loss import photometric
-from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.step import Stepper
 from tests.training.tiny import look_at_origin, random_gaussians, tiny_config
@@ -15,7 +15,7 @@ from tests.training.tiny import look_at_origin, random_gaussians, tiny_config
 
 def test_a_step_marks_its_stages_and_lowers_the_loss():
     config, table = tiny_config(), random_gaussians(300)
-    optimiser = LazyAdam(config.optimiser, Schedule(config.schedule), 1.0, "cpu")
+    optimiser = TableAdam(config.optimiser, Schedule(config.schedule), 1.0, "cpu")
     stepper = Stepper(table, optimiser, TileOwners(Ranks()), config.loss, 1.0)
     viewmat = torch.from_numpy(look_at_origin(np.array([3.0, 0.0, 1.5]))).float()[None]
     K = torch.tensor([[[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]])

@@ -18,7 +18,7 @@ from blitzgs.ops.view_gate import gate_views_
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.population.importance import ViewBatch, is_culled, sweep
 from blitzgs.training.batches import Batch
-from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.step import Stepper
 from blitzgs.view.blocks import BlockIndex
@@ -168,7 +168,7 @@ def test_training_behind_the_gate_is_dense_adams(device, smooth):
         sets = []
         table = GaussianTable({name: small[name].to(device) for name in small})
         table["level"] = levels.to(device)
-        optimiser = LazyAdam(config.optimiser, schedule, 1.0, device)
+        optimiser = TableAdam(config.optimiser, schedule, 1.0, device)
         stepper = Stepper(table, optimiser, TileOwners(Ranks(device=torch.device(device))), config.loss, 1.0)
         lod = LodGate(4.0, 2.0, 3, 2, smooth)
         gate = ViewGate(lod.reach(), 0b11)
