@@ -36,9 +36,9 @@ from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.scene.pictures import to_uint8
-from blitzgs.training import run as run_folder
-from blitzgs.training.run import TrainedModel
+from blitzgs.training import run_files
 from blitzgs.training.run_cameras import load_cameras
+from blitzgs.training.run_files import TrainedModel
 from blitzgs.training.views import CameraLike, ViewSet, render_options
 from blitzgs.view.gate import LodGate, SceneGate, centres_of
 
@@ -76,7 +76,7 @@ def popping(
         OSError: the clip cannot be written.
     """
     ranks = Ranks(device=torch.device(device))
-    model = run_folder.open_model(run, ranks)
+    model = run_files.open_model(run, ranks)
     return popping_of(model, load_cameras(run).cameras, ranks, out, frames, width, camera)
 
 

@@ -36,7 +36,7 @@ from blitzgs.training.config import Config
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.population_report import population_report
-from blitzgs.training.run import TrainedModel
+from blitzgs.training.run_files import TrainedModel
 from blitzgs.training.run_log import LOG
 from blitzgs.training.trainer import Trainer
 

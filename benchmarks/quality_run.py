@@ -24,7 +24,7 @@ from quality_plan import RunSpec
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
-from blitzgs.training import run
+from blitzgs.training import run_files
 from blitzgs.training.agreement import Agreement
 from blitzgs.training.evaluation import METRICS, evaluate, load_lpips
 from blitzgs.training.events.evaluate import measure
@@ -73,7 +73,7 @@ class Recorder:
 
     def record(self, images: int, seconds: float, gaussians: int, end: bool, measure: Measure) -> None:
         """Measure held-out views, and training views if that was planned."""
-        self.peak_bytes = max(self.peak_bytes, run.peak_memory_bytes(self._device))
+        self.peak_bytes = max(self.peak_bytes, run_files.peak_memory_bytes(self._device))
         found: dict[str, Any] = {"images": images, "seconds": seconds, "gaussians": gaussians}
         capture = self._capture
         if capture.test:

@@ -20,7 +20,7 @@ from blitzgs.cli.arguments import (
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.progress import image_progress
-from blitzgs.training import run as run_folder
+from blitzgs.training import run_files
 from blitzgs.training.evaluation import evaluate, load_lpips
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.training.lod import lod_gate, scene_gate
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     if args.pictures < 0:
         raise ValueError(f"--pictures: must be 0 or more, got {args.pictures}")
     with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
-        model = run_folder.open_model(args.folder, ranks, args.data, args.resident_gb)
+        model = run_files.open_model(args.folder, ranks, args.data, args.resident_gb)
         config = model.config
         if args.allow_missing:
             data = dataclasses.replace(config.data, allow_missing=True)
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
         check_capture(model.space, capture, args.folder)
         if not getattr(capture, args.split):
             raise ValueError(f"{args.folder} has no {args.split} views: choose another --split")
-        folder = args.out or args.folder / run_folder.EVALUATION / args.split
+        folder = args.out or args.folder / run_files.EVALUATION / args.split
         with image_progress("Comparing", ranks.rank == 0) as report:
             result = evaluate(
                 model.scene(ranks.device),

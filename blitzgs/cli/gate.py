@@ -15,7 +15,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.output import OutputFolder
 from blitzgs.population import gate_evaluation, gate_fit, spawn_samples
 from blitzgs.population.spawn_gate import SpawnGate, gate_file
-from blitzgs.training import run as run_folder
+from blitzgs.training import run_files
 from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.config_io import ConfigError, load_config
 from blitzgs.training.gate_replay import FIGURES, TABLE, replay
@@ -130,7 +130,7 @@ def run_evaluate(args: argparse.Namespace) -> int:
     figures = args.out / "evaluation.json"
     output.check(figures)
     args.out.mkdir(parents=True, exist_ok=True)
-    schedules = [load_config(folder / run_folder.CONFIG).schedule for folder in args.runs]
+    schedules = [load_config(folder / run_files.CONFIG).schedule for folder in args.runs]
     gate_from = [Schedule(schedule).pace.image(schedule.gate_from) for schedule in schedules]
     results = gate_evaluation.evaluate(gate, runs, gate_from, output)
     output.write(figures, (json.dumps(results, indent=1) + "\n").encode())
@@ -148,9 +148,9 @@ def run_replay(args: argparse.Namespace) -> int:
     if not 0 <= args.rate <= 1:
         raise ValueError(f"--rate: must be in [0, 1], got {args.rate}")
     gate = SpawnGate(args.gate)
-    if not (args.folder / run_folder.CONFIG).exists():
-        raise ConfigError(f"{args.folder} is not a run: it has no {run_folder.CONFIG}")
-    config = load_config(args.folder / run_folder.CONFIG)
+    if not (args.folder / run_files.CONFIG).exists():
+        raise ConfigError(f"{args.folder} is not a run: it has no {run_files.CONFIG}")
+    config = load_config(args.folder / run_files.CONFIG)
     if args.data is not None:
         config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(args.data)))
     results: list[dict[str, Any]] = []
@@ -185,11 +185,11 @@ def _spawns_of(folder: Path) -> gate_fit.Spawns:
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is not the folder of a run")
-    lineage = folder / run_folder.LINEAGE
+    lineage = folder / run_files.LINEAGE
     summary = open_run(folder).summary() if lineage.is_dir() else {}
     if lineage.is_dir() and not summary:
         raise ValueError(
-            f"{folder} is not finished (it has no {run_folder.SUMMARY}), so it is not known which Gaussians "
+            f"{folder} is not finished (it has no {run_files.SUMMARY}), so it is not known which Gaussians "
             "survive; finish it with blitzgs train ... --resume"
         )
     return gate_fit.read_spawns(lineage, summary.get("gaussians"))

@@ -16,7 +16,7 @@ from blitzgs.distributed.ownership import TileOwners
 from blitzgs.output import OutputFolder
 from blitzgs.progress import image_progress
 from blitzgs.scene.pictures import encode_image
-from blitzgs.training import run as run_folder
+from blitzgs.training import run_files
 from blitzgs.training.evaluation import render_view
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.training.lod import lod_gate, scene_gate
@@ -50,7 +50,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
 def run(args: argparse.Namespace) -> int:
     """Render the views of a run; returns the exit status."""
     with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
-        model = run_folder.open_model(args.folder, ranks, args.data, args.resident_gb)
+        model = run_files.open_model(args.folder, ranks, args.data, args.resident_gb)
         stored = _cameras(args, model, ranks)
         cameras: Sequence[CameraLike] = stored.cameras
         indices = range(len(cameras)) if args.split == "all" else getattr(stored, args.split)
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _cameras(args: argparse.Namespace, model: run_folder.TrainedModel, ranks: Ranks) -> RunCameras:
+def _cameras(args: argparse.Namespace, model: run_files.TrainedModel, ranks: Ranks) -> RunCameras:
     """Return the cameras of the given capture; without one, those that the run stored, else its capture's."""
     if args.data is None and (args.folder / CAMERAS).exists():
         return load_cameras(args.folder)

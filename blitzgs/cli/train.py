@@ -18,7 +18,7 @@ from rich.table import Table
 
 from blitzgs.cli.arguments import Commands, add_command, add_device, named_path
 from blitzgs.distributed.group import Ranks, Transport
-from blitzgs.training import run as run_folder
+from blitzgs.training import run_files
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import ConfigError, load_config, to_dict
 from blitzgs.training.folder_checks import locked
@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _config(args: argparse.Namespace) -> Config:
-    own = args.out / run_folder.CONFIG if args.out is not None else None
+    own = args.out / run_files.CONFIG if args.out is not None else None
     if args.config is not None:
         source = recipe_path(args.config)
     elif args.resume and own is not None and own.exists():
@@ -144,7 +144,7 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
     # Quoted, so that the commands can be copied.
     name = shlex.quote(str(folder))
     for text in (
-        f"pictures: {folder / run_folder.EVALUATION}",
+        f"pictures: {folder / run_files.EVALUATION}",
         f"for viewers: blitzgs export {name} --ply FILE.ply",
     ):
         console.print(text, markup=False, highlight=False, soft_wrap=True)

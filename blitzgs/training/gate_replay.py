@@ -37,7 +37,7 @@ from blitzgs.population.candidates import Candidates, Veto
 from blitzgs.population.lineage_parts import read_lineage
 from blitzgs.population.spawn_gate import RandomVeto, RankVeto, SpawnGate
 from blitzgs.scene.capture import Capture
-from blitzgs.training import run
+from blitzgs.training import run_files
 from blitzgs.training.batches import Images
 from blitzgs.training.checkpoint import MANIFEST
 from blitzgs.training.config import Config
@@ -136,7 +136,7 @@ def branch_point(folder: Path, config: Config) -> Path:
             f"{folder} ends before the gate's onset (schedule.gate_from {config.schedule.gate_from}, "
             f"{schedule.iterations} images): replay a run that goes on after it"
         )
-    for manifest in (folder / run.CHECKPOINTS).glob(f"checkpoint_*/{MANIFEST}"):
+    for manifest in (folder / run_files.CHECKPOINTS).glob(f"checkpoint_*/{MANIFEST}"):
         try:
             step = int(json.loads(manifest.read_text())["state"]["progress"]["step"])
         except (ValueError, LookupError, TypeError, RecursionError) as error:
@@ -196,7 +196,7 @@ def replay(
     def train(name: str, veto: Veto | None) -> dict[str, Any]:
         folder = out / name
         if ranks.rank == 0:
-            shutil.copytree(point, folder / run.CHECKPOINTS / point.name)
+            shutil.copytree(point, folder / run_files.CHECKPOINTS / point.name)
         ranks.barrier()
         trainer = Trainer(config, capture, images, folder, ranks, resume=True)
         trainer.state.veto, began = veto, trainer.state.progress.seconds
@@ -217,7 +217,7 @@ def replay(
     record = CandidateRecord()
     reference = train(REFERENCE, record)
     known = record.of_all_ranks(ranks)
-    spawned, dead = label_events(out / REFERENCE / run.LINEAGE)
+    spawned, dead = label_events(out / REFERENCE / run_files.LINEAGE)
     held_back = int(torch.isin(known, spawned, invert=True).sum()) / max(1, len(known))
     if held_back > 0.5 and ranks.rank == 0:
         warnings.warn(

@@ -8,7 +8,7 @@ import math
 from blitzgs.distributed.group import Ranks
 from blitzgs.model import GaussianTable
 from blitzgs.training.config import Config
-from blitzgs.training.run import Progress
+from blitzgs.training.run_files import Progress
 from blitzgs.view.gate import LodGate, SceneGate
 
 

@@ -13,7 +13,7 @@ import torch
 
 from blitzgs.charts import line_chart
 from blitzgs.output import write_file
-from blitzgs.training.run import peak_memory_bytes
+from blitzgs.training.run_files import peak_memory_bytes
 from blitzgs.training.run_log import LOG
 from blitzgs.training.state import TrainingState
 

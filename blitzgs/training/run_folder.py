@@ -21,7 +21,7 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks, resolve_device
 from blitzgs.model import PARAMETERS
 from blitzgs.rendering import rasterization
-from blitzgs.training import run
+from blitzgs.training import run_files
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import load_config
 from blitzgs.training.lod import scene_gate
@@ -167,19 +167,19 @@ class RunFolder:
             FileNotFoundError: it is not the folder of a run.
         """
         self.path = Path(path)
-        run.check_is_run(self.path)
+        run_files.check_is_run(self.path)
 
     def __repr__(self) -> str:
-        state = "finished" if (self.path / run.SUMMARY).exists() else "not finished"
+        state = "finished" if (self.path / run_files.SUMMARY).exists() else "not finished"
         return f"RunFolder({str(self.path)!r}, {state})"
 
     def config(self) -> Config:
         """Return the configuration in the folder."""
-        return load_config(self.path / run.CONFIG)
+        return load_config(self.path / run_files.CONFIG)
 
     def summary(self) -> dict[str, Any]:
         """Return the content of `summary.json`; empty if the run is not finished."""
-        return self._json(self.path / run.SUMMARY)
+        return self._json(self.path / run_files.SUMMARY)
 
     def log(self) -> list[dict[str, Any]]:
         """Return the records of the log, oldest first, without incomplete lines."""
@@ -193,7 +193,7 @@ class RunFolder:
 
     def metrics(self) -> dict[str, dict[str, Any]]:
         """Return the evaluations: number of images seen, or split -> metrics, each view's under "views"."""
-        files = sorted((self.path / run.EVALUATION).glob("*/metrics.json"))
+        files = sorted((self.path / run_files.EVALUATION).glob("*/metrics.json"))
         return {file.parent.name: self._json(file) for file in files}
 
     def cameras(self) -> RunCameras:
@@ -215,7 +215,7 @@ class RunFolder:
             CheckpointError: all checkpoints are damaged.
         """
         place, _ = resolve_device(str(device), local_rank=0, local_world_size=1, share_gpus=False)
-        found = run.open_model(self.path, Ranks())
+        found = run_files.open_model(self.path, Ranks())
         columns = {name: found.table[name].to(place) for name in (*PARAMETERS, "level")}
         return Model(
             **columns,

@@ -16,7 +16,7 @@ from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.population.lineage import Lineage, initial_births, ledger_of
 from blitzgs.population.position_noise import PositionNoise
 from blitzgs.scene.capture import Capture
-from blitzgs.training import run
+from blitzgs.training import run_files
 from blitzgs.training.adaptive import Signals
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.batches import Images
@@ -30,8 +30,8 @@ from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.population_report import PICTURE
-from blitzgs.training.run import Progress
 from blitzgs.training.run_cameras import CAMERAS, save_cameras
+from blitzgs.training.run_files import Progress
 from blitzgs.training.run_log import LOG, RunLog
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.schedule import Schedule, stretched
@@ -66,32 +66,32 @@ def set_up(
         FolderError: a rank cannot write to the folder, or the disk has too little space.
     """
     check_alike(config, capture, ranks, resume)
-    written = (run.CONFIG, CAMERAS, LOG, run.SUMMARY, PICTURE, run.LINEAGE)
-    check_unclaimed(folder / run.CHECKPOINTS, written, ranks)
-    check_writable(folder / run.CHECKPOINTS, ranks)
+    written = (run_files.CONFIG, CAMERAS, LOG, run_files.SUMMARY, PICTURE, run_files.LINEAGE)
+    check_unclaimed(folder / run_files.CHECKPOINTS, written, ranks)
+    check_writable(folder / run_files.CHECKPOINTS, ranks)
     space = Space.of(capture.offset, capture.extent)
     lpips = load_lpips(config.log.lpips_weights)
-    if not resume and any((folder / run.CHECKPOINTS).glob("checkpoint_*")):
+    if not resume and any((folder / run_files.CHECKPOINTS).glob("checkpoint_*")):
         raise FileExistsError(
             f"{folder} already holds a run: add --resume to continue it, or choose another --out"
         )
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
-    restored = run.restore(folder, ranks, home) if resume else None
+    restored = run_files.restore(folder, ranks, home) if resume else None
     config = _for_views(config, capture, restored)
-    config = run.with_pace_of(config, None if restored is None else restored.config)
+    config = run_files.with_pace_of(config, None if restored is None else restored.config)
     schedule = Schedule(config.schedule)
     if restored is None:
         table, progress = first_gaussians(config, capture, space, ranks, home)
     else:
         table, progress = restored.table, restored.progress
-        run.check_resumable(restored.config, config)
+        run_files.check_resumable(restored.config, config)
         check_capture(restored.space, capture, folder)
     progress = keep_to_views(table, progress, capture, ranks)
     veto, gate_digest = open_gate(config, capture, ranks, progress.gate)
     progress = replace(progress, gate=gate_digest)
     check_room(folder, table, ranks, config.population.max_gaussians)
     if ranks.rank == 0:
-        save_config(config, folder / run.CONFIG)
+        save_config(config, folder / run_files.CONFIG)
         if restored is None or not (folder / CAMERAS).exists():
             save_cameras(folder, capture)
     run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
@@ -130,7 +130,7 @@ def set_up(
     )
 
 
-def _for_views(config: Config, capture: Capture, restored: run.Restored | None) -> Config:
+def _for_views(config: Config, capture: Capture, restored: run_files.Restored | None) -> Config:
     """Return `config` with the values that depend on the number of training views.
 
     They are the length of the run (`schedule.images_per_view`) and the opacity term (`loss.opacity_total`). A
@@ -149,7 +149,7 @@ def _for_views(config: Config, capture: Capture, restored: run.Restored | None) 
     return replace(config, schedule=stretched(schedule, views), loss=weighted(loss, views))
 
 
-def _tile_owners(ranks: Ranks, progress: Progress, restored: run.Restored | None) -> TileOwners:
+def _tile_owners(ranks: Ranks, progress: Progress, restored: run_files.Restored | None) -> TileOwners:
     """Return the division of tiles, with the costs that the checkpoint has if they can be used."""
     owners = TileOwners(ranks)
     if restored is None or not restored.shared or ranks.world_size == 1:
@@ -199,13 +199,13 @@ def _start_lineage(
     if not config.population.lineage:
         return None
     about, ledger = lineage_subject(config, capture), ledger_of(progress.ledger)
-    lineage = Lineage(folder / run.LINEAGE, ranks, progress.step, ledger, about)
+    lineage = Lineage(folder / run_files.LINEAGE, ranks, progress.step, ledger, about)
     if not progress.ledger:
         lineage.born(initial_births(table["id"], table["parent"], table["means"]), progress.step)
     return lineage
 
 
-def _origin(restored: run.Restored | None, resume: bool, folder: Path) -> str:
+def _origin(restored: run_files.Restored | None, resume: bool, folder: Path) -> str:
     """Describe where the run begins, for the log."""
     if restored is not None:
         return f"resumed from {restored.source} after {restored.progress.step:,} steps"

@@ -27,7 +27,7 @@ from blitzgs.training.config import Config
 from blitzgs.training.evaluation import Lpips
 from blitzgs.training.lod import lod_gate
 from blitzgs.training.optimiser import TableAdam
-from blitzgs.training.run import Progress
+from blitzgs.training.run_files import Progress
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.schedule import PLACED, Schedule

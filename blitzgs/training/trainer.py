@@ -18,7 +18,7 @@ from blitzgs.output import write_file
 from blitzgs.pipeline import Frame
 from blitzgs.population.importance import PHI
 from blitzgs.scene.capture import Capture
-from blitzgs.training import run, view_level
+from blitzgs.training import run_files, view_level
 from blitzgs.training.agreement import MOST_STEPS, Agreement, StopRequest
 from blitzgs.training.batches import MOST_MASKED, BatchLoader, Images, PhotographError
 from blitzgs.training.budget import Budget
@@ -276,7 +276,7 @@ class Trainer:
             text += f"; {ranks.world_size} ranks, transport {ranks.transport}"
         if state.config.schedule.minutes > 0:
             text += f"; {state.config.schedule.minutes:g} minutes of training"
-        values = views | run.versions(ranks.device) | {"transport": ranks.transport}
+        values = views | run_files.versions(ranks.device) | {"transport": ranks.transport}
         state.log.event(
             state.images_seen, "start", {"origin": state.origin} | values, f"{state.origin}; {text}"
         )
@@ -309,10 +309,10 @@ class Trainer:
             write_picture(state, population)
             try:
                 # Pace and placed times were measured after the run first wrote its configuration.
-                save_config(state.config, state.folder / run.CONFIG)
+                save_config(state.config, state.folder / run_files.CONFIG)
                 if state.lineage is not None:
                     state.lineage.describe(lineage_subject(state.config, state.capture))
-                write_file(state.folder / run.SUMMARY, json.dumps(summary, indent=1) + "\n")
+                write_file(state.folder / run_files.SUMMARY, json.dumps(summary, indent=1) + "\n")
             except OSError as error:
                 warnings.warn(f"the model is saved, its summary is not: {error}", stacklevel=2)
         return summary
@@ -327,10 +327,10 @@ class Trainer:
             "gaussians": state.population(),
             "peak_gaussians": state.progress.peak_gaussians,
             "population": population,
-            "peak_memory_bytes": run.peak_memory_bytes(state.ranks.device),
+            "peak_memory_bytes": run_files.peak_memory_bytes(state.ranks.device),
             "config_hash": config_hash(state.config),
             "run": state.run_id,
-            "versions": run.versions(state.ranks.device),
+            "versions": run_files.versions(state.ranks.device),
         }
         if state.config.schedule.minutes > 0:
             figures |= {

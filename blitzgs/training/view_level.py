@@ -12,7 +12,7 @@ from blitzgs.model import CULL, GaussianTable
 from blitzgs.scene.capture import Capture
 from blitzgs.training.inputs import train_views_fingerprint
 from blitzgs.training.lod import lod_gate, scene_gate
-from blitzgs.training.run import Progress
+from blitzgs.training.run_files import Progress
 from blitzgs.training.state import TrainingState
 from blitzgs.view.gate import ViewGate, lod_bits
 

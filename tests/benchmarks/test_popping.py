@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run as run_folder
+from blitzgs.training import run_files
 from blitzgs.training.trainer import Trainer
 from tests.helpers import DEVICES
 from tests.training.tiny import tiny_config, tiny_scene
@@ -53,14 +53,14 @@ def test_smooth_levels_pop_less(trained, tmp_path, device, capsys):
 
 
 def test_a_model_of_one_level_does_not_pop(trained, monkeypatch):
-    opened = run_folder.open_model
+    opened = run_files.open_model
 
     def flat(*arguments):
         model = opened(*arguments)
         model.table["level"].zero_()
         return model
 
-    monkeypatch.setattr(run_folder, "open_model", flat)
+    monkeypatch.setattr(run_files, "open_model", flat)
     found = bm_popping.popping(trained, None, frames=4)
     assert found["gated"]["largest"] == 0 < found["full"]["mean_change"]
     assert found["smooth"]["largest"] < 1e-3  # opacities that went through a logit and back

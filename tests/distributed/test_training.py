@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run
+from blitzgs.training import run_files
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
 from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
@@ -50,7 +50,7 @@ def _train(ranks, folder, *overrides):
 
 
 def sorted_table(folder):
-    table = run.restore(folder, Ranks()).table
+    table = run_files.restore(folder, Ranks()).table
     order = table["id"].argsort()
     return {name: table[name][order] for name in table}
 
@@ -167,7 +167,7 @@ def test_a_photograph_lost_on_one_rank_is_named_by_all_and_costs_nothing(tmp_pat
     require_named_by_all(failure, "/photos/0")
     # The other rank is in the middle of the step: they save where they next agree. The last checkpoint of the
     # schedule is that after 19 images.
-    assert run.restore(tmp_path, Ranks()).progress.step == 16
+    assert run_files.restore(tmp_path, Ranks()).progress.step == 16
     for summary, _ in run_ranks(_train, 2, tmp_path):
         assert summary["images"] == 60
 
@@ -192,7 +192,7 @@ def test_a_photograph_lost_in_the_last_step_is_named_by_all(tmp_path):
     with pytest.raises(RankError) as failure:
         run_ranks(_lose_the_last_photographs, 2, tmp_path)
     require_named_by_all(failure, "rank 0: /photos/0")
-    assert run.restore(tmp_path, Ranks()).progress.step == 30
+    assert run_files.restore(tmp_path, Ranks()).progress.step == 30
 
 
 def _lose_a_held_out_photograph(ranks, folder, resume):
@@ -214,7 +214,7 @@ def test_a_held_out_photograph_lost_on_several_ranks_is_named_by_all_and_costs_n
     with pytest.raises(RankError) as failure:
         run_ranks(_lose_a_held_out_photograph, 2, tmp_path, False)
     require_named_by_all(failure, "/photos/05.png")
-    assert run.restore(tmp_path, Ranks()).progress.step == 16  # the evaluation is due after 30 images
+    assert run_files.restore(tmp_path, Ranks()).progress.step == 16  # the evaluation is due after 30 images
     assert all(run_ranks(_lose_a_held_out_photograph, 2, tmp_path, True))
 
 
@@ -243,7 +243,7 @@ def test_a_signal_within_an_evaluation_does_not_wait_for_its_end(tmp_path, world
     """torchrun ends a process 30 seconds after it was asked to stop; an evaluation may take longer."""
     for compared, summary in run_ranks(_stop_in_an_evaluation, world_size, tmp_path, every):
         assert compared == [step] and summary is None
-    assert run.restore(tmp_path, Ranks()).progress.step == step
+    assert run_files.restore(tmp_path, Ranks()).progress.step == step
     events = [record.get("event") for record in read_log(tmp_path)]
     assert "evaluation stopped" in events and "evaluation" not in events and events[-1] == "stopped"
     assert ("hint" in events) == (world_size > 1)  # a batch of 2 views
@@ -259,10 +259,10 @@ def _resume_with_fewer_views(ranks, folder):
     images.images[::2] = [image[:, :24].contiguous() for image in images.images[::2]]
     Trainer(tiny_config(*SETTINGS), capture, images, folder, ranks).train()
     if ranks.rank == 0:
-        for later in sorted((folder / run.CHECKPOINTS).glob("checkpoint_*"))[1:]:
+        for later in sorted((folder / run_files.CHECKPOINTS).glob("checkpoint_*"))[1:]:
             shutil.rmtree(later)
     ranks.barrier()
-    known = run.restore(folder, ranks).shared["steps"].tolist()
+    known = run_files.restore(folder, ranks).shared["steps"].tolist()
     del capture.cameras[0], images.images[0]
     capture.train, capture.test = [0, 1, 3, 4, 5, 6], [2]
     config = tiny_config(*SETTINGS, "data.allow_missing=true")
@@ -342,7 +342,7 @@ def assert_same_result(folder, expected):
 def test_sigterm_on_one_rank_saves_and_a_resume_finishes(capture, trained, tmp_path):
     flags = train_flags(capture, tmp_path)
     assert run_ranks(_train_and_stop, 2, flags, 12, join=False) == [0, 0]
-    assert run.restore(tmp_path, Ranks()).progress.step == 16  # where the ranks next agree
+    assert run_files.restore(tmp_path, Ranks()).progress.step == 16  # where the ranks next agree
     assert not (tmp_path / "summary.json").exists()
     # Another number of ranks may continue.
     assert run_ranks(_command, 3, flags, join=False) == [0, 0, 0]
@@ -358,7 +358,7 @@ def test_a_resume_on_as_many_ranks_repeats_every_bit(capture, trained, tmp_path)
     got, want = sorted_table(tmp_path), sorted_table(trained)
     for name in want:
         assert torch.equal(got[name], want[name]), name
-    got, want = (run.restore(folder, Ranks()).shared for folder in (tmp_path, trained))
+    got, want = (run_files.restore(folder, Ranks()).shared for folder in (tmp_path, trained))
     assert len(set(want["views"].tolist())) == 7 and sorted(got) == sorted(want)
     for name in want:
         assert torch.equal(got[name], want[name]), name

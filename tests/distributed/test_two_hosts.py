@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run
+from blitzgs.training import run_files
 from tests.training.tiny import OVERRIDES, write_tiny_capture
 
 ROOT = Path(__file__).parents[2]
@@ -78,7 +78,7 @@ def test_a_host_is_lost_and_both_resume(tmp_path):
         text = (tmp_path / "first").read_text()
         assert "rank" in text and ("has stopped reporting" in text or "connection" in text)
         lose(hosts[0])  # where torchrun still waits for the other host
-        saved = run.restore(out, Ranks()).progress.step
+        saved = run_files.restore(out, Ranks()).progress.step
         assert 0 < saved < 1500
 
         port = free_port()
@@ -94,4 +94,4 @@ def test_a_host_is_lost_and_both_resume(tmp_path):
                 lose(host)
     text = (tmp_path / "third").read_text()
     assert "resumed from checkpoint_" in text and f"after {saved:,} steps" in text
-    assert run.restore(out, Ranks()).progress.step == 1500
+    assert run_files.restore(out, Ranks()).progress.step == 1500

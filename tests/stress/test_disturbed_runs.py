@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run
+from blitzgs.training import run_files
 from tests.distributed.rank_harness import CONTEXT
 from tests.training.tiny import OVERRIDES, write_tiny_capture
 from tests.training.tiny_runs import steps_of
@@ -77,7 +77,7 @@ def finish(data, out):
     process = start(data, out, "--resume")
     process.join(240)
     assert process.exitcode == 0
-    return run.restore(out, Ranks()).table
+    return run_files.restore(out, Ranks()).table
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def scene(tmp_path_factory):
     begin = time.monotonic()
     process.join(240)
     assert process.exitcode == 0
-    return data, run.restore(out, Ranks()).table, time.monotonic() - begin
+    return data, run_files.restore(out, Ranks()).table, time.monotonic() - begin
 
 
 def kill(process, data, out):

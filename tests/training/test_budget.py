@@ -15,7 +15,7 @@ import torch
 
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run
+from blitzgs.training import run_files
 from blitzgs.training.budget import Budget
 from blitzgs.training.config import Config, ScheduleConfig
 from blitzgs.training.config_io import ConfigError, load_config
@@ -187,7 +187,7 @@ def test_a_run_resumes_before_and_after_it_has_chosen_its_pace(tmp_path, stop):
     assert bool(before) == (stop > 8)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert run.open_model(tmp_path, Ranks()).config.schedule.pace == before
+        assert run_files.open_model(tmp_path, Ranks()).config.schedule.pace == before
     second = start(tmp_path, resume=True)
     # The time that the checkpoint was trained counts, also if the command changes the budget.
     assert second.state.config.schedule.pace == before

@@ -18,7 +18,7 @@ from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
 from blitzgs.scene.capture import load_capture
-from blitzgs.training import run
+from blitzgs.training import run_files
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, write_tiny_capture
 
 ROOT = Path(__file__).parents[2]
@@ -73,7 +73,7 @@ def test_export_restores_the_units_of_the_capture(trained, tmp_path, capsys):
     path = tmp_path / "model.ply"
     assert main(["export", str(trained[1]), "--ply", str(path), "--classic"]) == 0
     assert "--classic changes nothing: the model was trained without" in capsys.readouterr().err
-    model, exported = run.open_model(trained[1], Ranks()), read_ply(path)
+    model, exported = run_files.open_model(trained[1], Ranks()), read_ply(path)
     means = model.table["means"].double() * model.space.unit + torch.tensor(model.space.offset)
     torch.testing.assert_close(exported.means.double(), means, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(exported.scales, model.table["scales"] + math.log(model.space.unit))

@@ -20,7 +20,7 @@ from blitzgs.population.importance import PHI, is_culled
 from blitzgs.population.lineage import ABOUT, Cause
 from blitzgs.population.lineage_parts import read_lineage
 from blitzgs.population.spawn_gate import GateError, GateInfo, RandomVeto, info_path
-from blitzgs.training import run, run_log
+from blitzgs.training import run_files, run_log
 from blitzgs.training.events import importance
 from blitzgs.training.gate import life_fields, reasons_against
 from blitzgs.training.guard import ModelLostError
@@ -116,7 +116,7 @@ def test_resume_is_exact_and_carries_the_columns(whole_run, tmp_path, monkeypatc
     second, _ = train(tmp_path, resume=True)
     assert_same_table(second.state.table, whole.state.table)
     assert second.state.progress.milestones == whole.state.progress.milestones
-    model = run.open_model(tmp_path, Ranks())
+    model = run_files.open_model(tmp_path, Ranks())
     assert torch.equal(model.table[PHI], whole.state.table[PHI])
 
 
@@ -192,7 +192,7 @@ def test_lineage_of_a_run_that_was_stopped_adds_up(tmp_path, monkeypatch):
     train(tmp_path, "population.lineage=true")
     monkeypatch.undo()
     trainer, _ = train(tmp_path, "population.lineage=true", resume=True)
-    tables = read_lineage(tmp_path / run.LINEAGE)
+    tables = read_lineage(tmp_path / run_files.LINEAGE)
     births, deaths = tables["births"]["id"], tables["deaths"]["id"]
     assert sorted(set(births) - set(deaths)) == sorted(trainer.state.table["id"].tolist())
     causes = dict(zip(*np.unique(tables["deaths"]["cause"], return_counts=True), strict=True))
@@ -220,7 +220,7 @@ def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
     pytest.importorskip("pyarrow")
     pytest.importorskip("xgboost")
     train(tmp_path / "lineage", "population.lineage=true", "population.grad_threshold=1e-4")
-    run_of = read_spawns(tmp_path / "lineage" / run.LINEAGE)
+    run_of = read_spawns(tmp_path / "lineage" / run_files.LINEAGE)
     assert run_of.features.shape[1] == len(FEATURES) and run_of.times.max() == 80
     path = tmp_path / "gate.json"
     figures = fit([run_of], path)
@@ -284,7 +284,7 @@ def test_lineage_says_at_what_pace_its_run_went(tmp_path):
     trainer, _ = train(tmp_path, "population.lineage=true", "schedule.minutes=0.02")
     pace = [[image, factor] for image, factor in trainer.state.config.schedule.pace]
     assert pace
-    about = json.loads((tmp_path / run.LINEAGE / ABOUT).read_text())
+    about = json.loads((tmp_path / run_files.LINEAGE / ABOUT).read_text())
     assert about["schedule"]["schedule.pace"] == pace
 
 
@@ -303,7 +303,7 @@ def test_importance_passes_on_two_ranks_keep_the_lineage_consistent(tmp_path, wo
     assert milestones["after_pass_1"] == int(0.7 * milestones["before_pass_1"])
     assert len(population["peak_memory_bytes"]) == 2
     ids = torch.cat([answer[0] for answer in answers])
-    tables = read_lineage(tmp_path / run.LINEAGE)
+    tables = read_lineage(tmp_path / run_files.LINEAGE)
     births, deaths = tables["births"]["id"], tables["deaths"]["id"]
     assert sorted(set(births) - set(deaths)) == sorted(ids.tolist())
     assert (ledger["births"], ledger["deaths"]) == (len(births), len(deaths))
@@ -360,4 +360,4 @@ def test_a_pass_that_a_signal_cuts_short_happens_after_the_resume(tmp_path, monk
 def test_a_pass_that_keeps_nothing_ends_the_run_before_it_is_saved(tmp_path, options, named):
     with pytest.raises(ModelLostError, match=named):
         train(tmp_path, *options, "schedule.checkpoint_every=10")
-    assert len(run.open_model(tmp_path, Ranks()).table) > 0
+    assert len(run_files.open_model(tmp_path, Ranks()).table) > 0

@@ -16,7 +16,7 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.lineage_parts import read_lineage
-from blitzgs.training import checkpoint, run
+from blitzgs.training import checkpoint, run_files
 from blitzgs.training.agreement import MOST_STEPS, Agreement, SaveClock, StopRequest
 from blitzgs.training.batches import PhotographError
 from blitzgs.training.events import save
@@ -66,7 +66,7 @@ def test_what_is_not_finite_is_not_saved(tmp_path, monkeypatch, column):
     with pytest.raises(NonFiniteError, match=message):
         running.train()
     assert checkpoints(tmp_path) == ["checkpoint_000000", "checkpoint_000001"]
-    assert run.restore(tmp_path, Ranks()).progress.step == 27
+    assert run_files.restore(tmp_path, Ranks()).progress.step == 27
 
 
 def test_a_checkpoint_with_nan_is_not_resumed_from(tmp_path):
@@ -77,7 +77,7 @@ def test_a_checkpoint_with_nan_is_not_resumed_from(tmp_path):
     newest = checkpoint.load_latest(tmp_path / "checkpoints", Ranks(), "cpu")
     checkpoint.save(tmp_path / "checkpoints", table.columns, newest.state, Ranks())
     with pytest.warns(UserWarning, match="is refused: column 'sh' is not finite.*; using checkpoint_000001"):
-        found = run.restore(tmp_path, Ranks())
+        found = run_files.restore(tmp_path, Ranks())
     assert found.source == "checkpoint_000001 (the newest sound one; 1 newer refused)"
 
 
@@ -102,7 +102,7 @@ def test_every_signal_saves(tmp_path, monkeypatch, number):
     at_step(monkeypatch, 17, lambda self: os.kill(os.getpid(), number))
     running = trainer(tmp_path)
     assert running.train() is None
-    assert run.restore(tmp_path, Ranks()).progress.step == 17
+    assert run_files.restore(tmp_path, Ranks()).progress.step == 17
     assert signal.Signals(number).name in read_log(tmp_path)[-1]["reason"]
 
 
@@ -237,7 +237,7 @@ def test_a_photograph_that_vanishes_costs_nothing(tmp_path, monkeypatch):
     running = trainer(tmp_path / "cut", images=images)
     with pytest.raises(PhotographError, match=r"/photos/0\d.png'.*put the photograph back.*--resume"):
         running.train()
-    saved = run.restore(tmp_path / "cut", Ranks()).progress.step
+    saved = run_files.restore(tmp_path / "cut", Ranks()).progress.step
     assert 40 <= saved <= 44  # some batches were loaded ahead
     images.get = get
     monkeypatch.undo()
@@ -260,7 +260,7 @@ def test_a_held_out_photograph_that_vanishes_costs_nothing(tmp_path):
     running = trainer(tmp_path, "schedule.evaluate_every=30", images=images)
     with pytest.raises(PhotographError, match=r"/photos/03.png.*put the photograph back.*--resume"):
         running.train()
-    assert run.restore(tmp_path, Ranks()).progress.step == 31
+    assert run_files.restore(tmp_path, Ranks()).progress.step == 31
     images.get = get
     assert trainer(tmp_path, "schedule.evaluate_every=30", resume=True).train() is not None
 
@@ -296,7 +296,7 @@ def test_the_last_checkpoint_waits_for_room(tmp_path, monkeypatch, capsys):
     assert trainer(tmp_path).train() is not None
     shown = capsys.readouterr().out
     assert shown.count("The model is still in memory: free some space") == 2
-    assert run.restore(tmp_path, Ranks()).progress.step == 100
+    assert run_files.restore(tmp_path, Ranks()).progress.step == 100
 
 
 def test_waiting_for_room_ends_when_asked(tmp_path, monkeypatch):

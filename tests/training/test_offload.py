@@ -7,7 +7,7 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
-from blitzgs.training import run
+from blitzgs.training import run_files
 from blitzgs.training.evaluation import render_view
 from blitzgs.training.lod import scene_gate
 from blitzgs.training.trainer import Trainer
@@ -142,7 +142,7 @@ def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypat
     trainer, _ = train(tmp_path, RESIDENT, "schedule.iterations=30", "view.lod=true", "view.most_kept=1",
                        "schedule.densify_until=10", "population.importance=true", "population.pass1_keep=1",
                        "schedule.t1=12", "schedule.t2=0", "view.cull=true")  # fmt: skip
-    model, ranks = run.open_model(tmp_path, Ranks()), Ranks()
+    model, ranks = run_files.open_model(tmp_path, Ranks()), Ranks()
     table = model.table
     lod = scene_gate(model.config, model.progress, table, ranks)
     options, owners = trainer.state.render_options, TileOwners(ranks)
@@ -161,7 +161,7 @@ def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypat
 def test_a_batch_that_does_not_fit_is_named(tmp_path):
     with pytest.raises(ResidenceError, match=r"see \d+ blocks of 256 Gaussians, .* lower schedule"):
         train(tmp_path, "memory.resident_gb=0.002")
-    assert not list((tmp_path / run.CHECKPOINTS).iterdir())
+    assert not list((tmp_path / run_files.CHECKPOINTS).iterdir())
 
 
 def test_a_model_that_outgrows_its_pool_is_saved_and_goes_on_with_a_larger_one(tmp_path):

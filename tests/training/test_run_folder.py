@@ -19,7 +19,7 @@ import blitzgs
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
-from blitzgs.training import checkpoint, run
+from blitzgs.training import checkpoint, run_files
 from blitzgs.training.export import export_ply, without_antialiasing
 from blitzgs.training.trainer import Trainer
 from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene
@@ -237,14 +237,14 @@ def test_eval_uses_the_configuration_of_the_checkpoint(copy, tmp_path, capsys, c
 
 
 def test_what_a_resume_may_change(trained):
-    saved = run.restore(trained[1], Ranks()).config
+    saved = run_files.restore(trained[1], Ranks()).config
     schedule = dataclasses.replace(saved.schedule, evaluate_every=7, checkpoint_every=9)
-    run.check_resumable(saved, dataclasses.replace(saved, schedule=schedule))
+    run_files.check_resumable(saved, dataclasses.replace(saved, schedule=schedule))
     half = dataclasses.replace(saved, ranks=dataclasses.replace(saved.ranks, half_exchange=True))
     with pytest.raises(
         ValueError, match="ranks.half_exchange: the checkpoint was trained with False, now True"
     ):
-        run.check_resumable(saved, half)
+        run_files.check_resumable(saved, half)
 
 
 @pytest.mark.parametrize(
@@ -252,7 +252,7 @@ def test_what_a_resume_may_change(trained):
 )
 def test_a_checkpoint_of_another_version_is_named(trained, tmp_path, capsys, state):
     shutil.copy(trained[1] / "config.yaml", tmp_path)
-    table = run.restore(trained[1], Ranks()).table
+    table = run_files.restore(trained[1], Ranks()).table
     checkpoint.save(tmp_path / "checkpoints", {name: table[name] for name in table}, state, Ranks())
     assert main(["eval", str(tmp_path)]) == 1
     assert "checkpoint_000000 belongs to another version of BlitzGS" in capsys.readouterr().err

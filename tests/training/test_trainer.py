@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run
+from blitzgs.training import run_files
 from blitzgs.training.config_io import ConfigError
 from blitzgs.training.guard import NonFiniteError
 from blitzgs.training.trainer import Trainer, small_batch_hint
@@ -48,11 +48,11 @@ def test_what_a_run_leaves_behind(whole_run):
     assert summary["peak_gaussians"] >= summary["gaussians"]
     assert [r["t"] for r in steps_of(folder)] == [20, 40, 60, 80, 100]
     assert [r["t"] for r in events_of(folder, "densify")] == [20, 40, 60, 80]
-    assert run.load_config(folder / "config.yaml") == trainer.state.config
+    assert run_files.load_config(folder / "config.yaml") == trainer.state.config
     metrics = json.loads((folder / "evaluation" / "000100" / "metrics.json").read_text())
     assert list(metrics["views"]) == ["03.png"]
     assert (folder / "evaluation" / "000100" / "03.png.jpg").stat().st_size > 0
-    model = run.open_model(folder, Ranks())
+    model = run_files.open_model(folder, Ranks())
     assert_same_table(model.table, trainer.state.table)
 
 
@@ -76,7 +76,7 @@ def test_a_run_that_views_made_longer_is_resumed_with_either_configuration(tmp_p
     views = len(first.state.capture.train)
     assert summary is None and first.state.schedule.iterations == 20 * views > 50
     monkeypatch.undo()
-    own = run.load_config(tmp_path / "config.yaml")
+    own = run_files.load_config(tmp_path / "config.yaml")
     assert own.schedule.images_per_view == 0 and own.schedule.scale == views / 2
     with pytest.raises(ConfigError, match="schedule.scale: the checkpoint was trained with"):
         train(tmp_path, asked[0], "schedule.images_per_view=19", resume=True)
@@ -94,7 +94,7 @@ def test_a_run_whose_opacity_term_follows_the_views_is_resumed_with_either_confi
     weight = 0.2 / len(first.state.capture.train)
     assert summary is None and first.state.config.loss.opacity == weight
     monkeypatch.undo()
-    own = run.load_config(tmp_path / "config.yaml")
+    own = run_files.load_config(tmp_path / "config.yaml")
     assert own.loss.opacity_total == 0 and own.loss.opacity == weight
     with pytest.raises(ConfigError, match="loss.opacity: the checkpoint was trained with"):
         train(tmp_path, "loss.opacity_total=0.3", resume=True)
@@ -108,7 +108,7 @@ def test_a_checkpoint_has_all_events_of_its_step(tmp_path):
     times = ("schedule.densify_from=22", "schedule.checkpoint_every=20")
     options = ("schedule.batch_size=4", "schedule.iterations=60", "log.keep_checkpoints=10", *times)
     whole, _ = train(tmp_path, *options)
-    checkpoints = sorted((tmp_path / run.CHECKPOINTS).iterdir())
+    checkpoints = sorted((tmp_path / run_files.CHECKPOINTS).iterdir())
     for later in checkpoints[1:]:
         shutil.rmtree(later)
     resumed, _ = train(tmp_path, *options, resume=True)

@@ -14,7 +14,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply, write_ply
 from blitzgs.model import CULL, GaussianTable
 from blitzgs.population.importance import is_culled
-from blitzgs.training import run
+from blitzgs.training import run_files
 from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.config_io import ConfigError
 from blitzgs.training.evaluation import image_metrics
@@ -111,7 +111,7 @@ def test_what_the_run_says_and_saves(whole_run):
     assert len(progress.gated_views) == 7 and "1" in progress.gated_views
     assert again["gated_views"] == progress.gated_views.count("1") and again["kept"] < 0.95
     assert events_of(folder, "clear_cull")[0]["t"] == 85 and CULL not in trainer.state.table
-    saved = run.open_model(folder, Ranks())
+    saved = run_files.open_model(folder, Ranks())
     assert saved.progress == progress
     gate = scene_gate(saved.config, saved.progress, saved.table, Ranks())
     assert gate.gate == scene_gate(trainer.state.config, progress, trainer.state.table, Ranks()).gate

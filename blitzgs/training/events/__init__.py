@@ -12,7 +12,7 @@ from dataclasses import astuple, replace
 
 from blitzgs.population.importance import SweepStoppedError
 from blitzgs.training.events import clear_cull, densify, evaluate, importance, place, reset_opacities, save
-from blitzgs.training.run import Progress
+from blitzgs.training.run_files import Progress
 from blitzgs.training.schedule import Event, EventKind
 from blitzgs.training.state import TrainingState
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from blitzgs.distributed.ownership import TileOwners
-from blitzgs.training import run as run_folder
+from blitzgs.training import run_files
 from blitzgs.training.evaluation import EvaluationStoppedError, evaluate
 from blitzgs.training.lod import scene_gate
 from blitzgs.training.schedule import Event
@@ -23,7 +23,7 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
         has to stop meanwhile.
     """
     with state.paused_clock():
-        folder = state.folder / run_folder.EVALUATION / f"{state.images_seen:06d}"
+        folder = state.folder / run_files.EVALUATION / f"{state.images_seen:06d}"
         capture = state.capture
         try:
             metrics = measure(state, capture.test or capture.train, folder)

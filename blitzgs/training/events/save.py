@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from blitzgs.population.lineage import ledger_state
-from blitzgs.training import run as run_folder
+from blitzgs.training import run_files
 from blitzgs.training.checkpoint import CheckpointError
 from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
@@ -83,7 +83,7 @@ def _write(state: TrainingState) -> None:
         state.progress = replace(state.progress, signals=state.signals.saved())
     # The division of tiles decides the order of sums, and therefore their last bits.
     shared = state.owners.columns() if state.ranks.world_size > 1 else None
-    run_folder.save(
+    run_files.save(
         state.folder,
         state.table,
         state.progress,
