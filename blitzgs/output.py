@@ -114,7 +114,7 @@ class OutputFolder:
         Args:
             names: names of images, as in their capture.
             suffix: suffix of the new files, with its dot.
-            flat: put every file into the folder itself, `a/b.jpg` as `a_b.jpg` + suffix.
+            flat: put every file into the folder itself, `a/b.jpg` as `a_b` + suffix.
 
         Raises:
             OSError: a path is an input, is no regular file, leaves the folder through a link, or exists in a
@@ -131,7 +131,7 @@ class OutputFolder:
         relatives = []
         for inner, key in zip(parts, short, strict=True):
             whole = PurePath(*inner)
-            stem = whole if flat or counts[key] > 1 else whole.with_suffix("")
+            stem = whole if counts[key] > 1 else whole.with_suffix("")
             relative, number = _with_name(stem, suffix), 1
             while _key(relative) in taken or _key(relative) in folders:
                 number += 1

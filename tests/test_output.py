@@ -42,6 +42,8 @@ def test_names_without_surprises_keep_their_shape(tmp_path):
     assert [str(path.relative_to(tmp_path)) for path in found] == [
         "a/b.png", "c.v2.png", "d.jpg.png", "d.png.png",
     ]  # fmt: skip
+    found = OutputFolder(tmp_path).paths(["a/b.jpg", "c.v2.jpg", "d.jpg", "d.png"], ".jpg", flat=True)
+    assert [path.name for path in found] == ["a_b.jpg", "c.v2.jpg", "d.jpg.jpg", "d.png.jpg"]
 
 
 def test_absolute_names_lose_the_folders_that_they_share(tmp_path):

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from blitzgs.scene.capture import Capture
 from blitzgs.training.config_ranges import RANGES
+from blitzgs.training.run_cameras import RunCameras
 
 Commands = argparse._SubParsersAction  # argparse has no public name for it
 
@@ -75,6 +77,30 @@ def _gigabytes(text: str) -> float:
     if value not in allowed:
         raise argparse.ArgumentTypeError(f"must be {allowed}, got {text}")
     return value
+
+
+def add_split(parser: argparse.ArgumentParser, verb: str) -> None:
+    """Add the flag --split, which views of the run to use; `verb` says for what."""
+    parser.add_argument(
+        "--split",
+        choices=("test", "train", "all"),
+        default="test",
+        help=f"views to {verb} (default: %(default)s)",
+    )
+
+
+def chosen_views(args: argparse.Namespace, cameras: Capture | RunCameras) -> Sequence[int]:
+    """Return the cameras that --split names, as indices.
+
+    Raises:
+        ValueError: there are none.
+    """
+    indices: Sequence[int] = (
+        range(len(cameras.cameras)) if args.split == "all" else getattr(cameras, args.split)
+    )
+    if not indices:
+        raise ValueError(f"{args.folder} has no {args.split} views: choose another --split")
+    return indices
 
 
 def add_device(parser: argparse.ArgumentParser, shares_gpus: bool = False) -> None:

@@ -15,6 +15,8 @@ from blitzgs.cli.arguments import (
     add_device,
     add_pool,
     add_run,
+    add_split,
+    chosen_views,
     named_path,
 )
 from blitzgs.distributed.group import Ranks
@@ -41,9 +43,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     add_capture(parser)
     add_device(parser, shares_gpus=True)
     add_pool(parser)
-    parser.add_argument(
-        "--split", choices=("test", "train"), default="test", help="views to measure (default: %(default)s)"
-    )
+    add_split(parser, "measure")
     parser.add_argument(
         "--out", type=named_path, metavar="DIR", help="folder for the results (default: RUN/evaluation/SPLIT)"
     )
@@ -77,8 +77,7 @@ def run(args: argparse.Namespace) -> int:
             config = dataclasses.replace(config, data=data)
         capture, images = open_capture(config, ranks, "--allow-missing")
         check_capture(model.space, capture, args.folder)
-        if not getattr(capture, args.split):
-            raise ValueError(f"{args.folder} has no {args.split} views: choose another --split")
+        indices = chosen_views(args, capture)
         folder = args.out or args.folder / run_files.EVALUATION / args.split
         with image_progress("Comparing", ranks.rank == 0) as report:
             result = evaluate(
@@ -86,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
                 ViewSet(list(capture.cameras), model.space, ranks.device),
                 capture.cameras,
                 images,
-                getattr(capture, args.split),
+                indices,
                 render_options(
                     config, model.space, model.progress.sh_degree, lod_gate(config, model.progress)
                 ),

@@ -10,7 +10,16 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
-from blitzgs.cli.arguments import Commands, add_command, add_device, add_pool, add_run, named_path
+from blitzgs.cli.arguments import (
+    Commands,
+    add_command,
+    add_device,
+    add_pool,
+    add_run,
+    add_split,
+    chosen_views,
+    named_path,
+)
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.output import OutputFolder
@@ -33,12 +42,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     )
     add_device(parser, shares_gpus=True)
     add_pool(parser)
-    parser.add_argument(
-        "--split",
-        choices=("test", "train", "all"),
-        default="test",
-        help="views to render (default: %(default)s)",
-    )
+    add_split(parser, "render")
     parser.add_argument("--out", type=named_path, required=True, metavar="DIR", help="folder for the images")
     parser.add_argument(
         "--raw",
@@ -53,9 +57,7 @@ def run(args: argparse.Namespace) -> int:
         model = run_files.open_model(args.folder, ranks, args.data, args.resident_gb)
         stored = _cameras(args, model, ranks)
         cameras: Sequence[CameraLike] = stored.cameras
-        indices = range(len(cameras)) if args.split == "all" else getattr(stored, args.split)
-        if not indices:
-            raise ValueError(f"{args.folder} has no {args.split} views: choose another --split")
+        indices = chosen_views(args, stored)
         views = ViewSet(list(cameras), model.space, ranks.device)
         gate = lod_gate(model.config, model.progress)
         options = render_options(model.config, model.space, model.progress.sh_degree, gate)

@@ -45,7 +45,8 @@ schedule half as long; with --minutes=M the run measures its speed and chooses t
 RUN gets config.yaml, cameras.json, log.jsonl, checkpoints/, evaluation/, summary.json and trajectory.svg, and
 tensorboard/ if TensorBoard is installed. A checkpoint is written every 10 minutes (log.checkpoint_seconds)
 and when the run is interrupted (Ctrl-C, SIGTERM or SIGHUP). The same command with --resume continues from the
-newest checkpoint; without any checkpoint it starts a new run and says so.
+newest checkpoint; without any checkpoint it starts a new run and says so. With --resume and without --config,
+the run's own configuration is used.
 
 Several processes share the work with torchrun --nproc-per-node=M -m blitzgs train (the same flags). With
 --resume and --max-restarts=K, a job that loses a process continues from its last checkpoint.

@@ -45,7 +45,7 @@ def evaluate(
     runs = with_distinct_names(runs)
     survival = output.root / SURVIVAL
     output.check(survival)
-    pictures = output.paths([f"regions_{run.name}" for run in runs], ".svg", flat=True)
+    pictures = output.paths([f"regions_{run.name}.svg" for run in runs], ".svg", flat=True)
     for run, begin, path in zip(runs, gate_from, pictures, strict=True):
         scores = gate.scores(torch.from_numpy(run.features)).double().numpy()
         late = run.times >= begin

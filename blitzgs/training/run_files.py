@@ -288,7 +288,8 @@ def check_resumable(saved: Config, wanted: Config) -> None:
         if not (_is_free(name) or is_budget):
             raise ConfigError(
                 f"{name}: the checkpoint was trained with {old!r}, now {new!r}; "
-                "resume with the run's own configuration or start another run"
+                "leave out --config and the fields to resume with the run's own configuration, or start "
+                "another run"
             )
 
 

@@ -55,7 +55,11 @@ def test_eval_repeats_the_metrics_of_training(trained, tmp_path, capsys):
     printed = capsys.readouterr()
     assert json.loads(printed.out) == {name: summary[name] for name in ("psnr", "ssim", "psnr_corrected")}
     assert f"{tmp_path}: metrics.json and pictures" in printed.err
-    assert len(list(tmp_path.glob("*.jpg"))) == 1
+    assert [path.name for path in tmp_path.glob("*.jpg")] == ["00.jpg"]
+    out = tmp_path / "all"
+    assert main(["eval", str(trained[1]), "--split", "all", "--pictures=0", "--out", str(out)]) == 0
+    views = json.loads((out / "metrics.json").read_text())["views"]
+    assert sorted(views) == [f"{index:02}.png" for index in range(8)]
 
 
 def test_render_writes_every_view(trained, tmp_path):

@@ -51,7 +51,7 @@ def test_what_a_run_leaves_behind(whole_run):
     assert run_files.load_config(folder / "config.yaml") == trainer.state.config
     metrics = json.loads((folder / "evaluation" / "000100" / "metrics.json").read_text())
     assert list(metrics["views"]) == ["03.png"]
-    assert (folder / "evaluation" / "000100" / "03.png.jpg").stat().st_size > 0
+    assert (folder / "evaluation" / "000100" / "03.jpg").stat().st_size > 0
     model = run_files.open_model(folder, Ranks())
     assert_same_table(model.table, trainer.state.table)
 
@@ -239,7 +239,9 @@ def test_a_run_is_not_overwritten_nor_resumed_with_another_configuration(whole_r
     folder, *_ = whole_run
     with pytest.raises(FileExistsError, match="add --resume"):
         train(folder)
-    with pytest.raises(ConfigError, match=r"loss.ssim: the checkpoint was trained with 0.2, now 0.3"):
+    with pytest.raises(
+        ConfigError, match=r"loss.ssim: the checkpoint was trained with 0.2, now 0.3; leave out --config"
+    ):
         train(folder, "loss.ssim=0.3", resume=True)
     train(folder, "log.every=50", resume=True)
 
