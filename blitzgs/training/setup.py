@@ -65,20 +65,16 @@ def set_up(
         MismatchError: the ranks differ in configuration, code or capture.
         FolderError: a rank cannot write to the folder, or the disk has too little space.
     """
+    # Everything that may refuse the run comes before the first file is written, so that a refused run leaves
+    # its folder as it was. The ranks are compared before they work together, and the folder is checked before
+    # a checkpoint is read from it.
     check_alike(config, capture, ranks, resume)
-    written = (run_files.CONFIG, CAMERAS, LOG, run_files.SUMMARY, PICTURE, run_files.LINEAGE)
-    check_unclaimed(folder / run_files.CHECKPOINTS, written, ranks)
-    check_writable(folder / run_files.CHECKPOINTS, ranks)
-    space = Space.of(capture.offset, capture.extent)
+    _check_folder(folder, ranks, resume)
     lpips = load_lpips(config.log.lpips_weights)
-    if not resume and any((folder / run_files.CHECKPOINTS).glob("checkpoint_*")):
-        raise FileExistsError(
-            f"{folder} already holds a run: add --resume to continue it, or choose another --out"
-        )
+    space = Space.of(capture.offset, capture.extent)
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
     restored = run_files.restore(folder, ranks, home) if resume else None
-    config = _for_views(config, capture, restored)
-    config = run_files.with_pace_of(config, None if restored is None else restored.config)
+    config = _resolved(config, capture, restored)
     schedule = Schedule(config.schedule)
     if restored is None:
         table, progress = first_gaussians(config, capture, space, ranks, home)
@@ -86,10 +82,12 @@ def set_up(
         table, progress = restored.table, restored.progress
         run_files.check_resumable(restored.config, config)
         check_capture(restored.space, capture, folder)
+    # The views and the spawn gate are compared with those of the checkpoint.
     progress = keep_to_views(table, progress, capture, ranks)
     veto, gate_digest = open_gate(config, capture, ranks, progress.gate)
     progress = replace(progress, gate=gate_digest)
     check_room(folder, table, ranks, config.population.max_gaussians)
+
     if ranks.rank == 0:
         save_config(config, folder / run_files.CONFIG)
         if restored is None or not (folder / CAMERAS).exists():
@@ -130,12 +128,27 @@ def set_up(
     )
 
 
-def _for_views(config: Config, capture: Capture, restored: run_files.Restored | None) -> Config:
-    """Return `config` with the values that depend on the number of training views.
+def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
+    """Check that a run may write to its folder, and that it replaces nothing there.
 
-    They are the length of the run (`schedule.images_per_view`) and the opacity term (`loss.opacity_total`). A
-    run that is resumed with fewer or more photographs (`data.allow_missing`) keeps the values that it began
-    with.
+    Raises:
+        FileExistsError, FolderError: as for `set_up`.
+    """
+    written = (run_files.CONFIG, CAMERAS, LOG, run_files.SUMMARY, PICTURE, run_files.LINEAGE)
+    check_unclaimed(folder / run_files.CHECKPOINTS, written, ranks)
+    check_writable(folder / run_files.CHECKPOINTS, ranks)
+    if not resume and any((folder / run_files.CHECKPOINTS).glob("checkpoint_*")):
+        raise FileExistsError(
+            f"{folder} already holds a run: add --resume to continue it, or choose another --out"
+        )
+
+
+def _resolved(config: Config, capture: Capture, restored: run_files.Restored | None) -> Config:
+    """Return `config` with the values that depend on the training views and on what the run has measured.
+
+    The number of views decides the length of the run (`schedule.images_per_view`) and the opacity term
+    (`loss.opacity_total`). A run that is resumed with fewer or more photographs (`data.allow_missing`) keeps
+    the values that it began with. `run_files.with_pace_of` says what a run measures.
     """
     schedule, loss = config.schedule, config.loss
     if restored is not None:
@@ -146,7 +159,8 @@ def _for_views(config: Config, capture: Capture, restored: run_files.Restored | 
             if loss.opacity_total > 0:
                 loss = replace(loss, opacity=own.loss.opacity, opacity_total=0.0)
     views = len(capture.train)
-    return replace(config, schedule=stretched(schedule, views), loss=weighted(loss, views))
+    config = replace(config, schedule=stretched(schedule, views), loss=weighted(loss, views))
+    return run_files.with_pace_of(config, None if restored is None else restored.config)
 
 
 def _tile_owners(ranks: Ranks, progress: Progress, restored: run_files.Restored | None) -> TileOwners:

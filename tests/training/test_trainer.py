@@ -237,12 +237,14 @@ def test_a_non_finite_loss_names_step_and_view(tmp_path, monkeypatch):
 
 def test_a_run_is_not_overwritten_nor_resumed_with_another_configuration(whole_run):
     folder, *_ = whole_run
+    written = (folder / "config.yaml").read_bytes()
     with pytest.raises(FileExistsError, match="add --resume"):
         train(folder)
     with pytest.raises(
         ConfigError, match=r"loss.ssim: the checkpoint was trained with 0.2, now 0.3; leave out --config"
     ):
         train(folder, "loss.ssim=0.3", resume=True)
+    assert (folder / "config.yaml").read_bytes() == written
     train(folder, "log.every=50", resume=True)
 
 
