@@ -131,7 +131,7 @@ def branch_point(folder: Path, config: Config) -> Path:
         ValueError: the run ends before the gate's onset, or a checkpoint is damaged.
     """
     schedule, found = Schedule(config.schedule), []
-    if not schedule.gates(schedule.iterations - 1):
+    if not schedule.has_spawn_gate(schedule.iterations - 1):
         raise ValueError(
             f"{folder} ends before the gate's onset (schedule.gate_from {config.schedule.gate_from}, "
             f"{schedule.iterations} images): replay a run that goes on after it"
@@ -142,7 +142,7 @@ def branch_point(folder: Path, config: Config) -> Path:
         except (ValueError, LookupError, TypeError, RecursionError) as error:
             raise ValueError(f"{manifest} is damaged: {error!r}") from error
         # Events before the end of a step belong to it.
-        if not schedule.gates(step * schedule.batch_size - 1):
+        if not schedule.has_spawn_gate(step * schedule.batch_size - 1):
             found.append((step, manifest.parent))
     if not found:
         raise FileNotFoundError(

@@ -128,16 +128,16 @@ class OffloadingStepper(Stepper):
         options: RenderOptions,
         batch: Batch,
         mark: Mark = unmarked,
-        gate: ViewGate | None = None,
+        view_gate: ViewGate | None = None,
     ) -> tuple[Frame, LossTerms, HostSum]:
         """See `Stepper.forward`."""
         self._up_to_date_at = None
         cameras = self._upcoming.cameras(step, options.limits)
-        if gate is None or not gate.columns:
+        if view_gate is None or not view_gate.columns:
             cameras = cameras._replace(columns=None)
         self._blocks = self._residence.load_for_step(step, cameras, self._upcoming.batch_size)
         mark("other")
-        rendered = super().forward(step, options, batch, mark, gate)
+        rendered = super().forward(step, options, batch, mark, view_gate)
         self._residence.prefetch(step + 1)
         return rendered
 

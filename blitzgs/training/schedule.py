@@ -188,7 +188,7 @@ class Schedule:
         whole = 1 - ratio**-waits
         return first + sum(begin + 1e-6 >= self.pace.image(until * share / whole) for share in unlocked)
 
-    def gates(self, time: int) -> bool:
+    def has_spawn_gate(self, time: int) -> bool:
         """Tell whether the spawn gate judges the candidates of a density event at `time`."""
         return time >= self._scaled(self._config.gate_from)
 

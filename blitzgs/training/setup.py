@@ -24,7 +24,6 @@ from blitzgs.training.config import Config
 from blitzgs.training.config_io import save_config
 from blitzgs.training.evaluation import load_lpips
 from blitzgs.training.folder_checks import check_room, check_unclaimed, check_writable
-from blitzgs.training.gate import lineage_subject, open_gate
 from blitzgs.training.inputs import check_alike, check_capture, train_views_fingerprint
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
@@ -35,6 +34,7 @@ from blitzgs.training.run_files import Progress
 from blitzgs.training.run_log import LOG, RunLog
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.schedule import Schedule, stretched
+from blitzgs.training.spawn_gate import lineage_subject, open_spawn_gate
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
 from blitzgs.training.view_level import keep_to_views
@@ -84,8 +84,8 @@ def set_up(
         check_capture(restored.space, capture, folder)
     # The views and the spawn gate are compared with those of the checkpoint.
     progress = keep_to_views(table, progress, capture, ranks)
-    veto, gate_digest = open_gate(config, capture, ranks, progress.gate)
-    progress = replace(progress, gate=gate_digest)
+    veto, spawn_gate_digest = open_spawn_gate(config, capture, ranks, progress.gate)
+    progress = replace(progress, gate=spawn_gate_digest)
     check_room(folder, table, ranks, config.population.max_gaussians)
 
     if ranks.rank == 0:

@@ -86,7 +86,7 @@ class Stepper:
         options: RenderOptions,
         batch: Batch,
         mark: Mark = unmarked,
-        gate: ViewGate | None = None,
+        view_gate: ViewGate | None = None,
     ) -> tuple[Frame, LossTerms, HostSum]:
         """Apply pending steps of the rows that the views may see, render, and compare with the photographs.
 
@@ -95,14 +95,14 @@ class Stepper:
             options: how to render.
             batch: B views, their photographs, and the tiles of each rank.
             mark: called at the end of each stage with the stage's name.
-            gate: LOD gate and cull mask of the views; None: neither.
+            view_gate: LOD gate and cull mask of the views; None: neither.
 
         Returns:
             The frame, the loss's terms, and the sums of its `LossTerms.parts` over all ranks, which
             begin with [2 B].
         """
         table, ranks, views = self.table, self._owners.ranks, batch.views
-        rules = None if gate is None else gate.rules(table)
+        rules = None if view_gate is None else view_gate.rules(table)
 
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
         for attempt in self._transport.capacity.attempts():

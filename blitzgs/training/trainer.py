@@ -25,12 +25,12 @@ from blitzgs.training.budget import Budget
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import config_hash, save_config
 from blitzgs.training.events import evaluate, events_left, handle_all, save
-from blitzgs.training.gate import lineage_subject
 from blitzgs.training.guard import LossGuard, ModelLostError
 from blitzgs.training.lod import lod_gate
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.setup import set_up
+from blitzgs.training.spawn_gate import lineage_subject
 from blitzgs.training.state import TrainingState, never
 from blitzgs.training.step_report import StepRecord, log_step, measure_step
 from blitzgs.training.views import render_options
@@ -192,9 +192,9 @@ class Trainer:
             raise PhotographError(str(error)) from error
         degree = schedule.sh_degree(begin, config.model.sh_degree)
         view_level.follow_schedule(state, begin)
-        gate = view_level.batch_gate(state, batch.indices)
+        view_gate = view_level.batch_gate(state, batch.indices)
         options = render_options(config, state.space, degree, lod_gate(config, state.progress))
-        frame, terms, sums = state.stepper.forward(step, options, batch, gate=gate)
+        frame, terms, sums = state.stepper.forward(step, options, batch, view_gate=view_gate)
         self._write_record()  # whose figures were copied meanwhile
         names = [state.capture.cameras[i].name for i in batch.indices]
         self._guard.check(step, names, sums, state.stepper.table, frame)

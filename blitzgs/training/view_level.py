@@ -87,9 +87,9 @@ def batch_gate(state: TrainingState, indices: list[int]) -> ViewGate | None:
         indices: training cameras, as indices into the capture.
     """
     columns = [state.columns[index] for index in indices]
-    gate, flags = lod_gate(state.config, state.progress), state.progress.gated_views
-    lod_views = 0 if gate is None else lod_bits([flags[column] == "1" for column in columns])
+    lod, flags = lod_gate(state.config, state.progress), state.progress.gated_views
+    lod_views = 0 if lod is None else lod_bits([flags[column] == "1" for column in columns])
     masked = state.config.view.cull and CULL in state.table
     if not (lod_views or masked):
         return None
-    return ViewGate(gate.reach() if gate is not None else [math.inf], lod_views, columns if masked else ())
+    return ViewGate(lod.reach() if lod is not None else [math.inf], lod_views, columns if masked else ())

@@ -22,8 +22,8 @@ from blitzgs.population.lineage_parts import read_lineage
 from blitzgs.population.spawn_gate import GateError, GateInfo, RandomVeto, info_path
 from blitzgs.training import run_files, run_log
 from blitzgs.training.events import importance
-from blitzgs.training.gate import life_fields, reasons_against
 from blitzgs.training.guard import ModelLostError
+from blitzgs.training.spawn_gate import life_fields, reasons_against
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training import tiny_runs

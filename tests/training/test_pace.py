@@ -40,7 +40,7 @@ def phases_of(schedule, begin):
         schedule.finest_level(begin, 9, 0.2, 1.5),
         schedule.gathers_statistics(begin),
         schedule.has_lod_gate(begin),
-        schedule.gates(begin),
+        schedule.has_spawn_gate(begin),
         schedule.prunes_by_size(begin),
     )
 

@@ -181,7 +181,7 @@ def test_training_behind_the_gate_is_dense_adams(device, smooth):
             batch = Batch([0, 1], views, targets.to(device), None, samples, None)
             # Sums in another order would make two trainings diverge.
             options = RenderOptions(0, 0.05, 100.0, deterministic=True, fade=lod.fade())
-            frame, terms, _ = stepper.forward(step, options, batch, gate=gate)
+            frame, terms, _ = stepper.forward(step, options, batch, view_gate=gate)
             stepper.backward(step, frame, terms)
             splats = frame.projected
             pairs = zip(splats.gaussian_ids.tolist(), splats.camera_ids.tolist(), strict=True)

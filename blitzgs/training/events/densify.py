@@ -107,7 +107,8 @@ def change_population(state: TrainingState, time: int, rules: DensityRules) -> D
             state.table[name].zero_()
         return report
     moved = relocate(state.table, rules, growth=0.0, **call) if population.relocate else None
-    report = densify(state.table, rules, veto=state.veto if state.schedule.gates(time) else None, **call)
+    veto = state.veto if state.schedule.has_spawn_gate(time) else None
+    report = densify(state.table, rules, veto=veto, **call)
     if moved is None:
         return report
     return dataclasses.replace(report, cloned=report.cloned + moved.cloned, relocated=moved.relocated)

@@ -57,7 +57,7 @@ def lineage_subject(config: Config, capture: Capture) -> dict[str, Any]:
     }
 
 
-def open_gate(config: Config, capture: Capture, ranks: Ranks, known: str) -> tuple[Veto | None, str]:
+def open_spawn_gate(config: Config, capture: Capture, ranks: Ranks, known: str) -> tuple[Veto | None, str]:
     """Open the gate that a configuration names, and warn if it does not suit the run. Collective.
 
     Args:
