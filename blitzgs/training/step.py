@@ -105,23 +105,25 @@ class Stepper:
         rules = None if view_gate is None else view_gate.rules(table)
 
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
+        on_gpu = views.viewmats.is_cuda
         for attempt in self._transport.capacity.attempts():
-            # On the CPU the number of blocks is known at once, so no estimate is needed.
-            capacity_blocks = (
-                attempt.sizes.blocks if attempt.sizes is not None and views.viewmats.is_cuda else None
-            )
+            # On the CPU the number of blocks is known at once: lists of this size need no estimate, and are
+            # complete at the first attempt.
+            capacity_blocks = attempt.sizes.blocks if attempt.sizes is not None and on_gpu else None
             active = self._blocks.active(
                 table, views.viewmats, views.Ks, views.width, views.height, options.near_plane,
                 options.far_plane, options.eps2d, rules, capacity_blocks,
             )  # fmt: skip
+            if not on_gpu:
+                active = active._replace(blocks=None)
             mark("other")
             self._optimiser.catch_up(table, active.ids, step - 1, active.length)
             mark("optimiser")
             if rules is not None:
                 gate_views_(active, table["means"], views.viewmats, rules)
             frame = pipeline.forward_once(
-                table, views, options, active if views.viewmats.is_cuda else active._replace(blocks=None),
-                assignment, self._transport, attempt, mark, backward_follows=True,
+                table, views, options, active, assignment, self._transport, attempt, mark,
+                backward_follows=True,
             )  # fmt: skip
         assert frame is not None  # or there would be another attempt
         terms = loss_terms(frame, batch, self._loss, self._extent)
