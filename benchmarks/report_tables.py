@@ -93,6 +93,7 @@ COMMANDS |= {
         "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 2 --arms all_off "
         "--batch-sizes 4 8 16"
     ),
+    "city_later": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 1 --ranks 1 --scale 0.6",
     "city_exchange": (
         "python benchmarks/bm_exchange.py --data CITY --downscale 1 --visible-threshold 0 --ranks 1 2"
     ),
@@ -116,6 +117,7 @@ GROUPS = (
     ("exchange", "training", "training_2"),
     ("city", "city_exchange"),
     ("city_ranks",),
+    ("city_later",),
 )
 # bm_quality.py takes no --json: it collects all of its runs in one file.
 COPIED = {
@@ -276,6 +278,12 @@ def city_lines(rows_of: Callable[[Json], city_report.Rows]) -> Callable[[Json], 
         return table(rows[0], (row.values() for row in rows)) if rows else ["No run got so far."]
 
     return lines
+
+
+def city_quality_lines(city: Json) -> list[str]:
+    """Tabulate the quality of the city's arms, without times."""
+    columns = ("view level", "PSNR", "SSIM", "images", "active", "visible")
+    return table(columns, ([str(row[name]) for name in columns] for row in city_report.arm_rows(city)))
 
 
 def photometric_lines(photometric: Json) -> list[str]:
@@ -466,6 +474,7 @@ SECTIONS = {
     "offload": Section(("offload",), offload_lines),
     "summary": Section(("render", "step_1", "step_4"), summary_lines),
     "summary_ranks": Section(("exchange",), summary_ranks_lines),
+    "city_later": Section(("city_later",), city_quality_lines),
     "city_exchange": Section(("city_exchange",), exchange_lines),
 }
 SECTIONS |= {
