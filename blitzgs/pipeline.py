@@ -216,7 +216,7 @@ def forward_once(
     backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
     # Skip autograd: for an op with a registered gradient formula, its Python takes 20 us of the host's time.
     with below_autograd():
-        exchange = transport.start(inputs, assignment, attempt, mark)
+        exchange = transport.project_and_send(inputs, assignment, attempt, mark)
         splats, n_splats, n_isects = exchange.arrived
         geometry = (splats.means2d, splats.conics, splats.opacities)
         isect_splats, tile_offsets = torch.ops.blitzgs.intersect(

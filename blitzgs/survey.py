@@ -65,7 +65,7 @@ def survey(
 
     with below_autograd():
         for attempt in transport.capacity.attempts():
-            exchange = transport.start(inputs, assignment, attempt)
+            exchange = transport.project_and_send(inputs, assignment, attempt)
             splats, n_splats, n_isects = exchange.arrived
             geometry = (splats.means2d, splats.conics, splats.opacities)
             lists = torch.ops.blitzgs.intersect(

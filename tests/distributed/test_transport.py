@@ -85,7 +85,7 @@ def _round_trip(ranks, half, capacity):
     transport = open_transport(ranks, half)
     assignment = TileAssignment(ranks, ranges_for(ranks.world_size))
     attempt = Attempt(capacity)
-    exchange = transport.start(inputs, assignment, attempt)
+    exchange = transport.project_and_send(inputs, assignment, attempt)
     got = exchange.arrived.splats
     assert exchange.gradient_table is None
     projected, splats, visible, traffic, way_back = exchange.finish()
@@ -210,7 +210,7 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
 
     def finished():
         for attempt in transport.capacity.attempts():
-            exchange = transport.start(inputs, assignment, attempt)
+            exchange = transport.project_and_send(inputs, assignment, attempt)
             arrived, table = exchange.arrived, exchange.gradient_table
             assert arrived.n_isects > 0 and len(arrived.splats.ids) >= len(table)
             counts = exchange.finish()
@@ -268,15 +268,15 @@ def test_traffic_of_uneven_ranks():
 def test_a_transport_that_does_not_serve_the_job_says_so():
     assignment = TileAssignment(Ranks(), ranges_for(1))
     with pytest.raises(ValueError, match="serves one rank"):
-        LocalTransport().start(scene(), assignment, Attempt(None))
+        LocalTransport().project_and_send(scene(), assignment, Attempt(None))
     with pytest.raises(ValueError, match="need an assignment"):
-        CollectiveTransport(Ranks()).start(scene(), None, Attempt(None))
+        CollectiveTransport(Ranks()).project_and_send(scene(), None, Attempt(None))
     with pytest.raises(ValueError, match="share no memory"):
         PeerTransport(Ranks())
 
 
 def test_one_rank_needs_no_way_back():
-    counts = LocalTransport().start(scene(), None, Attempt(None)).finish()
+    counts = LocalTransport().project_and_send(scene(), None, Attempt(None)).finish()
     assert counts.way_back is None and counts.traffic is None
 
 

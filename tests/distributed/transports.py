@@ -28,16 +28,16 @@ class RecordingTransport:
         self.inner, self.too_small = inner, too_small
         self.calls: list[tuple[str, Sizes | None]] = []
 
-    def start(
+    def project_and_send(
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
         attempt: Attempt,
         mark: Mark = unmarked,
     ) -> RecordingExchange:
-        """See `Transport.start`."""
+        """See `Transport.project_and_send`."""
         self.calls.append(("start", attempt.sizes))
-        return RecordingExchange(self, self.inner.start(inputs, assignment, attempt, mark), attempt)
+        return RecordingExchange(self, self.inner.project_and_send(inputs, assignment, attempt, mark), attempt)
 
 
 class RecordingExchange:

@@ -32,14 +32,14 @@ class CollectiveTransport:
         self.capacity = CapacityEstimate()
         self._ranks, self._codec = ranks, HalfCodec() if half else None
 
-    def start(
+    def project_and_send(
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
         attempt: Attempt,
         mark: Mark = unmarked,
     ) -> CollectiveExchange:
-        """See `Transport.start`."""
+        """See `Transport.project_and_send`."""
         if assignment is None:
             raise ValueError("several ranks need an assignment of tiles")
         return CollectiveExchange(self._ranks, self._codec, inputs, assignment, attempt, mark)

@@ -19,14 +19,14 @@ class LocalTransport:
         """Use a capacity estimate; None: a new one without any sizes."""
         self.capacity = capacity or CapacityEstimate()
 
-    def start(
+    def project_and_send(
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
         attempt: Attempt,
         mark: Mark = unmarked,
     ) -> LocalExchange:
-        """See `Transport.start`."""
+        """See `Transport.project_and_send`."""
         if assignment is not None:
             raise ValueError("a local transport serves one rank, which composites all tiles")
         return LocalExchange(inputs, attempt, mark)

@@ -121,14 +121,14 @@ class PeerTransport:
         # exchange was given up, a later record of the event comes after its counts, too.
         self._counted = torch.cuda.Event()
 
-    def start(
+    def project_and_send(
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
         attempt: Attempt,
         mark: Mark = unmarked,
     ) -> PeerExchange:
-        """See `Transport.start`."""
+        """See `Transport.project_and_send`."""
         if assignment is None:
             raise ValueError("several ranks need an assignment of tiles")
         if attempt.sizes is not None:

@@ -5,11 +5,11 @@ Every rank projects the Gaussians that it owns. Each splat (a Gaussian in a view
 that composite tiles which it touches, and its gradient is returned (BlitzGS, section 3.1). The calls of one
 frame, on every rank::
 
-    exchange = transport.start(inputs, assignment, attempt, mark)  # project; send splats to other ranks
-    exchange.arrived, exchange.gradient_table                      # for compositing
-    counts = exchange.finish()                                     # None: the capacity was too small
-    counts.way_back.check_still_valid()                            # before the backward pass of compositing
-    gradients = counts.way_back.return_gradients(gradients)        # gradients of this rank's own splats
+    exchange = transport.project_and_send(inputs, assignment, attempt, mark)
+    exchange.arrived, exchange.gradient_table                # for compositing
+    counts = exchange.finish()                               # None: the capacity was too small
+    counts.way_back.check_still_valid()                      # before the backward pass of compositing
+    gradients = counts.way_back.return_gradients(gradients)  # gradients of this rank's own splats
 
 The last two may be repeated. `local`, `collective` and `peer` each have one transport; `way_back` returns the
 gradients for the last two.
@@ -180,7 +180,7 @@ class Transport(Protocol):
 
     capacity: CapacityEstimate
 
-    def start(
+    def project_and_send(
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
