@@ -37,7 +37,9 @@ class RecordingTransport:
     ) -> RecordingExchange:
         """See `Transport.project_and_send`."""
         self.calls.append(("start", attempt.sizes))
-        return RecordingExchange(self, self.inner.project_and_send(inputs, assignment, attempt, mark), attempt)
+        return RecordingExchange(
+            self, self.inner.project_and_send(inputs, assignment, attempt, mark), attempt
+        )
 
 
 class RecordingExchange:
