@@ -13,8 +13,15 @@ from blitzgs.view.gate import LodGate, SceneGate
 
 
 def lod_gate(config: Config, progress: Progress) -> LodGate | None:
-    """Return the LOD gate at a point of a run; None if it is not open."""
+    """Return the LOD gate at a point of a run; None if it is not open, or no training view has it.
+
+    If every training view is rendered with all Gaussians (`view.most_kept`), the coarse levels have never
+    been trained to stand alone. A view from farther away would then show holes where it leaves out the fine
+    ones. Smooth levels fade in every training view.
+    """
     if progress.finest_level is None:
+        return None
+    if progress.gated_views and "1" not in progress.gated_views:
         return None
     return LodGate(
         progress.reference_distance,

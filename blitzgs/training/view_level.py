@@ -41,9 +41,10 @@ def choose_views(state: TrainingState) -> None:
     if state.progress.finest_level is None:
         return
     state.catch_up()  # the prediction reads the means
-    scene = scene_gate(state.config, state.progress, state.table, state.ranks)
-    if scene is None:
-        return
+    # Without the earlier choice, by which the gate may be closed.
+    unchosen = dataclasses.replace(state.progress, gated_views="")
+    scene = scene_gate(state.config, unchosen, state.table, state.ranks)
+    assert scene is not None  # the gate is open
     kept = scene.kept(state.views.centres(state.capture.train))
     gated = [share < scene.most_kept for share in kept]
     flags = "".join("1" if has_gate else "0" for has_gate in gated)

@@ -179,6 +179,15 @@ def test_render_honours_the_gate(tmp_path):
     np.testing.assert_allclose(np.load(path), image.numpy(), rtol=0, atol=1e-5)
 
 
+def test_a_gate_that_no_training_view_has_is_not_applied_elsewhere(tmp_path):
+    """Coarse levels that no training view shows alone are not shown alone by any other view."""
+    trainer, _ = train(tmp_path, "view.most_kept=0.0")
+    progress = trainer.state.progress
+    assert progress.finest_level is not None and set(progress.gated_views) == {"0"}
+    assert [event["gated_views"] for event in events_of(tmp_path, "lod_gate")][-1] == 0
+    assert blitzgs.open_run(tmp_path).model().lod is None
+
+
 def test_the_export_carries_the_levels(whole_run, tmp_path):
     folder, trainer, _, _ = whole_run
     path = tmp_path / "model.ply"
