@@ -254,15 +254,16 @@ def test_a_colour_that_is_not_finite_is_named(device, per_view, channels):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_a_zero_quaternion_is_the_identity_and_not_named(device, recwarn):
+@pytest.mark.parametrize("length", [0.0, 1e-40])
+def test_a_zero_quaternion_is_the_identity_and_not_named(device, length, recwarn):
     # No other test has this number of Gaussians, so on CUDA the first call makes the check.
-    scene = random_scene(n=49, cameras=2, device=device)
-    scene.quats = torch.zeros_like(scene.quats, requires_grad=True)
+    scene = random_scene(n=49 if length == 0 else 53, cameras=2, device=device)
+    scene.quats = torch.full_like(scene.quats, length, requires_grad=True)
     image, _, meta = rasterize_scene(scene)
     assert meta["non_finite"] == {} and not [w for w in recwarn if "blitzgs" in str(w.message)]
     image.sum().backward()
-    assert scene.quats.grad.shape == (49, 4) and not scene.quats.grad.any()
-    scene.quats = torch.tensor([[1.0, 0, 0, 0]], device=device).repeat(49, 1)
+    assert scene.quats.grad.shape == scene.quats.shape and not scene.quats.grad.any()
+    scene.quats = torch.tensor([[1.0, 0, 0, 0]], device=device).repeat(len(scene.quats), 1)
     assert torch.equal(image, rasterize_scene(scene)[0])
 
 

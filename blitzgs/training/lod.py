@@ -11,6 +11,9 @@ from blitzgs.training.config import Config
 from blitzgs.training.run_files import Progress
 from blitzgs.view.gate import LodGate, SceneGate
 
+# Gaussians move after the training views were chosen, and held-out views see a little more or less.
+_SLACK = 0.9
+
 
 def lod_gate(config: Config, progress: Progress) -> LodGate | None:
     """Return the LOD gate at a point of a run; None if it is not open, or no training view has it.
@@ -46,5 +49,6 @@ def scene_gate(config: Config, progress: Progress, table: GaussianTable, ranks: 
         return None
     # With smooth levels every view has the gate: a change from a view with it to one without would be a
     # visible jump.
-    most_kept = math.inf if gate.smooth else config.view.most_kept
-    return SceneGate(gate, most_kept, table, ranks)
+    if gate.smooth:
+        return SceneGate(gate, math.inf, table, ranks)
+    return SceneGate(gate, config.view.most_kept, table, ranks, _SLACK * progress.least_kept)

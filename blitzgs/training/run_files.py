@@ -68,6 +68,8 @@ class Progress:
         finest_level: finest level that the LOD gate keeps; None: there is no gate at this point of the run.
         gated_views: for each training view, in order, "1" if it has the LOD gate and "0" if the gate would
             keep almost all Gaussians; empty without a gate.
+        least_kept: the smallest share of the Gaussians that a training view keeps with the LOD gate; 0
+            without a gate, and in old checkpoints.
         train_views: digest of the names of the training views, in their order; empty in old checkpoints.
         signals: result of `blitzgs.training.adaptive.Signals.saved`, with `schedule.adaptive`.
         gate: digest of the spawn gate's files; empty without a gate, and in old checkpoints.
@@ -84,6 +86,7 @@ class Progress:
     reference_distance: float = 0.0
     finest_level: int | None = None
     gated_views: str = ""
+    least_kept: float = 0.0
     train_views: str = ""
     signals: dict[str, Any] = dataclasses.field(default_factory=dict)
     gate: str = ""

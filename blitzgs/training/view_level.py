@@ -42,13 +42,13 @@ def choose_views(state: TrainingState) -> None:
         return
     state.catch_up()  # the prediction reads the means
     # Without the earlier choice, by which the gate may be closed.
-    unchosen = dataclasses.replace(state.progress, gated_views="")
+    unchosen = dataclasses.replace(state.progress, gated_views="", least_kept=0.0)
     scene = scene_gate(state.config, unchosen, state.table, state.ranks)
     assert scene is not None  # the gate is open
     kept = scene.kept(state.views.centres(state.capture.train))
-    gated = [share < scene.most_kept for share in kept]
+    gated = [scene.applies(share) for share in kept]
     flags = "".join("1" if has_gate else "0" for has_gate in gated)
-    state.progress = dataclasses.replace(state.progress, gated_views=flags)
+    state.progress = dataclasses.replace(state.progress, gated_views=flags, least_kept=min(kept, default=0.0))
     mean = sum(share if has_gate else 1.0 for share, has_gate in zip(kept, gated, strict=True)) / len(kept)
     values = {"finest_level": state.progress.finest_level, "gated_views": sum(gated), "kept": mean}
     text = (

@@ -103,16 +103,21 @@ class SceneGate:
 
     A sample of the Gaussians of all ranks, drawn by their ids, predicts the share that each view would keep;
     the prediction does not depend on the number of ranks. A view that would keep at least `most_kept` of all
-    Gaussians is rendered without the gate.
+    Gaussians is rendered without the gate, because the gate would save little. So is a view that would keep
+    less than `least_kept`, which no training view does: there, coarse levels that have not been trained to
+    stand alone would show holes.
 
     Attributes:
         gate: the distances.
         most_kept: share of all Gaussians from which on a view has no gate.
+        least_kept: share of all Gaussians below which a view has no gate.
     """
 
-    def __init__(self, gate: LodGate, most_kept: float, table: GaussianTable, ranks: Ranks) -> None:
+    def __init__(
+        self, gate: LodGate, most_kept: float, table: GaussianTable, ranks: Ranks, least_kept: float = 0.0
+    ) -> None:
         """Draw the sample. Collective: every rank calls this with its share of the Gaussians, caught up."""
-        self.gate, self.most_kept, self._ranks = gate, most_kept, ranks
+        self.gate, self.most_kept, self.least_kept, self._ranks = gate, most_kept, least_kept, ranks
         device = ranks.device  # the table may be on another device
         count = int(ranks.all_reduce(torch.tensor([len(table)], device=device)).item())
         chosen = uniform(table["id"], _SAMPLE_KEY) < SAMPLE / max(count, 1)
@@ -135,6 +140,10 @@ class SceneGate:
             counts[begin : begin + length] = (distances <= self._reach).sum(1)
         self._ranks.all_reduce(counts)
         return (counts.double() / max(1, self._size)).tolist()
+
+    def applies(self, share: float) -> bool:
+        """Tell whether a view that keeps this share of all Gaussians has the gate."""
+        return self.least_kept <= share < self.most_kept
 
     def active(self, table: GaussianTable, viewmats: Tensor) -> ActiveRows | None:
         """Return the rows that each of B views keeps; None if every view keeps every row. Collective.
@@ -159,7 +168,7 @@ class SceneGate:
     def rules(self, level: Tensor, viewmats: Tensor) -> GateRules | None:
         """Return the rules of B views for these levels; None if no view leaves a row out. Collective."""
         shares = self.kept(centres_of(viewmats))
-        lod_views = lod_bits([share < self.most_kept for share in shares])
+        lod_views = lod_bits([self.applies(share) for share in shares])
         return None if lod_views == 0 else GateRules(level, self.gate.reach(), lod_views)
 
     def _gated(self, means: Tensor, level: Tensor, viewmats: Tensor) -> ActiveRows | None:

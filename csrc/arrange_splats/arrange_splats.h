@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Copies rows of several columns at once between the order of the splats and the arrangement of `meta`
+// Copies rows of several columns at once between the order of the splats and the arrangement in which
+// `blitzgs.rasterization` returns them: its third result, the dictionary `meta` of gsplat's interface
 // (blitzgs/rendering/layout.py).
 //
 // With `order` [n], entry i of the arrangement is splat order[i]. Without it, splat i is the entry

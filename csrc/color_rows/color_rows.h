@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Numbers the rows that are gathered for the visible Gaussians of a projection (project.h): row u is the
-// Gaussian visible_ids[u].
+// A call with SH gathers the rows of the visible Gaussians of a projection (project.h) into a small table,
+// row u for the Gaussian visible_ids[u]. This op writes the numbers that lead from rows and splats to each
+// other:
 //   rows[u] = u;   indices[u] = visible_ids[u];
 //   row_of_splat[i] = u for the splats i of this Gaussian, splat_offsets[u] <= i < splat_offsets[u + 1].
 // On CUDA nothing is written if there are more splats than the capacity. On the CPU the sizes of the capacity

@@ -202,7 +202,8 @@ class RunningSum {
   }
 
   // Publishes the sum `own` of a block and returns the sum over all blocks before it. All threads of the
-  // block call this, each reads the state of one predecessor at a time, and it is a barrier for them.
+  // block call this, and each reads the state of one predecessor at a time. It is no barrier for block 0,
+  // which has no predecessor, so a caller has a barrier of its own before its next take_turn().
   template <int kThreads>
   __device__ std::int64_t sum_before(int block, std::int64_t own) const {
     __shared__ std::int64_t parts[kThreads / 32];

@@ -5,7 +5,8 @@
 //   grad_sum[g]   += phi[g] * weight * |(v_means2d[r].x * width / 2, v_means2d[r].y * height / 2)|
 //   grad_count[g] += 1
 //   max_radii[g]   = max(max_radii[g], ceil(3 sqrt(largest eigenvalue of the 2D covariance))), in pixels
-// The root term of the eigenvalue is clamped at sqrt(0.1), as in the original renderer.
+// With the mean m and the product d of the eigenvalues, the largest is m + sqrt(max(0.1, m^2 - d)), as in the
+// original renderer.
 //
 // v_means2d [P, 2] is the gradient by the pixel position; the values of consecutive splats are v_stride
 // numbers apart. weight is the factor from the gradient of the batch's loss to the gradient of one view's
@@ -15,8 +16,10 @@
 #pragma once
 #include <cmath>
 #include <cstdint>
+#include <limits>
 
 #include "common/kernel.h"
+#include "math/tiles.h"
 
 namespace blitzgs {
 
@@ -35,15 +38,20 @@ struct DensityStatsArgs {
   T half_width, half_height, weight;
 };
 
-// The radius of a splat in pixels, three standard deviations of its longer axis; 0 for a conic that is not
-// positive definite.
+// The radius of a splat in pixels, three standard deviations of its longer axis; 0 for a conic whose diagonal
+// is not positive. In double, because the determinant of a thin splat's conic is a small difference. If that
+// is less than the rounding of the conic's own numbers, the rounding takes its place: the splat is then at
+// least so long, and not mistaken for a small one.
 template <class T>
 BLITZGS_HD T three_sigma_radius(const T* conic) {
-  const T determinant = conic[0] * conic[2] - conic[1] * conic[1];
-  if (!(determinant > 0)) return 0;
-  const T half_trace = T(0.5) * (conic[0] + conic[2]) / determinant;
-  const T gap = half_trace * half_trace - T(1) / determinant;
-  return std::ceil(T(3) * std::sqrt(half_trace + std::sqrt(gap > T(0.1) ? gap : T(0.1))));
+  constexpr double kRounding = std::numeric_limits<T>::epsilon();
+  const double a = static_cast<double>(conic[0]), c = static_cast<double>(conic[2]);
+  if (!(a > 0 && c > 0)) return 0;
+  const double found = conic_determinant(conic), least = kRounding * a * c;
+  const double determinant = found > least ? found : least;
+  const double half_trace = 0.5 * (a + c) / determinant;
+  const double gap = half_trace * half_trace - 1 / determinant;
+  return static_cast<T>(std::ceil(3 * std::sqrt(half_trace + std::sqrt(gap > 0.1 ? gap : 0.1))));
 }
 
 template <class T>

@@ -2,7 +2,8 @@
 // The exact distances of each point to its k nearest other points.
 //
 // points [N, 3]; distances [N, k] ascending, in the unit of the points. Duplicates have distance 0. A row
-// that is not finite is no point's neighbour, and its distances are infinite. If fewer than k other points
+// that is not finite is no point's neighbour, and its distances are infinite. Distances are exact as long as
+// their squares fit into T, for floats from 1e-19 to 1e19. If fewer than k other points
 // exist, the remaining entries are infinite, too.
 //
 // Points are sorted along a Morton curve. Boxes around 8 consecutive points are the leaves of an implicit

@@ -11,14 +11,14 @@
 //   m sum over j = 1 .. s - P of mu_j rho_j / (rho_j sqrt(v) + eps),
 //   rho_j = a_t beta2^(j/2),   mu_j = lr_t b_t / a_t q_0^j,   q_0 = beta1 / sqrt(beta2).
 // rho_j changes far more slowly than mu_j falls. The code therefore computes the sum by a two-point Gauss
-// rule in rho with the weights mu. The two places and weights of the rule reproduce the first four moments of
-// mu,
+// rule in rho with the weights mu. The two places and weights of the rule reproduce the sums
 //   sum over j of mu_j rho_j^k = tail_k[P] - q_k^(s-P) tail_k[s],   k = 0 .. 3,
 // where the tails are tabulated once per schedule (see the table below).
 //
-// The rule is exact if eps is negligible against sqrt(v) (moment 0) and if eps dominates (moment 1). In
-// between its relative error is largest near eps = 3 sqrt(v), and below half the square of rho's relative
-// variance: 1e-9 of the drift in mid-schedule, and the rounding of float32 after some 200 single-view steps.
+// The rule is exact if eps is negligible against sqrt(v) (then only the sum of k = 0 counts) and if eps
+// dominates (k = 1). In between its relative error is largest near eps = 3 sqrt(v), and below half the square
+// of rho's relative variance. In the middle of a schedule this is 1e-9 of the drift, and after some 200 steps
+// of one view it is below the rounding of float32.
 // If this is not exact enough (at earlier steps, and in float64), the elements for which eps matters take the
 // pending steps one by one. They need at most `explicit_steps` of them, because q_0^j is below the rounding
 // of the sum after that. For the same reason the drift of a row with at least that many pending steps depends

@@ -2,6 +2,8 @@
 // A Gaussian's rotation, axes and activations, and the spherical harmonics of its colour, with their
 // derivatives (docs/image.md, sections 1 and 4).
 #pragma once
+#include <limits>
+
 #include "math/vec.h"
 
 // Rotations from unnormalised quaternions (w, x, y, z), and the derivative.
@@ -20,15 +22,17 @@ struct UnitQuaternion {
   T inverse_norm;  // 1 / |q| of the quaternion it came from; 0 when that was zero
 };
 
-// A zero quaternion gives the identity, with a gradient of zero. The squares of very large or very small
-// components leave the range of float, so such quaternions are first divided by their largest component.
+// A quaternion of zeros gives the identity, with a gradient of zero, and so does one that is so short that
+// its inverse norm would overflow. The squares of very large or very small components leave the range of
+// float, so such quaternions are first divided by their largest component.
 template <class T>
 BLITZGS_HD UnitQuaternion<T> normalize_quaternion(const T* q) {
   T scale = T(1);
   T squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
   if (!(squared > T(1e-24) && squared < T(1e24))) {
     const T top = larger(larger(std::fabs(q[0]), std::fabs(q[1])), larger(std::fabs(q[2]), std::fabs(q[3])));
-    if (top == T(0) && squared == T(0)) return {T(1), T(0), T(0), T(0), T(0)};
+    // `squared` is NaN if a component is, and then so is the result.
+    if (top < T(1) / std::numeric_limits<T>::max() && squared >= T(0)) return {T(1), T(0), T(0), T(0), T(0)};
     scale = top;
     const T w = q[0] / top, x = q[1] / top, y = q[2] / top, z = q[3] / top;
     squared = w * w + x * x + y * y + z * z;

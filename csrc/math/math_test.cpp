@@ -78,6 +78,9 @@ TEST_CASE("rotation of a quaternion: derivative, zero, very long and very short"
   rotation_columns_vjp(normalize_quaternion(zero), columns(weights.data()), v_zero);
   REQUIRE(flat(rotation_columns(normalize_quaternion(zero))) == Values{1, 0, 0, 0, 1, 0, 0, 0, 1});
   for (const double v : v_zero) REQUIRE(v == 0.0);
+  const float tiny[4] = {1e-40f, 1e-41f, 0.0f, 0.0f};
+  REQUIRE(normalize_quaternion(tiny).w == 1.0f);
+  REQUIRE(normalize_quaternion(tiny).inverse_norm == 0.0f);
   for (const float size : {1e-38f, 1e-20f, 1e20f, 1e38f}) {
     const float q[4] = {0.5f * size, -0.5f * size, 0.5f * size, 0.5f * size};
     const UnitQuaternion<float> unit = normalize_quaternion(q);

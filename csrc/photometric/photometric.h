@@ -22,7 +22,9 @@
 // Q = E[(x - y)^2]. With A = mean(x)^2 + mean(y)^2 + C1, V = Q - e^2 (the variance of x - y) and
 // S = P - mean(x)^2 - mean(y)^2 + C2, it is SSIM = (1 - e^2 / A) (1 - V / S). This is the textbook quotient
 // rearranged. It needs four quantities instead of five, and it stays accurate in flat regions, where
-// var(x) + var(y) cancels. The windows are separable, so a quantity takes O(22 B H W) multiply-adds.
+// var(x) + var(y) cancels. In float32 this holds for values up to some 10, because S is a small difference of
+// squares; images have values from 0 to 1. The windows are separable, so a quantity takes O(22 B H W)
+// multiply-adds.
 //
 // The sums are written in parts, double [B, K, 2]. Each part is the sum over a fixed block of pixels in a
 // fixed order, and zero if the block has no pixel; the op report (report/report.h) adds the parts up. The

@@ -5,11 +5,12 @@
 //
 // A splat exists iff near < z <= far, its opacity (compensated when antialiased) is >= 1/255, the box around
 // alpha >= 1/255 overlaps the image and reaches beyond radius_clip, its view is in the candidate's mask, and
-// its geometry is finite. A NaN or infinite parameter therefore hides its own Gaussian and changes nothing
-// else. With radius_clip = 0 no dropped splat could have changed a pixel. A splat whose colour is not finite
-// exists but is hidden: its opacity, colour, radii and tiles_touched are 0, so the rasteriser skips it.
-// (Colours do not decide which splats exist, because SH rows are most of the bytes of a Gaussian and are read
-// once, for existing splats only.)
+// its geometry is finite. A parameter that is NaN therefore hides its own Gaussian and changes nothing else,
+// and so does an infinite one, except for limits that have a meaning: a scale of 0 and an opacity of 1. With
+// radius_clip = 0 no dropped splat could have changed a pixel. A splat whose colour is not finite exists but
+// is hidden: its opacity, colour, radii and tiles_touched are 0, so the rasteriser skips it. (Colours do not
+// decide which splats exist, because SH rows are most of the bytes of a Gaussian and are read once, for
+// existing splats only.)
 //
 // Splats are ordered by (Gaussian, view). Every value of a splat depends on its Gaussian and view alone, so
 // splats are bit-identical however Gaussians are divided among calls. The cost is O(candidates * B + splats),
@@ -29,7 +30,7 @@
 //
 // project_bwd (project_bwd_device.cuh on CUDA) visits each visible Gaussian once, recomputes its splats and
 // sums their gradients in splat order, so it needs no atomics and is deterministic. It sums the pose
-// gradients in double over fixed blocks of Gaussians.
+// gradients of a few Gaussians (on the CPU of a block) in T, and these sums in double, in a fixed order.
 #pragma once
 #include <cstddef>
 #include <cstdint>

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Where the splats of a run, kPlaceSplats consecutive splats, went when they were scattered to ranks
-// (scatter.h): one SplatPlace for each run and rank, [runs, M].
+// scatter.h copies each splat to the ranks that composite it. Places tell where they went: a SplatPlace,
+// [runs, M], has for a run of kPlaceSplats consecutive splats and one rank which of them the rank got, and
+// where they begin among all that it got.
 #pragma once
 #include <cstdint>
 

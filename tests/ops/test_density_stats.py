@@ -58,8 +58,8 @@ def test_matches_the_definition(device, with_phi):
             expected_radius[g] = max(expected_radius[g], float((3 * largest[r].sqrt()).ceil()))
     torch.testing.assert_close(sums.cpu(), expected_sum)
     assert counts.tolist() == expected_count.tolist()
-    assert (radii.cpu() - expected_radius).abs().max() <= 1  # a radius on an integer may round either way
-    assert (radii.cpu() == expected_radius).float().mean() > 0.9
+    off = (radii.cpu() - expected_radius)[visible.long().cpu()].abs()
+    assert off.max() <= 1 and (off == 0).float().mean() > 0.9  # a radius on an integer may round either way
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -188,6 +188,15 @@ def test_a_gate_that_no_training_view_has_is_not_applied_elsewhere(tmp_path):
     assert blitzgs.open_run(tmp_path).model().lod is None
 
 
+def test_a_view_from_farther_away_than_training_views_has_no_gate(whole_run):
+    folder, trainer, _, _ = whole_run
+    scene, state = blitzgs.open_run(folder).model().lod, trainer.state
+    kept = scene.kept(state.views.centres(state.capture.train))
+    assert [scene.applies(share) for share in kept] == [flag == "1" for flag in state.progress.gated_views]
+    (far,) = scene.kept(torch.tensor([[0.0, 0.0, 1e3 * state.progress.reference_distance]]).double())
+    assert far < scene.least_kept < min(kept) and not scene.applies(far)
+
+
 def test_the_export_carries_the_levels(whole_run, tmp_path):
     folder, trainer, _, _ = whole_run
     path = tmp_path / "model.ply"
