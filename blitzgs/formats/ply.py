@@ -180,6 +180,8 @@ def _moved(means: Tensor, offset: npt.NDArray[np.float64] | None) -> npt.NDArray
 def read_points(path: Path | str) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
     """Read positions, float64 [M, 3], and colours, uint8 [M, 3] (grey if there are none), of a point cloud.
 
+    Colours that are floats count as fractions of white if none is above 1, else as numbers from 0 to 255.
+
     Raises:
         ValueError: the file is damaged, has no x, y, z, or has colours of another kind.
     """
@@ -194,8 +196,11 @@ def read_points(path: Path | str) -> tuple[npt.NDArray[np.float64], npt.NDArray[
     # Some programs write bytes as signed ones.
     if colors.dtype.itemsize > 1 and not (usable := (colors >= 0) & (colors <= 255)).all():
         raise ValueError(
-            f"{path}: a point has the colour {colors[~usable][0]}: bytes or fractions from 0 to 1 are read"
+            f"{path}: a point has the colour {colors[~usable][0]}: numbers from 0 to 255 are read, or "
+            "fractions if none is above 1; write the colours as uchar"
         )
     if colors.dtype.kind == "f":
-        colors = np.clip(colors * 255 + 0.5, 0, 255)
+        # Some programs write fractions of white as floats, others bytes.
+        scale = 255 if colors.max(initial=0) <= 1 else 1
+        colors = np.clip(colors * scale + 0.5, 0, 255)
     return positions, colors.astype(np.uint8)

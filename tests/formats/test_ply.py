@@ -138,6 +138,19 @@ def test_point_clouds_with_faces_and_without_colours(tmp_path):
     assert read_points(tmp_path / "b.ply")[1].tolist() == [[128, 128, 128]]
 
 
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [([(0, 127.6, 255), (1, 2, 3)], [[0, 128, 255], [1, 2, 3]]), ([(0, 0.5, 1)], [[0, 128, 255]]), ([], [])],
+)
+def test_colours_as_floats_are_bytes_if_one_is_above_1_and_else_fractions(tmp_path, kind, values, expected):
+    rows = np.zeros(len(values), [(n, kind) for n in ("x", "y", "z", "red", "green", "blue")])
+    for row, colour in zip(rows, values, strict=True):
+        row["red"], row["green"], row["blue"] = colour
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(tmp_path / "a.ply")
+    assert read_points(tmp_path / "a.ply")[1].tolist() == expected
+
+
 @pytest.mark.parametrize(("kind", "red"), [("u2", 30_000), ("i4", -1), ("f4", float("nan")), ("f8", -0.5)])
 def test_colours_that_are_no_bytes_or_fractions_are_refused(tmp_path, kind, red):
     types = [(n, "f8") for n in "xyz"] + [(c, kind) for c in ("red", "green", "blue")]
