@@ -26,6 +26,7 @@ _MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "PINHOLE": ("PINHOLE", ()),
     "SIMPLE_PINHOLE": ("PINHOLE", ()),
 }
+_COEFFICIENTS = _MODELS["OPENCV"][1]
 
 
 @dataclass(frozen=True)
@@ -162,10 +163,35 @@ def _read_lens(fields: Mapping[str, Any], path: Path) -> Lens:
         )
     else:
         raise ValueError("neither fl_x nor camera_angle_x is given")
-    model = str(fields.get("camera_model", "OPENCV"))
-    if model not in _MODELS:
-        raise ValueError(f"camera_model {model} is not supported; known: {', '.join(_MODELS)}")
+    model = _camera_model(fields)
     name, distortion = _MODELS[model]
     params = [fx, fy, float(fields.get("cx", width / 2)), float(fields.get("cy", height / 2))]
     params += [float(fields.get(key, 0.0)) for key in distortion]
     return Lens(name, width, height, tuple(params))
+
+
+def _camera_model(fields: Mapping[str, Any]) -> str:
+    """Return the camera model; refuse coefficients that it would not apply as their writer meant them."""
+    is_fisheye = fields.get("is_fisheye", False)
+    if not isinstance(is_fisheye, bool):
+        raise ValueError(f"is_fisheye must be true or false, got {is_fisheye!r}")
+    # instant-ngp names no model.
+    model = str(fields.get("camera_model", "OPENCV_FISHEYE" if is_fisheye else "OPENCV"))
+    if model not in _MODELS:
+        raise ValueError(f"camera_model {model} is not supported; known: {', '.join(_MODELS)}")
+    if is_fisheye and model != "OPENCV_FISHEYE":
+        raise ValueError(f"is_fisheye is true but camera_model is {model}: remove the one that is wrong")
+    given = {key: value for key in _COEFFICIENTS if (value := float(fields.get(key, 0.0))) != 0}
+    if model == "OPENCV" and "k4" in given and not {"k5", "k6"} & fields.keys():
+        # nerfstudio multiplies by 1 + k1 r + k2 r^2 + k3 r^3 + k4 r^4 with r = x^2 + y^2.
+        raise ValueError(
+            f"k4 is {given['k4']:g}, without k5 and k6: a polynomial of four coefficients, as nerfstudio's, "
+            "is no lens of this package; fit the lens again without k4 or undistort the images, or write k5 "
+            "and k6 if k4 is of OpenCV's rational model"
+        )
+    if model == "OPENCV_FISHEYE" and (lost := sorted(given.keys() - set(_MODELS[model][1]))):
+        values = ", ".join(f"{key} = {given[key]:g}" for key in lost)
+        raise ValueError(
+            f"{values}: a fisheye lens has only k1 to k4; set the others to 0, or name another camera_model"
+        )
+    return model

@@ -11,6 +11,7 @@ import pytest
 
 from blitzgs.scene.capture import MissingImagesError, load_capture
 from blitzgs.scene.images import ImageStore
+from blitzgs.scene.transforms import read_transforms
 from tests.scene.helpers import edit_model, smooth_image, write_capture, write_image
 
 pytestmark = [
@@ -126,6 +127,10 @@ def test_blender_transforms(tmp_path):
         ({"val_filenames": ["a.png", 3]}, "val_filenames must be a list"),
         ({"val_filenames": ["./a.png", "b.png"]}, r"name 1 images that are no frames \(first: b.png\)"),
         ({"ply_file_path": None}, "ply_file_path must be text, got None"),
+        ({"k4": 0.01}, "frame 0: k4 is 0.01, without k5 and k6: .* undistort the images"),
+        ({"is_fisheye": True, "p1": 0.1}, "frame 0: p1 = 0.1: a fisheye lens has only k1 to k4"),
+        ({"is_fisheye": True, "camera_model": "OPENCV"}, "frame 0: is_fisheye is true but camera_model is"),
+        ({"is_fisheye": "yes"}, "frame 0: is_fisheye must be true or false, got 'yes'"),
         ({"k1": 1e300}, "the camera of .*a.png: the lens does not see along its own axis"),
     ],
 )
@@ -137,6 +142,24 @@ def test_transforms_that_make_no_sense_are_named(tmp_path, fields, message):
     with pytest.raises(ValueError, match=message) as caught:
         load_capture(tmp_path)
     assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("fields", "model", "distortion"),
+    [
+        ({"k1": 0.1, "k4": 0.0}, "FULL_OPENCV", (0.1, 0, 0, 0, 0, 0, 0, 0)),
+        ({"k4": 0.01, "k5": 0.0}, "FULL_OPENCV", (0, 0, 0, 0, 0, 0.01, 0, 0)),
+        ({"is_fisheye": False, "k1": 0.1}, "FULL_OPENCV", (0.1, 0, 0, 0, 0, 0, 0, 0)),
+        ({"is_fisheye": True, "k1": 0.1, "k4": 0.01, "p1": 0}, "OPENCV_FISHEYE", (0.1, 0, 0, 0.01)),
+        ({"camera_model": "OPENCV_FISHEYE", "k4": 0.01}, "OPENCV_FISHEYE", (0, 0, 0, 0.01)),
+    ],
+)
+def test_the_coefficients_of_transforms_are_those_of_their_lens(tmp_path, fields, model, distortion):
+    write_image(tmp_path / "a.png", smooth_image(48, 64))
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 60.0}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]} | fields))
+    lens = read_transforms(tmp_path).frames[0].lens
+    assert (lens.model, lens.distortion) == (model, distortion)
 
 
 @pytest.mark.parametrize("text", ['{"frames": ' + "[" * 100_000, "[]"])
