@@ -17,7 +17,9 @@ constexpr std::uint8_t kSof0 = 0xc0, kSof2 = 0xc2, kDht = 0xc4, kRst0 = 0xd0, kS
 // flat areas as zeros, but never hundreds of equal coefficients. The 8 bytes of look-ahead are included.
 constexpr unsigned kHoleBytes = 64 + 8;
 
+// Limits the memory that a small file can ask for: 8 bytes for each block of all components.
 constexpr std::uint64_t kMostBlocks = 1 << 24;
+constexpr unsigned kMostComponents = 4;
 
 struct Code {
   std::uint8_t length = 0;  // in bits; 0: no such code
@@ -83,7 +85,7 @@ class Checker {
   }
 
  private:
-  [[noreturn]] void fail(const char* reason) const {
+  [[noreturn]] void fail(const std::string& reason) const {
     throw FormatError(name_ + ": at byte " + std::to_string(at_), reason);
   }
 
@@ -138,6 +140,10 @@ class Checker {
     progressive_ = marker == kSof2;
     height_ = payload[1] * 256u + payload[2];
     width_ = payload[3] * 256u + payload[4];
+    if (payload[5] > kMostComponents) {
+      fail("damaged JPEG: it claims " + std::to_string(payload[5]) +
+           " components, and no picture has more than " + std::to_string(kMostComponents));
+    }
     components_.clear();
     h_max_ = v_max_ = 1;
     for (unsigned k = 0; k < payload[5]; ++k) {
@@ -150,9 +156,16 @@ class Checker {
       v_max_ = std::max(v_max_, component.v);
       components_.push_back(std::move(component));
     }
+    std::uint64_t blocks = 0;
+    for (const Component& component : components_) blocks += count_blocks(component);
     // A height of 0 means that the height follows after the first scan. In such files only the markers are
     // checked.
-    walked_ = walked_ && width_ > 0 && height_ > 0 && width_ * height_ / 64 <= kMostBlocks;
+    walked_ = walked_ && width_ > 0 && height_ > 0 && blocks <= kMostBlocks;
+  }
+
+  std::uint64_t count_blocks(const Component& component) const {
+    return ceil_div(ceil_div(width_ * component.h, h_max_), 8) *
+           ceil_div(ceil_div(height_ * component.v, v_max_), 8);
   }
 
   void read_scan(std::span<const std::uint8_t> payload) {
@@ -178,9 +191,7 @@ class Checker {
       }
       const bool alone = payload[0] == 1;
       blocks.insert(blocks.end(), alone ? 1 : found->h * found->v, block);
-      units = alone ? ceil_div(ceil_div(width_ * found->h, h_max_), 8) *
-                          ceil_div(ceil_div(height_ * found->v, v_max_), 8)
-                    : ceil_div(width_, 8 * h_max_) * ceil_div(height_, 8 * v_max_);
+      units = alone ? count_blocks(*found) : ceil_div(width_, 8 * h_max_) * ceil_div(height_, 8 * v_max_);
     }
     read_units(blocks, units, band);
   }

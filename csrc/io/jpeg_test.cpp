@@ -125,6 +125,26 @@ TEST_CASE("every code of a progressive JPEG is read") {
     REQUIRE_FALSE(problem(Bytes(file.begin(), file.begin() + n)).empty());
 }
 
+TEST_CASE("the sizes that a small JPEG claims are limited over all its components") {
+  // A progressive file of n components of the greatest width, with an empty scan of each.
+  const auto huge = [](std::uint8_t n, std::uint8_t height) {
+    Bytes out = {0xff, 0xd8};
+    append(out, table(0x10, {{0xe0}}));
+    Bytes frame = {8, height, 0, 0xff, 0xff, n};
+    for (std::uint8_t k = 0; k < n; ++k) append(frame, {k, 0x11, 0});
+    append(out, segment(0xc2, frame));
+    for (std::uint8_t k = 0; k < n; ++k) append(out, segment(0xda, {1, k, 0x00, 1, 63, 0}));
+    append(out, {0xff, 0xd9});
+    return out;
+  };
+  REQUIRE(mentions(huge(5, 1), "it claims 5 components"));
+  REQUIRE(mentions(huge(255, 0xff), "it claims 255 components"));
+  // 0x4000 rows are 2^24 blocks in one component, so the scan is walked and found to be empty; in more
+  // components only the markers are read.
+  REQUIRE(mentions(huge(1, 0x40), "image data end before the last block"));
+  REQUIRE(problem(huge(2, 0x40)).empty());
+}
+
 TEST_CASE("coefficients out of a hole of zeros are damage, flat areas are not") {
   // The code 0 ends a block in `jpeg`, so zeros are flat blocks: 160 x 160 pixels are 400 of them, 100 bytes.
   REQUIRE(problem(jpeg(160, 160, Bytes(100, 0x00))).empty());
