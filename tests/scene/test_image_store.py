@@ -236,6 +236,20 @@ def test_every_kind_of_whole_jpeg_passes(tmp_path, option, size):
             read_whole(path)
 
 
+def test_a_frame_of_motion_jpeg_has_no_huffman_tables(tmp_path):
+    path = tmp_path / "a.jpg"
+    write_image(path, smooth_image(48, 64))
+    data = path.read_bytes()
+    expected = decode_rgb(data, "a.jpg")
+    while (at := data.find(b"\xff\xc4")) >= 0:
+        data = data[:at] + data[at + 2 + int.from_bytes(data[at + 2 : at + 4]) :]
+    path.write_bytes(data)
+    np.testing.assert_array_equal(decode_rgb(read_whole(path), "a.jpg"), expected)
+    path.write_bytes(data[:-100] + data[-2:])
+    with pytest.raises(ValueError, match="image data end before the last block"):
+        read_whole(path)
+
+
 def test_damaged_headers_are_named_at_load(tmp_path):
     write_capture(tmp_path, NAMES[:3])
     path = tmp_path / "images" / NAMES[1]
