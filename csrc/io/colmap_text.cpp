@@ -29,8 +29,7 @@ void skip_observations(TextReader& reader) {
   std::string_view last;
   for (; reader.has_token(); ++tokens) last = reader.token("an observation");
   std::int64_t id = 0;
-  const auto [end, error] = std::from_chars(last.data(), last.data() + last.size(), id);
-  if (tokens % 3 != 0 || (tokens > 0 && (error != std::errc() || end != last.data() + last.size()))) {
+  if (tokens % 3 != 0 || (tokens > 0 && !parse_number(last, id))) {
     reader.fail(
         "expected the observations of an image (x, y and point id of each), which may be an empty line");
   }

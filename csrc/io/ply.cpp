@@ -9,6 +9,8 @@
 #include <sstream>
 #include <string>
 
+#include "io/parse_number.h"
+
 namespace blitzgs::io {
 
 namespace {
@@ -159,9 +161,7 @@ template <class T>
 void parse_value(ByteReader& reader, std::uint8_t* out) {
   const std::string token = read_token(reader);
   T value{};
-  const char* end = token.data() + token.size();
-  const auto [stop, error] = std::from_chars(token.data(), end, value);
-  if (error != std::errc() || stop != end) reader.fail("'" + token.substr(0, 40) + "' is not a valid value");
+  if (!parse_number(token, value)) reader.fail("'" + token.substr(0, 40) + "' is not a valid value");
   std::memcpy(out, &value, sizeof value);
 }
 

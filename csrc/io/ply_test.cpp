@@ -70,6 +70,13 @@ TEST_CASE("ASCII and big-endian PLY give the rows of the little-endian one") {
   REQUIRE(text.rows.size() == 20);
 }
 
+TEST_CASE("ASCII PLY may have signs, and numbers that its types do not hold") {
+  const PlyTable table = parsed(
+      "ply\nformat ascii 1.0\nelement vertex 1\nproperty float a\nproperty double b\nproperty uchar c\n"
+      "end_header\n1e-46 -1e-400 +7\n");
+  REQUIRE(table.rows == std::vector<std::uint8_t>{0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0x80, 7});
+}
+
 TEST_CASE("elements around the vertices are passed over") {
   const std::string header =
       "ply\nformat ascii 1.0\nelement camera 2\nproperty float f\nelement vertex 1\nproperty int x\n"

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 // Lines and numbers of untrusted text, independent of the locale.
 #pragma once
-#include <charconv>
 #include <cstdint>
 #include <istream>
 #include <string>
 #include <string_view>
 
 #include "io/byte_reader.h"
+#include "io/parse_number.h"
 
 namespace blitzgs::io {
 
@@ -30,14 +30,9 @@ class TextReader {
 
   template <class T>
   T number(const char* what) {
-    std::string_view text = token(what);
-    const std::string_view whole = text;
-    if (!text.empty() && text.front() == '+') text.remove_prefix(1);
+    const std::string_view text = token(what);
     T value{};
-    const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), value);
-    if (error != std::errc() || end != text.data() + text.size()) {
-      fail("'" + std::string(whole.substr(0, 40)) + "' is not a valid " + what);
-    }
+    if (!parse_number(text, value)) fail("'" + std::string(text.substr(0, 40)) + "' is not a valid " + what);
     return value;
   }
 

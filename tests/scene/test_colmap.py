@@ -93,13 +93,14 @@ def test_an_empty_model_round_trips(tmp_path):
 def test_text_tolerates_blank_lines_carriage_returns_and_a_missing_last_line(tmp_path):
     (tmp_path / "cameras.txt").write_bytes(b"# comment\r\n\r\n1 PINHOLE 4 3 +1.5 2 2 1.5\r\n")
     (tmp_path / "images.txt").write_bytes(
-        b"7 1 0 0 0 0 0 1e-3 1 name with blanks.jpg\n\n8 1 0 0 0 0 0 0 1 b.jpg"
+        b"7 1 0 0 0 0 1e-400 1e-3 1 name with blanks.jpg\n1 2 +3\n8 1 0 0 0 0 0 0 1 b.jpg"
     )
     (tmp_path / "points3D.txt").write_bytes(b"")
     model = colmap.read_model(tmp_path, points2d=True)
     assert model.cameras[0].params.tolist() == [1.5, 2, 2, 1.5]
     assert model.images.names == ["name with blanks.jpg", "b.jpg"]
     assert model.images.translations[0].tolist() == [0, 0, 1e-3]
+    assert colmap.read_model(tmp_path).images.names == model.images.names
 
 
 @pytest.mark.parametrize(
