@@ -21,6 +21,7 @@ from blitzgs.formats.native import native_io
 
 Float64 = npt.NDArray[np.float64]
 FILES = ("cameras", "images", "points3D")
+_SUFFIXES = (".bin", ".txt")
 
 
 def _empty(dtype: str, *shape: int) -> Any:
@@ -107,14 +108,14 @@ def find_incomplete_model(path: Path) -> Path | None:
 
 def _find(path: Path, enough: Callable[[Iterable[bool]], bool]) -> Path | None:
     for folder in ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap/sparse"):
-        for suffix in (".bin", ".txt"):
+        for suffix in _SUFFIXES:
             if enough((path / folder / (name + suffix)).is_file() for name in FILES):
                 return path / folder
     return None
 
 
 def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = False) -> ColmapModel:
-    """Read a sparse model; binary files are preferred where both kinds exist.
+    """Read a sparse model; binary files are preferred where both kinds are complete.
 
     Args:
         folder: holds cameras, images and points3D as .bin or .txt (rigs and frames files are not needed).
@@ -126,8 +127,9 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
         ValueError: a file is damaged; names the file, the byte offset or line, and the reason.
     """
     folder = Path(folder)
-    suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
-    paths = {name: folder / (name + suffix) for name in FILES}
+    binary, text = ({name: folder / (name + suffix) for name in FILES} for suffix in _SUFFIXES)
+    complete = (kind for kind in (binary, text) if all(path.is_file() for path in kind.values()))
+    paths = next(complete, binary if binary["cameras"].is_file() else text)
     for path in paths.values():
         if not path.is_file():
             raise FileNotFoundError(f"{path} is missing: {folder} is not a complete COLMAP sparse model")

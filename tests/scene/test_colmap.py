@@ -130,6 +130,20 @@ def test_a_missing_file_is_named(tmp_path):
         colmap.read_model(tmp_path)
 
 
+def test_the_complete_model_is_read_where_files_of_another_kind_are_left(tmp_path):
+    rec = reconstruction(NAMES[:1], 64, 48)
+    rec.write_text(str(tmp_path))
+    (tmp_path / "cameras.bin").write_bytes(b"stale")
+    assert colmap.read_model(tmp_path).images.names == NAMES[:1]
+    rec.write_binary(str(tmp_path))
+    (tmp_path / "cameras.txt").write_bytes(b"stale")
+    assert colmap.read_model(tmp_path).images.names == NAMES[:1]
+    (tmp_path / "images.bin").unlink()
+    (tmp_path / "points3D.txt").unlink()
+    with pytest.raises(FileNotFoundError, match="images.bin is missing"):
+        colmap.read_model(tmp_path)
+
+
 def test_columns_that_disagree_are_not_written(tmp_path):
     reconstruction(NAMES, 64, 48).write_binary(str(tmp_path))
     model = colmap.read_model(tmp_path)
