@@ -20,8 +20,8 @@ RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 MAX_SH_DEGREE = 3
 DEFAULT_TILE_SIZE = 16
-# The kernels count pixels of a row in float32 (checked_options of csrc/project/project_op.h).
-_SIZE_END = 1 << 24
+# Longest side of an image in pixels, of which the kernels make tiles (checked_tile_grid of csrc/common/op.h).
+MOST_SIDE = 1 << 20
 # What the kernels can composite (csrc/rasterize/rasterize_op.cpp).
 _MAX_CHANNELS = 4096
 # Further arguments of gsplat's calls (1.5.3 and later) and their defaults; no other values are supported.
@@ -177,8 +177,8 @@ def check_options(
     """
     for name, size in (("width", width), ("height", height)):
         _check_whole(name, size)
-        if not 1 <= size < _SIZE_END:
-            raise ValueError(f"{name} must be 1 to 2^24 - 1 px, got {size}")
+        if not 1 <= size <= MOST_SIDE:
+            raise ValueError(f"{name} must be 1 to 2^20 px, got {size}")
     _check_whole("tile_size", tile_size)
     if not 1 <= tile_size <= 64:
         raise ValueError(f"tile_size must be 1 to 64 px, got {tile_size}")

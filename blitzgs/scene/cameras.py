@@ -12,8 +12,6 @@ import numpy.typing as npt
 from blitzgs.scene.undistort import Rectification
 
 Float64 = npt.NDArray[np.float64]
-# Longest side of an image that the renderer takes, in pixels.
-MOST_SIDE = (1 << 24) - 1
 
 
 @dataclass(frozen=True, eq=False)

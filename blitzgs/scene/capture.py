@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from blitzgs.rendering.arguments import MOST_SIDE
 from blitzgs.scene.cameras import (
-    MOST_SIDE,
     Camera,
     Float64,
     camera_centres,
@@ -272,7 +272,8 @@ def _camera(
         )
     if max(width, height) > MOST_SIDE:
         raise ValueError(
-            f"{view.path} is {width} x {height}: no side may be longer than {MOST_SIDE:,} pixels"
+            f"{view.path} is {width} x {height}: no side may be longer than {MOST_SIDE:,} pixels; put a "
+            "smaller copy in its place"
         )
     lens = view.lens.scaled(width, height)
     if lens not in plans:

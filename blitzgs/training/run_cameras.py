@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.output import write_file
-from blitzgs.scene.cameras import MOST_SIDE
+from blitzgs.rendering.arguments import MOST_SIDE
 from blitzgs.scene.capture import Capture
 from blitzgs.training.views import CameraLike
 

@@ -144,8 +144,8 @@ class Model:
         Args:
             K: intrinsics in pixels, [3, 3].
             world_to_camera: rigid pose, [4, 4].
-            width: pixels, an integer from 1 to 2^24 - 1.
-            height: pixels, an integer from 1 to 2^24 - 1.
+            width: pixels, an integer from 1 to 2^20.
+            height: pixels, an integer from 1 to 2^20.
             name: name of the view.
 
         Raises:
