@@ -8,6 +8,7 @@ world-to-camera with y down, z forwards.
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -66,7 +67,8 @@ def read_transforms(root: Path) -> Transforms:
     """
     frames: list[Frame] = []
     points_path = None
-    for path in find_transforms(root):
+    files = find_transforms(root)
+    for path in files:
         try:
             content = json.loads(path.read_text(encoding="utf-8-sig"))
             entries = content["frames"]
@@ -90,6 +92,12 @@ def read_transforms(root: Path) -> Transforms:
                 f"{path}: test_filenames or val_filenames name {len(lost)} images that are no frames "
                 f"(first: {min(lost)})"
             )
+    counts = Counter(frame.path for frame in frames)
+    if twice := sorted({frame.name for frame in frames if counts[frame.path] > 1}):
+        shown = ", ".join(twice[:5]) + (", ..." if len(twice) > 5 else "")
+        raise ValueError(
+            f"{' and '.join(map(str, files))}: images of more than one frame: {shown}; keep one frame of each"
+        )
     return Transforms(frames, points_path)
 
 
@@ -111,12 +119,14 @@ def _read_frame(
     if not isinstance(relative, str) or not PurePath(relative).name:
         raise ValueError(f"file_path must name an image, got {relative!r}")
     path = next((p for s in _SUFFIXES if (p := root / (relative + s)).is_file()), root / relative)
-    mask = root / str(entry["mask_path"]) if "mask_path" in entry else None
+    mask = entry.get("mask_path")
+    if mask is not None and (not isinstance(mask, str) or not PurePath(mask).name):
+        raise ValueError(f"mask_path must name an image or be null, got {mask!r}")
     name = str(Path(relative))
     return Frame(
         name=name,
         path=path,
-        mask_path=mask,
+        mask_path=None if mask is None else root / mask,
         lens=_read_lens({**content, **entry}, path),
         world_to_camera=_read_pose(entry["transform_matrix"]),
         is_test=name in held_out if isinstance(held_out, set) else held_out,

@@ -127,6 +127,8 @@ def test_blender_transforms(tmp_path):
         ({"val_filenames": ["a.png", 3]}, "val_filenames must be a list"),
         ({"val_filenames": ["./a.png", "b.png"]}, r"name 1 images that are no frames \(first: b.png\)"),
         ({"ply_file_path": None}, "ply_file_path must be text, got None"),
+        ({"mask_path": 3}, "frame 0: mask_path must name an image or be null, got 3"),
+        ({"mask_path": ""}, "frame 0: mask_path must name an image or be null, got ''"),
         ({"k4": 0.01}, "frame 0: k4 is 0.01, without k5 and k6: .* undistort the images"),
         ({"is_fisheye": True, "p1": 0.1}, "frame 0: p1 = 0.1: a fisheye lens has only k1 to k4"),
         ({"is_fisheye": True, "camera_model": "OPENCV"}, "frame 0: is_fisheye is true but camera_model is"),
@@ -162,6 +164,19 @@ def test_the_coefficients_of_transforms_are_those_of_their_lens(tmp_path, fields
     assert (lens.model, lens.distortion) == (model, distortion)
 
 
+@pytest.mark.parametrize("again", ["a.png", "./a.png", "a"])
+def test_an_image_of_two_frames_is_refused(tmp_path, again):
+    frames = [
+        {"file_path": name, "transform_matrix": np.eye(4).tolist(), "fl_x": 60.0}
+        for name in ("a.png", "b.png", again)
+    ]
+    for name in ("a.png", "b.png"):
+        write_image(tmp_path / name, smooth_image(48, 64))
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    with pytest.raises(ValueError, match=r"transforms.json: images of more than one frame: a[^b]*; keep one"):
+        load_capture(tmp_path)
+
+
 @pytest.mark.parametrize("text", ['{"frames": ' + "[" * 100_000, "[]"])
 def test_transforms_that_are_damaged_are_named(tmp_path, text):
     (tmp_path / "transforms.json").write_text(text)
@@ -186,7 +201,7 @@ def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
         matrix = np.eye(4)
         matrix[0, 3] = i
         frame = {"file_path": f"images/f{i}.png", "transform_matrix": matrix.tolist()}
-        frames.append(frame | ({"mask_path": f"own/f{i}.png"} if i == 1 else {}))
+        frames.append(frame | ([{}, {"mask_path": f"own/f{i}.png"}, {"mask_path": None}, {}][i]))
     (tmp_path / "p.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
         "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
