@@ -145,7 +145,8 @@ def write_model(folder: Path | str, model: ColmapModel, *, text: bool = False) -
     """Write a sparse model as .bin (or .txt) files, creating the folder.
 
     Raises:
-        ValueError: columns disagree in length, or a camera's parameters do not fit its model.
+        ValueError: columns disagree in length, a camera's parameters do not fit its model, or a name cannot
+            stand in the file.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -84,6 +84,8 @@ void write_points_text(std::ostream& out, const ColmapPoints& points);
 void check_columns(const std::vector<ColmapCamera>& cameras);
 void check_columns(const ColmapImages& images);
 void check_columns(const ColmapPoints& points);
+// Throws std::invalid_argument if the readers of text, which strip blanks, would change a name.
+void check_text_names(const ColmapImages& images);
 // Returns why a camera cannot be used, or an empty string.
 std::string camera_problem(const ColmapCamera& camera);
 

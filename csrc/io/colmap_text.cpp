@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <charconv>
 #include <ostream>
+#include <stdexcept>
 
 #include "io/colmap.h"
 #include "io/text_reader.h"
@@ -121,8 +122,19 @@ void write_cameras_text(std::ostream& out, const std::vector<ColmapCamera>& came
   }
 }
 
+void check_text_names(const ColmapImages& images) {
+  for (const std::string& name : images.names) {
+    if (kBlanks.find(name.front()) != kBlanks.npos || kBlanks.find(name.back()) != kBlanks.npos) {
+      throw std::invalid_argument("images: the name '" + name +
+                                  "' begins or ends with a blank, which readers of text strip; rename the "
+                                  "image or write the model as .bin");
+    }
+  }
+}
+
 void write_images_text(std::ostream& out, const ColmapImages& images) {
   check_columns(images);
+  check_text_names(images);
   out << "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
       << "# Number of images: ";
   put(out, images.ids.size());

@@ -163,7 +163,9 @@ void write_images(const std::string& path, const py::dict& columns) {
                                 to_vector<std::uint64_t>(columns, "point2d_offsets"),
                                 to_vector<double>(columns, "points2d"),
                                 to_vector<std::int64_t>(columns, "point3d_ids")};
-  io::check_columns(images);  // before the file is opened, so that bad columns leave no file behind
+  // Before the file is opened, so that bad columns leave no file behind.
+  io::check_columns(images);
+  if (is_text(path)) io::check_text_names(images);
   to_file(path, [&](std::ostream& out) {
     is_text(path) ? io::write_images_text(out, images) : io::write_images_binary(out, images);
   });

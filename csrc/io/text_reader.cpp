@@ -4,7 +4,6 @@
 namespace blitzgs::io {
 
 namespace {
-constexpr std::string_view kBlanks = " \t\r\v\f";
 constexpr std::string_view kByteOrderMark = "\xef\xbb\xbf";
 }  // namespace
 

@@ -11,6 +11,8 @@
 
 namespace blitzgs::io {
 
+inline constexpr std::string_view kBlanks = " \t\r\v\f";
+
 class TextReader {
  public:
   TextReader(std::istream& in, std::string name) : in_(in), name_(std::move(name)) {

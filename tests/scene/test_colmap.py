@@ -153,6 +153,18 @@ def test_columns_that_disagree_are_not_written(tmp_path):
     assert not (tmp_path / "out" / "images.bin").exists()
 
 
+@pytest.mark.parametrize("name", [" a.jpg", "a.jpg ", "\ta.jpg", "a.jpg\r", "\va.jpg", "a.jpg\f", " "])
+def test_names_that_text_would_change_are_written_only_as_binary(tmp_path, name):
+    reconstruction(NAMES, 64, 48).write_binary(str(tmp_path))
+    model = colmap.read_model(tmp_path, tracks=True)
+    model.images.names[0] = name
+    with pytest.raises(ValueError, match=f"the name '{name}' begins or ends with a blank"):
+        colmap.write_model(tmp_path / "text", model, text=True)
+    assert not (tmp_path / "text" / "images.txt").exists()
+    colmap.write_model(tmp_path / "binary", model)
+    assert colmap.read_model(tmp_path / "binary").images.names == model.images.names
+
+
 @pytest.mark.skipif(shared_data() is None, reason="the real captures are not here")
 @pytest.mark.parametrize("name", ["sheffield", "caliterra"])
 def test_a_real_model_is_written_back_byte_for_byte(tmp_path, name):
