@@ -242,7 +242,7 @@ py::array_t<std::uint8_t> decode_qoi(const py::bytes& data) {
 }  // namespace
 
 PYBIND11_MODULE(_io, m) {
-  m.doc() = "Host-side I/O of BlitzGS; blitzgs.scene.colmap and blitzgs.scene.ply are its public face.";
+  m.doc() = "Host-side I/O of BlitzGS; blitzgs.scene.colmap and blitzgs.formats.ply are its public face.";
   py::register_exception<io::FormatError>(m, "FormatError", PyExc_ValueError);
   py::register_exception<WriteError>(m, "WriteError", PyExc_OSError);
   m.def("camera_models", &camera_models);
