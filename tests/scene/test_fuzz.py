@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Damaged files give a ValueError or a model of the size of the file: no crash, no wild allocation."""
 
+import json
 import resource
+import struct
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -14,8 +18,9 @@ from hypothesis import strategies as st
 from blitzgs.formats.native import native_io
 from blitzgs.formats.ply import read_ply
 from blitzgs.scene.image_files import decode_rgb, read_header, read_whole
+from blitzgs.scene.transforms import read_transforms
 from tests.formats.test_ply import gaussians, inria_file
-from tests.scene.helpers import reconstruction, smooth_image, write_image
+from tests.scene.helpers import ROOT, reconstruction, smooth_image, write_image
 
 SETTINGS = settings(max_examples=150, deadline=None, derandomize=True)
 
@@ -28,6 +33,11 @@ def samples():
     rec.write_text(str(folder))
     inria_file(folder / "model.ply", gaussians(4, 1))
     write_image(folder / "photo.jpg", smooth_image(48, 64))
+    assert cv2.imwrite(str(folder / "stages.jpg"), smooth_image(48, 64), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
+    (folder / "QOI").write_bytes(native_io().encode_qoi(smooth_image(48, 64)))
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "mask_path": "b.png"}
+    lens = {"w": 64, "h": 48, "fl_x": 60.0, "k1": 0.1, "ply_file_path": "p.ply"}
+    (folder / "transforms.json").write_text(json.dumps(lens | {"frames": [frame], "test_filenames": []}))
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
@@ -39,6 +49,11 @@ def damage(data: bytes, cut: float, flips: list[tuple[float, int]]) -> bytes:
     return bytes(out)
 
 
+def read_image(path: str) -> None:
+    read_header(Path(path))
+    decode_rgb(read_whole(Path(path)), path)
+
+
 READERS = {
     "cameras.bin": native_io().read_cameras,
     "images.bin": lambda path: native_io().read_images(path, True),
@@ -47,15 +62,46 @@ READERS = {
     "images.txt": lambda path: native_io().read_images(path, True),
     "points3D.txt": lambda path: native_io().read_points(path, True),
     "model.ply": read_ply,
-    "photo.jpg": lambda path: (read_header(Path(path)), decode_rgb(read_whole(Path(path)), path)),
+    "photo.jpg": read_image,
+    "stages.jpg": read_image,
+    "transforms.json": lambda path: read_transforms(Path(path).parent),
+    "QOI": lambda path: native_io().decode_qoi(Path(path).read_bytes()),  # its messages have no other name
 }
 FRACTION = st.floats(0, 1, exclude_max=True)
 
 
-@pytest.mark.parametrize("name", READERS)
-def test_damaged_files_never_crash_or_allocate_wildly(samples, tmp_path, name):
-    path = tmp_path / name
+# What a reader may take, in MiB. The samples have some kilobytes, and damaged counts claim gigabytes.
+LITTLE = 24
+# The check of a progressive JPEG keeps 8 bytes for each of its blocks, of which it reads at most 2^24.
+BLOCKS = 128
+
+
+def in_fresh_process(function, path: Path):
+    """Call a function of this file on a path in a process of its own, which has no freed memory."""
+    program = f"from tests.scene import test_fuzz; test_fuzz.{function.__name__}({str(path)!r})"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def limit_memory(mebibytes: int) -> None:
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + (mebibytes << 20)
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+
+def read_damaged(path: str) -> None:
+    name, sample = Path(path).name, Path(path).read_bytes()
     outcomes = {"read": 0, "refused": 0}
+
+    def attempt(data: bytes) -> None:
+        Path(path).write_bytes(data)
+        try:
+            READERS[name](path)
+            outcomes["read"] += 1
+        except ValueError as error:
+            assert name in str(error)
+            outcomes["refused"] += 1
 
     @SETTINGS
     @given(
@@ -63,19 +109,45 @@ def test_damaged_files_never_crash_or_allocate_wildly(samples, tmp_path, name):
         st.lists(st.tuples(FRACTION, st.integers(0, 255)), max_size=4),
     )
     def run(cut, flips):
-        path.write_bytes(damage(samples[name], cut, flips))
-        try:
-            READERS[name](str(path))
-            outcomes["read"] += 1
-        except ValueError as error:
-            assert name in str(error)
-            outcomes["refused"] += 1
+        attempt(damage(sample, cut, flips))
 
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    READERS[name](path)  # what is loaded at the first use is no part of what a file takes
+    limit_memory(LITTLE)
+    for at in range(min(len(sample), 250)):  # where the counts and sizes of all kinds are
+        attempt(sample[:at] + b"\x7f\x7f\x7f" + sample[at + 3 :])
+        attempt(sample[:at] + b"99999999" + sample[at:])
     run()
-    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-    assert grown < 200 * 1024, f"{grown} KiB more for files of {len(samples[name])} bytes"
+    print(json.dumps(outcomes))
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_damaged_files_never_crash_or_allocate_wildly(samples, tmp_path, name):
+    (tmp_path / name).write_bytes(samples[name])
+    outcomes = in_fresh_process(read_damaged, tmp_path / name)
     assert outcomes["read"] > 0 and outcomes["refused"] > 0
+
+
+def check_huge(path: str) -> None:
+    limit_memory(BLOCKS + LITTLE)
+    read_whole(Path(path))
+    print(json.dumps("whole"))
+
+
+@pytest.mark.parametrize(("components", "height"), [(1, 16384), (3, 5456), (3, 16384), (4, 65535)])
+def test_a_small_jpeg_of_many_blocks_allocates_little(tmp_path, components, height):
+    """Each component has a scan in which one code of 15 zero bits stands for 16,384 empty blocks."""
+
+    def segment(marker: int, *payload: int) -> bytes:
+        return struct.pack(">BBH", 0xFF, marker, len(payload) + 2) + bytes(payload)
+
+    blocks = 8192 * -(-height // 8)
+    kinds = [part for k in range(components) for part in (k, 0x11, 0)]
+    data = b"\xff\xd8" + segment(0xC4, 0x10, 1, *[0] * 15, 0xE0)
+    data += segment(0xC2, 8, height >> 8, height & 0xFF, 0xFF, 0xFF, components, *kinds)
+    for k in range(components):
+        data += segment(0xDA, 1, k, 0, 1, 63, 0) + bytes(-(-15 * (blocks // 16384) // 8))
+    (tmp_path / "huge.jpg").write_bytes(data + b"\xff\xd9")
+    assert in_fresh_process(check_huge, tmp_path / "huge.jpg") == "whole"
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "model.ply"])
