@@ -4,7 +4,7 @@
     python benchmarks/report.py           # writes the tables
     python benchmarks/report.py --check   # fails when a page differs from the results
 
-Every result is a JSON file that a benchmark wrote with --json; `COMMANDS` of report_tables.py names the file
+Every result is a JSON file that a benchmark wrote with --json; `COMMANDS` of report_files.py names the file
 and the command. A page has a pair of comments around each table, `<!-- table: NAME -->` and
 `<!-- end: NAME -->`; the text between them is replaced. The files must come from one commit, because figures
 of different code do not compare; those of each of `GROUPS` may come from another. In place of a table whose
@@ -19,7 +19,8 @@ import re
 import sys
 from pathlib import Path
 
-from report_tables import COMMANDS, COPIED, GROUPS, SECTIONS, Json
+from report_files import COMMANDS, COPIED, GROUPS
+from report_tables import SECTIONS, Json
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"

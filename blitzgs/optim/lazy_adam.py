@@ -14,6 +14,7 @@ from blitzgs.ops.sparse_rows import distinct_rows
 from blitzgs.optim.drift import Drift
 from blitzgs.optim.handed import Handed, move_to_grad
 from blitzgs.optim.joint import Joint, step_jointly
+from blitzgs.optim.lazy_adam_checks import check_group, check_mask, check_new_rows, check_order
 from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of, steps_of
 
 
@@ -94,7 +95,7 @@ class LazyAdam(torch.optim.Optimizer):
         """Add parameters with options of their own, see `__init__`."""
         super().add_param_group(param_group)
         try:
-            _check_group(self.param_groups[-1])
+            check_group(self.param_groups[-1])
         except ValueError:
             del self.param_groups[-1]
             raise
@@ -253,7 +254,7 @@ class LazyAdam(torch.optim.Optimizer):
                     f"LazyAdam: the state has no {', '.join(sorted(missing))}; load one of LazyAdam or "
                     "torch.optim.Adam"
                 )
-            _check_group({"lr_rest": None, **group})
+            check_group({"lr_rest": None, **group})
         self.leave_joint()
         super().load_state_dict(state_dict)
         self.drifts.clear()
@@ -277,20 +278,7 @@ class LazyAdam(torch.optim.Optimizer):
             ValueError: names or shapes do not fit.
         """
         named = self._named()
-        if rows.keys() != named.keys():
-            raise ValueError(f"LazyAdam.append: rows for {sorted(named)} are needed, got {sorted(rows)}")
-        for name, group in named.items():
-            new, old = rows[name], group["params"][0]
-            _check_tensor(f"append: new rows of {name}", new)
-            if new.dim() == 0 or new.shape[1:] != old.shape[1:]:
-                wanted = ", ".join(("M", *map(str, old.shape[1:])))
-                raise ValueError(
-                    f"LazyAdam.append: new rows of {name} must be [{wanted}], got {list(new.shape)}"
-                )
-        counts = {len(new) for new in rows.values()}
-        if len(counts) != 1:
-            raise ValueError(f"LazyAdam.append: the numbers of new rows differ: {sorted(counts)}")
-        (count,) = counts
+        count = check_new_rows(rows, named)
 
         def grow(name: str, old: Tensor) -> Tensor:
             return torch.cat([old, rows[name].to(old)])
@@ -307,17 +295,7 @@ class LazyAdam(torch.optim.Optimizer):
             TypeError: the mask is not a tensor.
             ValueError: the mask has another dtype or device, or not one entry for each row.
         """
-        _check_tensor("keep: mask", mask)
-        if mask.dtype != torch.bool:
-            raise ValueError(f"LazyAdam.keep: mask must be bool, got {mask.dtype}")
-        for name, group in self._named().items():
-            param = group["params"][0]
-            if mask.shape != param.shape[:1]:
-                raise ValueError(
-                    f"LazyAdam.keep: mask must be [{len(param)}], a value for each row of {name}, got "
-                    f"{list(mask.shape)}"
-                )
-            _check_device("keep: mask", mask, name, param)
+        check_mask(mask, self._named())
         return self._select(mask.nonzero()[:, 0])
 
     def permute(self, order: Tensor) -> dict[str, Parameter]:
@@ -331,30 +309,7 @@ class LazyAdam(torch.optim.Optimizer):
             ValueError: the order has another shape, dtype or device, or has a row twice or one that does not
                 exist.
         """
-        _check_tensor("permute: order", order)
-        if order.dtype != torch.int64 or order.dim() != 1:
-            raise ValueError(
-                f"LazyAdam.permute: order must be int64 [N'], the old rows, got {order.dtype} "
-                f"{list(order.shape)}; `keep` takes a mask"
-            )
-        named = self._named()
-        for name, group in named.items():
-            _check_device("permute: order", order, name, group["params"][0])
-        name, count = min(
-            ((name, len(group["params"][0])) for name, group in named.items()), key=lambda pair: pair[1]
-        )
-        absent = order[(order < 0) | (order >= count)]
-        if len(absent) > 0:
-            raise ValueError(
-                f"LazyAdam.permute: order must have rows 0 to {count - 1}, as {name} has {count}, got "
-                f"{int(absent[0])}"
-            )
-        twice = (order.bincount() > 1).nonzero()[:, 0]
-        if len(twice) > 0:
-            raise ValueError(
-                f"LazyAdam.permute: order must have each row at most once, got row {int(twice[0])} again; "
-                "`append` adds copies"
-            )
+        check_order(order, self._named())
         return self._select(order)
 
     def _select(self, rows: Tensor) -> dict[str, Parameter]:
@@ -465,33 +420,3 @@ class LazyAdam(torch.optim.Optimizer):
                     "both together (append, keep, permute)"
                 )
         return state
-
-
-def _check_tensor(argument: str, value: object) -> None:
-    if not isinstance(value, Tensor):
-        raise TypeError(f"LazyAdam.{argument} must be a torch.Tensor, got {type(value).__name__}")
-
-
-def _check_device(argument: str, value: Tensor, name: str, param: Tensor) -> None:
-    if value.device != param.device:
-        raise ValueError(f"LazyAdam.{argument} is on {value.device} and {name} on {param.device}; move one")
-
-
-def _check_group(group: dict[str, Any]) -> None:
-    """Check the parameters and options of a group.
-
-    Raises:
-        ValueError: a parameter has no rows, or an option is outside its range, or is one of
-            `torch.optim.Adam` that is not supported.
-    """
-    if any(isinstance(param, Tensor) and param.dim() == 0 for param in group["params"]):
-        raise ValueError("LazyAdam: a parameter must have rows, [N, ...], got a single number; use Adam")
-    beta1, beta2 = group["betas"]
-    if not (beta1 >= 0 and 0 < beta2 < 1 and beta1 * beta1 < beta2):
-        raise ValueError(f"LazyAdam: betas must satisfy 0 <= beta1 < sqrt(beta2) < 1, got {group['betas']}")
-    for name in ("lr", "lr_rest", "eps"):
-        if group[name] is not None and not group[name] >= 0:
-            raise ValueError(f"LazyAdam: {name} must be 0 or more, got {group[name]}")
-    for name in ("weight_decay", "amsgrad", "maximize"):
-        if group.get(name):
-            raise ValueError(f"LazyAdam: {name}={group[name]} is not supported; leave it out")

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The files of benchmarks/results: the command that writes each, and which of them are of one commit."""
+
+# File in benchmarks/results (without .json) -> the command that writes it.
+EXCHANGE = "python benchmarks/bm_exchange.py --gaussians 16000000 --device cuda --batch 4 --batches 4"
+TRAINING = "benchmarks/bm_training.py --data CAPTURE --config configs/aerial.yaml --images 3000"
+EARLY_GATE = (
+    "configs/compact.yaml --schedule.t1=8999 --population.pass1_keep=1 --schedule.gate_from=2000 "
+    "--population.pass2_keep=0.7"
+)
+COMMANDS = {
+    "render": "python benchmarks/bm_render.py",
+    "call": "python benchmarks/bm_render.py --scenes aerial1 aerial4",
+    "step_1": "python benchmarks/bm_step.py --views 1",
+    "step_4": "python benchmarks/bm_step.py --views 4",
+    "exchange": f"{EXCHANGE} --ranks 1 2",
+    "training": f"python {TRAINING}",
+    "training_2": f"torchrun --nproc-per-node=2 {TRAINING}",
+    "drop_in": "python benchmarks/bm_drop_in.py CAPTURE",
+    "drop_in_1": "python benchmarks/bm_drop_in.py CAPTURE --one-thread",
+    "importance": "python benchmarks/bm_importance.py",
+    "gate": "python benchmarks/bm_gate.py",
+    "scratch": "python benchmarks/bm_scratch.py",
+    "photometric": "python benchmarks/bm_photometric.py",
+    "accuracy": "python benchmarks/bm_accuracy.py",
+    "lineage": "python benchmarks/bm_lineage.py",
+    "quality": (
+        "python benchmarks/bm_quality.py --out runs/quality --capture NAME=CAPTURE "
+        '--recipe aerial=configs/aerial.yaml --recipe "aerial_half=configs/aerial.yaml --schedule.scale=0.5" '
+        "--seeds 0 1 2"
+    ),
+    "ablation": (
+        "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/ablation "
+        "--capture NAME=CAPTURE --per-gpu 3"
+    ),
+    "energy": (
+        "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/energy "
+        '--capture "NAME=CAPTURE --population.score=energy" --per-gpu 3'
+    ),
+}
+COMMANDS |= {
+    "compact": (
+        "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/compact "
+        '--capture "NAME=CAPTURE --schedule.scale=0.5"'
+    ),
+    "compact_later": (
+        "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/compact_later "
+        '--capture "NAME=CAPTURE --schedule.scale=0.5"'
+    ),
+    "gate_random": (
+        "python benchmarks/bm_quality.py --out runs/gate_random "
+        '--capture "NAME=CAPTURE --schedule.scale=0.5" '
+        f'--recipe "learned_NAME={EARLY_GATE} --population.gate=GATE" '
+        f'--recipe "random={EARLY_GATE} --population.gate=random" --per-gpu 2'
+    ),
+    "town": (
+        "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/town "
+        "--capture town=DATA/town --seeds 0 1"
+    ),
+    "adaptive": (
+        "python benchmarks/bm_quality.py --plan benchmarks/adaptive.yaml --out runs/adaptive "
+        "--capture NAME=CAPTURE --per-gpu 3"
+    ),
+    "oracle": "blitzgs gate replay GATE RUN --out REPLAY",
+    "offload": "python benchmarks/bm_offload.py --ratios 2 4",
+    "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 2 --popping",
+    "city_ranks": (
+        "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 2 --arms all_off "
+        "--batch-sizes 4 8 16"
+    ),
+    "city_later": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 1 --ranks 1 --scale 0.6",
+    "city_exchange": (
+        "python benchmarks/bm_exchange.py --data CITY --downscale 1 --visible-threshold 0 --ranks 1 2"
+    ),
+}
+# The files of a group are of one commit, and so are those that are in no group. Whole trainings take many
+# minutes and depend on the recipe more than on the kernels, several GPUs are seldom at hand, and the city has
+# a page of its own.
+GROUPS = (
+    ("quality",),
+    ("ablation", "oracle"),
+    ("energy",),
+    ("compact",),
+    ("compact_later",),
+    ("gate_random",),
+    ("town",),
+    ("adaptive",),
+    ("offload",),
+    ("importance",),
+    ("call",),
+    ("drop_in", "drop_in_1"),
+    ("exchange", "training", "training_2"),
+    ("city", "city_exchange"),
+    ("city_ranks",),
+    ("city_later",),
+)
+# bm_quality.py takes no --json: it collects all of its runs in one file.
+COPIED = {
+    "quality": "cp runs/quality/quality.json benchmarks/results/",
+    "ablation": "cp runs/ablation/quality.json benchmarks/results/ablation.json",
+    "energy": "cp runs/energy/quality.json benchmarks/results/energy.json",
+    "compact": "cp runs/compact/quality.json benchmarks/results/compact.json",
+    "compact_later": "cp runs/compact_later/quality.json benchmarks/results/compact_later.json",
+    "gate_random": "cp runs/gate_random/quality.json benchmarks/results/gate_random.json",
+    "town": "cp runs/town/quality.json benchmarks/results/town.json",
+    "adaptive": "cp runs/adaptive/quality.json benchmarks/results/adaptive.json",
+}
