@@ -102,6 +102,10 @@ class OneImport(GsplatTrainer):
             self.change_population(info)
 
 
+# Refinements from one sorting of the rows to the next: each appends few rows, so the order stays good.
+SORT_EVERY = 5
+
+
 class FourSwaps(OneImport):
     """The loop with our renderer of raw parameters, optimiser and loss, and rows in Morton order.
 
@@ -140,14 +144,14 @@ class FourSwaps(OneImport):
         step_together(self._optimisers, set_to_none=True)
 
     def change_population(self, info: Any) -> None:
-        """Bring all rows up to date before the strategy reads them, and sort them afterwards."""
+        """Bring all rows up to date before the strategy reads them; now and then sort them afterwards."""
         strategy = self._strategy
         refines = self.step < strategy.refine_stop_iter and self.step % strategy.refine_every == 0
         if refines:  # the strategy then reads and replaces parameters and their state
             for optimiser in self._optimisers.values():
                 optimiser.bring_up_to_date()
         super().change_population(info)
-        if refines:
+        if refines and self.step % (SORT_EVERY * strategy.refine_every) == 0:
             order = blitzgs.morton_order(self.params["means"].detach())
             for name, optimiser in self._optimisers.items():
                 self.params[name] = optimiser.permute(order)[name]

@@ -25,6 +25,8 @@ Transport = Literal["auto", "peer", "collective"]
 _REDUCE_OPS = {"sum": dist.ReduceOp.SUM, "min": dist.ReduceOp.MIN, "max": dist.ReduceOp.MAX}
 
 DEFAULT_TIMEOUT_SECONDS = 120.0
+# The environment variables that configure torch's CUDA allocator, the present one and the one before it.
+ALLOCATOR_VARIABLES = ("PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF")
 # Start-up includes importing torch on every rank and, with NCCL, building the communicator.
 STARTUP_TIMEOUT_SECONDS = 300.0
 
@@ -105,6 +107,8 @@ class Ranks:
                 " one; leave it out, and start no more processes per node than it has GPUs"
             )
         place, shared = resolve_device(device, local_rank, local_world_size, share_gpus)
+        if place.type == "cuda":
+            _extend_memory_in_place()
         ranks = cls(
             rank=rank,
             world_size=world_size,
@@ -280,6 +284,16 @@ class Ranks:
                     f"the ranks disagree on {name}: {detail}. Start every rank with the same configuration, "
                     "code and data."
                 )
+
+
+def _extend_memory_in_place() -> None:
+    """Let torch's CUDA allocator extend its memory, unless the user has configured it; before its first use.
+
+    A table that grows by some percent in each density event does not fit into the memory that its last copy
+    has left. By default, torch then asks CUDA for new memory for every column.
+    """
+    if not any(name in os.environ for name in ALLOCATOR_VARIABLES):
+        os.environ[ALLOCATOR_VARIABLES[0]] = "expandable_segments:True"
 
 
 def _list(ranks: Sequence[int]) -> str:

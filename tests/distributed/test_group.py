@@ -5,7 +5,13 @@ import time
 import pytest
 import torch
 
-from blitzgs.distributed.group import MismatchError, Ranks, resolve_device
+from blitzgs.distributed.group import (
+    ALLOCATOR_VARIABLES,
+    MismatchError,
+    Ranks,
+    _extend_memory_in_place,
+    resolve_device,
+)
 from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
 
 
@@ -172,3 +178,16 @@ def test_no_rank_waits_for_a_failed_rank():
         run_ranks(_fail_and_stay, 2, timeout_seconds=600.0, limit=45)
     assert time.monotonic() - start < 45
     assert "exit code 75" in failure.value.messages[0]
+
+
+def test_memory_is_extended_in_place_unless_the_user_has_configured_it(monkeypatch):
+    present, former = ALLOCATOR_VARIABLES
+    for name in ALLOCATOR_VARIABLES:
+        monkeypatch.setenv(name, "max_split_size_mb:128")  # so that the test's end restores both
+        monkeypatch.delenv(name)
+    _extend_memory_in_place()
+    assert os.environ[present] == "expandable_segments:True"
+    monkeypatch.delenv(present)
+    monkeypatch.setenv(former, "max_split_size_mb:128")
+    _extend_memory_in_place()
+    assert present not in os.environ
