@@ -28,6 +28,7 @@ import argparse
 import time
 from contextlib import nullcontext
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -170,6 +171,7 @@ class Gsplat(OneImport):
     """gsplat's loop without changes."""
 
     def __init__(self, *arguments: Any) -> None:
+        import_module("gsplat.cuda._backend")  # may compile gsplat's kernels, which is no part of training
         from gsplat import rasterization
 
         self.rasterization = rasterization

@@ -18,6 +18,7 @@ COMMANDS = {
     "training_2": f"torchrun --nproc-per-node=2 {TRAINING}",
     "drop_in": "python benchmarks/bm_drop_in.py CAPTURE",
     "drop_in_1": "python benchmarks/bm_drop_in.py CAPTURE --one-thread",
+    "drop_in_full": "python benchmarks/bm_drop_in.py CAPTURE --steps 30000 --one-thread",
     "importance": "python benchmarks/bm_importance.py",
     "gate": "python benchmarks/bm_gate.py",
     "scratch": "python benchmarks/bm_scratch.py",
@@ -62,6 +63,7 @@ COMMANDS |= {
         "--capture NAME=CAPTURE --per-gpu 3"
     ),
     "oracle": "blitzgs gate replay GATE RUN --out REPLAY",
+    "gate_judged": "blitzgs gate evaluate GATE RUN RUN --out JUDGED",
     "offload": "python benchmarks/bm_offload.py --ratios 2 4",
     "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 2 --popping",
     "city_ranks": (
@@ -78,7 +80,8 @@ COMMANDS |= {
 # a page of its own.
 GROUPS = (
     ("quality",),
-    ("ablation", "oracle"),
+    ("ablation",),
+    ("oracle", "gate_judged"),
     ("energy",),
     ("compact",),
     ("compact_later",),
@@ -89,6 +92,7 @@ GROUPS = (
     ("importance",),
     ("call",),
     ("drop_in", "drop_in_1"),
+    ("drop_in_full",),
     ("exchange", "training", "training_2"),
     ("city", "city_exchange"),
     ("city_ranks",),

@@ -167,6 +167,17 @@ def row_lines(file: Json) -> list[str]:
     return [f"{file['title']}.", "", *table(rows[0], cells)]
 
 
+def whole_loop_lines(file: Json) -> list[str]:
+    """Tabulate the steps of whole trainings in gsplat's loop, without the steps around refinements."""
+    spent, around = "training, s", "of it around refinements, s"
+    rows = [
+        {"arm": row["arm"], "steps outside refinements, s": row[spent] - row[around]}
+        | {name: row[name] for name in ("last steps, ms each", "Gaussians", "PSNR, dB")}
+        for row in file["rows"]
+    ]
+    return row_lines({"title": file["title"], "rows": rows})
+
+
 def city_lines(rows_of: Callable[[Json], city_report.Rows]) -> Callable[[Json], list[str]]:
     """Return the function that makes a table of the city's file."""
 
@@ -351,6 +362,7 @@ SECTIONS = {
     "training_2": Section(("training_2",), row_lines),
     "drop_in": Section(("drop_in",), row_lines),
     "drop_in_1": Section(("drop_in_1",), row_lines),
+    "drop_in_full": Section(("drop_in_full",), whole_loop_lines),
     "importance": Section(("importance",), row_lines),
     "gate": Section(("gate",), row_lines),
     "lineage": Section(("lineage",), row_lines),
@@ -363,6 +375,7 @@ SECTIONS = {
     "rho": Section(("ablation",), gate_lines("rho")),
     "onset": Section(("ablation",), gate_lines("onset")),
     "oracle": Section(("oracle",), row_lines),
+    "gate_judged": Section(("gate_judged",), row_lines),
     "compact": Section(("compact",), compact_lines),
     "compact_later": Section(("compact_later",), compact_lines),
     "gate_random": Section(("gate_random",), gate_random_lines),

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exact selection over all ranks: the k smallest keys, and the shortest prefix that holds a share of a mass.
 
-Both find a threshold by refining a histogram of the float's bits. Each round sums a few thousand integers
-over the ranks, so no rank needs the others' scores. All sums are integers, so the same rows are selected at
-every world size. Ids decide between equal scores.
+Both find a threshold by refining a histogram of the float's bits. Each round sums one histogram over the
+ranks, of at most 2^16 integers for each set of rows, so no rank needs the others' scores. All sums are
+integers, so the same rows are selected at every world size. Ids decide between equal scores.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from blitzgs.ops.mass_cut import CHOICE_STEP, STEPS, TIES_STEP, MassCut
 
 # Digits of a threshold search, most significant first. The first digit of a score is its exponent and three
 # bits of its mantissa, so all scores of a bin share one exponent and their mantissas can be summed exactly.
-_KEY_DIGITS = (11, 11, 10)
+# Keys are of one set of rows, so their histograms may be large; fewer rounds need fewer waits.
+_KEY_DIGITS = (16, 16)
 _SCORE_DIGITS = (11, 10, 10)
 _ID_DIGITS = (13, 13, 13, 12, 12)
 _MANTISSA_BITS = 23

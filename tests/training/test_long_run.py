@@ -173,7 +173,11 @@ def test_a_long_run_stays_with_dense_adam_and_needs_no_more_memory(tmp_path, dev
     other = GaussianTable({name: column.clone() for name, column in table.columns.items()})
     for column, values in zip(other.parameters, dense.columns(), strict=True):
         column.copy_(values.view(column.shape))
-    for index in range(0, ACROSS**2, 16):
-        pictures = [picture(gaussians, state.views, index) for gaussians in (table, other)]
-        assert (pictures[0] - pictures[1]).abs().max() < 1e-3
+    shown = [
+        torch.stack([picture(gaussians, state.views, index) for index in range(0, ACROSS**2, 16)])
+        for gaussians in (table, other)
+    ]
+    difference = (shown[0] - shown[1]).abs()
+    # A Gaussian whose alpha is close to the cut-off of 1/255 at a pixel may be in one picture alone.
+    assert difference.max() < 1 / 255 and (difference > 1e-3).float().mean() < 1e-3
     assert all(grown <= most for grown, most in zip(growth, MOST_GROWTH, strict=True))
