@@ -117,10 +117,8 @@ def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
         torch.from_numpy(capture.colors),
         centres,
         measure_levels(points.to(device), centres, lod.fork, lod.base_resolution),
-        visible_threshold=args.visible_threshold,
-        sh_degree=3,
-        opacity=0.5,
-    )
+        args.visible_threshold,
+    ).table(sh_degree=3, opacity=0.5)
     views = ViewSet(list(capture.cameras), space, device)
     count = min(args.batch * args.batches, len(capture.train))
     chosen = [capture.train[k * len(capture.train) // count] for k in range(count)]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from blitzgs.model import GaussianTable, opacity_logit
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.voxel_keys import voxel_keys
 from blitzgs.view.levels import Levels
+from blitzgs.view.point_blocks import PointBlocks
 
 SH_C0 = 0.28209479177387814
 # Smallest size of a first Gaussian, relative to the coarsest voxel: two voxel centres may coincide.
@@ -19,23 +21,66 @@ SMALLEST_SPACING = 1e-4
 _CELL_BITS = 21
 
 
+@dataclass(frozen=True)
+class FirstGaussians:
+    """What distinguishes the first Gaussians of a model from each other; the tensors are on the CPU.
+
+    Attributes:
+        means: float32 [C, 3].
+        log_scales: float32 [C], the same on all axes.
+        colors: float32 [C, 3], their SH coefficients of degree 0.
+        levels: uint8 [C], octree levels.
+    """
+
+    means: Tensor
+    log_scales: Tensor
+    colors: Tensor
+    levels: Tensor
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def table(
+        self,
+        sh_degree: int,
+        opacity: float,
+        device: torch.device | str = "cpu",
+        part: slice = slice(None),  # noqa: B008  (a slice cannot be changed)
+    ) -> GaussianTable:
+        """Make a table of them, without rotation; ids count from 0.
+
+        Args:
+            sh_degree: highest degree of the table.
+            opacity: of all of them, in (0, 1).
+            device: of the table.
+            part: which of them the table gets.
+        """
+        means = self.means[part].to(device)
+        sh = torch.zeros(len(means), (sh_degree + 1) ** 2, 3, device=device)
+        sh[:, 0] = self.colors[part].to(device)
+        return GaussianTable.create(
+            {
+                "means": means,
+                "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(len(means), 1),
+                "scales": self.log_scales[part].to(device)[:, None].repeat(1, 3),
+                "opacities": torch.full((len(means),), opacity_logit(opacity), device=device),
+                "sh": sh,
+                "level": self.levels[part].to(device),
+                "id": torch.arange(len(self))[part].to(device),
+            }
+        )
+
+
 def octree_gaussians(
-    points: Tensor,
-    colors: Tensor,
-    centres: Tensor,
-    levels: Levels,
-    *,
-    visible_threshold: float,
-    sh_degree: int,
-    opacity: float,
-) -> GaussianTable:
-    """Make one Gaussian per occupied voxel of every level that enough cameras can resolve.
+    points: Tensor, colors: Tensor, centres: Tensor, levels: Levels, visible_threshold: float
+) -> FirstGaussians:
+    """Find one Gaussian per occupied voxel of every level that enough cameras can resolve.
 
     Voxels of several sizes are those of Octree-GS (Ren et al. 2024); the size of a Gaussian is that of 3DGS
     (Kerbl et al. 2023).
 
-    A Gaussian sits at its voxel's centre with the mean colour of the points inside, an identity rotation and
-    the mean distance of its 3 nearest neighbours as its size on all axes. Ids count from 0.
+    A Gaussian sits at its voxel's centre with the mean colour of the points inside and the mean distance of
+    its 3 nearest neighbours as its size.
 
     Args:
         points: SfM points, float64 [M, 3], on the CPU.
@@ -44,11 +89,6 @@ def octree_gaussians(
         levels: from `measure_levels` on the same points and cameras.
         visible_threshold: a voxel is kept when its level is resolvable in more than this share of the
             cameras.
-        sh_degree: highest degree of the table.
-        opacity: initial opacity in (0, 1).
-
-    Returns:
-        A table on the CPU.
 
     Raises:
         ValueError: no voxel is left.
@@ -57,28 +97,18 @@ def octree_gaussians(
     parts = []
     for level in range(levels.count):
         means, mean_colors = _voxels(points, colors, origin, levels.voxel_size_of(level))
-        keep = _share_of_cameras(means, centres, levels.farthest(level)) > visible_threshold
+        keep = _seen_by_more(means, centres, levels.farthest(level), visible_threshold)
         parts.append(
             (means[keep], mean_colors[keep], torch.full((int(keep.sum()),), level, dtype=torch.uint8))
         )
     means, mean_colors, level_of = (torch.cat(column) for column in zip(*parts, strict=True))
-    count = len(means)
-    if count == 0:
+    if len(means) == 0:
         raise ValueError(
             f"the octree kept no voxel of {len(points)} points at lod.visible_threshold {visible_threshold}"
         )
     spacing = _spacing(means).clamp(min=SMALLEST_SPACING * levels.voxel_size)
-    sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
-    sh[:, 0] = ((mean_colors / 255.0 - 0.5) / SH_C0).float()
-    return GaussianTable.create(
-        {
-            "means": means.float(),
-            "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-            "scales": spacing.log().float()[:, None].repeat(1, 3),
-            "opacities": torch.full((count,), opacity_logit(opacity)),
-            "sh": sh,
-            "level": level_of,
-        }
+    return FirstGaussians(
+        means.float(), spacing.log().float(), ((mean_colors / 255.0 - 0.5) / SH_C0).float(), level_of
     )
 
 
@@ -102,15 +132,30 @@ def _voxels(points: Tensor, colors: Tensor, origin: Tensor, size: float) -> tupl
     return origin + (cells.double() + 0.5) * size, sums / counts[:, None]
 
 
-def _share_of_cameras(means: Tensor, centres: Tensor, farthest: float) -> Tensor:
-    """Return the share of the cameras within `farthest` of each mean, float64 [C]."""
-    if math.isinf(farthest):
-        return torch.ones(len(means), dtype=torch.float64)
+def _seen_by_more(means: Tensor, centres: Tensor, farthest: float, share: float) -> Tensor:
+    """Tell which means have more than a share of the cameras within `farthest`, bool [C] on the CPU."""
+    if math.isinf(farthest) or len(means) == 0:
+        return torch.full((len(means),), share < 1)
     places = means.to(centres.device)
-    near = torch.zeros(len(places), dtype=torch.int64, device=places.device)
+    blocks = PointBlocks.of(places)
+    least, most = (torch.zeros(len(blocks), dtype=torch.int64, device=places.device) for _ in range(2))
+    for _, nearest, greatest in blocks.distances(centres):
+        least += (greatest <= farthest).sum(dim=0)
+        most += (nearest <= farthest).sum(dim=0)
+
+    def enough(count: Tensor) -> Tensor:
+        return count.double() / len(centres) > share
+
+    seen = blocks.rows(enough(least))
+    # Only these rows need their distances.
+    rows = blocks.order[blocks.rows(enough(most)) & ~seen]
+    undecided, near = places[rows], torch.zeros_like(rows)
     for centre in centres:
-        near += (places - centre).norm(dim=1) <= farthest
-    return near.cpu().double() / len(centres)
+        near += (undecided - centre).norm(dim=1) <= farthest
+    kept = torch.zeros(len(places), dtype=torch.bool, device=places.device)
+    kept[blocks.order] = seen
+    kept[rows] = enough(near)
+    return kept.cpu()
 
 
 def _spacing(means: Tensor) -> Tensor:

@@ -234,25 +234,17 @@ def first_gaussians(
     points = torch.from_numpy(capture.points) / space.unit
     centres = trained_centres([capture.cameras[i] for i in capture.train], space).to(device)
     levels = measure_levels(points.to(device), centres, lod.fork, lod.base_resolution)
-    table = octree_gaussians(
-        points,
-        torch.from_numpy(capture.colors),
-        centres,
-        levels,
-        visible_threshold=lod.visible_threshold,
-        sh_degree=config.model.sh_degree,
-        opacity=config.model.initial_opacity,
-    )
-    count = len(table)
-    table.keep(torch.arange(count) % ranks.world_size == ranks.rank)
-    table = GaussianTable({name: table[name].to(home) for name in table})
+    first = octree_gaussians(points, torch.from_numpy(capture.colors), centres, levels, lod.visible_threshold)
+    # A row of the table has some 750 bytes, so each rank makes only its own rows, on its device.
+    share = slice(ranks.rank, None, ranks.world_size)
+    table = first.table(config.model.sh_degree, config.model.initial_opacity, home, share)
     table.permute(morton_order(table["means"]))
     return table, Progress(
         step=0,
         sh_degree=0,
         level_count=levels.count,
-        peak_gaussians=count,
+        peak_gaussians=len(first),
         seconds=0.0,
-        milestones={"initial": count},
+        milestones={"initial": len(first)},
         reference_distance=levels.reference_distance,
     )

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from blitzgs.view.point_blocks import BLOCK_POINTS, PointBlocks
+
 # Voxel keys have 21 bits per axis. With this many levels, the finest grid of `measure_levels` uses all of
 # them.
 MAX_LEVELS = 22
@@ -74,13 +76,8 @@ def measure_levels(points: Tensor, centres: Tensor, fork: float, base_resolution
         raise ValueError(
             f"octree levels need points and cameras, got {len(points)} points and {len(centres)} cameras"
         )
-    far, near = [], []
-    for centre in centres:
-        distances = (points - centre).norm(dim=1)
-        far.append(_quantile(distances, 0.999))
-        near.append(_quantile(distances, 0.001))
-    d_max = _quantile(torch.stack(far), 0.999).item()
-    d_min = _quantile(torch.stack(near), 0.001).item()
+    blocks = PointBlocks.of(points)
+    d_max, d_min = (_quantile(_distance_quantiles(blocks, centres, q), q).item() for q in (0.999, 0.001))
     box = 1.1 * max((_quantile(axis, 0.99) - _quantile(axis, 0.01)).item() for axis in points.unbind(1))
     if not (box > 0 and d_min > 0):
         raise ValueError(
@@ -93,11 +90,44 @@ def measure_levels(points: Tensor, centres: Tensor, fork: float, base_resolution
     return Levels(count=count, fork=fork, reference_distance=d_max, voxel_size=box / fork**base)
 
 
-def _quantile(values: Tensor, q: float) -> Tensor:
-    """Return the linearly interpolated quantile of values [M] near one of their ends, without a full sort."""
-    largest = q > 0.5
-    position = (1.0 - q if largest else q) * (len(values) - 1)
-    below = math.floor(position)
-    count = min(below + 2, len(values))
-    ends = values.topk(count, largest=largest).values
-    return ends[below] + (ends[count - 1] - ends[below]) * (position - below)
+def _distance_quantiles(blocks: PointBlocks, centres: Tensor, q: float) -> Tensor:
+    """Return a quantile of each camera's distances to points, near one of their ends, float64 [V].
+
+    Args:
+        blocks: of the points.
+        centres: float64 [V, 3].
+        q: quantile.
+    """
+    values, count = [], len(blocks.order)
+    rank = _values_needed(count, q) - 1
+    # So many blocks, in the order of their bounds, have all values that the quantile needs.
+    enough = min(-(-rank // BLOCK_POINTS), len(blocks) - 1) + 1
+    for some, nearest, farthest in blocks.distances(centres):
+        if q > 0.5:
+            needed = farthest >= nearest.topk(enough).values[:, -1:]
+        else:
+            needed = nearest <= farthest.topk(enough, largest=False).values[:, -1:]
+        for centre, own in zip(some, needed, strict=True):
+            distances = (blocks.points_of(own) - centre).norm(dim=1)
+            values.append(_quantile(distances, q, count))
+    return torch.stack(values)
+
+
+def _values_needed(count: int, q: float) -> int:
+    """Return how many values, counted from the nearer end, a quantile of `count` values needs."""
+    return min(math.floor((1.0 - q if q > 0.5 else q) * (count - 1)) + 2, count)
+
+
+def _quantile(values: Tensor, q: float, count: int | None = None) -> Tensor:
+    """Return the linearly interpolated quantile of values near one of their ends, without a full sort.
+
+    Args:
+        values: [M], or as many of them as include `_values_needed`.
+        q: quantile.
+        count: M; None: `values` has all.
+    """
+    count = count or len(values)
+    position = (1.0 - q if q > 0.5 else q) * (count - 1)
+    below, needed = math.floor(position), _values_needed(count, q)
+    ends = values.topk(needed, largest=q > 0.5).values
+    return ends[below] + (ends[needed - 1] - ends[below]) * (position - below)

@@ -19,8 +19,7 @@ def scene(scale=1.0):
 
 def make(points, colors, centres, threshold=0.5):
     levels = measure_levels(points, centres, 2.0, 0.01)
-    options = {"visible_threshold": threshold, "sh_degree": 2, "opacity": 0.1}
-    return levels, octree_gaussians(points, colors, centres, levels, **options)
+    return levels, octree_gaussians(points, colors, centres, levels, threshold).table(2, 0.1)
 
 
 def brute_force(points, colors, centres, levels: Levels, threshold):
@@ -83,8 +82,7 @@ def test_a_stray_point_does_not_spoil_the_grid():
     _, table = make(points, colors, centres)
     stray = torch.cat((points, torch.full((1, 3), -1e9, dtype=torch.float64)))
     levels = measure_levels(points, centres, 2.0, 0.01)
-    options = {"visible_threshold": 0.5, "sh_degree": 2, "opacity": 0.1}
-    spoilt = octree_gaussians(stray, torch.cat((colors, colors[:1])), centres, levels, **options)
+    spoilt = octree_gaussians(stray, torch.cat((colors, colors[:1])), centres, levels, 0.5).table(2, 0.1)
     assert abs(len(spoilt) - len(table)) < 0.1 * len(table)
     assert spoilt["means"].abs().max() < 10
 
@@ -96,8 +94,16 @@ def test_one_point():
         torch.zeros(1, 3, dtype=torch.uint8),
         torch.ones(2, 3, dtype=torch.float64),
         levels,
-        visible_threshold=0.9,
-        sh_degree=0,
-        opacity=0.1,
-    )
+        0.9,
+    ).table(sh_degree=0, opacity=0.1)
     assert len(one) == 1 and bool(one["scales"].isfinite().all())
+
+
+def test_parts_of_the_first_gaussians_are_rows_of_the_whole_table():
+    points, colors, centres = scene()
+    first = octree_gaussians(points, colors, centres, measure_levels(points, centres, 2.0, 0.01), 0.5)
+    whole, parts = first.table(1, 0.1), [first.table(1, 0.1, part=slice(rank, None, 3)) for rank in range(3)]
+    for rank, part in enumerate(parts):
+        for name in whole:
+            assert torch.equal(part[name], whole[name][rank::3]), name
+    assert sum(len(part) for part in parts) == len(whole) == len(first)
