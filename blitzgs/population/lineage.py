@@ -99,8 +99,8 @@ class Lineage:
         Args:
             folder: folder of the parts of all ranks, made if missing.
             ranks: the job.
-            step: optimiser step of the checkpoint; parts of later steps are deleted. 0: all parts are.
-            ledger: ledger of the checkpoint.
+            step: optimiser step of the checkpoint; parts of later steps are deleted.
+            ledger: ledger of the checkpoint. One without births begins a log: all parts are deleted.
             about: description of the run, for the file `ABOUT`.
 
         Raises:
@@ -112,7 +112,8 @@ class Lineage:
             folder.mkdir(parents=True, exist_ok=True)
             for path in list(folder.iterdir()):
                 name = PART_NAME.fullmatch(path.name)
-                if path.name.startswith(".") or (name and (step == 0 or int(name[2]) > step)):
+                # A checkpoint of step 0, before the first photograph, has parts of its own.
+                if path.name.startswith(".") or (name and (ledger.births == 0 or int(name[2]) > step)):
                     path.unlink()
             self.describe(about or {})
         ranks.barrier()

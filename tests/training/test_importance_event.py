@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import signal
+from pathlib import Path
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -21,13 +22,14 @@ from blitzgs.population.lineage import ABOUT, Cause
 from blitzgs.population.lineage_parts import read_lineage
 from blitzgs.population.spawn_gate import GateError, GateInfo, RandomVeto, info_path
 from blitzgs.training import run_files, run_log
+from blitzgs.training.batches import PhotographError
 from blitzgs.training.events import importance
 from blitzgs.training.guard import ModelLostError
 from blitzgs.training.spawn_gate import life_fields, reasons_against
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training import tiny_runs
-from tests.training.tiny import tiny_config, tiny_scene
+from tests.training.tiny import Images, tiny_config, tiny_scene
 from tests.training.tiny_runs import assert_same_table, events_of, read_log, stop_at
 
 # Density events at 20, 40, 60 and 80; the passes after those at 40 and 80.
@@ -203,6 +205,20 @@ def test_lineage_of_a_run_that_was_stopped_adds_up(tmp_path, monkeypatch):
     assert causes[Cause.SPLIT] + causes.get(Cause.OPACITY, 0) > 0
     ledger = trainer.state.progress.ledger
     assert ledger["births"] == len(births) and ledger["deaths"] == len(deaths)
+
+
+def test_lineage_of_a_run_that_was_saved_before_its_first_step_adds_up(tmp_path, monkeypatch):
+    """The first Gaussians were logged before a photograph could not be read, and stay logged."""
+    pytest.importorskip("pyarrow")
+    monkeypatch.setattr(Images, "get", lambda self, index: Path("/photos/00.png").read_bytes())
+    with pytest.raises(PhotographError, match="put the photograph back"):
+        train(tmp_path, "population.lineage=true")
+    monkeypatch.undo()
+    trainer, _ = train(tmp_path, "population.lineage=true", resume=True)
+    tables = read_lineage(tmp_path / run_files.LINEAGE)
+    births, deaths = tables["births"]["id"], tables["deaths"]["id"]
+    assert sorted(set(births) - set(deaths)) == sorted(trainer.state.table["id"].tolist())
+    assert len(births) == trainer.state.progress.ledger["births"]
 
 
 def require_vetoes_from_60(folder):
