@@ -18,6 +18,7 @@ from blitzgs.population.gate_evaluation import correlation, region_rates, surviv
 from blitzgs.population.gate_fit import read_spawns
 from blitzgs.population.spawn_samples import read_sample
 from blitzgs.scene.colmap import read_model, write_model
+from blitzgs.training.config_io import save_config
 from blitzgs.training.gate_replay import OracleVeto, branch_point, event_keys, label_events
 from tests.population.test_spawn_gate import candidates, spawns
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, tiny_config, write_tiny_capture
@@ -318,6 +319,24 @@ def test_a_run_without_a_view_to_measure_is_not_replayed(lineage_run, tmp_path, 
     assert main(["gate", "replay", gate, run, "--data", str(capture), "--out", str(out)]) == 1
     assert "its arms could not be compared, because the views" in capsys.readouterr().err
     assert not out.exists()
+
+
+@pytest.mark.parametrize("resident_gb", [0.0, 0.5])
+def test_the_ranks_of_a_replay_can_send_tables_that_are_on_the_host(
+    lineage_run, tmp_path, monkeypatch, resident_gb
+):
+    run, gate, asked = tmp_path / "run", str(tmp_path / "g.json"), {}
+
+    def joined(*_, **options):
+        asked.update(options)
+        raise ValueError("joined")
+
+    assert main(["gate", "fit", str(lineage_run / "run"), "--out", gate]) == 0
+    run.mkdir()
+    save_config(tiny_config(f"memory.resident_gb={resident_gb}"), run / "config.yaml")
+    monkeypatch.setattr(Ranks, "from_environment", joined)
+    assert main(["gate", "replay", gate, str(run), "--out", str(tmp_path / "out")]) == 1
+    assert asked["tables_on_host"] == (resident_gb > 0)
 
 
 def test_a_run_that_ends_before_the_gate_is_not_replayed(tmp_path):
