@@ -11,6 +11,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import Views
 from blitzgs.population.scale_floor import FLOOR, raise_scales, scale_floors
+from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
 from tests.training.tiny import random_gaussians, tiny_cameras, tiny_config, tiny_scene
 
@@ -85,3 +86,13 @@ def test_no_scale_falls_below_the_floor_in_a_run(tmp_path, batch_size):
     born = table["birth"] > 20
     assert born.any() and (floors[born] > -80).any()
     assert GaussianTable(table.columns)[FLOOR] is floors
+
+
+def test_the_first_density_event_of_a_compressed_schedule_finds_the_floors(tmp_path):
+    # Events are less than an image apart, so the time of an event in images does not tell its number.
+    options = ("schedule.scale=0.3", "schedule.densify_from=5", "schedule.densify_every=3", "log.pictures=0")
+    config = tiny_config(*options, "model.scale_floor=0.447", "population.max_gaussians=400")
+    trainer = Trainer(config, *tiny_scene(), tmp_path, Ranks())
+    densify.run(trainer.state, trainer.state.schedule.events(0, 2)[0])
+    assert (trainer.state.table[FLOOR] > -80).any()
+    trainer.close()

@@ -124,6 +124,8 @@ def find_floors(state: TrainingState) -> None:
 
 def _finds_floors(state: TrainingState, time: int) -> bool:
     """Tell whether a density event recomputes the floors of scales: the first does, and then every tenth."""
+    if FLOOR not in state.table:
+        return True  # the times of a much compressed schedule are too coarse to number its events
     schedule, unscaled = state.config.schedule, state.schedule.pace.time(time)
     count = round((unscaled - schedule.densify_from) / schedule.densify_every)
     return count % 10 == 0
