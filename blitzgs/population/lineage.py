@@ -20,6 +20,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -81,11 +82,13 @@ class Ledger:
         births: number of births.
         deaths: number of deaths.
         id_sum: sum of the hashed ids of births less that of deaths, modulo 2^64, as a signed integer.
+        parts: number of parts that each rank has written, the largest of all ranks; 0 in old checkpoints.
     """
 
     births: int = 0
     deaths: int = 0
     id_sum: int = 0
+    parts: int = 0
 
 
 class Lineage:
@@ -99,7 +102,7 @@ class Lineage:
         Args:
             folder: folder of the parts of all ranks, made if missing.
             ranks: the job.
-            step: optimiser step of the checkpoint; parts of later steps are deleted.
+            step: optimiser step of the checkpoint; parts that were written later are deleted.
             ledger: ledger of the checkpoint. One without births begins a log: all parts are deleted.
             about: description of the run, for the file `ABOUT`.
 
@@ -112,8 +115,7 @@ class Lineage:
             folder.mkdir(parents=True, exist_ok=True)
             for path in list(folder.iterdir()):
                 name = PART_NAME.fullmatch(path.name)
-                # A checkpoint of step 0, before the first photograph, has parts of its own.
-                if path.name.startswith(".") or (name and (ledger.births == 0 or int(name[2]) > step)):
+                if path.name.startswith(".") or (name and _is_later(name, step, ledger)):
                     path.unlink()
             self.describe(about or {})
         ranks.barrier()
@@ -121,7 +123,9 @@ class Lineage:
         self._births = self._deaths = 0
         self._id_sum = torch.zeros((), dtype=torch.int64, device=ranks.device)
         self._pending: dict[str, list[tuple[Tensor, ...]]] = {table: [] for table in TABLES}
-        self._rows, self._parts = 0, 0
+        # The events that a stop kept from happening write parts of the checkpoint's step, beside those of the
+        # events before the stop.
+        self._rows, self._parts = 0, ledger.parts
 
     def describe(self, about: dict[str, Any]) -> None:
         """Write the description of the run to the file `ABOUT`; one rank calls this."""
@@ -161,9 +165,11 @@ class Lineage:
             OSError: on every rank, when one could not write a part; a later call tries that part again.
         """
         self.flush(step)
-        problems = [text for part in self._ranks.all_gather_object(self._writer.finish()) for text in part]
+        found = self._ranks.all_gather_object((self._writer.finish(), self._parts))
+        problems = [text for part, _ in found for text in part]
         if problems:
             raise OSError(f"the lineage could not be written: {problems[0]}")
+        self._parts = max(parts for _, parts in found)
         device = self._id_sum.device
         counts = torch.tensor([self._births, self._deaths, len(ids)], device=device)
         hashes = torch.stack((self._id_sum, hash_keys(ids).sum().to(device)))
@@ -174,6 +180,7 @@ class Lineage:
             self.ledger.births + births,
             self.ledger.deaths + deaths,
             _wrapped(self.ledger.id_sum + change),
+            self._parts,
         )
         if ledger.births - ledger.deaths != live or ledger.id_sum != id_sum:
             raise LineageError(
@@ -233,6 +240,14 @@ def ledger_of(state: dict[str, int] | None) -> Ledger:
 def ledger_state(ledger: Ledger) -> dict[str, int]:
     """Return a ledger for a checkpoint."""
     return dataclasses.asdict(ledger)
+
+
+def _is_later(name: re.Match[str], step: int, ledger: Ledger) -> bool:
+    """Tell whether a part was written after the checkpoint of `step` that has this ledger."""
+    its_step, number = int(name[2]), int(name[4])
+    if ledger.births == 0 or its_step > step:
+        return True
+    return its_step == step and 0 < ledger.parts <= number
 
 
 def _wrapped(value: int) -> int:

@@ -21,7 +21,7 @@ from blitzgs.ops.host import current_stream
 from blitzgs.output import new_file
 from blitzgs.population.candidates import FEATURES
 
-PART_NAME = re.compile(r"(births|deaths)_(\d{8})_(\d{4})_(\d{4})\.parquet")
+PART_NAME = re.compile(r"(births|deaths)_(\d{8})_(\d{4})_(\d{4,})\.parquet")
 # The columns of each table. Those of one dtype are the rows of one tensor [columns, M], a group.
 TABLES: dict[str, tuple[tuple[str, ...], ...]] = {
     "births": (("id", "parent"), ("x", "y", "z", *FEATURES)),  # int64, float32

@@ -130,6 +130,23 @@ def test_ledger_matches_the_log_after_random_events(data, tmp_path_factory):
         assert live(folder)[0].tolist() == sorted(alive)
 
 
+def test_events_that_a_stop_kept_from_happening_are_logged_beside_those_of_the_same_step(tmp_path):
+    lineage = Lineage(tmp_path, Ranks(), 0, Ledger())
+    lineage.born(some([1, 2]), 3)
+    ledger = lineage.flush_and_check(torch.tensor([1, 2]), 3)
+    lineage.close()
+    for first in (7, 3):  # the first of two resumed processes is killed after it has written a part
+        lineage = Lineage(tmp_path, Ranks(), 3, ledger)
+        lineage.born(some([first, first + 1]), 3)
+        if first == 7:
+            lineage.died(torch.tensor([2]), torch.tensor([Cause.SIZE]), 10, 3)
+            lineage.flush(3)
+        else:
+            lineage.flush_and_check(torch.tensor([1, 2, 3, 4]), 3)
+        lineage.close()
+    assert live(tmp_path)[0].tolist() == [1, 2, 3, 4]
+
+
 @pytest.mark.parametrize(
     ("ids", "message"),
     [
