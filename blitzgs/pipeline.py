@@ -233,19 +233,19 @@ def forward_once(
             )
             zeros = allocated if zeros is None else None
         mark("raster")
-        counts = exchange.finish()
-    if counts is None:
+        result = exchange.finish()
+    if result is None:
         return None
     renders, transmittances, last_ids, tile_work, packed_splats, tile_order = composited
     return Frame(
         views=views,
         options=options,
-        projected=counts.projected,
-        splats=counts.splats,
+        projected=result.projected,
+        splats=result.splats,
         assignment=assignment,
-        way_back=counts.way_back,
-        traffic=counts.traffic,
-        visible=counts.visible,
+        way_back=result.way_back,
+        traffic=result.traffic,
+        visible=result.visible,
         active=active,
         backgrounds=backgrounds,
         isect_splats=isect_splats,
@@ -256,7 +256,7 @@ def forward_once(
         tile_work=tile_work,
         packed_splats=packed_splats,
         tile_order=tile_order,
-        gradients=GradientBuffer(zeros, None if counts.way_back is None else counts.way_back.cleared_table),
+        gradients=GradientBuffer(zeros, None if result.way_back is None else result.way_back.cleared_table),
     )
 
 

@@ -72,11 +72,11 @@ def survey(
                 *geometry, splats.depths, splats.camera_ids, splats.ids, grid, n_isects, n_splats, True
             )
             sums = torch.ops.blitzgs.contributions(*geometry, *lists, grid, n_splats, squares)
-            counts = exchange.finish()
-    assert counts is not None  # or there would be another attempt
-    columns = [column[: len(counts.splats.depths)] for column in (sums if squares else sums[:2])]
-    if counts.way_back is not None:
-        returned = counts.way_back.return_sums(torch.stack([column.long() for column in columns], 1))
+            result = exchange.finish()
+    assert result is not None  # or there would be another attempt
+    columns = [column[: len(result.splats.depths)] for column in (sums if squares else sums[:2])]
+    if result.way_back is not None:
+        returned = result.way_back.return_sums(torch.stack([column.long() for column in columns], 1))
         weights, pixels, *rest = (column.contiguous() for column in returned.unbind(1))
         columns = [weights, pixels.int(), *rest]
-    return Survey(counts.projected, *columns)
+    return Survey(result.projected, *columns)

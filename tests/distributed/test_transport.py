@@ -213,26 +213,26 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
             exchange = transport.project_and_send(inputs, assignment, attempt)
             arrived, table = exchange.arrived, exchange.gradient_table
             assert arrived.n_isects > 0 and len(arrived.splats.ids) >= len(table)
-            counts = exchange.finish()
-            assert (counts is None) != attempt.fits
-        return counts, attempt.needed
+            result = exchange.finish()
+            assert (result is None) != attempt.fits
+        return result, attempt.needed
 
-    counts, needed = finished()
+    result, needed = finished()
     assert alone.memory.generation == 2  # the first attempt had too small a capacity
-    assert len(alone.memory.buffers[0]) >= len(counts.projected.depths) * WORDS_PER_SPLAT
+    assert len(alone.memory.buffers[0]) >= len(result.projected.depths) * WORDS_PER_SPLAT
     projected = project_splats(inputs)
-    assert all(torch.equal(a, b) for a, b in zip(counts.projected[:11], projected[:11], strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(result.projected[:11], projected[:11], strict=True))
     masks = masks_by_lists(projected, 1)
-    assert torch.equal(counts.splats.means2d, projected.means2d[masks == 1])
-    table = counts.way_back.cleared_table()
+    assert torch.equal(result.splats.means2d, projected.means2d[masks == 1])
+    table = result.way_back.cleared_table()
     table.copy_(torch.arange(table.numel()).view_as(table))
-    returned = counts.way_back.return_gradients(SplatGradients([table]))
+    returned = result.way_back.return_gradients(SplatGradients([table]))
     sums = sum_of_ranks(returned, len(projected.depths))
     assert torch.equal(sums[masks == 1], table) and not sums[masks == 0].any()
     later, _ = finished()
     later.way_back.check_still_valid()
     with pytest.raises(RuntimeError, match="a later exchange has overwritten"):
-        counts.way_back.check_still_valid()
+        result.way_back.check_still_valid()
     # One entry more than the capacity: the frame is repeated with a larger capacity.
     short = CapacityEstimate(Sizes(1, 1, needed[2] - 1))
     again = PeerTransport(alone, short)
@@ -276,8 +276,8 @@ def test_a_transport_that_does_not_serve_the_job_says_so():
 
 
 def test_one_rank_needs_no_way_back():
-    counts = LocalTransport().project_and_send(scene(), None, Attempt(None)).finish()
-    assert counts.way_back is None and counts.traffic is None
+    result = LocalTransport().project_and_send(scene(), None, Attempt(None)).finish()
+    assert result.way_back is None and result.traffic is None
 
 
 def test_a_frame_that_did_not_fit_is_rendered_again_but_not_for_ever():

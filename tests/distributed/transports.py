@@ -8,7 +8,7 @@ from torch import Tensor
 
 from blitzgs.distributed.shared_memory import Shared
 from blitzgs.distributed.tiles import TileAssignment
-from blitzgs.distributed.transport.protocol import Exchange, HostCounts, Mark, Transport, unmarked
+from blitzgs.distributed.transport.protocol import Exchange, ExchangeResult, Mark, Transport, unmarked
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.projection_types import ProjectionInputs
 
@@ -50,15 +50,15 @@ class RecordingExchange:
         self._transport, self._inner, self._attempt = transport, inner, attempt
         self.arrived, self.gradient_table = inner.arrived, inner.gradient_table
 
-    def finish(self) -> HostCounts | None:
+    def finish(self) -> ExchangeResult | None:
         """See `Exchange.finish`."""
         self._transport.calls.append(("finish", None))
-        counts = self._inner.finish()
+        result = self._inner.finish()
         if self._transport.too_small > 0:
             self._transport.too_small -= 1
             self._attempt.fits = False
             return None
-        return counts
+        return result
 
 
 class LoneMemory:

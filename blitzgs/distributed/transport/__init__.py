@@ -10,7 +10,7 @@ from blitzgs.distributed.transport.peer import PeerTransport
 from blitzgs.distributed.transport.protocol import (
     Arrived,
     Exchange,
-    HostCounts,
+    ExchangeResult,
     Mark,
     Traffic,
     Transport,
@@ -22,7 +22,7 @@ __all__ = [
     "Arrived",
     "CollectiveTransport",
     "Exchange",
-    "HostCounts",
+    "ExchangeResult",
     "LocalTransport",
     "Mark",
     "PeerTransport",

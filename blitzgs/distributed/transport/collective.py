@@ -9,7 +9,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.tiles import TileAssignment
-from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, Traffic, unmarked
+from blitzgs.distributed.transport.protocol import Arrived, ExchangeResult, Mark, Traffic, unmarked
 from blitzgs.distributed.transport.way_back import CollectiveWayBack
 from blitzgs.ops.capacity import Attempt, CapacityEstimate
 from blitzgs.ops.host import to_host
@@ -91,15 +91,15 @@ class CollectiveExchange:
         self.gradient_table: Tensor | None = None
         # After rounding, splats may touch a few more tiles.
         self.arrived = Arrived(splats, None, traffic.n_isects if codec is None else -1)
-        self._counts: HostCounts | None = None
+        self._result: ExchangeResult | None = None
         if attempt.fits:
             way_back = CollectiveWayBack(ranks, traffic, places, half=codec is not None)
-            self._counts = HostCounts(own, splats, visible, traffic, way_back)
+            self._result = ExchangeResult(own, splats, visible, traffic, way_back)
         mark("exchange")
 
-    def finish(self) -> HostCounts | None:
+    def finish(self) -> ExchangeResult | None:
         """See `Exchange.finish`; the host has known all numbers since the splats were sent."""
-        return self._counts
+        return self._result
 
 
 class HalfCodec:

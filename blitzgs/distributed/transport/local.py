@@ -6,7 +6,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from blitzgs.distributed.tiles import TileAssignment
-from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, unmarked
+from blitzgs.distributed.transport.protocol import Arrived, ExchangeResult, Mark, unmarked
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.host import HostCopy
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs
@@ -51,7 +51,7 @@ class LocalExchange:
         self.gradient_table: Tensor | None = None
         mark("exchange")
 
-    def finish(self) -> HostCounts | None:
+    def finish(self) -> ExchangeResult | None:
         """See `Exchange.finish`."""
         needed = Sizes(*self._copy.read()[:VIEW_TOTALS].tolist())
         fits = self._capacity is None or self._capacity.holds(needed)
@@ -59,4 +59,4 @@ class LocalExchange:
         if not fits:
             return None  # the splats are undefined
         own = self._projected.first(needed)
-        return HostCounts(own.splats, own.composited, self._visible, None, None)
+        return ExchangeResult(own.splats, own.composited, self._visible, None, None)

@@ -45,7 +45,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.tiles import TileAssignment
-from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, Traffic, unmarked
+from blitzgs.distributed.transport.protocol import Arrived, ExchangeResult, Mark, Traffic, unmarked
 from blitzgs.distributed.transport.way_back import PeerWayBack
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.host import current_stream
@@ -179,7 +179,7 @@ class PeerExchange:
         self.gradient_table: Tensor | None = buffers.tables[ranks.rank]
         mark("exchange")
 
-    def finish(self) -> HostCounts | None:
+    def finish(self) -> ExchangeResult | None:
         """See `Exchange.finish`."""
         traffic, sizes = self._read(), self._attempt.sizes
         fits = traffic.most <= self._buffers.length
@@ -194,7 +194,7 @@ class PeerExchange:
             self._ranks, self._memory, self._generation, self._buffers.tables, traffic,
             self._places[: runs_of(traffic.own.splats)],
         )  # fmt: skip
-        return HostCounts(splats_of(self._own, traffic.own), composited, visible, traffic, way_back)
+        return ExchangeResult(splats_of(self._own, traffic.own), composited, visible, traffic, way_back)
 
     def _read(self) -> Traffic:
         """Wait for the counts of all ranks."""

@@ -7,9 +7,9 @@ frame, on every rank::
 
     exchange = transport.project_and_send(inputs, assignment, attempt, mark)
     exchange.arrived, exchange.gradient_table                # for compositing
-    counts = exchange.finish()                               # None: the capacity was too small
-    counts.way_back.check_still_valid()                      # before the backward pass of compositing
-    gradients = counts.way_back.return_gradients(gradients)  # gradients of this rank's own splats
+    result = exchange.finish()                               # None: the capacity was too small
+    result.way_back.check_still_valid()                      # before the backward pass of compositing
+    gradients = result.way_back.return_gradients(gradients)  # gradients of this rank's own splats
 
 The last two may be repeated. `local`, `collective` and `peer` each have one transport; `way_back` returns the
 gradients for the last two.
@@ -101,8 +101,8 @@ class Arrived(NamedTuple):
     n_isects: int
 
 
-class HostCounts(NamedTuple):
-    """The result of an exchange, when the host knows all numbers.
+class ExchangeResult(NamedTuple):
+    """The splats after an exchange, cut to their numbers, which the host knows by now.
 
     Attributes:
         projected: this rank's own splats, only valid ones.
@@ -131,11 +131,11 @@ class Exchange(Protocol):
     arrived: Arrived
     gradient_table: Tensor | None
 
-    def finish(self) -> HostCounts | None:
+    def finish(self) -> ExchangeResult | None:
         """Wait for the numbers and end the attempt.
 
         Returns:
-            The counts; None if the capacity was too small and the frame must be started again.
+            The result; None if the capacity was too small and the frame must be started again.
         """
 
 
