@@ -276,7 +276,7 @@ def inputs_of(
 
 def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> list[int]:
     """Return the grid of tiles and this rank's range of it, as the ops take them."""
-    tiles = (0, -1) if assignment is None else assignment.composited
+    tiles = (0, -1) if assignment is None else assignment.composited_tiles
     return [len(views), views.width, views.height, options.tile_size, *tiles]
 
 
@@ -301,7 +301,7 @@ def backward_splats(
         RuntimeError: the ranks share memory, and a later frame has overwritten this frame's splats.
     """
     views, options, splats, way_back = frame.views, frame.options, frame.splats, frame.way_back
-    tiles = (0, -1) if frame.assignment is None else frame.assignment.tiles
+    tiles = (0, -1) if frame.assignment is None else frame.assignment.own_tiles
     forward_pass = RasterizeForward(
         [splats.means2d, splats.conics, splats.opacities, splats.colors],
         frame.backgrounds,

@@ -102,15 +102,15 @@ class TileAssignment:
     Attributes:
         ranks: the job; all its ranks render together.
         ranges: the tiles of each rank.
-        tiles: this rank's own [first, one past last) tile.
-        composited: the [first, one past last) tile that this rank composites: its own and the halo around
-            them.
-        all_composited: `composited` of every rank.
+        own_tiles: this rank's own [first, one past last) tile.
+        composited_tiles: the [first, one past last) tile that this rank composites: its own and the halo
+            around them.
+        composited_by_rank: `composited_tiles` of every rank.
     """
 
     def __init__(self, ranks: Ranks, ranges: TileRanges) -> None:
         """Compute which tiles each rank composites."""
         self.ranks, self.ranges = ranks, ranges
-        self.tiles = ranges.of(ranks.rank)
-        self.all_composited = [ranges.composited(rank) for rank in range(ranks.world_size)]
-        self.composited = self.all_composited[ranks.rank]
+        self.own_tiles = ranges.of(ranks.rank)
+        self.composited_by_rank = [ranges.composited(rank) for rank in range(ranks.world_size)]
+        self.composited_tiles = self.composited_by_rank[ranks.rank]

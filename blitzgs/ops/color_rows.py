@@ -36,8 +36,8 @@ def colored_rows(
         splats: those of `tables`. Splats whose colour is not finite are hidden in place.
         tables: the inputs of the projection, without SH.
         sh: the SH of all Gaussians in parts, [N, L, 3] each; empty: the splats have no colours.
-        totals: `Projected.totals` if the splats have spare capacity (CUDA); the contents of the results are
-            undefined if they do not fit it.
+        totals: `ProjectionOutputs.totals` if the splats have spare capacity (CUDA); the contents of the
+            results are undefined if they do not fit it.
 
     Returns:
         The splats with colours, and the rows, both of the capacity of `splats`.

@@ -17,7 +17,7 @@ from blitzgs.ops.capacity import Sizes
 
 # Largest number of views of one launch (kMaxViews of csrc/common/kernel.h): an int32 has a bit for each.
 MOST_VIEWS = 32
-# Where the splats of the views begin in `Projected.totals` (kTotalViews of csrc/project/project.h).
+# Where the splats of the views begin in `ProjectionOutputs.totals` (kTotalViews of csrc/project/project.h).
 VIEW_TOTALS = 4
 
 
@@ -182,7 +182,7 @@ class ProjectionInputs(NamedTuple):
         """The number of views B."""
         return self.cameras[0].shape[0]
 
-    def run(self, capacity: Sizes | None, rank_tiles: Sequence[tuple[int, int]] = ()) -> Projected:
+    def run(self, capacity: Sizes | None, rank_tiles: Sequence[tuple[int, int]] = ()) -> ProjectionOutputs:
         """Project the Gaussians, without gradients.
 
         Args:
@@ -201,10 +201,10 @@ class ProjectionInputs(NamedTuple):
             self.ids,
             self.level,
         )
-        return Projected(ProjectedSplats._make((*columns, None)), splat_ids, totals)
+        return ProjectionOutputs(ProjectedSplats._make((*columns, None)), splat_ids, totals)
 
 
-class Projected(NamedTuple):
+class ProjectionOutputs(NamedTuple):
     """What `ProjectionInputs.run` returns.
 
     Attributes:
@@ -226,7 +226,7 @@ class Projected(NamedTuple):
         return self.totals[1:2]
 
     @property
-    def composited(self) -> Splats:
+    def for_compositing(self) -> Splats:
         """Return the columns that compositing reads; without SH, the conics stand in for the colours.
 
         A transport sends every column, so each needs a row for every splat.
@@ -235,6 +235,6 @@ class Projected(NamedTuple):
         colors = s.colors if s.colors.shape[0] == s.conics.shape[0] else s.conics
         return Splats(s.means2d, s.conics, s.opacities, colors, s.depths, s.camera_ids, self.ids)
 
-    def first(self, sizes: Sizes) -> Projected:
+    def first(self, sizes: Sizes) -> ProjectionOutputs:
         """Return only the valid splats, with their `counts`; `sizes` has the numbers in `totals`."""
-        return Projected(splats_of(self.splats, sizes), self.ids[: sizes.splats], self.totals)
+        return ProjectionOutputs(splats_of(self.splats, sizes), self.ids[: sizes.splats], self.totals)

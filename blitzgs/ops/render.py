@@ -16,9 +16,9 @@ from blitzgs.ops.host import HostCopy
 from blitzgs.ops.project import TableRows, capacity_for
 from blitzgs.ops.projection_types import (
     VIEW_TOTALS,
-    Projected,
     ProjectedSplats,
     ProjectionInputs,
+    ProjectionOutputs,
     first_rows,
     lengths_of,
 )
@@ -115,7 +115,7 @@ def render_queued(
 
 
 def _colored(
-    projected: Projected, inputs: ProjectionInputs, tables: ShTables, spare: bool
+    projected: ProjectionOutputs, inputs: ProjectionInputs, tables: ShTables, spare: bool
 ) -> tuple[ProjectedSplats, VisibleRows]:
     """Colour splats from the tables' rows; spare: whether the splats may have spare capacity."""
     splats, totals = projected.splats, projected.totals if spare else None

@@ -79,7 +79,7 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, extent: float) ->
         batch.masks,
         *_weights(config.ssim, count, batch.samples.device),
         frame.options.tile_size,
-        *((0, -1) if assignment is None else assignment.tiles),
+        *((0, -1) if assignment is None else assignment.own_tiles),
         samples=batch.samples,
         visible=frame.visible,
         scale_weight=config.scale / (extent * config.scale_reference * count),

@@ -39,7 +39,7 @@ class Rank:
         splats, _, totals = projected
         assert torch.equal(totals, self.totals)
         places, plan = ops.send_splats_(
-            list(projected.composited), splats.rank_masks, everyone, self.number, buffers, capacity
+            list(projected.for_compositing), splats.rank_masks, everyone, self.number, buffers, capacity
         )
         sizes, rest = Sizes(*totals[:3].tolist()), everyone[:, VIEW_TOTALS + VIEWS :]
         most = max(everyone[:, 1].max(), rest[:, ::2].sum(0).max(), rest[:, ::2].sum(1).max())
@@ -73,7 +73,7 @@ def test_splats_arrive_and_their_gradients_are_found(counts, slack):
         wanted = []
         for rank, splats in zip(ranks, expected, strict=True):
             here = (splats[11] >> m & 1).bool()
-            columns = rank.projected.composited
+            columns = rank.projected.for_compositing
             part = [column[here] for column in columns]
             order = (part[6] * VIEWS + part[5]).argsort()
             wanted.append([column[order] for column in part])
@@ -113,7 +113,7 @@ def test_send_refuses_columns_below_the_capacity():
     projected = rank.inputs.run(Sizes(64, 63, 0), RANGES)
     with pytest.raises(RuntimeError, match="columns must have room for 64 splats, got 63"):
         ops.send_splats_(
-            list(projected.composited), projected.splats.rank_masks, rank.totals[None], 0,
+            list(projected.for_compositing), projected.splats.rank_masks, rank.totals[None], 0,
             [torch.zeros(WORDS_PER_SPLAT * 64, dtype=torch.int32, device="cuda")], 64,
         )  # fmt: skip
 

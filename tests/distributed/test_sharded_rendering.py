@@ -90,7 +90,7 @@ def _render(ranks):
         image, tile_work = frame.renders.clone(), frame.tile_work
         if ranges is not None:
             collect_images(image, ranges, ranks, 0)
-            tile_work = tile_work[slice(*assignment.tiles)]
+            tile_work = tile_work[slice(*assignment.own_tiles)]
         targets, masks, samples = photographs(n_views)
         if ranges is not None:
             for view, (y0, y1) in enumerate(ranges.pixel_rows(ranks.rank)):  # it did not get the other pixels
@@ -107,8 +107,8 @@ def _render(ranks):
         dense = [torch.zeros_like(column) for column in table.parameters]
         for column, gradient in zip(dense, gradients, strict=True):
             column[frame.projected.visible_ids.long()] = gradient
-        tiles = (0, len(frame.tile_work)) if assignment is None else assignment.tiles
-        composited = tiles if assignment is None else assignment.composited
+        tiles = (0, len(frame.tile_work)) if assignment is None else assignment.own_tiles
+        composited = tiles if assignment is None else assignment.composited_tiles
         out.append(
             {
                 "image": image.cpu(),
@@ -179,7 +179,7 @@ def _render_plain(ranks):
     with pytest.raises(ValueError, match="the loss reads 10 px beyond"):
         loss_terms(frame, Batch([0, 1, 2], views, *photographs(3), ranges), LOSS, EXTENT)
     collect_images(frame.renders, ranges, ranks, 1)
-    return assignment.composited == ranges.of(ranks.rank), frame.renders
+    return assignment.composited_tiles == ranges.of(ranks.rank), frame.renders
 
 
 def test_rendering_without_a_loss_composites_no_halo():

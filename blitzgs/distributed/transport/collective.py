@@ -58,7 +58,7 @@ class CollectiveExchange:
         mark: Mark,
     ) -> None:
         """Project, exchange the numbers of splats, and send the splats."""
-        sizes, tiles, n_views = attempt.sizes, assignment.all_composited, assignment.ranges.n_views
+        sizes, tiles, n_views = attempt.sizes, assignment.composited_by_rank, assignment.ranges.n_views
         # Without sizes the projection waits for the device, which may still wait for other ranks.
         with ranks.watchdog.waiting("project"):
             projected = inputs.run(sizes, tiles)
@@ -78,7 +78,7 @@ class CollectiveExchange:
         attempt.end(needed, sizes is None or needed.blocks <= sizes.blocks)
         mark("project")
         projected = projected.first(needed)
-        own, sent = projected.splats, projected.composited
+        own, sent = projected.splats, projected.for_compositing
         shape = (sent.conics, sent.opacities, sent.colors)
         columns = [sent.means2d, sent.depths, sent.camera_ids, sent.ids]
         columns += [codec.encode(*shape)] if codec is not None else shape

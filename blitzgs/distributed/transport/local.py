@@ -41,7 +41,7 @@ class LocalExchange:
         self._attempt, self._capacity = attempt, attempt.sizes if inputs.gaussians[0].is_cuda else None
         self._projected = projected = inputs.run(self._capacity)
         self._visible = projected.totals[VIEW_TOTALS : VIEW_TOTALS + inputs.n_views]
-        splats = projected.composited
+        splats = projected.for_compositing
         self._copy = HostCopy(projected.totals)
         mark("project")
         if self._capacity is None:
@@ -59,4 +59,4 @@ class LocalExchange:
         if not fits:
             return None  # the splats are undefined
         own = self._projected.first(needed)
-        return ExchangeResult(own.splats, own.composited, self._visible, None, None)
+        return ExchangeResult(own.splats, own.for_compositing, self._visible, None, None)

@@ -162,12 +162,12 @@ class PeerExchange:
         self._n_views = inputs.n_views
         self._traffic: Traffic | None = None
         capacity = Sizes(buffers.length, buffers.length, 0)
-        projected = inputs.run(capacity, assignment.all_composited)
+        projected = inputs.run(capacity, assignment.composited_by_rank)
         self._own = projected.splats
         self._shared = memory.share(projected.totals)  # barrier A
         counted.record(current_stream(ranks.device))
         self._places, plan = torch.ops.blitzgs.send_splats_(
-            list(projected.composited), projected.splats.rank_masks, self._shared.everyone, ranks.rank,
+            list(projected.for_compositing), projected.splats.rank_masks, self._shared.everyone, ranks.rank,
             buffers.buffers, buffers.length,
         )  # fmt: skip
         memory.barrier()  # B

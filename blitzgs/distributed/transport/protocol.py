@@ -62,7 +62,7 @@ class Traffic(NamedTuple):
 
     @classmethod
     def of(cls, totals: list[list[int]], n_views: int, rank: int) -> Traffic:
-        """Read the numbers from every rank's `Projected.totals`."""
+        """Read the numbers from every rank's `ProjectionOutputs.totals`."""
         first = VIEW_TOTALS + n_views
         columns = list(zip(*totals, strict=True))  # columns[i][s] is number i of rank s
         _, owned, _, blocks = columns[:VIEW_TOTALS]  # as in `Sizes`
