@@ -89,7 +89,7 @@ def measure(scene: BenchmarkScene, length: int, repeats: int) -> list[dict[str, 
     splats = frame.splats
     grid = pipeline.tile_grid(batches[0].views, OPTIONS, None)
     shapes = (splats.means2d, splats.conics, splats.opacities)
-    lists = (frame.isect_splats, frame.tile_offsets)
+    lists = frame.saved.lists
 
     def composite() -> None:
         torch.ops.blitzgs.rasterize_fwd(*shapes, splats.colors, None, *lists, grid, False, False, None)

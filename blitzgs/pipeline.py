@@ -32,7 +32,7 @@ from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.capacity import Attempt
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions, Splats
-from blitzgs.ops.rasterize import RasterizeForward
+from blitzgs.ops.rasterize import RasterizeSaved
 from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients, absolute_column
 
 
@@ -120,16 +120,9 @@ class Frame(NamedTuple):
         traffic: numbers of splats sent between the ranks; None: none were sent.
         visible: int64 [B], Gaussians visible in each view, over all ranks; valid until the next exchange.
         active: rows that were considered, and the views of each; None: all.
-        backgrounds: [B, 3]; None: black.
-        isect_splats: int32 [I], indices of splats by tile, front to back.
-        tile_offsets: int64 [B * T + 1].
-        renders: [B, H, W, 3]; undefined, as `transmittances` and `last_ids` are, in pixels that only other
-            ranks composite.
-        transmittances: [B, H, W], weight of the background in each pixel.
-        last_ids: int32 [B, H, W], for the backward pass.
+        renders: [B, H, W, 3]; undefined in pixels that only other ranks composite.
         tile_work: int32 [B * T], list entries each composited tile went through.
-        packed_splats: uint8 [.., bytes], the splats as the backend's kernels read them.
-        tile_order: int32 [.., 16], in which order the backend's kernels took the tiles.
+        saved: the tensors that the backward pass of compositing reads.
         gradients: memory in which the gradients of the splats are summed.
     """
 
@@ -142,15 +135,9 @@ class Frame(NamedTuple):
     traffic: Traffic | None
     visible: Tensor
     active: ActiveRows | None
-    backgrounds: Tensor | None
-    isect_splats: Tensor
-    tile_offsets: Tensor
     renders: Tensor
-    transmittances: Tensor
-    last_ids: Tensor
     tile_work: Tensor
-    packed_splats: Tensor
-    tile_order: Tensor
+    saved: RasterizeSaved
     gradients: GradientBuffer
 
 
@@ -224,38 +211,40 @@ def forward_once(
         )
         mark("sort")
         arguments = (*geometry, splats.colors, backgrounds, isect_splats, tile_offsets, grid)
-        zeros = exchange.gradient_table
-        if zeros is not None and backward_follows:
-            composited = torch.ops.blitzgs.rasterize_fwd_packed_(*arguments, zeros, n_splats)
+        gradient_table = exchange.gradient_table
+        if gradient_table is not None and backward_follows:
+            composited = torch.ops.blitzgs.rasterize_fwd_packed_(*arguments, gradient_table, n_splats)
+            zeros = gradient_table
         else:
-            *composited, allocated = torch.ops.blitzgs.rasterize_fwd(
+            *composited, zeros = torch.ops.blitzgs.rasterize_fwd(
                 *arguments, False, backward_follows, n_splats
             )
-            zeros = allocated if zeros is None else None
+            if gradient_table is not None:
+                zeros = None  # the gradients must be in this table, which the backward pass then zeroes
         mark("raster")
         result = exchange.finish()
     if result is None:
         return None
     renders, transmittances, last_ids, tile_work, packed_splats, tile_order = composited
+    splats = result.splats
     return Frame(
         views=views,
         options=options,
         projected=result.projected,
-        splats=result.splats,
+        splats=splats,
         assignment=assignment,
         way_back=result.way_back,
         traffic=result.traffic,
         visible=result.visible,
         active=active,
-        backgrounds=backgrounds,
-        isect_splats=isect_splats,
-        tile_offsets=tile_offsets,
         renders=renders,
-        transmittances=transmittances,
-        last_ids=last_ids,
         tile_work=tile_work,
-        packed_splats=packed_splats,
-        tile_order=tile_order,
+        saved=RasterizeSaved(
+            [splats.means2d, splats.conics, splats.opacities, splats.colors],
+            backgrounds,
+            [isect_splats, tile_offsets],
+            [transmittances, last_ids, packed_splats, tile_order],
+        ),
         gradients=GradientBuffer(zeros, None if result.way_back is None else result.way_back.cleared_table),
     )
 
@@ -275,7 +264,7 @@ def inputs_of(
 
 
 def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> list[int]:
-    """Return the grid of tiles and this rank's range of it, as the ops take them."""
+    """Return the grid of tiles, and the range of them that this rank composites, as the ops take both."""
     tiles = (0, -1) if assignment is None else assignment.composited_tiles
     return [len(views), views.width, views.height, options.tile_size, *tiles]
 
@@ -300,26 +289,20 @@ def backward_splats(
     Raises:
         RuntimeError: the ranks share memory, and a later frame has overwritten this frame's splats.
     """
-    views, options, splats, way_back = frame.views, frame.options, frame.splats, frame.way_back
+    views, options, way_back = frame.views, frame.options, frame.way_back
     tiles = (0, -1) if frame.assignment is None else frame.assignment.own_tiles
-    forward_pass = RasterizeForward(
-        [splats.means2d, splats.conics, splats.opacities, splats.colors],
-        frame.backgrounds,
-        [frame.isect_splats, frame.tile_offsets],
-        [frame.transmittances, frame.last_ids, frame.packed_splats, frame.tile_order],
-    )
     grid = [len(views), views.width, views.height, options.tile_size, *tiles]
     if way_back is not None:
         way_back.check_still_valid()
     if v_renders.is_cuda:
-        packed = frame.gradients.take(splats.means2d)
+        packed = frame.gradients.take(frame.splats.means2d)
         torch.ops.blitzgs.rasterize_bwd_packed_(
-            *forward_pass, v_renders, grid, options.deterministic, packed, absolute
+            *frame.saved, v_renders, grid, options.deterministic, packed, absolute
         )
         gradients = SplatGradients([packed], None, absolute_column(packed) if absolute else None)
     else:
         *parts, v_abs = torch.ops.blitzgs.rasterize_bwd(
-            *forward_pass, v_renders, None, grid, absolute, options.deterministic
+            *frame.saved, v_renders, None, grid, absolute, options.deterministic
         )
         gradients = SplatGradients(parts, None, v_abs if absolute else None)
     mark("raster back")

@@ -21,14 +21,17 @@ rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
 _ONE = torch.ones((), device="cpu")
 
 
-class RasterizeForward(NamedTuple):
-    """The tensors of the forward pass that the ops of the backward pass take, in their groups.
+class RasterizeSaved(NamedTuple):
+    """The tensors that a forward pass saves for the ops of the backward pass, in the groups that these take.
 
     Attributes:
-        splats: means2d, conics, splat_opacities, colors.
+        splats: means2d [P, 2], conics [P, 3], splat_opacities [P], colors [P, D].
         backgrounds: [B, D]; None: black.
-        lists: isect_splats, tile_offsets.
-        composited: transmittances, last_ids, packed_splats, tile_order.
+        lists: isect_splats, int32 [I], the splats of each tile, front to back; tile_offsets, int64
+            [B * T + 1], where each tile's list begins.
+        composited: transmittances [B, H, W], the weight of the background in each pixel; last_ids, int32
+            [B, H, W], where each pixel's list ended; packed_splats and tile_order, the splats and the order
+            of the tiles in layouts that only the kernels of the backend read.
     """
 
     splats: list[Tensor]
@@ -230,12 +233,12 @@ def _save(ctx: Any, splats: Any, grid: Any, output: Sequence[Tensor]) -> None:
     ctx.grid = grid
 
 
-def _saved(ctx: Any) -> RasterizeForward:
+def _saved(ctx: Any) -> RasterizeSaved:
     """Return the tensors that `_save` saved. Call this once: checkpointing recomputes them each time."""
     means2d, conics, opacities, colors, backgrounds, isect_splats, tile_offsets, *composited = (
         ctx.saved_tensors
     )
-    return RasterizeForward(
+    return RasterizeSaved(
         [means2d, conics, opacities, colors], backgrounds, [isect_splats, tile_offsets], composited
     )
 
@@ -269,7 +272,7 @@ def _gradients(
 
 def _first_gradients(
     ctx: Any,
-    saved: RasterizeForward,
+    saved: RasterizeSaved,
     v_renders: Tensor | None,
     v_alphas: Tensor | None,
     absgrad: bool,

@@ -30,13 +30,8 @@ def test_packed_gradients_equal_those_from_columns(degree):
     v_renders = torch.randn_like(frame.renders)
     (packed,) = pipeline.backward_splats(frame, v_renders).parts
     assert packed.shape == (len(frame.splats.depths), 12)
-    projected, splats = frame.projected, frame.splats
-    *unpacked, _ = ops.rasterize_bwd(
-        [splats.means2d, splats.conics, splats.opacities, splats.colors], frame.backgrounds,
-        [frame.isect_splats, frame.tile_offsets],
-        [frame.transmittances, frame.last_ids, frame.packed_splats, frame.tile_order], v_renders, None,
-        [len(views), views.width, views.height, options.tile_size, 0, -1], False, True,
-    )  # fmt: skip
+    projected, grid = frame.projected, pipeline.tile_grid(views, options, None)
+    *unpacked, _ = ops.rasterize_bwd(*frame.saved, v_renders, None, grid, False, True)
     for x, y in zip(gradient_columns(packed), unpacked, strict=True):
         assert y.any() and torch.equal(x, y)
     scale_reg = torch.linspace(0.1, 0.3, 3, device="cuda")
@@ -135,6 +130,6 @@ def test_a_frame_without_splats_works_with_any_capacity():
     for sizes in (Sizes(10, 10, 10), Sizes(1, 1, 1), None):
         transport = LocalTransport(CapacityEstimate(sizes))
         frame = pipeline.forward(table, views, OPTIONS, transport=transport, backward_follows=True)
-        assert len(frame.projected.gaussian_ids) == 0 and (frame.transmittances == 1).all()
+        assert len(frame.projected.gaussian_ids) == 0 and (frame.saved.composited[0] == 1).all()
         v_renders = torch.ones_like(frame.renders)
         assert not any(g.any() for g in parameter_gradients(table, frame, v_renders))

@@ -5,7 +5,7 @@ import pytest
 import torch
 from cuda_scenes import Scene, ops, relative_error
 
-from blitzgs.ops.rasterize import RasterizeForward
+from blitzgs.ops.rasterize import RasterizeSaved
 from blitzgs.ops.splat_gradients import absolute_column
 
 # Where rounding decides whether a splat takes part, the images differ by up to about alpha = 1/255.
@@ -37,7 +37,7 @@ class Job:
     def saved(self, device, dtype, outputs):
         """What the backward pass takes of the forward pass."""
         *splats, backgrounds, isect_splats, tile_offsets = self.inputs(device, dtype)
-        return RasterizeForward(splats, backgrounds, [isect_splats, tile_offsets], kept_by(outputs))
+        return RasterizeSaved(splats, backgrounds, [isect_splats, tile_offsets], kept_by(outputs))
 
     def forward(self, device, dtype=torch.float32, backward_follows=False):
         return ops.rasterize_fwd(*self.inputs(device, dtype), self.grid, True, backward_follows)

@@ -158,7 +158,8 @@ def _hidden(ranks):
     for _ in range(4):
         frame = pipeline.forward(parts[0], views, OPTIONS, assignment=assignment, transport=transport)
         assert torch.equal(frame.renders[own], alone.renders[own])
-        assert torch.equal(frame.transmittances[own], alone.transmittances[own])
+        transmittances = [rendered.saved.composited[0][own] for rendered in (frame, alone)]
+        assert torch.equal(*transmittances)
     hidden = frame.projected.opacities == 0
     assert hidden.any() and not hidden.all()
     return True
