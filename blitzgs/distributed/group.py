@@ -106,19 +106,19 @@ class Ranks:
                 f"share_gpus is for the ranks of one host, but {local_world_size} of {world_size} are on this"
                 " one; leave it out, and start no more processes per node than it has GPUs"
             )
-        place, shared = resolve_device(device, local_rank, local_world_size, share_gpus)
-        if place.type == "cuda":
+        chosen, shared = resolve_device(device, local_rank, local_world_size, share_gpus)
+        if chosen.type == "cuda":
             _extend_memory_in_place()
         ranks = cls(
             rank=rank,
             world_size=world_size,
             local_world_size=local_world_size,
-            device=place,
+            device=chosen,
             timeout_seconds=timeout_seconds,
             shares_gpu=shared,
         )
-        if place.type == "cuda":
-            torch.cuda.set_device(place)
+        if chosen.type == "cuda":
+            torch.cuda.set_device(chosen)
         if world_size > 1:
             ranks._join(transport, tables_on_host)
         return ranks
@@ -312,24 +312,24 @@ def resolve_device(
         device = "cuda" if torch.cuda.is_available() else "cpu"
     if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
         raise ValueError(f"device must be auto, cpu, cuda or cuda:N, got {device!r}")
-    place = torch.device(device)
-    if place.type == "cpu":
-        return place, False
+    chosen = torch.device(device)
+    if chosen.type == "cpu":
+        return chosen, False
     count = torch.cuda.device_count()
     # All ranks of a host get the same argument `device`, with an index or without.
-    shared = share_gpus and local_world_size > (count if place.index is None else 1)
-    if place.index is None:
-        place = torch.device("cuda", local_rank % max(count, 1) if shared else local_rank)
+    shared = share_gpus and local_world_size > (count if chosen.index is None else 1)
+    if chosen.index is None:
+        chosen = torch.device("cuda", local_rank % max(count, 1) if shared else local_rank)
     if count == 0:
         built = "sees no GPU" if torch.version.cuda else f"({torch.__version__}) is built for CPUs alone"
         raise ValueError(
             f"device {device}: this torch {built}; install one with CUDA and check `nvidia-smi`, or use "
             "--device cpu"
         )
-    if place.index >= count:
+    if chosen.index >= count:
         raise ValueError(
-            f"local rank {local_rank} needs {place}, but this host has {count} CUDA devices; start fewer "
+            f"local rank {local_rank} needs {chosen}, but this host has {count} CUDA devices; start fewer "
             "processes per node (torchrun --nproc-per-node), use --device cpu or, for development, let ranks "
             "share GPUs (train: --ranks.share_gpus=true; eval and render: --share-gpus)"
         )
-    return place, shared
+    return chosen, shared

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.ops.host import PinnedPlace, current_stream
+from blitzgs.ops.host import PinnedNumbers, current_stream
 from blitzgs.ops.report import report_
 
 
@@ -49,13 +49,13 @@ class _Queued:
         self._tensors: tuple[Tensor | None, ...] = ()  # for __del__, if `take` raises an error
         # Powers of two, so that images of many sizes share few pieces of pinned memory.
         length = 1 << (words - 1).bit_length()
-        self._place = PinnedPlace.take(length, torch.float32, side.stream.device)
+        self._pinned = PinnedNumbers.take(length, torch.float32, side.stream.device)
         self._tensors = tensors
-        self.memory, self.written = self._place.memory[:words], self._place.written
+        self.memory, self.written = self._pinned.memory[:words], self._pinned.written
 
     def has_ended(self) -> None:
         """Release the memory: the host has waited for `written` and copied the numbers."""
-        self._place.give_back()
+        self._pinned.give_back()
         self._tensors = ()
 
     def __del__(self) -> None:

@@ -31,8 +31,8 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 
 T = TypeVar("T")
 MAX_PEERS = 16
-# Largest number of values that a rank may write for a barrier; there are two places for them, and for their
-# sums.
+# Largest number of values that a rank may write for a barrier; there is memory for two barriers, and for
+# their sums.
 MAX_VALUES = 256
 _LEAST_WORDS = 1 << 20
 LEAST_BOARD = 1 << 16
@@ -106,8 +106,8 @@ class SharedMemory:
             2, MAX_VALUES * self.world_size, dtype=torch.int64, pin_memory=control.is_cuda
         )
         self._boards: list[Tensor] = []
-        self._places: dict[tuple[int, int], list[Tensor]] = {}  # parts of the boards, by length and half
-        self._gathered: dict[tuple[int, int], Shared] = {}  # by number of values and place
+        self._board_parts: dict[tuple[int, int], list[Tensor]] = {}  # parts of the boards, by length and half
+        self._gathered: dict[tuple[int, int], Shared] = {}  # by number of values and half
 
     def map_symmetric(self, name: str, mine: Tensor) -> list[Tensor]:
         """Map every rank's counterpart of a symmetric tensor; collective."""
@@ -134,17 +134,17 @@ class SharedMemory:
         Args:
             values: int64 [n], n <= MAX_VALUES, the same n on all ranks.
         """
-        # Use the other place: a rank may have left the last barrier without having read its numbers yet.
-        place = self._shared % 2
+        # Use the other half: a rank may have left the last barrier without having read its numbers yet.
+        half = self._shared % 2
         self._shared += 1
         count, numbers = self.world_size, values.shape[0]
         # The sums are stored behind the numbers, always in the same words, where no other rank writes.
-        first = count + place * MAX_VALUES * (count + 1) + count * (MAX_VALUES - numbers)
-        if (numbers, place) not in self._gathered:
+        first = count + half * MAX_VALUES * (count + 1) + count * (MAX_VALUES - numbers)
+        if (numbers, half) not in self._gathered:
             words = self._control[self.rank][first : first + (count + 1) * numbers].view(count + 1, numbers)
-            host = self._host[place, : count * numbers].view(count, numbers)
-            self._gathered[numbers, place] = Shared(words[:count], words[count], host)
-        shared = self._gathered[numbers, place]
+            host = self._host[half, : count * numbers].view(count, numbers)
+            self._gathered[numbers, half] = Shared(words[:count], words[count], host)
+        shared = self._gathered[numbers, half]
         self._barrier(values, first, shared.host)
         return shared
 
@@ -158,15 +158,15 @@ class SharedMemory:
             # After the last barrier no rank writes to this rank's board any more.
             torch.cuda.current_stream(self.device).synchronize()
             self._boards = []
-            self._places.clear()
+            self._board_parts.clear()
             mine = symmetric.empty(2 * max(words, LEAST_BOARD), dtype=torch.float32, device=self.device)
             torch.cuda.current_stream(self.device).synchronize()
             self._boards = self.map_symmetric("board", mine)
         key = words, self._side_barriers % 2
-        if key not in self._places:
+        if key not in self._board_parts:
             begin = key[1] * (len(self._boards[0]) // 2)
-            self._places[key] = [board[begin : begin + words] for board in self._boards]
-        return self._places[key]
+            self._board_parts[key] = [board[begin : begin + words] for board in self._boards]
+        return self._board_parts[key]
 
     def _barrier(self, values: Tensor | None, first: int, host: Tensor | None) -> None:
         self._barriers += 1
@@ -198,9 +198,9 @@ def connect(job: Job, timeout_seconds: float) -> SharedMemory | str:
         job: the ranks, joined.
         timeout_seconds: longest wait in a barrier.
     """
-    place = (socket.gethostname(), job.device.index if job.device.type == "cuda" else None)
-    places = job.all_gather_object(place)
-    obstacle, control = find_obstacle(places, job), None
+    location = (socket.gethostname(), job.device.index if job.device.type == "cuda" else None)
+    locations = job.all_gather_object(location)
+    obstacle, control = find_obstacle(locations, job), None
     if obstacle is None:
         try:
             words = control_words(job.world_size)
@@ -216,9 +216,9 @@ def connect(job: Job, timeout_seconds: float) -> SharedMemory | str:
     return memory
 
 
-def find_obstacle(places: list[tuple[str, Any]], job: Job) -> str | None:
+def find_obstacle(locations: list[tuple[str, Any]], job: Job) -> str | None:
     """Return why a rank cannot reach the others' memory; None if it can."""
-    hosts, devices = {host for host, _ in places}, [device for _, device in places]
+    hosts, devices = {host for host, _ in locations}, [device for _, device in locations]
     mine = job.device.index
     if None in devices:
         return "not every rank computes on a GPU"

@@ -13,22 +13,22 @@ from torch import Tensor
 import blitzgs._library  # noqa: F401  (registers the ops)
 
 
-class PinnedPlace(NamedTuple):
-    """Pinned memory of the host, into which the device writes numbers, with an event.
+class PinnedNumbers(NamedTuple):
+    """A piece of pinned memory of the host, into which the device writes numbers, with an event.
 
     Attributes:
         memory: [n] numbers.
         written: event of one device; the user records it after the work that writes the memory.
-        idle: the places of this kind that are not in use.
+        idle: the pieces of this length, dtype and device that are not in use.
     """
 
     memory: Tensor
     written: torch.cuda.Event
-    idle: list[PinnedPlace]
+    idle: list[PinnedNumbers]
 
     @classmethod
-    def take(cls, n: int, dtype: torch.dtype, device: torch.device) -> PinnedPlace:
-        """Return a place of `n` numbers, an idle one if possible: making one takes longer than a copy."""
+    def take(cls, n: int, dtype: torch.dtype, device: torch.device) -> PinnedNumbers:
+        """Return memory for `n` numbers, idle memory if possible: pinning takes longer than a copy."""
         idle = _idle[n, dtype, device.index]
         try:
             return idle.pop()
@@ -36,21 +36,21 @@ class PinnedPlace(NamedTuple):
             return cls(torch.empty(n, dtype=dtype, pin_memory=True), torch.cuda.Event(), idle)
 
     def give_back(self) -> None:
-        """Let others use the place: the host has waited for `written` and read the numbers."""
+        """Let others use the memory: the host has waited for `written` and read the numbers."""
         self.idle.append(self)
 
-    def leave(self) -> None:
-        """Keep the memory until the device has written numbers that are not read; does not wait."""
-        _left[id(self)] = self
-        for key, place in list(_left.items()):
-            if place.written.query():
-                _left.pop(key, None)
+    def abandon(self) -> None:
+        """Keep the memory until the device has written it, though nobody will read it; does not wait."""
+        _abandoned[id(self)] = self
+        for key, pinned in list(_abandoned.items()):
+            if pinned.written.query():
+                _abandoned.pop(key, None)
 
 
-# Idle places by number of values, dtype and index of the device.
-_idle: defaultdict[tuple[int, torch.dtype, int], list[PinnedPlace]] = defaultdict(list)
-# Places whose numbers are not read, by their `id`, until the device has written them.
-_left: dict[int, PinnedPlace] = {}
+# Idle memory by number of values, dtype and index of the device.
+_idle: defaultdict[tuple[int, torch.dtype, int], list[PinnedNumbers]] = defaultdict(list)
+# Memory that nobody will read, by its `id`, until the device has written it.
+_abandoned: dict[int, PinnedNumbers] = {}
 
 
 class HostCopy:
@@ -62,28 +62,28 @@ class HostCopy:
 
     def __init__(self, values: Tensor) -> None:
         """Start to copy `values`, int64 [n], to the host."""
-        self._place: PinnedPlace | None = None
+        self._pinned: PinnedNumbers | None = None
         self._host = values
         if values.is_cuda:
-            place = PinnedPlace.take(values.shape[0], values.dtype, values.device)
-            torch.ops.blitzgs.copy_to_host_(place.memory, values)
-            place.written.record(current_stream(values.device))
-            self._place = place
+            pinned = PinnedNumbers.take(values.shape[0], values.dtype, values.device)
+            torch.ops.blitzgs.copy_to_host_(pinned.memory, values)
+            pinned.written.record(current_stream(values.device))
+            self._pinned = pinned
 
     def read(self) -> Tensor:
         """Wait for the copy and return the numbers as a CPU tensor."""
-        if self._place is not None:
-            place = self._place
-            place.written.synchronize()
-            self._host, self._place = place.memory.clone(), None
-            place.give_back()
+        if self._pinned is not None:
+            pinned = self._pinned
+            pinned.written.synchronize()
+            self._host, self._pinned = pinned.memory.clone(), None
+            pinned.give_back()
         return self._host
 
     def __del__(self) -> None:
         # The memory must exist until the kernel has written it. The host does not wait for that, because the
         # numbers may depend on a rank that has failed, and then never come.
-        if self._place is not None:
-            self._place.leave()
+        if self._pinned is not None:
+            self._pinned.abandon()
 
 
 @torch.library.register_fake("blitzgs::copy_to_host_")

@@ -214,9 +214,9 @@ class RunFolder:
             FileNotFoundError: there is no checkpoint yet.
             CheckpointError: all checkpoints are damaged.
         """
-        place, _ = resolve_device(str(device), local_rank=0, local_world_size=1, share_gpus=False)
+        chosen, _ = resolve_device(str(device), local_rank=0, local_world_size=1, share_gpus=False)
         found = run_files.open_model(self.path, Ranks())
-        columns = {name: found.table[name].to(place) for name in (*PARAMETERS, "level")}
+        columns = {name: found.table[name].to(chosen) for name in (*PARAMETERS, "level")}
         return Model(
             **columns,
             lod=scene_gate(found.config, found.progress, found.table, Ranks()),

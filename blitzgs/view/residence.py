@@ -256,7 +256,7 @@ class Residence:
 
     def store_bounds(self, index: BlockIndex) -> None:
         """Store the bounds of the index that `load_for_step` returned, after a step has moved rows."""
-        self._bounds[self._places] = index.bounds
+        self._bounds[self._table_blocks] = index.bounds
 
     def load_for_views(self, cameras: Cameras) -> BlockIndex:
         """Load the blocks that views see, to render without a training step; else as `load_for_step`."""
@@ -271,15 +271,15 @@ class Residence:
 
     def rows_of(self, rows: Tensor) -> Tensor:
         """Map rows of the pool to rows of the table, both int32."""
-        blocks = self._places[rows.long() // BLOCK_ROWS].int()
+        blocks = self._table_blocks[rows.long() // BLOCK_ROWS].int()
         return blocks * BLOCK_ROWS + rows % BLOCK_ROWS
 
     def _index(self) -> BlockIndex:
         blocks = np.where(self._block_in < 0, len(self._bounds) - 1, self._block_in)
-        places = torch.from_numpy(np.append(blocks, self._blocks) if self._rest else blocks)
-        self._places = to_device(places, self._device)
+        table_blocks = torch.from_numpy(np.append(blocks, self._blocks) if self._rest else blocks)
+        self._table_blocks = to_device(table_blocks, self._device)
         return BlockIndex.of_bounds(
-            self._bounds[self._places], self._level_ranges[self._places], self._schedule
+            self._bounds[self._table_blocks], self._level_ranges[self._table_blocks], self._schedule
         )
 
     def _load(

@@ -10,7 +10,7 @@ from cuda_scenes import Scene, ops
 from blitzgs.distributed.transport import Traffic
 from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, PeerBuffers
 from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.host import HostCopy, PinnedPlace
+from blitzgs.ops.host import HostCopy, PinnedNumbers
 from blitzgs.ops.projection_types import VIEW_TOTALS, splats_of
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SplatGradients
@@ -56,9 +56,9 @@ def exchange(counts, slack=0, capacity=None):
         capacity = -(-traffic[0].most // 32) * 32 + slack
     words = WORDS_PER_SPLAT * capacity
     buffers = [torch.full((words,), -1, dtype=torch.int32, device="cuda") for _ in ranks]
-    places = [PeerBuffers(buffers, m) for m in range(len(ranks))]
-    assert all(place.length == capacity for place in places)
-    return ranks, traffic, places, [rank.send(everyone, buffers, capacity) for rank in ranks]
+    parts = [PeerBuffers(buffers, m) for m in range(len(ranks))]
+    assert all(part.length == capacity for part in parts)
+    return ranks, traffic, parts, [rank.send(everyone, buffers, capacity) for rank in ranks]
 
 
 @pytest.mark.parametrize("slack", [32, 3200])
@@ -165,12 +165,12 @@ def test_copies_to_the_host_need_pinned_memory():
 
 def test_pinned_memory_is_used_again_after_it_was_read():
     device = torch.device("cuda", 0)
-    first, second = (PinnedPlace.take(77, torch.float32, device) for _ in range(2))
+    first, second = (PinnedNumbers.take(77, torch.float32, device) for _ in range(2))
     assert first.memory.is_pinned() and first.memory.data_ptr() != second.memory.data_ptr()
     first.give_back()
     for other in ((78, torch.float32), (77, torch.int64)):
-        assert PinnedPlace.take(*other, device).memory is not first.memory
-    assert PinnedPlace.take(77, torch.float32, device).memory is first.memory
+        assert PinnedNumbers.take(*other, device).memory is not first.memory
+    assert PinnedNumbers.take(77, torch.float32, device).memory is first.memory
 
 
 def test_deleting_a_copy_that_was_not_read_does_not_wait():
@@ -178,7 +178,7 @@ def test_deleting_a_copy_that_was_not_read_does_not_wait():
     HostCopy(values).read()
     torch.cuda._sleep(1_000_000_000)
     copy = HostCopy(values)
-    memory = weakref.ref(copy._place.memory)
+    memory = weakref.ref(copy._pinned.memory)
     del copy
     assert memory() is not None and not torch.cuda.current_stream().query()
     torch.cuda.synchronize()

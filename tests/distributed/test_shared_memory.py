@@ -220,7 +220,7 @@ def alone(monkeypatch):
 
 
 def test_two_shares_in_turn_use_different_words(alone):
-    """Two calls of `share` in turn use different places."""
+    """Two calls of `share` in turn use different memory."""
     control, memory, queued = alone
     numbers, second = torch.arange(3), 2 * MAX_VALUES
     first = MAX_VALUES - 2
@@ -281,12 +281,12 @@ def test_peers_need_gpus():
 
 
 def test_ranks_on_one_gpu_need_to_be_told(monkeypatch):
-    places = [("host", 0), ("host", 1), ("host", 0)]
+    locations = [("host", 0), ("host", 1), ("host", 0)]
     monkeypatch.setattr(torch.cuda, "can_device_access_peer", lambda mine, other: mine != other)
     gpu = torch.device("cuda:0")
-    assert "under the same number" in shared_memory.find_obstacle(places, Ranks(device=gpu))
-    assert shared_memory.find_obstacle(places, Ranks(device=gpu, shares_gpu=True)) is None
-    assert shared_memory.find_obstacle(places[:2], Ranks(device=gpu)) is None
+    assert "under the same number" in shared_memory.find_obstacle(locations, Ranks(device=gpu))
+    assert shared_memory.find_obstacle(locations, Ranks(device=gpu, shares_gpu=True)) is None
+    assert shared_memory.find_obstacle(locations[:2], Ranks(device=gpu)) is None
 
 
 def _falls_back(ranks):
