@@ -71,7 +71,7 @@ class TableAdam:
         self,
         table: GaussianTable,
         frame: Frame,
-        v: SplatGradients,
+        gradients: SplatGradients,
         scale_reg: Tensor | None,
         opacity_reg: Tensor | None,
         size_reg: Tensor | None,
@@ -84,7 +84,7 @@ class TableAdam:
         Args:
             table: the table that was rendered, unchanged since.
             frame: of `pipeline.forward`.
-            v: gradients of the frame's splats, from `pipeline.backward_splats`.
+            gradients: gradients of the frame's splats, from `pipeline.backward_splats`.
             scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no
                 such term.
             opacity_reg: weight per view, [B], of the opacity of each Gaussian visible in it; None: no such
@@ -103,7 +103,7 @@ class TableAdam:
             WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg, size_reg),
             frame.projected,
             frame.options.projection(frame.views),
-            v,
+            gradients,
             table["level"] if frame.options.fade else None,
             means2d_sums,
             absolute_sums,

@@ -161,15 +161,16 @@ class Stepper:
         table = self.table
         absolute &= keep_means2d
         gradients = pipeline.backward_splats(frame, terms.v_renders, mark, absolute)
-        v_means2d = sums = None
+        v_means2d = means2d_sums = None
         if keep_means2d:
             v_means2d = gradients.means2d_abs if absolute else gradients.means2d
             if v_means2d is None:
                 # The gradients are in the memory of several ranks. The optimiser's kernel adds them up.
-                v_means2d = sums = torch.empty_like(frame.projected.means2d)
+                v_means2d = means2d_sums = torch.empty_like(frame.projected.means2d)
         self._optimiser.step(
-            table, frame, gradients, terms.scale_reg, terms.opacity_reg, terms.size_reg, step, sums, absolute
-        )
+            table, frame, gradients, terms.scale_reg, terms.opacity_reg, terms.size_reg, step, means2d_sums,
+            absolute,
+        )  # fmt: skip
         if self._noise is not None:
             self._noise.add(table, frame.projected.visible_ids, step, self._optimiser.position_rate(step))
         if FLOOR in table.columns:

@@ -79,25 +79,25 @@ class BlockIndex:
         level_ranges: the coarsest and the finest level of each block, uint8 [blocks, 2].
     """
 
-    def __init__(self, table: GaussianTable, schedule: Tensor | None = None) -> None:
+    def __init__(self, table: GaussianTable, pending_table: Tensor | None = None) -> None:
         """Compute the bounds of every block of the table.
 
         Args:
             table: the rows.
-            schedule: `AdamSchedule.table` of the lazy optimiser, if rows may have pending steps; None: they
-                have none.
+            pending_table: `AdamSchedule.table` of the lazy optimiser, if rows may have pending steps; None:
+                they have none.
         """
-        self._schedule = schedule
+        self._pending_table = pending_table
         count = -(-len(table) // BLOCK_ROWS)
         self.bounds = torch.empty(count, 8, dtype=torch.float32, device=table.device)
         self.level_ranges = _level_ranges(table["level"], count)
         self.update(table, None)
 
     @classmethod
-    def of_bounds(cls, bounds: Tensor, level_ranges: Tensor, schedule: Tensor | None) -> BlockIndex:
+    def of_bounds(cls, bounds: Tensor, level_ranges: Tensor, pending_table: Tensor | None) -> BlockIndex:
         """Make an index from `bounds` and `level_ranges` that are known already."""
         index = cls.__new__(cls)
-        index._schedule, index.bounds, index.level_ranges = schedule, bounds, level_ranges
+        index.bounds, index.level_ranges, index._pending_table = bounds, level_ranges, pending_table
         return index
 
     def active(
@@ -132,9 +132,9 @@ class BlockIndex:
         update_block_bounds_(self.bounds, ids, table["means"], table["scales"], self._pending(table))
 
     def _pending(self, table: GaussianTable) -> PendingSteps | None:
-        if self._schedule is None:
+        if self._pending_table is None:
             return None
-        return PendingSteps._make((*_PENDING_OF(table.columns), self._schedule))
+        return PendingSteps._make((*_PENDING_OF(table.columns), self._pending_table))
 
 
 def _level_ranges(level: Tensor, blocks: int) -> Tensor:

@@ -85,7 +85,7 @@ class Residence:
     """
 
     def __init__(
-        self, table: HostTable, device: torch.device, budget_bytes: int, schedule: Tensor | None
+        self, table: HostTable, device: torch.device, budget_bytes: int, pending_table: Tensor | None
     ) -> None:
         """Allocate the pool.
 
@@ -93,7 +93,7 @@ class Residence:
             table: the table on the host; pinned if `device` is a GPU.
             device: device of the pool.
             budget_bytes: bytes of the device that the pool may take.
-            schedule: as for `BlockIndex`, on the device.
+            pending_table: as for `BlockIndex`, on the device.
 
         Raises:
             ResidenceError: the budget is less than two blocks.
@@ -105,17 +105,17 @@ class Residence:
         self._storage: dict[str, Tensor] = {}
         self.pool = self._pool_of({name: column[:0] for name, column in table.columns.items()}, 0)
         self._is_open = self._rest_changed = False
-        self.reindex(schedule)
+        self.reindex(pending_table)
 
     # --- The pool -----------------------------------------------------------------------------------------
 
-    def reindex(self, schedule: Tensor | None) -> None:
+    def reindex(self, pending_table: Tensor | None) -> None:
         """Rebuild the index after rows were added, removed or reordered, or the schedule changed."""
         self.write_back()
-        self._schedule = schedule
+        self._pending_table = pending_table
         self._blocks, self._rest = divmod(len(self.table), BLOCK_ROWS)
         self._make_pool()
-        index = BlockIndex(self.table, None if schedule is None else schedule.cpu())
+        index = BlockIndex(self.table, None if pending_table is None else pending_table.cpu())
         # The last entry is used for slots without a block: a box that no view sees.
         nothing = torch.full((1, 8), torch.finfo(torch.float32).max)
         nothing[:, 3:6] *= -1
@@ -279,7 +279,7 @@ class Residence:
         table_blocks = torch.from_numpy(np.append(blocks, self._blocks) if self._rest else blocks)
         self._table_blocks = to_device(table_blocks, self._device)
         return BlockIndex.of_bounds(
-            self._bounds[self._table_blocks], self._level_ranges[self._table_blocks], self._schedule
+            self._bounds[self._table_blocks], self._level_ranges[self._table_blocks], self._pending_table
         )
 
     def _load(
