@@ -24,12 +24,13 @@ from blitzgs.ops.tile_costs import divide_tiles, tile_costs
 TILE_COST = 8
 # Largest number of costs that are stored for a view, 16 KB; a view with fewer tiles has one for each tile.
 _MOST_NUMBERS = 8192
-# The costs of this number of latest batches are not used for a division. The host has read the sums of
-# earlier batches already, with their losses. It therefore does not wait, and all ranks have the same costs.
-_LATE = 2
-# The cost of a view that was not visited yet is estimated as the mean cost of this number of other views.
+# Divisions use the costs of a batch only after this number of later batches. By then the host has read the
+# sums of the batch, with its losses. It therefore does not wait, and all ranks have the same costs.
+_DELAY = 2
+# The costs of a view that was not visited yet are estimated as the mean costs of this number of other views,
+# those that were visited last.
 _SIMILAR = 16
-# Stands for the costs of such a view.
+# The costs of such a view.
 _UNKNOWN = torch.empty(0, dtype=torch.float16)
 
 
@@ -63,7 +64,8 @@ class TileOwners:
     def __init__(self, ranks: Ranks) -> None:
         self.ranks = ranks
         self._costs: dict[Hashable, _ViewCost] = {}  # by view, in the order of the last visits
-        self._late: deque[Callable[[], Sequence[_ViewCost]]] = deque()  # read the costs of the latest batches
+        # For each of the latest `_DELAY` batches, a function that reads its costs.
+        self._delayed: deque[Callable[[], Sequence[_ViewCost]]] = deque()
         self._planned: dict[int, tuple[int, ...]] = {}
 
     def plan(self, step: int, keys: Sequence[Hashable], width: int, height: int, halo: int) -> TileRanges:
@@ -95,7 +97,7 @@ class TileOwners:
             are from the k-th of the latest batches, whose costs are not used yet; steps int64 [S] and bounds
             int64 [S, M + 1]: the stored divisions. Keys must be integers.
         """
-        batches = [list(self._costs.values()), *(measured() for measured in self._late)]
+        batches = [list(self._costs.values()), *(measured() for measured in self._delayed)]
         ages = [age for age, batch in enumerate(batches) for _ in batch]
         costs = [cost for batch in batches for cost in batch]
         return {
@@ -126,7 +128,7 @@ class TileOwners:
             if age == 0:
                 self._learn(measured)
             else:
-                self._late.append(measured)
+                self._delayed.append(measured)
 
     def divide(
         self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16, halo: int = 0
@@ -148,7 +150,7 @@ class TileOwners:
         costs = [_UNKNOWN if cost is None or cost.tiles != tiles else cost.pieces for cost in found]
         # Views have costs in common: in oblique views the far (upper) tiles cost more than the near ones. A
         # view without a visit is therefore expected to cost what similar views do.
-        similar = self._latest(tiles) if any(cost is _UNKNOWN for cost in costs) else ()
+        similar = self._similar(tiles) if any(cost is _UNKNOWN for cost in costs) else ()
         bounds = divide_tiles(costs, similar, tiles, _grain(tiles), TILE_COST, self.ranks.world_size)
         return TileRanges(bounds, len(keys), width, height, tile_size, halo)
 
@@ -172,11 +174,11 @@ class TileOwners:
         Returns:
             The sums; see `HostSum.read`.
         """
-        if len(self._late) == _LATE:
-            self._learn(self._late.popleft())
+        if len(self._delayed) == _DELAY:
+            self._learn(self._delayed.popleft())
         sums = HostSum(self.ranks, parts, tile_work, ranges.of(self.ranks.rank))
         first = 0 if parts is None else 2 * len(parts)
-        self._late.append(partial(_measured, sums, list(keys), ranges.tiles_per_view, first))
+        self._delayed.append(partial(_measured, sums, list(keys), ranges.tiles_per_view, first))
         return sums
 
     def _learn(self, measured: Callable[[], Sequence[_ViewCost]]) -> None:
@@ -185,7 +187,7 @@ class TileOwners:
             self._costs.pop(cost.key, None)
             self._costs[cost.key] = cost
 
-    def _latest(self, tiles: int) -> list[Tensor]:
+    def _similar(self, tiles: int) -> list[Tensor]:
         """Return the stored costs of the latest views with this number of tiles, the latest first."""
         alike = (cost.pieces for cost in reversed(self._costs.values()) if cost.tiles == tiles)
         return list(islice(alike, _SIMILAR))
