@@ -104,7 +104,7 @@ class Trainer:
                 self._announce()
                 budget = Budget(state)
                 if not handle_all(state, events_left(state.progress)):
-                    self._stop_for(agreement.now(done).signal)
+                    self._stop(_stopped_by(agreement.now(done).signal))
                     return None
                 # The budget may change the number of steps.
                 while (step := state.progress.step + 1) <= state.schedule.steps:
@@ -113,14 +113,14 @@ class Trainer:
                     if events:
                         self._write_record()
                     if not handle_all(state, events):
-                        self._stop_for(agreement.now(step).signal)
+                        self._stop(_stopped_by(agreement.now(step).signal))
                         return None
                     budget.after(step)
                     if step == state.schedule.steps:
                         break
                     decision = agreement.after(step, self.loader.lost is not None)
                     if decision.signal is not None:
-                        self._stop_for(decision.signal)
+                        self._stop(_stopped_by(decision.signal))
                         return None
                     if decision.lost:
                         break
@@ -130,7 +130,6 @@ class Trainer:
                 self._check_photographs()
                 return self.finish(agreement)
         except PhotographError as error:  # on every rank
-            self._write_record()
             self._stop(f"saved after {state.images_seen:,} images, before a photograph that cannot be read")
             raise PhotographError(
                 f"{error}. The model so far is saved: put the photograph back and continue with --resume"
@@ -147,7 +146,6 @@ class Trainer:
         except ResidenceError as error:
             if is_first or state.ranks.world_size > 1:
                 raise  # all is saved, or the other ranks are in the middle of the step
-            self._write_record()
             self._stop(f"saved after {state.images_seen:,} images, before a step that lacks room")
             raise ResidenceError(
                 f"{error}. The model so far is saved: continue with --resume and a larger memory.resident_gb"
@@ -162,18 +160,14 @@ class Trainer:
                 f"{'; '.join(lost)}. The last steps, {MOST_STEPS + 1} at most, went without it"
             )
 
-    def _stop_for(self, signal: str | None) -> None:
-        """Save where the run is, because of a signal."""
+    def _stop(self, reason: str) -> None:
+        """Write the log record of the last step, save a checkpoint, and log why the run stops."""
         self._write_record()
-        self._stop(_stopped_by(signal))
-
-    def _stop(self, text: str) -> None:
-        """Save a checkpoint and log why the run stops."""
         save.run_last(self.state, save.STOPPING_PATIENCE_SECONDS, lambda: False)
-        self._log_stop(text)
+        self._log_stop(reason)
 
-    def _log_stop(self, text: str) -> None:
-        self.state.log.event(self.state.images_seen, "stopped", {"reason": text}, text)
+    def _log_stop(self, reason: str) -> None:
+        self.state.log.event(self.state.images_seen, "stopped", {"reason": reason}, reason)
 
     def close(self) -> None:
         """Stop loading batches and close the log."""
@@ -212,7 +206,7 @@ class Trainer:
             absolute=config.population.absolute_gradients,
         )
         if v_means2d is not None:
-            self._gather(frame, v_means2d)
+            self._add_statistics(frame, v_means2d)
         state.stepped(step, degree)
         state.log.advance(end)
         if is_logged:
@@ -242,7 +236,7 @@ class Trainer:
             log_step(self.state, self._unwritten)
             self._unwritten = None
 
-    def _gather(self, frame: Frame, v_means2d: Tensor) -> None:
+    def _add_statistics(self, frame: Frame, v_means2d: Tensor) -> None:
         """Add a step's screen-space gradients to the statistics that density control reads."""
         splats, views, table = frame.projected, frame.views, self.state.stepper.table
         density_stats_(
@@ -362,4 +356,5 @@ def _largest_size(state: TrainingState) -> str:
 
 
 def _stopped_by(signal: str | None) -> str:
+    """Return the reason to log for a run that a signal stops."""
     return f"stopped by {signal}; continue with --resume"
