@@ -22,10 +22,10 @@ from blitzgs.scene.images import ImageMemory
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.views import VIEW_NUMBERS, ViewSet, unpack_views
 
-# For every batch that is prepared ahead, the photographs of this number of later batches are decoded, too.
-# Decoding one takes as long as several steps on a fast GPU.
-_DECODED = 4
-# A view of which masks exclude a larger share is counted in `BatchLoader.masked`.
+# Photographs are decoded further ahead than batches are uploaded: for every batch that is uploaded ahead,
+# those of this number of later batches. Decoding one takes as long as several steps on a fast GPU.
+_DECODED_AHEAD = 4
+# A view of which masks exclude a larger share is counted in `BatchLoader.views_masked`.
 MOST_MASKED = 0.95
 
 
@@ -87,7 +87,7 @@ class _Photograph(NamedTuple):
     samples: float
 
 
-class _Memory:
+class _BatchMemory:
     """Memory in which batches of one shape are assembled and from which they are uploaded.
 
     On the CPU, host memory and device memory are the same. All parts of a batch are in one allocation, so
@@ -98,7 +98,7 @@ class _Memory:
         shape: views, height, width, and whether there are masks.
         numbers: on the host, float32: the views as `ViewSet.write` writes them, then each view's samples.
         pixels: on the host, uint8 [B, H, W, 3].
-        counted: on the host, uint8 [B, H, W]; None without masks.
+        included: on the host, uint8 [B, H, W], 0 = excluded pixel; None without masks.
     """
 
     def __init__(self, shape: tuple[int, int, int, bool], device: torch.device) -> None:
@@ -111,9 +111,9 @@ class _Memory:
         size = self._end + masked * area
         self._host = torch.empty(size, dtype=torch.uint8, pin_memory=on_gpu)
         self._device = torch.empty(size, dtype=torch.uint8, device=device) if on_gpu else self._host
-        numbers, pixels, counted = self._parts(self._host)
+        numbers, pixels, included = self._parts(self._host)
         self.numbers, self.pixels = numbers.numpy(), pixels.numpy()
-        self.counted = None if counted is None else counted.numpy()
+        self.included = None if included is None else included.numpy()
         numbers, self._targets, self._masks = self._parts(self._device)
         self._views = unpack_views(numbers[:-count], width, height)
         self._samples = numbers[-count:]
@@ -151,21 +151,21 @@ class _Slot:
 
     Attributes:
         uploaded: on CUDA, the event after the upload of the newest batch.
-        read: on CUDA, the event after all work that reads that batch.
+        consumed: on CUDA, the event after all work that reads that batch.
     """
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
-        self._memory: _Memory | None = None
+        self._memory: _BatchMemory | None = None
         if device.type == "cuda":
-            self.uploaded, self.read = torch.cuda.Event(), torch.cuda.Event()
+            self.uploaded, self.consumed = torch.cuda.Event(), torch.cuda.Event()
 
-    def reserve(self, shape: tuple[int, int, int, bool]) -> _Memory:
+    def reserve(self, shape: tuple[int, int, int, bool]) -> _BatchMemory:
         """Return memory for a batch of this shape."""
         if self._device.type != "cuda":
-            return _Memory(shape, self._device)
+            return _BatchMemory(shape, self._device)
         if self._memory is None or self._memory.shape != shape:
-            self._memory = _Memory(shape, self._device)
+            self._memory = _BatchMemory(shape, self._device)
         return self._memory
 
 
@@ -179,7 +179,8 @@ class BatchLoader:
         lost: on several ranks, why this rank could not read a photograph (the first one, if there are
             several). The rank cannot stop alone in the middle of a step, so it continues and treats all
             pixels of such photographs as masked. None: it has read all photographs.
-        masked: number of views, among the `read` ones, of which a mask excludes more than `MOST_MASKED`.
+        views_masked: number of views, among the `views_read`, of which a mask excludes more than
+            `MOST_MASKED`.
         waited: seconds that the caller has waited for batches so far.
     """
 
@@ -209,9 +210,9 @@ class BatchLoader:
         self._images = images
         self._views = views
         self._owners = owners
-        self._counts: dict[int, float] = {}
+        self._sample_counts: dict[int, float] = {}
         self.lost: str | None = None
-        self.masked = 0
+        self.views_masked = 0
         self.waited = 0.0
         self._train = train
         self._sampler = sampler
@@ -223,20 +224,20 @@ class BatchLoader:
         self._pending: dict[int, Future[tuple[Batch, _Slot]]] = {}
         # One slot is in use; the others hold batches that are ready or being prepared.
         self._free = deque(_Slot(device) for _ in range(ahead + 2))
-        self._used: _Slot | None = None
-        self._worker = ThreadPoolExecutor(1, "batches", self._enter)
+        self._current: _Slot | None = None
+        self._worker = ThreadPoolExecutor(1, "batches", self._use_stream)
 
     def get(self, step: int, last: int) -> Batch:
         """Return the batch of a step (0-based) and start to prepare the next ones, up to step `last` - 1."""
         stream = None if self._stream is None else current_stream(self._device)
-        if self._used is not None:
+        if self._current is not None:
             if stream is not None:
-                self._used.read.record(stream)
-            self._give_back(self._used)
-            self._used = None  # in case the next batch cannot be loaded
+                self._current.consumed.record(stream)
+            self._give_back(self._current)
+            self._current = None  # in case the next batch cannot be loaded
         if self._owners is not None:
             self._owners.forget_before(step)
-        for later in range(step, max(step + 1, min(step + (1 + _DECODED) * self._ahead + 1, last))):
+        for later in range(step, max(step + 1, min(step + (1 + _DECODED_AHEAD) * self._ahead + 1, last))):
             is_near = later <= step + self._ahead
             if later not in self._plans:
                 self._plans[later] = self._plan(later)
@@ -253,19 +254,19 @@ class BatchLoader:
         self._prefetched.discard(step)
         if stream is not None:
             stream.wait_event(slot.uploaded)
-        self._used = slot
+        self._current = slot
         return batch
 
     @property
-    def read(self) -> int:
+    def views_read(self) -> int:
         """The number of views that have been read so far, each counted once."""
-        return len(self._counts)
+        return len(self._sample_counts)
 
     def close(self) -> None:
         """Stop the thread."""
         self._worker.shutdown(wait=True, cancel_futures=True)
 
-    def _enter(self) -> None:
+    def _use_stream(self) -> None:
         """Make the loader's stream the current stream of its thread."""
         if self._stream is not None:
             torch.cuda.set_stream(self._stream)
@@ -345,13 +346,13 @@ class BatchLoader:
         strips, masks, samples = zip(*photographs, strict=True)
         if self._stream is not None:
             slot.uploaded.synchronize()  # returns at once: this upload ended long ago
-            self._stream.wait_event(slot.read)
+            self._stream.wait_event(slot.consumed)
         memory = slot.reserve((count, height, width, any(mask is not None for mask in masks)))
         for view, (strip, (y0, y1)) in enumerate(zip(strips, rows, strict=True)):
             if strip is not None:
                 memory.pixels[view, y0:y1] = strip
-        if memory.counted is not None:
-            for place, mask in zip(memory.counted, masks, strict=True):
+        if memory.included is not None:
+            for place, mask in zip(memory.included, masks, strict=True):
                 place[...] = 1 if mask is None else mask.numpy()
         self._views.write(indices, memory.numbers[:-count])
         memory.numbers[-count:] = samples
@@ -361,12 +362,13 @@ class BatchLoader:
         return memory.batch(indices, ranges)
 
     def _samples(self, index: int, mask: Tensor | None) -> float:
-        if index not in self._counts:
+        """Return `Batch.samples` of a view; count its pixels when it is read for the first time."""
+        if index not in self._sample_counts:
             width, height = self._views.size([index])
             counted = width * height if mask is None else int((mask != 0).sum())
-            self.masked += counted < (1.0 - MOST_MASKED) * width * height
-            self._counts[index] = float(max(1, 3 * counted))
-        return self._counts[index]
+            self.views_masked += counted < (1.0 - MOST_MASKED) * width * height
+            self._sample_counts[index] = float(max(1, 3 * counted))
+        return self._sample_counts[index]
 
 
 def _aligned(size: int) -> int:

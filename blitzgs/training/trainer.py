@@ -218,7 +218,7 @@ class Trainer:
 
     def _check_masks(self) -> None:
         """Warn once if masks exclude nearly all of some training views, as inverted masks do."""
-        masked, read = self.loader.masked, self.loader.read
+        masked, read = self.loader.views_masked, self.loader.views_read
         if not masked or self._warned_of_masks:
             return
         self._warned_of_masks = True
