@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import partial
@@ -16,7 +17,8 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.distributed.tiles import TileRanges, count_tiles
+from blitzgs.distributed.tiles import TileRanges
+from blitzgs.ops.intersect import tile_counts
 from blitzgs.ops.tile_costs import divide_tiles, tile_costs
 
 # Fixed cost of a tile, in units of one list entry: its pixels are written and compared with the photograph.
@@ -145,7 +147,7 @@ class TileOwners:
         Returns:
             Ranges whose costs differ from equal shares by at most the cost of one tile.
         """
-        tiles = count_tiles(width, height, tile_size)
+        tiles = math.prod(tile_counts(width, height, tile_size))
         found = [self._costs.get(key) for key in keys]
         costs = [_UNKNOWN if cost is None or cost.tiles != tiles else cost.pieces for cost in found]
         # Views have costs in common: in oblique views the far (upper) tiles cost more than the near ones. A

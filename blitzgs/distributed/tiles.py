@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,15 +11,11 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.ops.intersect import pixels_of_tiles, tile_counts
 
 # The loss of an owned pixel reads pixels up to this distance: 5 px for its window, and 5 more for the
 # gradient.
 LOSS_HALO = 10
-
-
-def count_tiles(width: int, height: int, tile_size: int) -> int:
-    """Return the number of tiles of an image; all arguments are in pixels."""
-    return -(-width // tile_size) * -(-height // tile_size)
 
 
 @dataclass(frozen=True)
@@ -53,7 +50,7 @@ class TileRanges:
     @cached_property
     def tiles_per_view(self) -> int:
         """Tiles of one view, T."""
-        return count_tiles(self.width, self.height, self.tile_size)
+        return math.prod(tile_counts(self.width, self.height, self.tile_size))
 
     def of(self, rank: int) -> tuple[int, int]:
         """Return a rank's [first, one past last) tile."""
@@ -75,11 +72,7 @@ class TileRanges:
 
     def pixel_mask(self, rank: int, device: torch.device) -> Tensor:
         """Mark the pixels of a rank's tiles, bool [B, H, W]."""
-        begin, end = self.of(rank)
-        tiles = torch.arange(self.n_views * self.tiles_per_view, device=device)
-        owned = ((tiles >= begin) & (tiles < end)).view(self.n_views, -1, self.tiles_x)
-        pixels = owned.repeat_interleave(self.tile_size, 1).repeat_interleave(self.tile_size, 2)
-        return pixels[:, : self.height, : self.width]
+        return pixels_of_tiles(self.n_views, self.width, self.height, self.tile_size, *self.of(rank), device)
 
     def pixel_rows(self, rank: int, margin: int = LOSS_HALO) -> list[tuple[int, int]]:
         """Return the rows [y0, y1) of each view's image that a rank's tiles and a margin around them cover.

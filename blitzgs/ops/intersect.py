@@ -16,6 +16,17 @@ def tile_counts(width: int, height: int, tile_size: int) -> tuple[int, int]:
     return -(-width // tile_size), -(-height // tile_size)
 
 
+def pixels_of_tiles(
+    n_cameras: int, width: int, height: int, tile_size: int, begin: int, end: int, device: torch.device
+) -> Tensor:
+    """Mark the pixels of the tiles [begin, end), bool [n_cameras, height, width]."""
+    tiles_x, tiles_y = tile_counts(width, height, tile_size)
+    tiles = torch.arange(n_cameras * tiles_y * tiles_x, device=device)
+    owned = ((tiles >= begin) & (tiles < end)).view(n_cameras, tiles_y, tiles_x)
+    pixels = owned.repeat_interleave(tile_size, 1).repeat_interleave(tile_size, 2)
+    return pixels[:, :height, :width]
+
+
 def intersect(
     means2d: Tensor,
     conics: Tensor,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from torch import Tensor
 from blitzgs._library import without_autograd
 from blitzgs.ops.arrange_splats import Places
 from blitzgs.ops.derivatives import first_only
-from blitzgs.ops.intersect import tile_counts
+from blitzgs.ops.intersect import pixels_of_tiles
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, GradientBuffer, gradient_columns
 
 rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
@@ -132,18 +133,9 @@ def rasterize(
         call = _Call(splats, grid, tell_absgrad, places, packed, composited)
         renders, alphas = _Rasterize.apply(*geometry, colors, backgrounds, call)  # type: ignore[no-untyped-call]
     if (tile_begin, tile_end) != (0, -1):
-        alphas = alphas * _owned_pixels(alphas, tile_size, tile_begin, tile_end)
+        end = sys.maxsize if tile_end < 0 else tile_end
+        alphas = alphas * pixels_of_tiles(n_cameras, width, height, tile_size, tile_begin, end, alphas.device)
     return renders, alphas
-
-
-def _owned_pixels(images: Tensor, tile_size: int, tile_begin: int, tile_end: int) -> Tensor:
-    n_cameras, height, width = images.shape
-    tiles_x, tiles_y = tile_counts(width, height, tile_size)
-    tiles = torch.arange(n_cameras * tiles_y * tiles_x, device=images.device)
-    end = tile_end if tile_end >= 0 else tiles.numel()
-    owned = ((tiles >= tile_begin) & (tiles < end)).view(n_cameras, tiles_y, tiles_x)
-    owned = owned.repeat_interleave(tile_size, 1).repeat_interleave(tile_size, 2)
-    return owned[:, :height, :width]
 
 
 @torch.library.register_fake("blitzgs::rasterize_fwd")
