@@ -5,17 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from blitzgs._library import below_autograd
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
-from blitzgs.ops.color_rows import VisibleRows
-from blitzgs.ops.derivatives import first_only
-from blitzgs.ops.gather_rows import split_rows
 from blitzgs.ops.host import HostCopy
+from blitzgs.ops.project_gradient import Project, ProjectCall, TableRows
 from blitzgs.ops.projection_types import (
     VIEW_TOTALS,
     ProjectedSplats,
@@ -23,8 +21,6 @@ from blitzgs.ops.projection_types import (
     ProjectionOptions,
     splats_of,
 )
-from blitzgs.ops.sparse_rows import HandOver, full_gradients
-from blitzgs.ops.splat_gradients import packed_table
 
 
 def project(
@@ -156,8 +152,8 @@ def differentiable_splats(
         tables = inputs.gaussians if rows is None else [*inputs.gaussians, *rows.sh]
         if rows is not None and rows.hand_over is not None:
             tables = [rows.hand_over.ticket]
-        call = _Call(inputs, sparse_grad, splats, rows)
-        columns = _Project.apply(viewmats, call, *tables)  # type: ignore[no-untyped-call]
+        call = ProjectCall(inputs, sparse_grad, splats, rows)
+        columns = Project.apply(viewmats, call, *tables)  # type: ignore[no-untyped-call]
         means2d, conics, depths, opacities, colors = columns
         return splats._replace(
             means2d=means2d, conics=conics, depths=depths, opacities=opacities, colors=colors
@@ -176,208 +172,6 @@ def differentiable_splats(
         inputs.level,
     )
     return ProjectedSplats._make((*columns, totals.cpu()[:3]))
-
-
-class TableRows(NamedTuple):
-    """The visible rows of tables, gathered for the colours and the backward pass.
-
-    Attributes:
-        visible: the rows.
-        sh: the SH of all Gaussians in parts, from which the rows' SH were joined; empty: without SH.
-        hand_over: takes the gradients of the tables, if autograd is not to have them.
-    """
-
-    visible: VisibleRows
-    sh: Sequence[Tensor]
-    hand_over: HandOver | None
-
-
-def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats, rows: TableRows | None = None) -> None:
-    """Save what `_gradients` needs: the rows that were projected, their splats, and the shapes of tables."""
-    ctx.set_materialize_grads(False)
-    read, visible_ids, ids, ctx.tables, ctx.parts = inputs, splats.visible_ids, None, None, []
-    ctx.hand_over = None if rows is None else rows.hand_over
-    if rows is not None:
-        read, visible_ids, ids = rows.visible
-        # The tables are not saved: the gradient does not depend on their values, which may change.
-        ctx.tables, ctx.parts = (*inputs.gaussians, *rows.sh), [part.shape[1] for part in rows.sh]
-    index = splats.camera_ids, visible_ids, splats.splat_offsets
-    ctx.save_for_backward(*read.gaussians, *read.cameras, *index, inputs.level, ids)
-    ctx.options = inputs.options
-
-
-class _Differentiable(NamedTuple):
-    """The columns of `ProjectedSplats` that have gradients; or these gradients, None for zero."""
-
-    means2d: Any
-    conics: Any
-    depths: Any
-    opacities: Any
-    colors: Any
-
-    @classmethod
-    def of(cls, splats: ProjectedSplats) -> _Differentiable:
-        """Take the columns from all columns."""
-        return cls(splats.means2d, splats.conics, splats.depths, splats.opacities, splats.colors)
-
-
-class _Saved(NamedTuple):
-    """The tensors that `_save` saved, in its groups; ids: of the tables, whose rows are the gaussians."""
-
-    gaussians: Sequence[Tensor]
-    cameras: Sequence[Tensor]
-    splats: Sequence[Tensor]
-    level: Tensor | None
-    ids: Tensor | None
-
-    @classmethod
-    def of(cls, ctx: Any) -> _Saved:
-        """Read them. Call this once: checkpointing recomputes saved tensors at each reading."""
-        *tensors, viewmats, Ks, camera_ids, visible_ids, splat_offsets, level, ids = ctx.saved_tensors  # noqa: N806
-        return cls(tensors, (viewmats, Ks), (camera_ids, visible_ids, splat_offsets), level, ids)
-
-
-def _gradients(
-    ctx: Any, needed: Sequence[bool], need_viewmats: bool, sparse: Sequence[bool], v: _Differentiable
-) -> Sequence[Tensor | None]:
-    """Return the gradients of viewmats and of all gaussians, or of the tables, if they are needed.
-
-    Args:
-        ctx: from `_save`.
-        needed: which of means, quats, scales, opacities and the given parts of SH need a gradient.
-        need_viewmats: whether viewmats need a gradient.
-        sparse: which of these gradients are to be sparse.
-        v: gradients of the splats; None: zero.
-    """
-    saved = _Saved.of(ctx)
-    return first_only(
-        "project",
-        lambda: _first_gradients(ctx, saved, needed, need_viewmats, sparse, v),
-        (*(ctx.tables or saved.gaussians), saved.cameras[0], *v),
-    )
-
-
-def _first_gradients(
-    ctx: Any,
-    saved: _Saved,
-    needed: Sequence[bool],
-    need_viewmats: bool,
-    sparse: Sequence[bool],
-    v: _Differentiable,
-) -> tuple[Tensor | None, ...]:
-    """Compute what `_gradients` returns; `saved` has the tensors of `ctx`."""
-    _, visible_ids, _ = saved.splats
-    gathered = ctx.tables is not None
-    all_dense = not gathered and not any(sparse)
-    # If all Gaussians are visible, the rows of these are all rows. While torch traces the backward pass, the
-    # number of rows is unknown, and tensors are of another type.
-    complete = (
-        all_dense and type(visible_ids) is Tensor and visible_ids.shape[0] == saved.gaussians[0].shape[0]
-    )
-    # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
-    dense = all_dense and not complete and all(needed)
-    # Torch resolves the negative bit of an op's tensors, but not of those in a list of optional ones.
-    cameras = [tensor.resolve_neg() for tensor in saved.cameras]
-    *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
-        saved.gaussians, cameras, saved.splats, ctx.options.ints, ctx.options.floats,
-        _splat_gradients(saved, v), v.depths, need_viewmats, dense, saved.level,
-    )  # fmt: skip
-    found: list[Tensor | None] = gradients[: len(saved.gaussians)]
-    if len(ctx.parts) > 1:
-        # Autograd would copy a gradient that is not contiguous, and its indices with it.
-        found[4:] = split_rows(gradients[4], ctx.parts)
-    if not dense:
-        found = [gradient if wanted else None for gradient, wanted in zip(found, needed, strict=True)]
-    if ctx.hand_over is not None:
-        ctx.hand_over.give(saved.ids, found)
-        found = [None]  # of the ticket
-    elif not dense and not complete:
-        ids = visible_ids if saved.ids is None else saved.ids
-        shapes = [table.shape for table in ctx.tables or saved.gaussians]
-        found = full_gradients(ids, found, shapes, sparse)
-    return (v_viewmats if need_viewmats else None, *found)
-
-
-def _splat_gradients(saved: _Saved, v: _Differentiable) -> list[Tensor]:
-    """Return the gradients of means2d, conics, opacities and colors as `project_bwd` takes them."""
-    columns = [v.means2d, v.conics, v.opacities] + ([v.colors] if len(saved.gaussians) > 4 else [])
-    if v.depths is None and len(columns) == 4 and (table := packed_table(columns)) is not None:
-        return [table]
-    if all(column is not None for column in columns):
-        return columns
-    zeros = saved.gaussians[0].new_zeros(saved.splats[0].shape[0], 3)
-    parts = (zeros[:, :2], zeros, zeros[:, 0], zeros)
-    return [part if column is None else column for column, part in zip(columns, parts, strict=False)]
-
-
-class _Call(NamedTuple):
-    """The arguments of `differentiable_splats` that have no gradient."""
-
-    inputs: ProjectionInputs
-    sparse_grad: bool
-    splats: ProjectedSplats
-    rows: TableRows | None
-
-
-class _Project(torch.autograd.Function):
-    """Makes the splats of `project_splats` differentiable, with the gradient formula registered below.
-
-    It is for calls outside of `torch.compile`. Calling an op with a registered formula through torch takes
-    0.2 ms of the host's time. Each argument and each result adds to it, so all arguments without a gradient
-    are passed as one, and only the columns that have gradients pass through.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, _viewmats: Tensor, call: _Call, *tables: Tensor) -> Any:
-        _save(ctx, call.inputs, call.splats, call.rows)
-        # Means, quats and scales are leaves, or come from operations that accept a sparse gradient.
-        ctx.sparse = [
-            call.sparse_grad and (i < 3 or call.rows is not None or (len(tables) > 4 and table.is_leaf))
-            for i, table in enumerate(tables)
-        ]
-        return tuple(_Differentiable.of(call.splats))
-
-    @staticmethod
-    def backward(ctx: Any, *v_output: Tensor | None) -> Any:
-        need_viewmats, _, *needed = ctx.needs_input_grad
-        if ctx.hand_over is not None:
-            # Autograd runs the ticket's node unless it was asked for other gradients only, as of viewmats.
-            wanted = torch._C._will_engine_execute_node(ctx.next_functions[-1][0])
-            needed = [wanted and need for need in ctx.hand_over.needed]
-        v = _Differentiable(*v_output)
-        v_viewmats, *gradients = _gradients(ctx, needed, need_viewmats, ctx.sparse, v)
-        return (v_viewmats, None, *gradients)
-
-
-def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-    gaussians, cameras, *others = inputs
-    _, ints, floats, *_, level = others
-    options = ProjectionOptions.of(ints, floats)
-    # Torch wants a gradient for each argument, and for each tensor of a list.
-    ctx.no_gradients = [_no_gradient(argument) for argument in others]
-    *columns, _, _ = output
-    _save(
-        ctx,
-        ProjectionInputs(gaussians, cameras, options, level=level),
-        ProjectedSplats._make((*columns, None)),
-    )
-
-
-def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
-    needed, (need_viewmats, _), *_ = ctx.needs_input_grad
-    *v_columns, _, _ = v_output
-    v = _Differentiable.of(ProjectedSplats._make((*v_columns, None)))
-    v_viewmats, *gradients = _gradients(ctx, needed, need_viewmats, [False] * len(needed), v)
-    return gradients, [v_viewmats, None], *ctx.no_gradients
-
-
-def _no_gradient(argument: object) -> list[None] | None:
-    """Return what the backward pass returns for an argument without gradients."""
-    tensors = isinstance(argument, (list, tuple)) and all(isinstance(x, Tensor) for x in argument)
-    return [None] * len(argument) if tensors else None  # type: ignore[arg-type]
-
-
-torch.library.register_autograd("blitzgs::project_fwd", _backward, setup_context=_setup_context)
 
 
 @torch.library.register_fake("blitzgs::project_fwd")
@@ -413,30 +207,4 @@ def _(
         means.new_empty(P if rank_tiles else 0, dtype=torch.int64),
         means.new_empty(0 if ids is None else P, dtype=torch.int64),
         means.new_empty(VIEW_TOTALS + cameras[0].shape[0] + len(rank_tiles), dtype=torch.int64),
-    )
-
-
-@torch.library.register_fake("blitzgs::project_bwd")
-def _(
-    gaussians: Sequence[Tensor],
-    views: Sequence[Tensor | None],
-    splats: Sequence[Tensor],
-    ints: Sequence[int],
-    floats: Sequence[float],
-    v_splats: Sequence[Tensor],
-    v_depths: Tensor | None,
-    need_viewmats: bool,
-    dense: bool = False,
-    level: Tensor | None = None,
-) -> tuple[Tensor, ...]:
-    means, (_, visible_ids, _), viewmats = gaussians[0], splats, views[0]
-    assert viewmats is not None
-    length = (means if dense else visible_ids).shape[0]
-    return (
-        means.new_empty(length, 3),
-        means.new_empty(length, 4),
-        means.new_empty(length, 3),
-        means.new_empty(length),
-        means.new_empty(length, gaussians[4].shape[1] if len(gaussians) > 4 else 0, 3),
-        means.new_empty(viewmats.shape[0] if need_viewmats else 0, 4, 4),
     )

@@ -13,7 +13,8 @@ from blitzgs._library import below_autograd
 from blitzgs.ops.capacity import Attempt, Sizes
 from blitzgs.ops.color_rows import VisibleRows, colored_rows
 from blitzgs.ops.host import HostCopy
-from blitzgs.ops.project import TableRows, capacity_for
+from blitzgs.ops.project import capacity_for
+from blitzgs.ops.project_gradient import TableRows
 from blitzgs.ops.projection_types import (
     VIEW_TOTALS,
     ProjectedSplats,
