@@ -14,7 +14,14 @@ from blitzgs.ops.sparse_rows import distinct_rows
 from blitzgs.optim.drift import Drift
 from blitzgs.optim.handed import Handed, move_to_grad
 from blitzgs.optim.joint import Joint, step_jointly
-from blitzgs.optim.lazy_adam_checks import check_group, check_mask, check_new_rows, check_order
+from blitzgs.optim.lazy_adam_checks import (
+    check_group,
+    check_mask,
+    check_new_rows,
+    check_order,
+    check_saved_groups,
+    groups_by_name,
+)
 from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of, steps_of
 
 
@@ -248,13 +255,7 @@ class LazyAdam(torch.optim.Optimizer):
             ValueError: the state does not fit, or is of another optimiser, or of an Adam with weight decay,
                 AMSGrad or maximize.
         """
-        for group in state_dict["param_groups"]:
-            if missing := {"lr", "betas", "eps"} - group.keys():
-                raise ValueError(
-                    f"LazyAdam: the state has no {', '.join(sorted(missing))}; load one of LazyAdam or "
-                    "torch.optim.Adam"
-                )
-            check_group({"lr_rest": None, **group})
+        check_saved_groups(state_dict["param_groups"])
         self.leave_joint()
         super().load_state_dict(state_dict)
         self.drifts.clear()
@@ -277,16 +278,13 @@ class LazyAdam(torch.optim.Optimizer):
             TypeError: rows are not a tensor.
             ValueError: names or shapes do not fit.
         """
-        named = self._named()
+        named = groups_by_name(self.param_groups)
         count = check_new_rows(rows, named)
-
-        def grow(name: str, old: Tensor) -> Tensor:
-            return torch.cat([old, rows[name].to(old)])
-
-        def grow_state(old: Tensor) -> Tensor:
-            return torch.cat([old, old.new_zeros(count, *old.shape[1:])])
-
-        return self._renew(named, grow, grow_state)
+        return self._renew(
+            named,
+            lambda name, old: torch.cat([old, rows[name].to(old)]),
+            lambda old: torch.cat([old, old.new_zeros(count, *old.shape[1:])]),
+        )
 
     def keep(self, mask: Tensor) -> dict[str, Parameter]:
         """Keep the rows where `mask`, bool [N], is true; return the new parameters as `append` does.
@@ -295,7 +293,7 @@ class LazyAdam(torch.optim.Optimizer):
             TypeError: the mask is not a tensor.
             ValueError: the mask has another dtype or device, or not one entry for each row.
         """
-        check_mask(mask, self._named())
+        check_mask(mask, groups_by_name(self.param_groups))
         return self._select(mask.nonzero()[:, 0])
 
     def permute(self, order: Tensor) -> dict[str, Parameter]:
@@ -309,13 +307,15 @@ class LazyAdam(torch.optim.Optimizer):
             ValueError: the order has another shape, dtype or device, or has a row twice or one that does not
                 exist.
         """
-        check_order(order, self._named())
+        check_order(order, groups_by_name(self.param_groups))
         return self._select(order)
 
     def _select(self, rows: Tensor) -> dict[str, Parameter]:
         """Make the parameters of some of their rows, int64 [N']."""
         return self._renew(
-            self._named(), lambda _, old: old.index_select(0, rows), lambda old: old.index_select(0, rows)
+            groups_by_name(self.param_groups),
+            lambda _, old: old.index_select(0, rows),
+            lambda old: old.index_select(0, rows),
         )
 
     @torch.no_grad()
@@ -325,6 +325,7 @@ class LazyAdam(torch.optim.Optimizer):
         of_param: Callable[[str, Tensor], Tensor],
         of_state: Callable[[Tensor], Tensor],
     ) -> dict[str, Parameter]:
+        """Replace every parameter and its moments by what the functions make of them."""
         self.bring_up_to_date()
         renewed = {}
         for name, group in named.items():
@@ -357,19 +358,6 @@ class LazyAdam(torch.optim.Optimizer):
             if id(known[g]) in places
         }
         self._drift_groups = list(now)
-
-    def _named(self) -> dict[str, dict[str, Any]]:
-        """Return the groups by name.
-
-        Raises:
-            ValueError: a group has no name of its own, or several parameters.
-        """
-        named = {group.get("name"): group for group in self.param_groups if len(group["params"]) == 1}
-        if None in named or len(named) != len(self.param_groups):
-            raise ValueError(
-                "LazyAdam: to change rows, each group needs one parameter and a 'name' of its own"
-            )
-        return named  # type: ignore[return-value]
 
     def _placed(self) -> Iterator[tuple[tuple[int, int], dict[str, Any], Tensor]]:
         """Iterate over all parameters with their indices (group, parameter) and their groups."""

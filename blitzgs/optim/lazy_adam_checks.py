@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -30,6 +30,33 @@ def check_group(group: dict[str, Any]) -> None:
     for name in ("weight_decay", "amsgrad", "maximize"):
         if group.get(name):
             raise ValueError(f"LazyAdam: {name}={group[name]} is not supported; leave it out")
+
+
+def check_saved_groups(groups: Sequence[dict[str, Any]]) -> None:
+    """Check the groups of a state that `load_state_dict` takes.
+
+    Raises:
+        ValueError: as `LazyAdam.load_state_dict`.
+    """
+    for group in groups:
+        if missing := {"lr", "betas", "eps"} - group.keys():
+            raise ValueError(
+                f"LazyAdam: the state has no {', '.join(sorted(missing))}; load one of LazyAdam or "
+                "torch.optim.Adam"
+            )
+        check_group({"lr_rest": None, **group})
+
+
+def groups_by_name(groups: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return the groups by name.
+
+    Raises:
+        ValueError: a group has no name of its own, or several parameters.
+    """
+    named = {group.get("name"): group for group in groups if len(group["params"]) == 1}
+    if None in named or len(named) != len(groups):
+        raise ValueError("LazyAdam: to change rows, each group needs one parameter and a 'name' of its own")
+    return named  # type: ignore[return-value]
 
 
 def check_new_rows(rows: Mapping[str, Tensor], named: Groups) -> int:
