@@ -23,8 +23,8 @@ class _Side:
 
     Attributes:
         stream: the second stream.
-        ready: event that is recorded on the step's stream before each use of the second one. It may be
-            recorded again after a stream was told to wait for it: the wait is for the earlier record.
+        ready: event by which the second stream waits for the step's stream. It is recorded on the step's
+            stream before each use of the second one; a new record does not change waits that are queued.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -45,8 +45,8 @@ class _Queued:
     """
 
     def __init__(self, side: _Side, words: int, tensors: tuple[Tensor | None, ...]) -> None:
-        self._side: _Side = side
-        self._tensors: tuple[Tensor | None, ...] = ()  # for __del__, if `take` raises an error
+        self._side = side
+        self._tensors: tuple[Tensor | None, ...] = ()  # `__del__` reads it even if `take` raises an error
         # Powers of two, so that images of many sizes share few pieces of pinned memory.
         length = 1 << (words - 1).bit_length()
         self._pinned = PinnedNumbers.take(length, torch.float32, side.stream.device)
@@ -152,7 +152,8 @@ class HostSum:
     def _folded(self, numbers: NDArray[np.float32]) -> Tensor:
         """Add up the sums of the ranks in the order of the ranks; the result is a copy."""
         end = self._ranks.world_size * self._sums
-        total = numbers[end - self._sums :].copy()  # those of the last rank, then the costs
+        # The costs follow the sums of the last rank. Copy both; the totals then replace that rank's sums.
+        total = numbers[end - self._sums :].copy()
         of_ranks = numbers[:end].reshape(self._ranks.world_size, self._sums)
         np.add.reduce(of_ranks, 0, out=total[: self._sums])
         return torch.from_numpy(total)

@@ -61,7 +61,15 @@ class _Differentiable(NamedTuple):
 
 
 class _Saved(NamedTuple):
-    """The tensors that `_save` saved, in its groups; ids: of the tables, whose rows are the gaussians."""
+    """The tensors that `_save` saved, in its groups.
+
+    Attributes:
+        gaussians: the rows that were projected: whole tables, or rows that were gathered from tables.
+        cameras: viewmats, Ks.
+        splats: camera_ids, visible_ids, splat_offsets.
+        level: octree levels, if opacities fade with them; else None.
+        ids: for gathered rows, their numbers in the tables; else None.
+    """
 
     gaussians: Sequence[Tensor]
     cameras: Sequence[Tensor]

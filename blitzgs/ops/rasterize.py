@@ -17,8 +17,8 @@ from blitzgs.ops.intersect import pixels_of_tiles
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, GradientBuffer, gradient_columns
 
 rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
-# `1 - t` takes 5 us more of the host's time, in which torch makes a tensor of the number. A tensor without
-# dimensions on the CPU combines with tensors of any device and dtype.
+# For alphas = 1 - transmittances. With the number 1, torch would first make a tensor of it, which takes 5 us
+# of the host's time. A tensor without dimensions on the CPU combines with tensors of any device and dtype.
 _ONE = torch.ones((), device="cpu")
 
 
@@ -42,7 +42,10 @@ class RasterizeSaved(NamedTuple):
 
 
 class Through(NamedTuple):
-    """Arranged geometry of splats through which the gradients of the splats pass.
+    """The geometry of splats in the arrangement of `meta`, whose tensors get the gradients.
+
+    `rasterize` composites the splats themselves. Its backward pass arranges the gradients of their geometry
+    and gives them to these tensors, so that a caller finds them in `.grad` of `meta["means2d"]`.
 
     Attributes:
         places: the arrangement.

@@ -43,11 +43,11 @@ class Traffic(NamedTuple):
         splats: splats[s][d] is the number of splats that rank s sends to rank d.
         sent: number of splats sent to each rank.
         received: number of splats received from each rank.
-        starts: index at which this rank's splats begin among those that each rank receives.
+        starts: for each rank, the position of this rank's first splat among all that the rank receives.
         most: largest number of splats that any rank has, sends or receives.
         n_isects: upper bound of the tile entries of the splats received.
         most_isects: largest `n_isects` of any rank.
-        most_blocks: largest number of blocks, of any rank, of which a view may see a part.
+        most_blocks: largest number of blocks of which a view may see a part, of any rank.
     """
 
     own: Sizes
@@ -120,12 +120,12 @@ class ExchangeResult(NamedTuple):
 
 
 class Exchange(Protocol):
-    """The exchange of one frame's splats.
+    """The exchange of one frame's splats: queued work, whose sizes the host may not know until `finish`.
 
     Attributes:
         arrived: the splats that this rank composites.
-        gradient_table: memory, [R, 12], for the gradients of these splats, which compositing must zero; None:
-            any memory can be used.
+        gradient_table: memory, [R, 12], in which the gradients of these splats must be added up, because
+            other ranks read them there; compositing must zero it. None: any memory can be used.
     """
 
     arrived: Arrived
