@@ -63,8 +63,8 @@ def add_pool(parser: argparse.ArgumentParser) -> None:
         "--resident-gb",
         type=_gigabytes,
         metavar="GB",
-        help="gigabytes of each device for Gaussians, the others stay in host memory; 0: no limit (default: "
-        "memory.resident_gb of the run)",
+        help="gigabytes of each device that hold Gaussians; those that do not fit stay in host memory; 0: "
+        "all are on the device (default: memory.resident_gb of the run)",
     )
 
 
@@ -112,5 +112,7 @@ def add_device(parser: argparse.ArgumentParser, shares_gpus: bool = False) -> No
     )
     if shares_gpus:
         parser.add_argument(
-            "--share-gpus", action="store_true", help="with torchrun: let several ranks use one GPU (slow)"
+            "--share-gpus",
+            action="store_true",
+            help="with torchrun: let several processes use one GPU (slow)",
         )

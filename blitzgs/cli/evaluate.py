@@ -31,8 +31,9 @@ from blitzgs.training.views import ViewSet, render_options
 
 HELP = """\
 Compare renders of a run's held-out views with their photographs. Prints the mean PSNR and SSIM as JSON, and
-writes the figures of each view (metrics.json) and some pictures to --out. psnr_corrected is the PSNR after
-the colours of each render were fitted to its photograph.
+writes the figures of each view (metrics.json) and some pictures to --out. Held-out views are those that the
+model was not trained on. psnr_corrected is the PSNR after the colours of each render were fitted to its
+photograph.
 """
 
 
@@ -57,8 +58,8 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--lpips",
         metavar="FILE",
-        help="also measure LPIPS, with this TorchScript module: (render, photograph) to distance, "
-        "images [1, 3, H, W] in [-1, 1]",
+        help="also measure LPIPS, with this TorchScript module; it takes a render and its photograph, "
+        "[1, 3, H, W] in [-1, 1], and returns their distance",
     )
     parser.add_argument(
         "--allow-missing", action="store_true", help="leave out views whose photograph is missing"

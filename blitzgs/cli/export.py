@@ -26,8 +26,8 @@ property, `level`, is their octree level. The line
 the distance D * F^(1/2 - l), no level above L, and level 0 at any distance.
 
 A model trained with model.antialiased is marked `comment SplatRenderMode: mip`. For a viewer that does not
-know the mark, --classic writes opacities with the compensation that they have at the distance of the training
-views; at other distances it is an approximation.
+know the mark, --classic multiplies the opacities by the compensation that antialiasing has at the distance
+of the training views; at other distances it is an approximation.
 """
 
 

@@ -24,15 +24,15 @@ from blitzgs.training.run_folder import open_run
 from blitzgs.training.schedule import Schedule
 
 HELP = """\
-A spawn gate is a predictor that withholds candidates of densification whose children would probably be pruned
-later. It is fitted on the lineage of finished runs: the log of all births and deaths of Gaussians.
-The repository's docs/guide/fewer-gaussians.md has an example.
+A spawn gate is a predictor. Among the Gaussians about to be cloned or split (the candidates), it withholds
+those whose children would probably be pruned later. It is fitted on the lineage of finished runs: the log of
+all births and deaths of Gaussians. The repository's docs/guide/fewer-gaussians.md has an example.
 
   blitzgs train ... --population.lineage=true       log births and deaths (for each scene)
   blitzgs gate fit RUN RUN RUN --out gate.json      fit on them; prints figures for scenes left out
-  blitzgs gate sample RUN --out NAME.parquet        a run's lineage in one small file, to fit elsewhere
+  blitzgs gate sample RUN --out NAME.parquet        reduce a run's lineage to one small file
   blitzgs gate evaluate gate.json RUN --out DIR     measure it on a scene that it has not seen
-  blitzgs gate replay gate.json RUN --out DIR       compare it with an oracle and with chance
+  blitzgs gate replay gate.json RUN --out DIR       compare it with an oracle and with random vetoes
   blitzgs train ... --population.gate=gate.json     use it
 """
 
@@ -55,8 +55,8 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         type=float,
         default=ScheduleConfig.gate_from,
         metavar="IMAGES",
-        help="spawns from this time on are also evaluated separately: schedule.gate_from of the runs that "
-        "will use the gate, times their schedule.scale (default: %(default)s)",
+        help="also evaluate separately the spawns (births during training) from this time on; take "
+        "schedule.gate_from times schedule.scale of the runs that will use the gate (default: %(default)s)",
     )
     sample = add_command(actions, "sample", run_sample, "reduce the lineage of a run to one file")
     sample.add_argument("folder", type=named_path, metavar="RUN", help="folder of a run with lineage")
@@ -71,7 +71,9 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         help="approximate number of births in the file (default: %(default)s)",
     )
     judge = add_command(actions, "evaluate", run_evaluate, "measure a gate on the lineage of runs")
-    judge.add_argument("gate", type=gate_file, metavar="GATE", help="file of the gate, or: default")
+    judge.add_argument(
+        "gate", type=gate_file, metavar="GATE", help='file of a gate, or "default" (the included one)'
+    )
     judge.add_argument("runs", type=named_path, nargs="+", metavar="RUN", help="folder of a run with lineage")
     judge.add_argument(
         "--out", type=named_path, required=True, metavar="DIR", help="folder for figures and maps"
@@ -80,9 +82,11 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         actions,
         "replay",
         run_replay,
-        "continue one checkpoint several times: without a gate, with it, with an oracle and with chance",
+        "continue one checkpoint several times: without a gate, with it, with an oracle, with random vetoes",
     )
-    again.add_argument("gate", type=gate_file, metavar="GATE", help="file of the gate, or: default")
+    again.add_argument(
+        "gate", type=gate_file, metavar="GATE", help='file of a gate, or "default" (the included one)'
+    )
     again.add_argument("folder", type=named_path, metavar="RUN", help="folder of a run with lineage")
     again.add_argument(
         "--out", type=named_path, required=True, metavar="DIR", help="folder for these runs and their figures"

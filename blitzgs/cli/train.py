@@ -28,14 +28,14 @@ from blitzgs.training.trainer import Trainer
 
 HELP = """\
 Train a model of a capture, which is a folder DIR with photographs and their cameras: a COLMAP model
-(DIR/sparse/0 and DIR/images) or a transforms.json. At the end the held-out views are measured: every 8th,
-unless the capture has its own split.
+(DIR/sparse/0 and DIR/images) or a transforms.json. Every 8th view is held out, unless the capture has its
+own split: the model is not trained on these views, and its quality is measured on them at the end.
 
   blitzgs train --data DIR --out RUN
 
 A GPU trains with the recipe aerial, a CPU with aerial_cpu. --config takes another recipe (compact: fewer
 Gaussians; smoke: a first model in minutes; city: thousands of photographs; paper: the paper's values), a YAML
-file of yours, or "defaults": the defaults of all fields, which blitzgs/training/config.py describes. Every
+file of yours, or "defaults" (the defaults of all fields; blitzgs/training/config.py describes them). Every
 field is also a flag, for example --data.downscale=2 --population.max_gaussians=2000000. --show-config prints
 the resulting configuration and stops.
 
@@ -48,8 +48,8 @@ and when the run is interrupted (Ctrl-C, SIGTERM or SIGHUP). The same command wi
 newest checkpoint; without any checkpoint it starts a new run and says so. With --resume and without --config,
 the run's own configuration is used.
 
-Several processes share the work with torchrun --nproc-per-node=M -m blitzgs train (the same flags). With
---resume and --max-restarts=K, a job that loses a process continues from its last checkpoint.
+To share the work among M processes, run torchrun --nproc-per-node=M -m blitzgs train with the same flags.
+With torchrun's --max-restarts=K and --resume, a job that loses a process continues from its last checkpoint.
 """
 
 

@@ -18,9 +18,9 @@ _HELP = {
     "views": "number of images",
     "width": "image width, pixels",
     "height": "image height, pixels",
-    "points_per_view": "feature points searched for in each image",
+    "points_per_view": "number of feature points to search for in each image",
     "oblique": "fraction of oblique views, 0 to 1",
-    "seed": "seed of everything random",
+    "seed": "seed of all random choices",
 }
 
 
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--preset",
         choices=PRESETS,
         default="demo",
-        help=f"values of the flags that are not given (default: %(default)s): {_sizes()}",
+        help=f"city that the other flags change (default: %(default)s): {_sizes()}",
     )
     for field in fields(CityOptions):
         parser.add_argument(
