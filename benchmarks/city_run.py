@@ -71,8 +71,9 @@ class CityTrainer(Trainer):
         """Do nothing."""
         return {}
 
-    def _stop(self, text: str) -> None:
+    def _stop(self, reason: str) -> None:
         """Write no checkpoint of a stopped run: it takes longer than the time that is left."""
+        self._write_record()
 
 
 def phases_of(config: Config, records: Sequence[Record], images: int, seconds: float) -> list[Record]:

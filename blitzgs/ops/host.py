@@ -40,7 +40,7 @@ class PinnedNumbers(NamedTuple):
         self.idle.append(self)
 
     def abandon(self) -> None:
-        """Keep the memory until the device has written it, though nobody will read it; does not wait."""
+        """Keep the memory, which is not read any more, until the device has written it; does not wait."""
         _abandoned[id(self)] = self
         for key, pinned in list(_abandoned.items()):
             if pinned.written.query():
@@ -49,7 +49,7 @@ class PinnedNumbers(NamedTuple):
 
 # Idle memory by number of values, dtype and index of the device.
 _idle: defaultdict[tuple[int, torch.dtype, int], list[PinnedNumbers]] = defaultdict(list)
-# Memory that nobody will read, by its `id`, until the device has written it.
+# Memory that is not read any more, by its `id`, until the device has written it.
 _abandoned: dict[int, PinnedNumbers] = {}
 
 
