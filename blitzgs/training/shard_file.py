@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,11 +75,16 @@ def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[st
     head = json.dumps(header).encode()
     head += b" " * (-len(head) % 8)
     digest = hashlib.sha256()
-    with open(path, "wb") as file:
+    # The digest takes as long as writing. It is computed while the data are written and the next are fetched.
+    with open(path, "wb") as file, ThreadPoolExecutor(1, "digest") as thread:
+        hashed: Future[None] | None = None
 
         def put(data: bytes | memoryview) -> None:
+            nonlocal hashed
+            if hashed is not None:
+                hashed.result()
+            hashed = thread.submit(digest.update, data)
             file.write(data)
-            digest.update(data)
 
         put(len(head).to_bytes(8, "little"))
         put(head)
@@ -92,6 +98,7 @@ def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[st
         reached("shard written")
         os.fsync(file.fileno())
         size = file.tell()
+    # The end of the block has waited for the thread.
     reached("shard synced")
     return size, digest.hexdigest()
 
