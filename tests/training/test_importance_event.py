@@ -187,24 +187,30 @@ def test_passes_are_the_same_at_every_world_size(tmp_path, world_size, device):
             assert torch.equal(a[order], b[reference])
 
 
+def lineage_of_the_resumed(folder):
+    """Resume a run, check that its births less its deaths are its final model, and return both."""
+    trainer, _ = train(folder, "population.lineage=true", resume=True)
+    tables = read_lineage(folder / run_files.LINEAGE)
+    births, deaths = tables["births"]["id"], tables["deaths"]["id"]
+    assert sorted(set(births) - set(deaths)) == sorted(trainer.state.table["id"].tolist())
+    ledger = trainer.state.progress.ledger
+    assert ledger["births"] == len(births) and ledger["deaths"] == len(deaths)
+    return tables
+
+
 def test_lineage_of_a_run_that_was_stopped_adds_up(tmp_path, monkeypatch):
     """Every Gaussian of the final model was born and did not die; each death has its mechanism."""
     pytest.importorskip("pyarrow")
     stop_at(monkeypatch, 50)
     train(tmp_path, "population.lineage=true")
     monkeypatch.undo()
-    trainer, _ = train(tmp_path, "population.lineage=true", resume=True)
-    tables = read_lineage(tmp_path / run_files.LINEAGE)
-    births, deaths = tables["births"]["id"], tables["deaths"]["id"]
-    assert sorted(set(births) - set(deaths)) == sorted(trainer.state.table["id"].tolist())
+    tables = lineage_of_the_resumed(tmp_path)
     causes = dict(zip(*np.unique(tables["deaths"]["cause"], return_counts=True), strict=True))
     events = pass_events(tmp_path)
     assert causes[Cause.PASS_1] == events["pass_1"]["before"] - events["pass_1"]["gaussians"]
     late = causes.get(Cause.PASS_2, 0) + causes.get(Cause.LATE_OPACITY, 0)
     assert late == events["pass_2"]["before"] - events["pass_2"]["gaussians"]
     assert causes[Cause.SPLIT] + causes.get(Cause.OPACITY, 0) > 0
-    ledger = trainer.state.progress.ledger
-    assert ledger["births"] == len(births) and ledger["deaths"] == len(deaths)
 
 
 def test_lineage_of_a_run_that_was_saved_before_its_first_step_adds_up(tmp_path, monkeypatch):
@@ -214,11 +220,7 @@ def test_lineage_of_a_run_that_was_saved_before_its_first_step_adds_up(tmp_path,
     with pytest.raises(PhotographError, match="put the photograph back"):
         train(tmp_path, "population.lineage=true")
     monkeypatch.undo()
-    trainer, _ = train(tmp_path, "population.lineage=true", resume=True)
-    tables = read_lineage(tmp_path / run_files.LINEAGE)
-    births, deaths = tables["births"]["id"], tables["deaths"]["id"]
-    assert sorted(set(births) - set(deaths)) == sorted(trainer.state.table["id"].tolist())
-    assert len(births) == trainer.state.progress.ledger["births"]
+    lineage_of_the_resumed(tmp_path)
 
 
 def require_vetoes_from_60(folder):
