@@ -22,7 +22,7 @@
 
 namespace blitzgs {
 
-inline constexpr double kContributionScale = 4294967296.0;  // 2^32, the number of units in 1
+inline constexpr std::int64_t kContributionScale = std::int64_t{1} << 32;  // the number of units in 1
 
 template <class T>
 struct ContributionInput {

@@ -78,6 +78,13 @@ struct ContributionArguments {
   ContributionSums sums;
 };
 
+// Returns 1, or 0 for 0. The compiler turns min(units, 1) into a comparison, an addition and a move.
+__device__ __forceinline__ std::uint32_t one_if_any(std::uint32_t units) {
+  std::uint32_t one;
+  asm("min.u32 %0, %1, 1;" : "=r"(one) : "r"(units));
+  return one;
+}
+
 // Sums an entry's weights, and with kSquares their squares, over the 16 pixels of a subtile, and adds the
 // sums to those of the entry.
 template <bool kSquares>
@@ -90,7 +97,7 @@ __device__ __forceinline__ void sum_pixels(const std::uint32_t* words, Entry& en
     for (const std::uint32_t units : {four.x, four.y, four.z, four.w}) {
       weight += units;
       if constexpr (kSquares) squares += __umulhi(units, units);
-      pixels += units != 0;
+      pixels += one_if_any(units);
     }
   }
   if (pixels == 0) return;
@@ -115,7 +122,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const 
   const int count = static_cast<int>(args.tile_offsets[tile.tile + 1] - start);
   batch.init(thread);
 
-  Compositor state;
+  Compositor<kContributionScale> state;
   state.limit = pixel.inside ? kLog2Cut : INFINITY;
   std::uint32_t* const group = shared.groups[pixel.subtile];
   const auto splat_at = [&](int at) {
@@ -150,8 +157,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const 
         const QuadAlphas alpha = state.alphas(entries, QuadOffsets(list[i + quad]), pixel);
 #pragma unroll
         for (int k = 0; k < 4; ++k) {
-          group[(4 * quad + k) * kEntryStride + lane] =
-              __float2uint_rn(state.composite(alpha.at[k]) * static_cast<float>(kContributionScale));
+          group[(4 * quad + k) * kEntryStride + lane] = __float2uint_rn(state.composite(alpha.at[k]));
         }
       }
       __syncwarp();

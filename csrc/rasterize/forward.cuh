@@ -84,10 +84,13 @@ struct QuadAlphas {
 };
 
 // The state of one pixel while its list is composited. For each four entries, alphas() comes first, and then
-// composite() of each alpha in order. `ended` is a byte offset of an entry in the current batch.
+// composite() of each alpha in order. `ended` is a byte offset of an entry in the current batch. The
+// transmittance and the weights are in units of 1 / kScale. It is a power of two, so it changes no rounding.
+template <std::int64_t kScale = 1>
 struct Compositor {
   static constexpr std::uint32_t kNone = ~0u;
-  float transmittance = 1.f;
+  static constexpr float kEnd = static_cast<float>(kMinTransmittance) * static_cast<float>(kScale);
+  float transmittance = static_cast<float>(kScale);
   float limit;                  // the least log2(alpha) that is composited; infinite once the pixel has ended
   std::uint32_t ended = kNone;  // the entry at which the pixel ended
 
@@ -103,7 +106,7 @@ struct Compositor {
       alpha.at[k] = alpha.touched[k] ? fminf(exp2_approx(log2_a), static_cast<float>(kAlphaMax)) : 0.f;
       after = __fmaf_rn(-alpha.at[k], after, after);
     }
-    if (__any_sync(kFullWarp, after < static_cast<float>(kMinTransmittance))) end(alpha, offsets);
+    if (__any_sync(kFullWarp, after < kEnd)) end(alpha, offsets);
     return alpha;
   }
 
@@ -120,7 +123,7 @@ struct Compositor {
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
       after = __fmaf_rn(-alpha.at[k], after, after);
-      if (ended == kNone && after < static_cast<float>(kMinTransmittance)) ended = offsets.at[k];
+      if (ended == kNone && after < kEnd) ended = offsets.at[k];
       if (ended != kNone) {
         alpha.at[k] = 0.f;
         alpha.touched[k] = false;

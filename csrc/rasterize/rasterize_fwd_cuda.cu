@@ -19,7 +19,7 @@ struct ForwardArguments : ChunkInput {
 // instructions.
 template <int CHANNELS>
 __device__ __forceinline__ void add_colors(const char* entries, const QuadOffsets& offsets,
-                                           const Pixel& pixel, Compositor& state, float* color,
+                                           const Pixel& pixel, Compositor<>& state, float* color,
                                            std::uint32_t* last) {
   const QuadAlphas alpha = state.alphas(entries, offsets, pixel);
 #pragma unroll
@@ -101,7 +101,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) forward_kernel(const Forwar
   if (thread == 0) tile_work = 0;
   batch.init(thread);
 
-  Compositor state;
+  Compositor<> state;
   float color[CHANNELS] = {};
   std::uint32_t touched = state.kNone;  // byte offset of the last entry of the batch that touches the pixel
   state.limit = pixel.inside ? kLog2Cut : INFINITY;

@@ -54,19 +54,38 @@ BLITZGS_HD std::int64_t score_term(const ViewSumsArgs& args, std::int64_t splat,
   return round(term / args.unit);
 }
 
+// Clears the bits of one word of a Gaussian's row of the cull matrix after the other. It stores a word only
+// when the next bit is in another one, because stores would keep the loads of later splats waiting.
+struct CullRow {
+  std::uint32_t* words;
+  std::int32_t word = 0;
+  std::uint32_t bits = 0;
+
+  BLITZGS_HD void clear(std::int32_t column) {
+    if (column / 32 != word) store();
+    word = column / 32;
+    bits |= 1u << column % 32;
+  }
+  BLITZGS_HD void store() {
+    if (bits != 0) words[word] &= ~bits;
+    bits = 0;
+  }
+};
+
 template <class Round>
 BLITZGS_HD void view_sums_of(const ViewSumsArgs& args, std::int64_t u, const Round& round) {
   const std::int32_t id = args.visible_ids[u];
   std::int64_t score = 0;
   std::int32_t seen = 0, counted = 0;
+  CullRow cull{args.cull + id * args.words};
   for (std::int64_t i = args.splat_offsets[u]; i < args.splat_offsets[u + 1]; ++i) {
     score += score_term(args, i, round);
     seen += args.radii[2 * i] > 0 || args.radii[2 * i + 1] > 0;
     if (!args.counts[i]) continue;
     ++counted;
-    const std::int32_t column = args.columns[args.camera_ids[i]];
-    args.cull[id * args.words + column / 32] &= ~(1u << column % 32);
+    cull.clear(args.columns[args.camera_ids[i]]);
   }
+  cull.store();
   args.score[id] += score;
   args.seen[id] += seen;
   args.counted[id] += counted;
