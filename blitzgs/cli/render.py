@@ -31,6 +31,7 @@ from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.training.lod import lod_gate, scene_gate
 from blitzgs.training.run_cameras import CAMERAS, RunCameras, input_files, load_cameras
 from blitzgs.training.views import CameraLike, ViewSet, render_options
+from blitzgs.view.visible_scene import VisibleFinder
 
 
 def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -61,8 +62,8 @@ def run(args: argparse.Namespace) -> int:
         views = ViewSet(list(cameras), model.space, ranks.device)
         gate = lod_gate(model.config, model.progress)
         options = render_options(model.config, model.space, model.progress.sh_degree, gate)
-        scene = model.scene(ranks.device)
-        owners, lod = TileOwners(ranks), scene_gate(model.config, model.progress, model.table, ranks)
+        lod = scene_gate(model.config, model.progress, model.table, ranks)
+        finder, owners = VisibleFinder(model.scene(ranks.device), lod), TileOwners(ranks)
         output = OutputFolder(args.out, stored.inputs)
         # Names for all views, so that a view's file has the same name whichever split is rendered.
         paths = output.paths([camera.name for camera in cameras], ".npy" if args.raw else ".png")
@@ -71,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
             for position, index in enumerate(indices):
                 # The ranks take turns at writing.
                 destination = position % ranks.world_size
-                render = render_view(scene, views, index, options, owners, destination, lod)
+                render = render_view(finder, views, index, options, owners, destination)
                 report(position + 1, len(indices))
                 if render is None:
                     continue

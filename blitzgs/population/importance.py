@@ -40,7 +40,7 @@ from blitzgs.ops.view_sums import ViewSums, view_sums_
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.survey import Survey, survey
 from blitzgs.view.gate import SceneGate
-from blitzgs.view.visible_scene import Scene, VisibleScene, find_visible, table_of
+from blitzgs.view.visible_scene import Scene, VisibleFinder, VisibleScene, table_of
 
 # The constants of the formulas above. PHI_EPS and VIEW_MASS are the paper's values; the paper calls the
 # epsilon of the score small and gives no value.
@@ -129,12 +129,12 @@ def sweep(
     table = table_of(scene)
     sums = _Sums(len(table), n_views, table.device, rule)
     owners = owners or TileOwners(ranks)
-    transport = open_transport(ranks)
+    transport, finder = open_transport(ranks), VisibleFinder(scene, lod)
     for number, batch in enumerate(batches):
         if stops is not None and number > 0 and stops():
             raise SweepStoppedError
         assignment = _assign(batch, options, owners)
-        visible = find_visible(scene, *batch.views.as_arguments(), options.limits, lod)
+        visible = finder.find(*batch.views.as_arguments(), options.limits)
         surveyed = survey(
             visible.table, batch.views, options, assignment, transport, visible.active, rule == "energy"
         )

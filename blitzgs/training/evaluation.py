@@ -26,7 +26,7 @@ from blitzgs.scene.pictures import comparison, encode_image
 from blitzgs.training.batches import Images, PhotographError
 from blitzgs.training.views import CameraLike, ViewSet
 from blitzgs.view.gate import SceneGate
-from blitzgs.view.visible_scene import Scene, find_visible
+from blitzgs.view.visible_scene import Scene, VisibleFinder
 
 Lpips = Callable[[Tensor, Tensor], Tensor]
 Stops = Callable[[], bool]
@@ -99,30 +99,28 @@ def load_lpips(path: str | None) -> Lpips | None:
 
 
 def render_view(
-    scene: Scene,
+    finder: VisibleFinder,
     views: ViewSet,
     index: int,
     options: RenderOptions,
     owners: TileOwners,
     destination: int = 0,
-    lod: SceneGate | None = None,
 ) -> Tensor | None:
     """Render camera `index` with the Gaussians of all ranks; every rank calls this.
 
     Args:
-        scene: this rank's Gaussians, without pending optimiser steps.
+        finder: finds this rank's Gaussians in the view.
         views: all cameras.
         index: the camera to render.
         options: how to render.
         owners: divides the tiles among the ranks.
         destination: rank that gets the image.
-        lod: leaves out Gaussians whose octree level is too fine for their distance; None: no gate.
 
     Returns:
         float32 [H, W, 3] on rank `destination`, the same bits at any number of ranks; None elsewhere.
     """
     picked, ranks = views.pick([index]), owners.ranks
-    table, active, _ = find_visible(scene, *picked.as_arguments(), options.limits, lod)
+    table, active, _ = finder.find(*picked.as_arguments(), options.limits)
     if ranks.world_size == 1:
         return pipeline.forward(table, picked, options, active).renders[0]
     ranges = owners.divide([index], picked.width, picked.height, options.tile_size)
@@ -178,7 +176,7 @@ def evaluate(
         report: called with (views rendered, number of views) after each view.
         inputs: files that must not be overwritten.
         optional_files: if a file cannot be written, warn instead of raising an error; used during training.
-        lod: as for `render_view`.
+        lod: leaves out Gaussians whose octree level is too fine for their distance; None: no gate.
         stops: asked after each round in which every rank compares one view; if it returns True, the
             evaluation ends. It must return the same on every rank. None: never stop.
 
@@ -198,13 +196,14 @@ def evaluate(
     per_view: dict[str, dict[str, float]] = {}
     lost: str | None = None
     own = list(indices[ranks.rank :: ranks.world_size])
+    finder = VisibleFinder(scene, lod)
     for position, index in enumerate(indices):
         turn, destination = divmod(position, ranks.world_size)
         if destination == 0:
             if stops is not None and position > 0 and stops():
                 raise EvaluationStoppedError
             images.prefetch(own[turn : turn + 4])
-        render = render_view(scene, views, index, options, owners, destination, lod)
+        render = render_view(finder, views, index, options, owners, destination)
         if report is not None:
             report(position + 1, len(indices))
         if render is None:

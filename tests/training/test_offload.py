@@ -12,6 +12,7 @@ from blitzgs.training.evaluation import render_view
 from blitzgs.training.lod import scene_gate
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.residence import Residence, ResidenceError
+from blitzgs.view.visible_scene import VisibleFinder
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import DEVICES
 from tests.training.tiny import HEIGHT, WIDTH, Camera, photographed, random_gaussians, tiny_config
@@ -146,12 +147,14 @@ def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypat
     table = model.table
     lod = scene_gate(model.config, model.progress, table, ranks)
     options, owners = trainer.state.render_options, TileOwners(ranks)
-    expected = [render_view(table, trainer.state.views, i, options, owners, lod=lod) for i in (0, 5)]
+    resident, views = VisibleFinder(table, lod), trainer.state.views
+    expected = [render_view(resident, views, i, options, owners) for i in (0, 5)]
     whole = GaussianTable({name: table[name].clone() for name in table})
     scene = model.scene(ranks.device)
+    finder = VisibleFinder(scene, lod)
     assert isinstance(scene, Residence) and len(scene.pool) < 0.42 * len(whole)
     for i, image in zip((0, 5), expected, strict=True):
-        assert torch.equal(render_view(scene, trainer.state.views, i, options, owners, lod=lod), image)
+        assert torch.equal(render_view(finder, views, i, options, owners), image)
         assert image.std() > 0.01
     scene.write_back()
     for name in whole:
