@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import blitzgs
-from blitzgs.ops import project, splat_gradients
+from blitzgs.ops import project_gradient, splat_gradients
 from tests.helpers import PARAMETERS, random_scene, relative_error
 
 PER_SPLAT = ("radii", "means2d", "depths", "conics", "opacities", "tiles_per_gauss")
@@ -136,7 +136,7 @@ def test_gradients_of_splats_stay_in_their_table(monkeypatch):
         found.append(splat_gradients.packed_table(columns))
         return found[-1]
 
-    monkeypatch.setattr(project, "packed_table", packed_table)
+    monkeypatch.setattr(project_gradient, "packed_table", packed_table)
     for _ in range(3):
         leaves = scene.leaves()
         renders, _, meta = blitzgs.rasterization(*leaves.arguments(), sh_degree=scene.sh_degree)
