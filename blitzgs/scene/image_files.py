@@ -19,6 +19,7 @@ UInt8 = npt.NDArray[np.uint8]
 
 _HEADER_BYTES = 1 << 16
 _EXIF_ORIENTATION = 0x0112
+_TIFF_STARTS = (b"II*\0", b"MM\0*")
 _TURNS: dict[int, tuple[int, ...]] = {3: (cv2.ROTATE_180,), 6: (cv2.ROTATE_90_CLOCKWISE,)}
 _TURNS[8] = (cv2.ROTATE_90_COUNTERCLOCKWISE,)
 
@@ -57,8 +58,11 @@ def read_header(path: Path) -> ImageHeader:
         # Palettes and single colours may be transparent too (the chunk tRNS, before the pixels).
         has_alpha = data[25] in (4, 6) or b"tRNS" in data.partition(b"IDAT")[0]
         return ImageHeader(width, height, has_alpha=has_alpha)
-    pixels = _imdecode(path.read_bytes(), cv2.IMREAD_UNCHANGED, str(path))
-    return ImageHeader(pixels.shape[1], pixels.shape[0], has_alpha=pixels.ndim == 3 and pixels.shape[2] == 4)
+    data = path.read_bytes()
+    pixels = _imdecode(data, cv2.IMREAD_UNCHANGED, str(path))
+    orientation = _exif_orientation(data) if data[:4] in _TIFF_STARTS else 1
+    has_alpha = pixels.ndim == 3 and pixels.shape[2] == 4
+    return ImageHeader(pixels.shape[1], pixels.shape[0], orientation, has_alpha)
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -95,22 +99,40 @@ def _jpeg_header(data: bytes) -> ImageHeader | None:
 
 def _exif_orientation(tiff: bytes) -> int:
     """Return the orientation tag of the first directory; 1 if it is missing or invalid."""
+    found = _orientation_field(tiff)
+    return found[1] if found is not None and 1 <= found[1] <= 8 else 1
+
+
+def _orientation_field(tiff: bytes) -> tuple[slice, int] | None:
+    """Return the two bytes of the orientation tag in the first directory, and its value; None: no tag."""
     order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
+    if order is None:
+        return None
     try:
-        if order is None:
-            return 1
         (at,) = struct.unpack(order + "I", tiff[4:8])
         (entries,) = struct.unpack(order + "H", tiff[at : at + 2])
         for entry in range(at + 2, at + 2 + 12 * entries, 12):
             tag, _, _, value = struct.unpack(order + "HHIH", tiff[entry : entry + 10])
             if tag == _EXIF_ORIENTATION:
-                return value if 1 <= value <= 8 else 1
+                return slice(entry + 8, entry + 10), value
     except struct.error:
         pass
-    return 1
+    return None
+
+
+def _unturned(tiff: bytes) -> bytes:
+    """Return a TIFF file without its orientation: OpenCV turns TIFF files by their tag whatever the flags."""
+    found = _orientation_field(tiff)
+    if found is None:
+        return tiff
+    field, _ = found
+    upright = (1).to_bytes(2, "little" if tiff[:2] == b"II" else "big")
+    return tiff[: field.start] + upright + tiff[field.stop :]
 
 
 def _imdecode(data: bytes, flags: int, name: str) -> UInt8:
+    if data[:4] in _TIFF_STARTS:
+        data = _unturned(data)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
     except cv2.error as error:

@@ -5,12 +5,13 @@ import warnings
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from blitzgs.scene import colmap
 from blitzgs.scene.cameras import camera_centres
 from blitzgs.scene.capture import load_capture
 from blitzgs.scene.files import find_mask
-from blitzgs.scene.image_files import apply_orientation, read_header
+from blitzgs.scene.image_files import ImageHeader, apply_orientation, read_header
 from blitzgs.scene.images import ImageStore
 from tests.scene.helpers import edit_model, shared_data, smooth_image, write_capture, write_image
 
@@ -174,6 +175,21 @@ def test_exif_orientation_turns_an_image_only_when_its_camera_is_upright(tmp_pat
     applied = load_capture(tmp_path / "asstored", exif="apply") if orientation < 5 else None
     if applied is not None:
         np.testing.assert_array_equal(ImageStore(applied).get(0).numpy(), cv2.imread(str(path))[..., ::-1])
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("channels", [3, 4])
+def test_the_orientation_of_a_tiff_is_that_of_exif(tmp_path, orientation, channels):
+    stored = smooth_image(80, 48)
+    pixels = np.dstack([stored, np.full((80, 48), 255, dtype=np.uint8)])[..., :channels]
+    root = write_capture(tmp_path, ["a.tif"], width=48, height=80)
+    path = root / "images" / "a.tif"
+    Image.fromarray(pixels).save(path, exif={0x0112: orientation})
+    assert read_header(path) == ImageHeader(48, 80, orientation, channels == 4)
+    np.testing.assert_array_equal(ImageStore(load_capture(root)).get(0).numpy(), stored)
+    if orientation < 5:
+        turned = ImageStore(load_capture(root, exif="apply")).get(0).numpy()
+        np.testing.assert_array_equal(turned, apply_orientation(stored, orientation))
 
 
 def test_masks_are_found_turned_and_shrunk_so_that_mixed_pixels_are_excluded(tmp_path):
