@@ -190,9 +190,12 @@ def decode_mask(data: bytes, name: str) -> UInt8:
     Raises:
         ValueError: the file cannot be decoded.
     """
-    # Labels may be small numbers of 16 bits, which a conversion to 8 bits would make black.
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    # Labels may be small numbers of 16 bits or dark colours: a conversion to 8 bits or to grey would make
+    # them black.
+    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     pixels = _imdecode(data, flags, name)
+    if pixels.ndim == 3:
+        pixels = pixels.max(axis=2)
     return np.asarray((pixels > 0).astype(np.uint8))
 
 
