@@ -37,7 +37,7 @@ from blitzgs.scene.undistort import Rectification, rectify
 _LEAST_SIDE = 8
 _HEADER_THREADS = 16
 _SAMPLED_POINTS = 2000
-_MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
+_MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp")
 # Cameras whose distance is below this share of the points' distance count as being in one place: the parallax
 # between them is far below a pixel.
 _LEAST_SPREAD = 1e-6

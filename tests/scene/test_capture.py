@@ -386,16 +386,17 @@ def test_real_captures_load_and_decode(name, views, test, downscale):
     assert inside.sum() > 1000
 
 
-def test_masks_that_belong_to_no_image_are_not_ignored(tmp_path):
+@pytest.mark.parametrize("name", ["mask_of_v00.png", "v00.tif"])
+def test_masks_that_belong_to_no_image_are_not_ignored(tmp_path, name):
     root = write_capture(tmp_path, NAMES)
     (root / "masks").mkdir()
     mask = np.zeros((48, 64), dtype=np.uint8)
-    cv2.imwrite(str(root / "masks" / "mask_of_v00.png"), mask)
-    with pytest.raises(ValueError, match="none of the 1 masks in .*mask_of_v00.png.*data.masks=false"):
+    cv2.imwrite(str(root / "masks" / name), mask)
+    with pytest.raises(ValueError, match=f"none of the 1 masks in .*{name}.*data.masks=false"):
         load_capture(root)
     assert load_capture(root, masks=False).cameras[0].mask_path is None
     cv2.imwrite(str(root / "masks" / f"{NAMES[1]}.png"), mask)
-    with pytest.warns(UserWarning, match="1 of 2 masks in .* belong to no image .first: mask_of_v00.png"):
+    with pytest.warns(UserWarning, match=f"1 of 2 masks in .* belong to no image .first: {name}"):
         load_capture(root)
 
 
