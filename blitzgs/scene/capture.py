@@ -201,7 +201,12 @@ def _existing(views: list[SourceView], root: Path, images: str, allow_missing: b
     if not missing:
         return found
     shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
-    message = f"{len(missing)} of {len(views)} images are not in {root / images}: {shown}"
+    # The names of a transforms.json are paths in the capture; those of a COLMAP model, in its image folder.
+    are_paths = all(view.path == root / view.name for view in views if not view.path.is_file())
+    folder = root if are_paths else root / images
+    message = f"{len(missing)} of {len(views)} images are not in {folder}: {shown}"
+    if not found and are_paths:
+        raise FileNotFoundError(f"{message}; put them there, or correct file_path in its transforms.json")
     if not found:
         # A user may name the folder of the model, CAPTURE/sparse/0.
         above = next((folder for folder in root.resolve().parents[:2] if (folder / images).is_dir()), None)

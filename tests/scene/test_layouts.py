@@ -177,6 +177,21 @@ def test_an_image_of_two_frames_is_refused(tmp_path, again):
         load_capture(tmp_path)
 
 
+def test_missing_images_of_transforms_are_named_by_their_paths(tmp_path):
+    """The folder `images` and the flag data.images have no meaning for them."""
+    frames = [
+        {"file_path": f"photos/{name}.png", "w": 64, "h": 48, "fl_x": 50.0, "transform_matrix": pose.tolist()}
+        for name, pose in (("a", np.eye(4)), ("b", np.diag([-1.0, -1.0, 1.0, 1.0])))
+    ]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    with pytest.raises(FileNotFoundError, match="correct file_path in its transforms.json") as caught:
+        load_capture(tmp_path)
+    assert f"2 of 2 images are not in {tmp_path}: photos/a.png, photos/b.png;" in str(caught.value)
+    write_image(tmp_path / "photos" / "a.png", smooth_image(48, 64))
+    with pytest.raises(MissingImagesError, match=f"1 of 2 images are not in {tmp_path}: photos/b.png;"):
+        load_capture(tmp_path, split=0)
+
+
 @pytest.mark.parametrize("text", ['{"frames": ' + "[" * 100_000, "[]"])
 def test_transforms_that_are_damaged_are_named(tmp_path, text):
     (tmp_path / "transforms.json").write_text(text)
