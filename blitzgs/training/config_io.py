@@ -8,6 +8,7 @@ import dataclasses
 import difflib
 import hashlib
 import json
+import math
 import types
 import typing
 from collections.abc import Iterable
@@ -48,7 +49,7 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
         if not equals:
             raise ConfigError(f"'{text}' is not an override: write --section.field=value")
         try:
-            parsed = yaml.safe_load(value)
+            parsed = yaml.load(value, _Loader)
         except _UNREADABLE as error:
             raise ConfigError(f"{name}: cannot read the value '{value}': {error}") from error
         _merge(values, _nest(name.split("."), parsed), name)
@@ -81,7 +82,10 @@ def config_hash(config: Config) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """A YAML loader that refuses duplicate keys, of which PyYAML silently keeps the last."""
+    """A YAML loader that refuses duplicate keys, of which PyYAML silently keeps the last.
+
+    A number whose usual form is another one, and a date, stay text: 100_0001 may be the name of a folder.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Build a mapping as the parent class does; a duplicate key is an error."""
@@ -93,6 +97,17 @@ class _Loader(yaml.SafeLoader):
             seen.add(str(key.value))
         return super().construct_mapping(node, deep)
 
+    def construct_number(self, node: yaml.ScalarNode) -> int | float | str:
+        """Return the number if Python writes it as the file does, else its text, which `_convert` reads."""
+        is_int = node.tag == "tag:yaml.org,2002:int"
+        value: int | float = self.construct_yaml_int(node) if is_int else self.construct_yaml_float(node)
+        not_finite = isinstance(value, float) and not math.isfinite(value)
+        return value if not_finite or str(value) == node.value else node.value
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_number)
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_number)
+_Loader.add_constructor("tag:yaml.org,2002:timestamp", lambda _, node: node.value)
 
 # Errors that PyYAML raises for text that is not YAML or has a value that Python cannot represent.
 _UNREADABLE = (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError)
@@ -186,9 +201,11 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
             _convert(o, v, f"{path}[{i}]") for i, (o, v) in enumerate(zip(options, value, strict=True))
         )
     if hint in (int, float) and isinstance(value, str):
-        # YAML 1.1 reads 1e-4 as a string.
-        with contextlib.suppress(ValueError):
-            value = float(value)
+        # YAML 1.1 reads 1e-4 as a string. An integer keeps all its digits, which a float may not hold.
+        text = value
+        for kind in (float, int):
+            with contextlib.suppress(ValueError):
+                value = kind(text)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         try:
             return float(value)

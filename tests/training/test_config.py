@@ -172,6 +172,20 @@ def test_a_position_rate_of_zero_keeps_the_means_in_place():
     assert rates.isfinite().all() and not rates[:, 0].any() and rates[1:, 1:].all()
 
 
+@pytest.mark.parametrize("name", ["100_0001", "0042", "2024-01-05", "1.50", "12:30"])
+def test_a_name_that_looks_like_a_number_or_a_date_is_kept(tmp_path, name):
+    assert load_config(None, [f"--data.images={name}"]).data.images == name
+    file = tmp_path / "c.yaml"
+    file.write_text(f"data:\n  images: {name}\n")
+    assert load_config(file).data.images == name
+
+
+def test_a_number_may_have_zeros_in_front_and_underscores():
+    numbers = ["--seed=9_223_372_036_854_775_807", "--log.every=010", "--model.near=1.5e-01"]
+    config = load_config(None, numbers)
+    assert (config.seed, config.log.every, config.model.near) == (2**63 - 1, 10, 0.15)
+
+
 def test_masks_may_be_switched_off():
     assert load_config(None, ["--data.masks=false"]).data.masks is False
     assert load_config(None, ["--data.masks=true"]).data.masks is True
