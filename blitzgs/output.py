@@ -55,6 +55,11 @@ def new_file(path: Path, sync: bool = True) -> Iterator[Path]:
         os.replace(partial, path)
         if sync:
             sync_to_disk(path.parent)
+    except OSError as error:
+        # A write to a full disk names no file.
+        if error.errno is not None and error.filename in (None, str(partial)):
+            error.filename = str(path)
+        raise
     finally:
         partial.unlink(missing_ok=True)
 

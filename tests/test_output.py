@@ -131,3 +131,12 @@ def test_an_error_names_the_file_that_was_asked_for(tmp_path):
     with pytest.raises(FileNotFoundError) as caught:
         write_file(path, "{}")
     assert caught.value.filename == str(path)
+
+
+def test_a_full_disk_names_the_file_that_was_asked_for(tmp_path):
+    path = tmp_path / "figures.json"
+    with pytest.raises(OSError, match="No space left") as caught, new_file(path) as partial:
+        partial.unlink()
+        partial.symlink_to("/dev/full")
+        partial.write_bytes(b"x")
+    assert caught.value.filename == str(path) and not list(tmp_path.iterdir())
