@@ -171,6 +171,8 @@ def decode_rgb(data: bytes, name: str, background: tuple[float, float, float] | 
     if background is not None:
         pixels = _imdecode(data, cv2.IMREAD_UNCHANGED, name)
         if pixels.ndim == 3 and pixels.shape[2] == 4:
+            if pixels.dtype.kind != "u":
+                raise ValueError(f"{name}: pixels must be of 8 or 16 bits, got {pixels.dtype}")
             return _over(pixels, background)
     pixels = _imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, name)
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))

@@ -278,6 +278,13 @@ def test_transparent_colours_of_a_palette_are_alpha(tmp_path):
     assert capture.has_alpha and image[0, 0].tolist() == [255, 0, 0] and image[0, 63].tolist() == [0, 255, 0]
 
 
+def test_floating_point_pixels_with_alpha_are_refused_by_name(tmp_path):
+    root = write_capture(tmp_path, ["a.tif"], width=64, height=48)
+    cv2.imwrite(str(root / "images" / "a.tif"), np.ones((48, 64, 4), dtype=np.float32))
+    with pytest.raises(ValueError, match="a.tif: pixels must be of 8 or 16 bits, got float32"):
+        ImageStore(load_capture(root)).get(0)
+
+
 def test_a_file_that_changed_its_size_is_refused(capture):
     write_image(capture.cameras[0].image_path, smooth_image(20, 30))
     with pytest.raises(ValueError, match="is 30 x 20 now but was 64 x 48"):
