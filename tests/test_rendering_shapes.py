@@ -113,6 +113,17 @@ def test_sh_may_differ_from_view_to_view(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_sh_of_no_views_have_images_and_gradients(device):
+    scene = random_scene(n=10, cameras=1, device=device).leaves()
+    scene.colors = torch.zeros(0, 10, 16, 3, device=device, requires_grad=True)
+    scene.viewmats, scene.Ks = scene.viewmats.detach()[:0], scene.Ks[:0]
+    renders, alphas, meta = rasterize_scene(scene)
+    renders.sum().backward()
+    assert renders.shape[0] == alphas.shape[0] == meta["n_cameras"] == 0
+    assert scene.colors.grad.shape == (0, 10, 16, 3) and not scene.means.grad.any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("mode", ["D", "ED"])
 def test_depth_needs_no_colours(device, mode):
     scene = random_scene(n=30, device=device)

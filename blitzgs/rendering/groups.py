@@ -54,7 +54,10 @@ def _sh_of_views(gaussians: Gaussians, scene: Scene, parts: int) -> Sequence[Ten
     """Return the SH that each part of a scene's views is rendered with."""
     if gaussians.sh_degree is None or scene.colors is None:
         return (None,) * parts
-    return scene.colors.unbind(0) if gaussians.per_view else (scene.colors,) * parts
+    if not gaussians.per_view:
+        return (scene.colors,) * parts
+    # Without views there is still one part, and the sum over no views is a zero for each coefficient.
+    return scene.colors.unbind(0) if gaussians.views else (scene.colors.sum(dim=0),)
 
 
 def project_groups(groups: Sequence[Group], sparse_grad: bool, ready: Rendered | None) -> ProjectedSplats:
