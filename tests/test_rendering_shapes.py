@@ -186,6 +186,18 @@ def test_covariances_of_a_batch(device):
     assert relative_error(renders, rasterize_scene(batch)[0]) < 1e-4
 
 
+@pytest.mark.parametrize("batch", [(), (2,)])
+def test_no_covariances_are_an_empty_image(batch):
+    scene = random_scene(n=0, cameras=2)
+    if batch:
+        scene = batch_of([scene, scene])
+    scene.quats = scene.scales = None
+    covars = torch.zeros(*batch, 0, 3, 3, requires_grad=True)
+    renders, _, _ = rasterize_scene(scene, covars=covars)
+    renders.sum().backward()
+    assert renders.shape[:-3] == (*batch, 2) and not renders.any() and covars.grad.shape == covars.shape
+
+
 @pytest.mark.parametrize("seed", [10, 18, 25, 28])
 def test_covariances_of_needles_whose_tiles_depend_on_rounding(seed):
     scene = random_scene(n=200, cameras=1, seed=seed, scale=0.3)

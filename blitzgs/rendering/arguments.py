@@ -348,7 +348,9 @@ def with_covariances(gaussians: Gaussians, covars: Tensor) -> Gaussians:
     batch = gaussians.lead[:-1]
     _require("covars", covars, (*batch, gaussians.count, 3, 3), "[..., N, 3, 3]")
     scenes, uppers = [], []
-    for scene, own in zip(gaussians.scenes, covars.reshape(-1, *covars.shape[-3:]).unbind(0), strict=True):
+    for scene, own in zip(
+        gaussians.scenes, covars.reshape(len(gaussians.scenes), *covars.shape[-3:]).unbind(0), strict=True
+    ):
         found = decompose(own)
         uppers.append(found.upper)
         scenes.append(scene._replace(quats=found.quats, scales=found.scales, covariances=found))
