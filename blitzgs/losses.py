@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_loss, pixel_counts
@@ -37,6 +38,7 @@ def l1_ssim(
         ValueError: shapes or devices do not fit, the weight is outside [0, 1], or the targets require a
             gradient.
         RuntimeError: float64 images are on a GPU.
+        NotImplementedError: the images have forward-mode derivatives.
     """
     _check_types(renders, targets, masks)
     if renders.dim() < 3 or renders.shape[-1] != 3 or targets.shape != renders.shape:
@@ -58,7 +60,9 @@ def l1_ssim(
     if renders.dim() != 4:  # else leave the images as they are: a view would be a node of autograd's graph
         x, y = renders.reshape(-1, *renders.shape[-3:]), targets.reshape(-1, *targets.shape[-3:])
         masks = None if masks is None else masks.reshape(-1, *masks.shape[-2:])
-    if torch.compiler.is_compiling() or not (torch.is_grad_enabled() and renders.requires_grad):
+    if torch.compiler.is_compiling() or not (
+        torch.is_grad_enabled() and renders.requires_grad or _has_tangent(renders) or _has_tangent(targets)
+    ):
         return photometric_loss(x, y, masks, ssim_weight).mean()
     loss: Tensor = _L1Ssim.apply(x, y, masks, ssim_weight)  # type: ignore[no-untyped-call]
     return loss
@@ -77,6 +81,11 @@ def _check_types(renders: object, targets: object, masks: object) -> None:
         )
     if isinstance(masks, Tensor) and masks.dtype not in (torch.bool, torch.uint8):
         raise TypeError(f"masks must be bool or uint8, got {masks.dtype}; pass masks != 0")
+
+
+def _has_tangent(images: Tensor) -> bool:
+    """Tell whether images have a forward-mode derivative, which an op drops and torch's Function refuses."""
+    return unpack_dual(images).tangent is not None
 
 
 class _L1Ssim(torch.autograd.Function):

@@ -6,6 +6,7 @@ import contextlib
 import pytest
 import torch
 from torch._subclasses.fake_tensor import DynamicOutputShapeException, FakeTensorMode
+from torch.autograd import forward_ad
 
 import blitzgs
 from blitzgs.ops.photometric import photometric_loss
@@ -77,6 +78,14 @@ def test_a_second_derivative_is_refused():
     (gradient,) = torch.autograd.grad(blitzgs.l1_ssim(x, targets), x, create_graph=True)
     with pytest.raises(RuntimeError, match="l1_ssim has first derivatives only"):
         gradient.sum().backward()
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_a_forward_mode_derivative_is_refused(learned):
+    renders, targets, _ = images("cpu", torch.float64, 1)
+    renders.requires_grad_(learned)
+    with forward_ad.dual_level(), pytest.raises(NotImplementedError, match="jvp"):
+        blitzgs.l1_ssim(forward_ad.make_dual(renders, torch.ones_like(renders)), targets)
 
 
 def test_a_call_with_fake_tensors_leaves_later_calls_intact():
