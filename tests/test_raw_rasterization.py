@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import blitzgs
-from blitzgs.optim import LazyAdam
+from blitzgs.optim import LazyAdam, step_together
 from tests.helpers import BACKENDS, DEVICES, needs_cuda, random_scene, relative_error
 
 NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -337,3 +337,33 @@ def test_memory_follows_what_is_visible():
         for t in far.values():
             t.grad = None
     assert peak < 40e6  # 1 M Gaussians have 236 MB of parameters
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize("direct_grad", [True, False])
+def test_the_default_device_of_torch_has_no_effect(device, together, direct_grad):
+    scene = spread(random_scene(n=40, device=device))
+    targets = torch.full((2, scene.height, scene.width, 3), 0.5, device=device)
+
+    def train():
+        params = raw_parameters(scene)
+        optimizers = {name: LazyAdam([{"params": [param], "name": name}]) for name, param in params.items()}
+        for _ in range(3):
+            for _ in range(2):  # gradients are accumulated
+                renders, _, _ = raw(params, scene, optimizers=optimizers, direct_grad=direct_grad)
+                blitzgs.l1_ssim(renders, targets).backward()
+            if together:
+                step_together(optimizers, set_to_none=True)
+            for optimizer in optimizers.values():
+                if not together:
+                    optimizer.step()
+                    optimizer.zero_grad()
+                optimizer.load_state_dict(optimizer.state_dict())
+        return params
+
+    expected = train()
+    with torch.device("meta"):
+        actual = train()
+    for name, param in expected.items():
+        assert relative_error(actual[name], param) < 1e-5, name

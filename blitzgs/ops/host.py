@@ -33,7 +33,7 @@ class PinnedNumbers(NamedTuple):
         try:
             return idle.pop()
         except IndexError:
-            return cls(torch.empty(n, dtype=dtype, pin_memory=True), torch.cuda.Event(), idle)
+            return cls(torch.empty(n, dtype=dtype, device="cpu", pin_memory=True), torch.cuda.Event(), idle)
 
     def give_back(self) -> None:
         """Let others use the memory: the host has waited for `written` and read the numbers."""
@@ -116,6 +116,7 @@ def to_host(tensor: Tensor) -> Tensor:
     if not tensor.is_cuda:
         return tensor.cpu()
     # Pinned: a copy to pageable memory passes through the driver's own buffer first.
-    values = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor, non_blocking=True)
+    values = torch.empty(tensor.shape, dtype=tensor.dtype, device="cpu", pin_memory=True)
+    values.copy_(tensor, non_blocking=True)
     current_stream(tensor.device).synchronize()
     return values

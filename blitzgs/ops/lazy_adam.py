@@ -177,14 +177,14 @@ def table_without_rates(steps: int, beta1: float, beta2: float, before: int = 0)
             f"Adam's decay rates must satisfy 0 <= beta1 < sqrt(beta2) < 1, got beta1={beta1}, beta2={beta2}"
         )
     ratio, root = beta1 / math.sqrt(beta2), math.sqrt(beta2)
-    t = torch.arange(steps, dtype=torch.float64)
-    table = torch.zeros(steps, _COLUMNS, dtype=torch.float64)
+    t = torch.arange(steps, dtype=torch.float64, device="cpu")
+    table = torch.zeros(steps, _COLUMNS, dtype=torch.float64, device="cpu")
     powers = (beta1**t, beta2**t, ratio**t, root**t)
     for column, power in enumerate(powers, start=_POWERS):
         table[:, column] = power
     t += before
     # -expm1(t log beta) keeps the digits that 1 - beta^t loses while t is small.
-    first = 1 / (-torch.expm1(t[1:] * math.log(beta1)) if beta1 > 0 else torch.ones(steps - 1))
+    first = 1 / (-torch.expm1(t[1:] * math.log(beta1)) if beta1 > 0 else torch.ones_like(t[1:]))
     second = (-torch.expm1(t[1:] * math.log(beta2))).rsqrt()
     table[1:, CORRECTION1], table[1:, CORRECTION2] = first, second
     return table

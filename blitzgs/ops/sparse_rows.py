@@ -55,7 +55,9 @@ def _sparse_table(indices: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
     if indices.shape[1] == 0:
         # Torch adds to an empty gradient in place, and would change the indices of all that share them.
         indices = indices.clone()
-    return torch.sparse_coo_tensor(indices, values, shape, is_coalesced=True, check_invariants=False)
+    return torch.sparse_coo_tensor(
+        indices, values, shape, device=values.device, is_coalesced=True, check_invariants=False
+    )
 
 
 def full_gradients(

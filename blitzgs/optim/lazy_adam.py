@@ -263,7 +263,7 @@ class LazyAdam(torch.optim.Optimizer):
             group.setdefault("lr_rest", None)
             state = self.state.get(param)
             if state:
-                state["step"] = torch.tensor(float(state["step"]), dtype=torch.float32)
+                state["step"] = torch.tensor(float(state["step"]), dtype=torch.float32, device="cpu")
 
     def append(self, rows: Mapping[str, Tensor]) -> dict[str, Parameter]:
         """Add rows at the end of every parameter; their moments are zero.
@@ -394,7 +394,7 @@ class LazyAdam(torch.optim.Optimizer):
                 f"LazyAdam: a parameter of shape {list(param.shape)} is not contiguous; clone it"
             )
         if not state:
-            state["step"] = torch.tensor(0.0, dtype=torch.float32)
+            state["step"] = torch.tensor(0.0, dtype=torch.float32, device="cpu")
             state.update({name: torch.zeros_like(param) for name in MOMENTS})
         columns = [name for name in STEPS if name in state]
         for name in columns:
