@@ -19,7 +19,7 @@ from blitzgs.optim.lazy_adam_checks import (
     check_mask,
     check_new_rows,
     check_order,
-    check_saved_groups,
+    check_saved,
     groups_by_name,
 )
 from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of, steps_of
@@ -255,7 +255,7 @@ class LazyAdam(torch.optim.Optimizer):
             ValueError: the state does not fit, or is of another optimiser, or of an Adam with weight decay,
                 AMSGrad or maximize.
         """
-        check_saved_groups(state_dict["param_groups"])
+        check_saved(state_dict, [param for _, _, param in self._placed()])
         self.leave_joint()
         super().load_state_dict(state_dict)
         self.drifts.clear()

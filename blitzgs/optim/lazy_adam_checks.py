@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from blitzgs.optim.table import MOMENTS
+
 Groups = Mapping[str, dict[str, Any]]  # parameter groups of one parameter each, by name
 
 
@@ -32,19 +34,39 @@ def check_group(group: dict[str, Any]) -> None:
             raise ValueError(f"LazyAdam: {name}={group[name]} is not supported; leave it out")
 
 
-def check_saved_groups(groups: Sequence[dict[str, Any]]) -> None:
-    """Check the groups of a state that `load_state_dict` takes.
+def check_saved(saved: Mapping[str, Any], params: Sequence[Tensor]) -> None:
+    """Check the state that `load_state_dict` takes.
+
+    Args:
+        saved: the state.
+        params: all parameters; `torch.optim.Optimizer` checks their number.
 
     Raises:
         ValueError: as `LazyAdam.load_state_dict`.
     """
-    for group in groups:
+    for group in saved["param_groups"]:
         if missing := {"lr", "betas", "eps"} - group.keys():
             raise ValueError(
                 f"LazyAdam: the state has no {', '.join(sorted(missing))}; load one of LazyAdam or "
                 "torch.optim.Adam"
             )
         check_group({"lr_rest": None, **group})
+    indices = [index for group in saved["param_groups"] for index in group["params"]]
+    for index, param in zip(indices, params, strict=False):
+        state = saved["state"].get(index)
+        if not state:
+            continue
+        if state.keys() != {"step", *MOMENTS}:
+            raise ValueError(
+                f"LazyAdam: the state of a parameter has {', '.join(sorted(state))} instead of step, "
+                f"{', '.join(MOMENTS)}; load one of LazyAdam or torch.optim.Adam"
+            )
+        for name in MOMENTS:
+            if state[name].shape != param.shape:
+                raise ValueError(
+                    f"LazyAdam: a parameter is {list(param.shape)} and its saved {name} "
+                    f"{list(state[name].shape)}; load the parameters that were saved with it first"
+                )
 
 
 def groups_by_name(groups: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:

@@ -226,6 +226,17 @@ def test_wrong_use_is_refused():
         ValueError, match="the state has no betas, eps; load one of LazyAdam or torch.optim.Adam"
     ):
         LazyAdam([param]).load_state_dict(torch.optim.SGD([param], lr=0.1).state_dict())
+    param.grad = torch.ones_like(param)
+    for other, names in ((torch.optim.Adamax, "exp_inf"), (torch.optim.NAdam, "mu_product")):
+        saved = other([param])
+        saved.step()
+        with pytest.raises(ValueError, match=f"the state of a parameter has .*{names}.* instead of step"):
+            LazyAdam([param]).load_state_dict(saved.state_dict())
+    saved, fewer = LazyAdam([param]), LazyAdam([torch.ones(2, 3, requires_grad=True)])
+    saved.step()
+    with pytest.raises(ValueError, match=r"a parameter is \[2, 3\] and its saved exp_avg \[4, 3\]"):
+        fewer.load_state_dict(saved.state_dict())
+    assert not fewer.state
     half = torch.ones(4, 3, dtype=torch.float16, requires_grad=True)
     half.grad = torch.ones_like(half)
     with pytest.raises(ValueError, match=r"one of shape \[4, 3\] is torch.float16; convert it"):
