@@ -19,7 +19,7 @@ def step_together(optimizers: Iterable[LazyAdam] | Mapping[str, LazyAdam], set_t
     parameter does the same in its own `step`. Step hooks of the optimisers are not called.
 
     Args:
-        optimizers: the optimisers, as a mapping or a sequence.
+        optimizers: the optimisers, as a mapping or a sequence; one that occurs several times takes one step.
         set_to_none: whether to remove the gradients afterwards, as `zero_grad(set_to_none=True)` does.
 
     Raises:
@@ -30,7 +30,7 @@ def step_together(optimizers: Iterable[LazyAdam] | Mapping[str, LazyAdam], set_t
         raise TypeError(
             "step_together takes a mapping or a sequence of optimisers; call `step` of a single one"
         )
-    chosen = list(optimizers.values() if isinstance(optimizers, Mapping) else optimizers)
+    chosen = list(dict.fromkeys(optimizers.values() if isinstance(optimizers, Mapping) else optimizers))
     for optimizer in chosen:
         if not isinstance(optimizer, LazyAdam):
             raise TypeError(

@@ -242,7 +242,8 @@ def _lazy(optimizers: Any) -> list[CatchesUp]:
     found: list[CatchesUp] = []
     for optimizer in given:
         joint = getattr(optimizer, "joint", None)
-        if joint in found:
+        # A mapping may have an optimiser under several names; it would take the gradients as often.
+        if joint in found or optimizer in found:
             continue
         if joint is not None and joint.follow():
             found.append(joint)

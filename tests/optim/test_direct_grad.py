@@ -269,6 +269,20 @@ def test_many_views(backend, frozen):
     require_same(script, backend, frozen=frozen)
 
 
+@pytest.mark.parametrize("direct", [True, False])
+def test_an_optimiser_under_several_names_takes_one_step(direct):
+    shared, alone = Arm(direct, in_one=True), Arm(direct, in_one=True)
+    shared.optimizers = dict.fromkeys(NAMES, shared.optimizers["all"])
+    for arm in (shared, alone):
+        for view in range(4):
+            arm.backward(view)
+            arm.step()
+            arm.zero_grad()
+        arm.optimizers.popitem()[1].catch_up()
+    for name in NAMES:
+        assert torch.equal(shared.params[name], alone.params[name]), name
+
+
 def test_depth_alone():
     def script(arm):
         for view in range(3):
