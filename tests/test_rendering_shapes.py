@@ -300,6 +300,10 @@ def test_an_argument_that_gsplat_has_not_is_refused(value):
             {"sh_degree": None, "colors": torch.zeros(4, 4097)},
             "colors must have 1 to 4096 channels, got 4097",
         ),
+        (
+            {"sh_degree": None, "colors": torch.zeros(4, 4096), "render_mode": "RGB+D"},
+            "colors must have 1 to 4095 channels, got 4096",
+        ),
         ({"means": torch.zeros(1, 4, 3)}, r"quats must be \[..., N, 4\] = \[1, 4, 4\], got \[4, 4\]"),
         ({"quats": torch.zeros(4, 3)}, r"quats must be \[..., N, 4\]"),
         ({"Ks": torch.zeros(3, 3)}, r"Ks must be \[..., C, 3, 3\]"),

@@ -278,7 +278,7 @@ def gaussians_of(
     viewmats: Tensor,
     Ks: Tensor,
     sh_degree: int | None,
-    with_colors: bool,
+    render_mode: str,
     raw: bool = False,
 ) -> Gaussians:
     """Check shapes and fold the batch dimensions into one.
@@ -293,7 +293,7 @@ def gaussians_of(
         viewmats: [..., C, 4, 4].
         Ks: [..., C, 3, 3].
         sh_degree: degree to evaluate; None when `colors` holds values.
-        with_colors: whether colours are rendered.
+        render_mode: as for `blitzgs.rasterization`; without "RGB", colours are not rendered.
         raw: whether scales and opacities are before their activation.
 
     Raises:
@@ -311,12 +311,14 @@ def gaussians_of(
     _require("opacities", opacities, (*batch, N), "[..., N]")  # another shape might broadcast
     _require("viewmats", viewmats, (*batch, C, 4, 4), "[..., C, 4, 4]")
     _require("Ks", Ks, (*batch, C, 3, 3), "[..., C, 3, 3]")
+    with_colors = "RGB" in render_mode
     if colors is None and with_colors:
         raise ValueError("colors may be None for the render modes D and ED alone")
     per_view = colors is not None and _per_view(colors, batch, C, N, sh_degree)
     colors = colors if with_colors else None
-    if colors is not None and not 1 <= colors.shape[-1] <= _MAX_CHANNELS:
-        raise ValueError(f"colors must have 1 to {_MAX_CHANNELS} channels, got {colors.shape[-1]}")
+    most = _MAX_CHANNELS - (render_mode != "RGB")  # the depth is a channel too
+    if colors is not None and not 1 <= colors.shape[-1] <= most:
+        raise ValueError(f"colors must have 1 to {most} channels, got {colors.shape[-1]}")
     whole = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
     degree = sh_degree if with_colors else None
     return Gaussians(_scenes(whole, batch), colors, opacities, degree, per_view, (*batch, C), raw)

@@ -141,9 +141,7 @@ def rasterization(
         # Placeholders, which the decomposition of the covariances replaces.
         quats, scales = (means.new_zeros(()).expand(*means.shape[:-1], length) for length in (4, 3))
     assert quats is not None and scales is not None
-    gaussians = gaussians_of(
-        means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, "RGB" in render_mode
-    )
+    gaussians = gaussians_of(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, render_mode)
     if sparse_grad and len(gaussians.lead) > 1:
         raise ValueError("sparse_grad does not support batch dimensions; leave one of them out")
     if sparse_grad and covars is not None:

@@ -158,7 +158,7 @@ def raw_rasterization(
         width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, True
     )
     geometry = (means, quats, scales, opacities)
-    whole = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, False, raw=True)
+    whole = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, "D", raw=True)
     if sparse_grad and torch.is_grad_enabled():
         sh = {"sh0": sh0, "shN": shN} if shaded else {}
         _check_leaves({"means": means, "quats": quats, "scales": scales, "opacities": opacities, **sh})
