@@ -37,7 +37,7 @@ def save_image(path: Path | str, image: Tensor) -> None:
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: the format is not known.
+        ValueError: the format is not known, or the image has another shape.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,8 +48,10 @@ def encode_image(image: Tensor, suffix: str) -> bytes:
     """Return an RGB image, float [H, W, 3] in [0, 1] or uint8, as a file of the format of `suffix`.
 
     Raises:
-        ValueError: the format is not known.
+        ValueError: the format is not known, or the image has another shape.
     """
+    if image.dim() != 3 or image.shape[2] != 3:
+        raise ValueError(f"an image must be [H, W, 3], got {list(image.shape)}")
     try:
         written, data = cv2.imencode(suffix, np.ascontiguousarray(to_uint8(image)[..., ::-1]))
     except cv2.error as error:

@@ -28,6 +28,12 @@ def test_unwritable_pictures_are_named(tmp_path):
     assert (tmp_path / "target.png").read_bytes() == b"precious"
 
 
+@pytest.mark.parametrize("shape", [(4, 5), (4, 5, 1), (4, 5, 4), (1, 4, 5, 3)], ids=str)
+def test_pictures_of_other_shapes_are_refused(tmp_path, shape):
+    with pytest.raises(ValueError, match=r"an image must be \[H, W, 3\], got"):
+        save_image(tmp_path / "a.png", torch.zeros(shape))
+
+
 def test_error_map_runs_from_blue_to_red_and_masked_pixels_are_grey():
     target = torch.full((1, 4, 3), 100, dtype=torch.uint8)
     render = target.float() / 255 + torch.tensor([0.0, 0.1, 0.25, 0.6])[None, :, None]
