@@ -141,6 +141,8 @@ class Drift:
                 indices,
                 current,
             )
+        # A backward pass that has saved the parameters must fail, as it does after a step of torch's Adam.
+        torch.autograd.graph.increment_version(states)
 
     def alone(self, table: int, group: int) -> Drift:
         """Return a copy for a parameter alone, which had the learning rates of a group of a table.

@@ -97,6 +97,18 @@ def test_one_call_takes_the_step_of_all(backend, in_one, calls):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("without", [(), ("quats",)], ids=["jointly", "alone"])
+def test_a_graph_that_saved_the_parameters_is_refused_after_a_step(backend, without):
+    pair = Pair(backend)
+    losses = {name: param.square().sum() for name, param in pair.lazy.items() if name not in without}
+    pair.step(without=without)
+    assert pair.joined == (not without)
+    for loss in losses.values():
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            loss.backward()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("with_moments", [True, False])
 def test_rows_change_as_strategies_change_them(backend, with_moments, calls):
     pair = Pair(backend)
