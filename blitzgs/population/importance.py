@@ -92,7 +92,8 @@ class Importance:
     def store(self, table: GaussianTable, with_cull: bool) -> None:
         """Store phi and, if `with_cull`, the cull matrix as columns of the table."""
         table[PHI] = self.phi
-        table.columns.pop(CULL, None)
+        if CULL in table:
+            del table[CULL]
         if with_cull:
             table[CULL] = self.cull
 

@@ -46,9 +46,12 @@ class HostTable(GaussianTable):
             del columns[name]
             self._store_raw(name, self.columns[name])
 
+    def __delitem__(self, name: str) -> None:
+        """Drop a column and free its memory."""
+        super().__delitem__(name)
+        del self._memory[name]
+
     def _store_raw(self, name: str, tensor: Tensor) -> None:
-        for lost in self._memory.keys() - self.columns.keys():
-            del self._memory[lost]
         memory = self._memory.get(name)
         if not (
             memory is not None
