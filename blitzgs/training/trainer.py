@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +90,8 @@ class Trainer:
             NonFiniteError: a loss or a parameter is not finite.
             PhotographError: a photograph cannot be read; the steps before it are saved.
             ModelLostError: no Gaussian is left.
-            ResidenceError: the Gaussians that a step needs do not fit into the pool of `memory.resident_gb`;
-                with one rank, the steps before it are saved.
+            ResidenceError: the Gaussians that a step or an event needs do not fit into the pool of
+                `memory.resident_gb`; with one rank, the steps before it are saved.
             CheckpointError: the model could not be saved, although the run waited for disk space.
         """
         state, done, size = self.state, self.state.progress.step, self.state.schedule.batch_size
@@ -108,11 +110,14 @@ class Trainer:
                     return None
                 # The budget may change the number of steps.
                 while (step := state.progress.step + 1) <= state.schedule.steps:
-                    self._step_or_save(step, is_first=step == done + 1)
+                    with self._saving_without_room("a step", is_saved=step == done + 1):
+                        self.step(step)
                     events = state.schedule.events((step - 1) * size, step * size)
                     if events:
                         self._write_record()
-                    if not handle_all(state, events):
+                    with self._saving_without_room("an event"):
+                        all_ran = handle_all(state, events)
+                    if not all_ran:
                         self._stop(_stopped_by(agreement.now(step).signal))
                         return None
                     budget.after(step)
@@ -138,15 +143,21 @@ class Trainer:
             state.stops = never
             self.close()
 
-    def _step_or_save(self, step: int, is_first: bool) -> None:
-        """Take a step; if its Gaussians do not fit into the pool, save the model before raising the error."""
+    @contextlib.contextmanager
+    def _saving_without_room(self, what: str, is_saved: bool = False) -> Iterator[None]:
+        """Save the model before an error says that the Gaussians of a step or event do not fit into the pool.
+
+        Args:
+            what: what needs the Gaussians, as text.
+            is_saved: whether the newest checkpoint already has all steps.
+        """
         state = self.state
         try:
-            self.step(step)
+            yield
         except ResidenceError as error:
-            if is_first or state.ranks.world_size > 1:
-                raise  # all is saved, or the other ranks are in the middle of the step
-            self._stop(f"saved after {state.images_seen:,} images, before a step that lacks room")
+            if is_saved or state.ranks.world_size > 1:
+                raise  # with several ranks, the others are in the middle of the step or event
+            self._stop(f"saved after {state.images_seen:,} images, before {what} that lacks room")
             raise ResidenceError(
                 f"{error}. The model so far is saved: continue with --resume and a larger memory.resident_gb"
             ) from error

@@ -179,6 +179,17 @@ def test_a_model_that_outgrows_its_pool_is_saved_and_goes_on_with_a_larger_one(t
     assert_same_run(larger, whole)
 
 
+def test_a_pass_that_does_not_fit_costs_nothing_and_happens_with_a_larger_pool(tmp_path):
+    # The first step fits into the pool, and the pass behind it surveys views that see more blocks.
+    options = ("schedule.iterations=20", "population.importance=true", "schedule.t1=1", "schedule.t2=0")
+    whole, _ = train(tmp_path / "whole", *options)
+    with pytest.raises(ResidenceError, match=r"The model so far is saved: continue with --resume"):
+        train(tmp_path / "pooled", *options, "memory.resident_gb=0.0048")
+    larger, _ = train(tmp_path / "pooled", *options, "memory.resident_gb=0.1", resume=True)
+    assert "after 2 steps" in larger.state.origin
+    assert_same_run(larger, whole)
+
+
 def test_a_mask_for_a_table_of_less_than_a_block(tmp_path):
     options = ("population.importance=true", "schedule.t1=30", "schedule.t2=0", "view.cull=true",
                "population.grad_threshold=1e30", "schedule.iterations=45")  # fmt: skip

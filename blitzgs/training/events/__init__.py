@@ -15,6 +15,7 @@ from blitzgs.training.events import clear_cull, densify, evaluate, importance, p
 from blitzgs.training.run_files import Progress
 from blitzgs.training.schedule import Event, EventKind
 from blitzgs.training.state import TrainingState
+from blitzgs.view.residence import ResidenceError
 
 HANDLERS: Mapping[EventKind, Callable[[TrainingState, Event], object]] = {
     "densify": densify.run,
@@ -38,14 +39,20 @@ def handle_all(state: TrainingState, events: Sequence[Event]) -> bool:
     Returns:
         Whether all events have run. If a signal stops the run before that, `progress.events_left` holds the
         others, and the resumed run begins with them (`events_left`).
+
+    Raises:
+        ResidenceError: the Gaussians that an event needs do not fit into the pool; `progress.events_left`
+            holds it and the events after it.
     """
     state.progress = replace(state.progress, events_left=[])
     ordered = sorted(events, key=lambda event: event.kind in ("evaluate", "checkpoint"))
     for done, event in enumerate(ordered):
         try:
             HANDLERS[event.kind](state, event)
-        except SweepStoppedError:
+        except (SweepStoppedError, ResidenceError) as error:
             state.progress = replace(state.progress, events_left=[astuple(other) for other in ordered[done:]])
+            if isinstance(error, ResidenceError):
+                raise
             return False
     return True
 
