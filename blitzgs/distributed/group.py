@@ -106,6 +106,7 @@ class Ranks:
                 f"share_gpus is for the ranks of one host, but {local_world_size} of {world_size} are on this"
                 " one; leave it out, and start no more processes per node than it has GPUs"
             )
+        _share_cores(local_world_size)
         chosen, shared = resolve_device(device, local_rank, local_world_size, share_gpus)
         if chosen.type == "cuda":
             _extend_memory_in_place()
@@ -284,6 +285,18 @@ class Ranks:
                     f"the ranks disagree on {name}: {detail}. Start every rank with the same configuration, "
                     "code and data."
                 )
+
+
+def _share_cores(local_world_size: int) -> None:
+    """Let torch use this process's share of the host's cores, if torchrun has set one thread for it.
+
+    torchrun sets OMP_NUM_THREADS to 1 when it starts several processes and the variable is not set. The
+    host's part of the set-up, such as finding the neighbours of the first Gaussians, would take many times as
+    long, and trainings on CPUs would leave cores idle. Other values are the user's and stay.
+    """
+    is_by_torchrun = "TORCHELASTIC_RUN_ID" in os.environ and os.environ.get("OMP_NUM_THREADS") == "1"
+    if is_by_torchrun and local_world_size > 1:
+        torch.set_num_threads(max(1, len(os.sched_getaffinity(0)) // local_world_size))
 
 
 def _extend_memory_in_place() -> None:

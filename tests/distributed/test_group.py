@@ -191,3 +191,29 @@ def test_memory_is_extended_in_place_unless_the_user_has_configured_it(monkeypat
     monkeypatch.setenv(former, "max_split_size_mb:128")
     _extend_memory_in_place()
     assert present not in os.environ
+
+
+@pytest.mark.parametrize(
+    ("variables", "processes", "threads"),
+    [
+        ({"TORCHELASTIC_RUN_ID": "none", "OMP_NUM_THREADS": "1"}, 2, 4),
+        ({"TORCHELASTIC_RUN_ID": "none", "OMP_NUM_THREADS": "1"}, 16, 1),
+        ({"TORCHELASTIC_RUN_ID": "none", "OMP_NUM_THREADS": "3"}, 2, 3),
+        ({"OMP_NUM_THREADS": "1"}, 2, 3),
+        ({"TORCHELASTIC_RUN_ID": "none", "OMP_NUM_THREADS": "1"}, 1, 3),
+    ],
+)
+def test_processes_of_torchrun_share_the_cores(monkeypatch, variables, processes, threads):
+    before = torch.get_num_threads()
+    for name in ("TORCHELASTIC_RUN_ID", "OMP_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", str(processes))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
+    torch.set_num_threads(3)
+    try:
+        Ranks.from_environment("cpu")
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
