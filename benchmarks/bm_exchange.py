@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measures a training step on several ranks: time by stage, bytes exchanged, balance, half precision's error.
 
-    python benchmarks/bm_exchange.py --data DIR [--downscale 2] [--ranks 1 2 4] [--batch 4]
+    python benchmarks/bm_exchange.py --data DIR [--downscale 2] [--device cuda] [--ranks 1 2 4] [--batch 4]
     python benchmarks/bm_exchange.py --gaussians 16000000 --device cuda [--ranks 1 2 4]
 
 With --data the Gaussians are the octree of the capture's points, seen from evenly spaced training views;

@@ -39,6 +39,7 @@ from blitzgs.view.blocks import morton_order
 LOSS = LossConfig(ssim=0.2, scale=0)
 STEP, RATE, BEHIND, WARM_UP = 2000, 1e-6, 40, 5
 GAUSSIANS = {"aerial1": 1_000_000, "aerial4": 4_000_000, "aerial16": 16_000_000}
+DRAWN_ROWS = 1 << 20  # rows whose moments are drawn at a time, so that a large table leaves room for them
 
 
 def make_scene(name: str, views: int, order: str) -> BenchmarkScene:
@@ -67,10 +68,11 @@ def make_table(scene: BenchmarkScene) -> GaussianTable:
     """Return the scene as a table in the middle of a training: with moments, at step 0."""
     table = GaussianTable.create(scene.raw())
     # Gradients of this loss are around 1e-7; their sizes spread over some orders of magnitude.
-    for first, second in zip(EXP_AVGS, EXP_AVG_SQS, strict=True):
-        size = 1e-7 * torch.exp(2 * torch.randn_like(table[first]))
-        table[first].copy_(torch.randn_like(size)).mul_(size)
-        table[second].copy_(size).square_()
+    for names in zip(EXP_AVGS, EXP_AVG_SQS, strict=True):
+        for first, second in zip(*(table[name].split(DRAWN_ROWS) for name in names), strict=True):
+            size = 1e-7 * torch.exp(2 * torch.randn_like(first))
+            first.copy_(torch.randn_like(size)).mul_(size)
+            second.copy_(size).square_()
     return table
 
 
