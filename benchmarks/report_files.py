@@ -17,7 +17,6 @@ COMMANDS = {
     "training": f"python {TRAINING}",
     "training_2": f"torchrun --nproc-per-node=2 {TRAINING}",
     "drop_in": "python benchmarks/bm_drop_in.py CAPTURE",
-    "drop_in_1": "python benchmarks/bm_drop_in.py CAPTURE --one-thread",
     "drop_in_full": "python benchmarks/bm_drop_in.py CAPTURE --steps 30000 --one-thread",
     "importance": "python benchmarks/bm_importance.py",
     "gate": "python benchmarks/bm_gate.py",
@@ -25,6 +24,9 @@ COMMANDS = {
     "photometric": "python benchmarks/bm_photometric.py",
     "accuracy": "python benchmarks/bm_accuracy.py",
     "lineage": "python benchmarks/bm_lineage.py",
+    "lineage_training": (
+        "python benchmarks/bm_lineage.py --data CAPTURE --config configs/compact.yaml --images 15000"
+    ),
     "quality": (
         "python benchmarks/bm_quality.py --out runs/quality --capture NAME=CAPTURE "
         '--recipe aerial=configs/aerial.yaml --recipe "aerial_half=configs/aerial.yaml --schedule.scale=0.5" '
@@ -65,19 +67,19 @@ COMMANDS |= {
     "oracle": "blitzgs gate replay GATE RUN --out REPLAY",
     "gate_judged": "blitzgs gate evaluate GATE RUN RUN --out JUDGED",
     "offload": "python benchmarks/bm_offload.py --ratios 2 4",
-    "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 2 --popping",
+    "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 --popping --scale 0.6",
     "city_ranks": (
         "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 2 --arms all_off "
-        "--batch-sizes 4 8 16"
+        "--batch-sizes 4 16 --scale 0.6"
     ),
-    "city_later": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 1 --ranks 1 --scale 0.6",
     "city_exchange": (
-        "python benchmarks/bm_exchange.py --data CITY --downscale 1 --visible-threshold 0 --ranks 1 2"
+        "python benchmarks/bm_exchange.py --data CITY --downscale 1 --visible-threshold 0 "
+        "--device cuda --ranks 1 2"
     ),
 }
-# The files of a group are of one commit, and so are those that are in no group. Whole trainings take many
-# minutes and depend on the recipe more than on the kernels, several GPUs are seldom at hand, and the city has
-# a page of its own.
+# The files of a group are of one commit, and so are those that are in no group. Comparisons of whole
+# trainings take many minutes and depend on the recipe more than on the kernels, and the city has a page of
+# its own.
 GROUPS = (
     ("quality",),
     ("ablation",),
@@ -88,15 +90,12 @@ GROUPS = (
     ("gate_random",),
     ("town",),
     ("adaptive",),
-    ("offload",),
-    ("importance",),
     ("call",),
-    ("drop_in", "drop_in_1"),
-    ("drop_in_full",),
+    ("scratch",),
+    ("drop_in",),
     ("exchange", "training", "training_2"),
-    ("city", "city_exchange"),
-    ("city_ranks",),
-    ("city_later",),
+    ("city", "city_ranks"),
+    ("city_exchange",),
 )
 # bm_quality.py takes no --json: it collects all of its runs in one file.
 COPIED = {

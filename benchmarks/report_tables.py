@@ -167,17 +167,6 @@ def row_lines(file: Json) -> list[str]:
     return [f"{file['title']}.", "", *table(rows[0], cells)]
 
 
-def whole_loop_lines(file: Json) -> list[str]:
-    """Tabulate the steps of whole trainings in gsplat's loop, without the steps around refinements."""
-    spent, around = "training, s", "of it around refinements, s"
-    rows = [
-        {"arm": row["arm"], "steps outside refinements, s": row[spent] - row[around]}
-        | {name: row[name] for name in ("last steps, ms each", "Gaussians", "PSNR, dB")}
-        for row in file["rows"]
-    ]
-    return row_lines({"title": file["title"], "rows": rows})
-
-
 def city_lines(rows_of: Callable[[Json], city_report.Rows]) -> Callable[[Json], list[str]]:
     """Return the function that makes a table of the city's file."""
 
@@ -186,12 +175,6 @@ def city_lines(rows_of: Callable[[Json], city_report.Rows]) -> Callable[[Json], 
         return table(rows[0], (row.values() for row in rows)) if rows else ["No run got so far."]
 
     return lines
-
-
-def city_quality_lines(city: Json) -> list[str]:
-    """Tabulate the quality of the city's arms, without times."""
-    columns = ("view level", "PSNR", "SSIM", "images", "active", "visible")
-    return table(columns, ([str(row[name]) for name in columns] for row in city_report.arm_rows(city)))
 
 
 def photometric_lines(photometric: Json) -> list[str]:
@@ -355,17 +338,17 @@ SECTIONS = {
     "render": Section(("render",), render_lines),
     "stages": Section(("render",), stage_lines),
     "call": Section(("render",), call_lines),
-    "call_threads": Section(("call",), call_lines),
+    "call_quiet": Section(("call",), call_lines),
     "step": Section(("step_1", "step_4"), step_lines),
     "exchange": Section(("exchange",), exchange_lines),
     "training": Section(("training",), row_lines),
     "training_2": Section(("training_2",), row_lines),
     "drop_in": Section(("drop_in",), row_lines),
-    "drop_in_1": Section(("drop_in_1",), row_lines),
-    "drop_in_full": Section(("drop_in_full",), whole_loop_lines),
+    "drop_in_full": Section(("drop_in_full",), row_lines),
     "importance": Section(("importance",), row_lines),
     "gate": Section(("gate",), row_lines),
     "lineage": Section(("lineage",), row_lines),
+    "lineage_training": Section(("lineage_training",), row_lines),
     "scratch": Section(("scratch",), row_lines),
     "photometric": Section(("photometric",), photometric_lines),
     "accuracy": Section(("accuracy",), accuracy_lines),
@@ -384,7 +367,6 @@ SECTIONS = {
     "offload": Section(("offload",), offload_lines),
     "summary": Section(("render", "step_1", "step_4"), summary_lines),
     "summary_ranks": Section(("exchange",), summary_ranks_lines),
-    "city_later": Section(("city_later",), city_quality_lines),
     "city_exchange": Section(("city_exchange",), exchange_lines),
 }
 SECTIONS |= {
