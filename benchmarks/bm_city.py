@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Trains a synthetic city with and without the view level: quality, speed by phase, memory, popping, ranks.
 
-    blitzgs synth CITY --preset city --views 2048 --width 1024 --height 684 | tee generation.txt
-    python benchmarks/bm_city.py CITY --out RESULTS --generation-log generation.txt \
+    blitzgs synth CITY --preset city | tee generation.txt
+    python benchmarks/bm_city.py CITY --out RESULTS --generation-log generation.txt --scale 0.6 \
         --gpus 2 --ranks 1 2 --popping --json benchmarks/results/city.json
 
 The arms are `configs/city.yaml` with the LOD gate and the cull mask (full), without the one (no_lod), the
