@@ -84,12 +84,18 @@ def save(
         raise ValueError(f"checkpoint: keep must be at least 1, got {keep}")
     rows = _common_length(columns)
     directory = Path(directory)
-    name = _next_name(directory) if ranks.rank == 0 else ""
+    name, problem = "", None
     if ranks.rank == 0:
-        _delete_unfinished(directory)
-    name = ranks.broadcast_object(name)
+        try:
+            name = _next_name(directory)
+            _delete_unfinished(directory)
+        except OSError as error:
+            problem = f"no checkpoint was saved, because rank 0 could not read {directory}: {error}."
+    name, problem = ranks.broadcast_object((name, problem))
+    if problem:
+        raise CheckpointError(problem)
     unfinished = directory / (_UNFINISHED + name)
-    mine, common, problem = None, None, None
+    mine, common = None, None
     try:
         reached("begin")
         unfinished.mkdir(parents=True, exist_ok=True)
@@ -121,7 +127,11 @@ def save(
             "Earlier checkpoints are untouched."
         )
     if ranks.rank == 0:
-        _delete_old(directory, keep, reached)
+        try:
+            _delete_old(directory, keep, reached)
+        except OSError as error:
+            # The new checkpoint is complete; the next save tries to delete the old ones again.
+            warnings.warn(f"an older checkpoint could not be deleted: {error}", stacklevel=2)
     return directory / name
 
 

@@ -180,6 +180,36 @@ def test_full_disk(tmp_path, monkeypatch):
     assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 0}
 
 
+def _refuse(monkeypatch, method, folder):
+    original = getattr(checkpoint.Path, method)
+
+    def refused(path, *arguments):
+        if path == folder:
+            raise PermissionError(1, "Operation not permitted", str(path))
+        return original(path, *arguments)
+
+    monkeypatch.setattr(checkpoint.Path, method, refused)
+
+
+def test_an_old_checkpoint_that_cannot_be_deleted_is_named_and_stays(tmp_path, monkeypatch):
+    for iteration in range(2):
+        checkpoint.save(tmp_path, table(3), {"iteration": iteration}, ALONE, keep=2)
+    with monkeypatch.context() as patch:
+        _refuse(patch, "rename", tmp_path / "checkpoint_000000")
+        with pytest.warns(UserWarning, match="could not be deleted.*not permitted.*checkpoint_000000"):
+            checkpoint.save(tmp_path, table(3), {"iteration": 2}, ALONE, keep=2)
+    assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 2}
+    checkpoint.save(tmp_path, table(3), {"iteration": 3}, ALONE, keep=2)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint_000002", "checkpoint_000003"]
+
+
+def test_a_folder_that_cannot_be_read_is_a_failed_checkpoint(tmp_path, monkeypatch):
+    checkpoint.save(tmp_path, table(3), {}, ALONE)
+    _refuse(monkeypatch, "iterdir", tmp_path)
+    with pytest.raises(checkpoint.CheckpointError, match=f"could not read {tmp_path}"):
+        checkpoint.save(tmp_path, table(3), {}, ALONE)
+
+
 def test_bad_arguments(tmp_path):
     with pytest.raises(ValueError, match="of one length"):
         checkpoint.save(tmp_path, {"a": torch.zeros(2), "b": torch.zeros(3)}, {}, ALONE)
