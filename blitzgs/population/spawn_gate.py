@@ -148,7 +148,7 @@ class SpawnGate:
             self._trees = _Trees.of(_read_model(path))
         except GateError:
             raise
-        except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
+        except (OSError, ValueError, LookupError, TypeError, OverflowError, RuntimeError) as error:
             raise GateError(f"{path} is not a binary classifier in XGBoost's JSON: {error!r}") from error
 
     def scores(self, features: Tensor) -> Tensor:

@@ -232,6 +232,7 @@ def without_trees(path):
             "objective reg:squarederror",
         ),
         (lambda path: spoil_tree(path, "left_children", 0), "the nodes of a tree do not form one"),
+        (lambda path: spoil_tree(path, "left_children", math.nan), "is not a binary classifier"),
         (lambda path: spoil_tree(path, "right_children", 1 << 20), "the nodes of a tree do not form one"),
         (lambda path: spoil_tree(path, "split_indices", 99), "a split of feature 99"),
         (lambda path: spoil_tree(path, "split_indices", 1.5), "a split of feature 1.5"),
