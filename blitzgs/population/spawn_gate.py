@@ -148,7 +148,9 @@ class SpawnGate:
             self._trees = _Trees.of(_read_model(path))
         except GateError:
             raise
-        except (OSError, ValueError, LookupError, TypeError, OverflowError, RuntimeError) as error:
+        except OSError as error:
+            raise GateError(f"{path} cannot be read: {error.strerror or error}") from error
+        except (ValueError, LookupError, TypeError, OverflowError, RuntimeError) as error:
             raise GateError(f"{path} is not a binary classifier in XGBoost's JSON: {error!r}") from error
 
     def scores(self, features: Tensor) -> Tensor:

@@ -220,6 +220,7 @@ def without_trees(path):
     [
         (lambda path: info_path(path).unlink(), "is missing: a gate is a model and its metadata"),
         (lambda path: info_path(path).write_text("{}"), "is not the metadata of a gate"),
+        (lambda path: path.unlink(), "gate.json cannot be read: No such file"),
         (lambda path: path.write_text("no"), "is not a binary classifier in XGBoost's JSON"),
         (
             lambda path: info_path(path).write_text(
