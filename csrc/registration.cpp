@@ -220,6 +220,12 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "position_noise_(Tensor(a!) means, Tensor quats, Tensor scales, Tensor opacities, Tensor ids, Tensor "
       "visible_ids, int seed, int step, float threshold, float strength) -> ()");
 
+  // What the spawn gate knows of candidates. columns: (grad_sum, grad_count, opacities, scales, birth, level,
+  // exp_avg_sq.sh).
+  m.def(
+      "spawn_features(Tensor[] columns, Tensor rows, Tensor is_split, int time, float extent, int "
+      "level_count) "
+      "-> Tensor");
   // Gradient-boosted trees: the sum of the leaves that each row of features reaches.
   m.def("tree_sums(Tensor features, Tensor roots, Tensor nodes, Tensor leaves, int depth) -> Tensor");
 

@@ -78,6 +78,7 @@ TESTS = [
         "knn_distances.py::test_small_clouds[cuda]",
         "cull_mask.py::test_every_bit_is_at_its_place_and_comes_back[257-3-cuda]",
         "mass_cut.py::test_equals_sorting[share2-ties-3-cuda]",
+        "spawn_features.py::test_matches_the_formulas[1000-cuda]",
         "tree_sums.py::test_sums_equal_a_walk_down_each_tree[700-cuda]",
         "view_sums.py::test_equals_dense_sums[density-cuda]",
         "report_op.py::test_each_target_gets_this_ranks_share[3000-cuda]",

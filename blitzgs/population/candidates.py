@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 import torch
 from torch import Tensor
 
+from blitzgs._library import below_autograd
 from blitzgs.distributed.group import Ranks
 from blitzgs.model import GaussianTable
 
@@ -25,6 +27,8 @@ FEATURES = (
     "parent_color_gradient",
     "parent_flatness",
 )
+# The columns of a table that they are computed from.
+_COLUMNS_OF = itemgetter("grad_sum", "grad_count", "opacities", "scales", "birth", "level", "exp_avg_sq.sh")
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,6 @@ class Candidates:
 Veto = Callable[[Candidates, Ranks], Tensor]
 
 
-@torch.no_grad()
 def spawn_features(
     table: GaussianTable,
     rows: Tensor,
@@ -75,20 +78,12 @@ def spawn_features(
         colour, which grows with the parent's weight in the images, and the ratio of the parent's smallest to
         its largest scale.
     """
-    views = table["grad_count"][rows]
-    level = table["level"][rows].int()
-    scales = table["scales"][rows].double()
-    # In float64, so that the rounded result does not depend on how the maths library vectorises.
-    columns = (
-        table["grad_sum"][rows] / views.clamp(min=1),
-        table["opacities"][rows].double().sigmoid(),
-        scales.exp().mean(1) / extent,
-        time - table["birth"][rows],
-        views,
-        torch.where(is_split, (level + 1).clamp(max=level_count - 1), level),
-        torch.full_like(views, time),
-        is_split,
-        table["exp_avg_sq.sh"][rows, 0].double().mean(1).sqrt(),
-        (scales.amin(1) - scales.amax(1)).exp(),
-    )
-    return torch.stack([column.float() for column in columns], 1)
+    with below_autograd():
+        return torch.ops.blitzgs.spawn_features(
+            list(_COLUMNS_OF(table.columns)), rows, is_split, time, extent, level_count
+        )
+
+
+@torch.library.register_fake("blitzgs::spawn_features")
+def _(columns: Sequence[Tensor], rows: Tensor, *_rest: object) -> Tensor:
+    return columns[0].new_empty(rows.shape[0], len(FEATURES))

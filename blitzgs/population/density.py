@@ -131,7 +131,8 @@ def densify(
     causes = torch.cat((causes, death_causes(new, None, rules)))
     rows = (causes == 0).nonzero().squeeze(1)
     if lineage is not None:
-        _log(lineage, table, new, (clones, splits), causes, time, step, extent, level_count)
+        died = len(causes) - len(rows)
+        _log(lineage, table, new, (clones, splits), causes, died, time, step, extent, level_count)
     grown = len(clones) + len(splits)
     report = DensityReport(
         cloned=len(clones),
@@ -264,14 +265,17 @@ def _log(
     new: dict[str, Tensor],
     parents: tuple[Tensor, Tensor],
     causes: Tensor,
+    died: int,
     time: int,
     step: int,
     extent: float,
     level_count: int,
 ) -> None:
-    """Log an event, before its rows are removed and its statistics are reset."""
-    # This waits for the device, so it comes before the work that is only queued.
-    gone = causes.nonzero().squeeze(1)
+    """Log an event, before its rows are removed and its statistics are reset.
+
+    `died` is the number of `causes` that are not 0, so that the host need not wait for it.
+    """
+    gone = torch.nonzero_static(causes, size=died).squeeze(1)
     clones, splits = parents
     rows = torch.cat((clones, *[splits] * CHILDREN_OF_A_SPLIT))
     is_split = torch.arange(len(rows), device=rows.device) >= len(clones)

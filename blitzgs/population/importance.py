@@ -22,7 +22,8 @@ world size and for any division of the work.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
@@ -131,15 +132,17 @@ def sweep(
     sums = _Sums(len(table), n_views, table.device, rule)
     owners = owners or TileOwners(ranks)
     transport, finder = open_transport(ranks), VisibleFinder(scene, lod)
-    for number, batch in enumerate(batches):
-        if stops is not None and number > 0 and stops():
-            raise SweepStoppedError
-        assignment = _assign(batch, options, owners)
-        visible = finder.find(*batch.views.as_arguments(), options.limits)
-        surveyed = survey(
-            visible.table, batch.views, options, assignment, transport, visible.active, rule == "energy"
-        )
-        sums.add(surveyed, batch.columns, visible, ranks)
+    with _NextSurvey(table.device, ranks.world_size == 1 and scene is table) as beside:
+        for number, batch in enumerate(batches):
+            if stops is not None and number > 0 and stops():
+                raise SweepStoppedError
+            assignment = _assign(batch, options, owners)
+            visible = finder.find(*batch.views.as_arguments(), options.limits)
+            surveyed = survey(
+                visible.table, batch.views, options, assignment, transport, visible.active, rule == "energy"
+            )
+            with beside.work(surveyed, visible):
+                sums.add(surveyed, batch.columns, visible, ranks)
     return sums.result()
 
 
@@ -155,6 +158,43 @@ def _assign(batch: ViewBatch, options: RenderOptions, owners: TileOwners) -> Til
     views, keys = batch.views, batch.columns if batch.keys is None else batch.keys
     ranges = owners.divide(list(keys), views.width, views.height, options.tile_size)
     return TileAssignment(owners.ranks, ranges)
+
+
+class _NextSurvey:
+    """Runs what follows each survey on a stream of its own, beside the survey of the next batch.
+
+    That work is many short kernels, most of which leave the GPU idle. When the block ends, for whatever
+    reason, the caller's stream waits for all of it.
+    """
+
+    def __init__(self, device: torch.device, wanted: bool) -> None:
+        """Open a stream on a GPU; on the CPU, or if not `wanted`, the work follows its survey as usual."""
+        self._stream = torch.cuda.Stream(device, priority=-1) if wanted and device.type == "cuda" else None
+        self._held: object = None
+        self._done: torch.cuda.Event | None = None
+
+    def __enter__(self) -> _NextSurvey:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        if self._stream is not None:
+            torch.cuda.current_stream(self._stream.device).wait_stream(self._stream)
+
+    @contextmanager
+    def work(self, *held: object) -> Iterator[None]:
+        """Queue work that reads tensors of the caller's stream, which `held` must keep alive."""
+        if self._stream is None:
+            yield
+            return
+        main = torch.cuda.current_stream(self._stream.device)
+        if self._done is not None:
+            # Before the memory that the work for the last batch reads is free for the next one.
+            main.wait_event(self._done)
+        self._held = held
+        self._stream.wait_stream(main)
+        with torch.cuda.stream(self._stream):
+            yield
+        self._done = self._stream.record_event()
 
 
 class _Sums:

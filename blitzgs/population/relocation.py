@@ -72,14 +72,16 @@ def relocate(
     """
     causes = death_causes(table.columns, table["max_radii"], rules)
     dead = causes != 0
-    counts = torch.tensor([len(table), int(dead.sum())], device=table.device)
+    n_dead = int(dead.sum())
+    counts = torch.tensor([len(table), n_dead], device=table.device)
     population, deaths = ranks.all_reduce(counts).tolist()
     grown = math.floor(population * (1.0 + growth))
     wanted = max(population, grown if rules.max_gaussians is None else min(grown, rules.max_gaussians))
     weights = (table["opacities"].double().sigmoid().float().double() * 2**_WEIGHT_BITS).long()
     weights[dead] = 0
     draws = draw(weights, wanted - population + deaths, table["id"], seed, time, ranks)
-    sources, gone = draws.nonzero().squeeze(1), dead.nonzero().squeeze(1)
+    # With a size that it knows, the host does not wait for the device.
+    sources, gone = draws.nonzero().squeeze(1), torch.nonzero_static(dead, size=n_dead).squeeze(1)
     parents = sources.repeat_interleave(draws[sources])
     features = None
     if lineage is not None:
@@ -89,7 +91,8 @@ def relocate(
     if lineage is not None and features is not None:
         lineage.born(Births(new["id"], new["parent"], new["means"], features), step)
         lineage.died(table["id"][gone], torch.full_like(gone, Cause.RELOCATED), time, step)
-    kept = torch.cat((~dead, dead.new_ones(len(new["id"])))).nonzero().squeeze(1)
+    lives = torch.cat((~dead, dead.new_ones(len(parents))))
+    kept = torch.nonzero_static(lives, size=len(lives) - n_dead).squeeze(1)
     means = torch.cat((table["means"], new["means"])).index_select(0, kept)
     table.renew(kept[morton_order(means)], new)
     held_back = max(0, grown - wanted) if ranks.rank == 0 else 0

@@ -165,6 +165,11 @@ BLITZGS_HD bool descends(const MassSearch& search, bool first) {
   return first ? search.missing > 0 : search.shift > 0;
 }
 
+// Whether a round after the first one has a digit to find.
+BLITZGS_HD bool finds_digit(const SegmentSearch& search, int round) {
+  return round < kRounds ? descends(search.weight, false) : descends(search.id, round == kRounds);
+}
+
 namespace BLITZGS_BACKEND {
 // Runs the steps first_step to last_step - 1.
 void mass_cut(const MassCutArgs& args, int first_step, int last_step, CudaStream);

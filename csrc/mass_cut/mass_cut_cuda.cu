@@ -11,6 +11,8 @@ constexpr int kThreads = 512;
 constexpr int kWarps = kThreads / 32;
 // The number of segments whose first digits a block sums in shared memory, 8 KiB each.
 constexpr int kSegmentsAtOnce = 8;
+// The first round whose scan reads the list.
+constexpr int kListedRounds = 2;
 
 // A 64-bit sum as two words, because shared memory has an atomic addition of 32-bit words but none of 64-bit
 // ones, which would be a loop.
@@ -57,9 +59,8 @@ __global__ void __launch_bounds__(kThreads) first_scan_kernel(const MassCutArgs 
   }
 }
 
-__device__ void add_term(const MassCutArgs& args, int round, std::int64_t item) {
-  const ScanTerm term = scan_term(args, round, item);
-  if (term.adds) add_to(args.sums + std::int64_t{args.segments[item]} * kDigits + term.digit, term.amount);
+__device__ void add_term(const MassCutArgs& args, std::int64_t segment, const ScanTerm& term) {
+  if (term.adds) add_to(args.sums + segment * kDigits + term.digit, term.amount);
 }
 
 // The scan of round 1: lists the items with the first digit of their segment's threshold, and sums their
@@ -78,7 +79,7 @@ __global__ void __launch_bounds__(kThreads) second_scan_kernel(const MassCutArgs
     place = __shfl_sync(kFullWarp, place, 0) + __popc(lanes & ((1u << lane) - 1));
     if (!lists) continue;
     args.listed[1 + place] = static_cast<std::int32_t>(item);
-    add_term(args, 1, item);
+    add_term(args, args.segments[item], scan_term(args, 1, item));
   }
 }
 
@@ -87,7 +88,8 @@ __global__ void __launch_bounds__(kThreads) scan_kernel(const MassCutArgs args, 
   wait_for_earlier_kernels();
   const std::int64_t count = args.listed[0], stride = static_cast<std::int64_t>(gridDim.x) * kThreads;
   for (std::int64_t i = blockIdx.x * kThreads + threadIdx.x; i < count; i += stride) {
-    add_term(args, round, args.listed[1 + i]);
+    const std::int64_t item = args.listed[1 + i];
+    add_term(args, args.segments[item], scan_term(args, round, item));
   }
 }
 
@@ -110,11 +112,10 @@ __device__ BlockScan scan_block(std::int64_t value) {
   return {until, total};
 }
 
-// The descent of a round: finds the next digit of each segment's threshold and sets the sums to zero. One
-// block per segment; each thread sums over kEach neighbouring digits, thread 0 over the largest ones.
-__global__ void __launch_bounds__(kThreads) descent_kernel(const MassCutArgs args, int round) {
+// The descent of a round in the segment of this block: finds the next digit of the threshold and sets the
+// sums to zero. Each thread sums over kEach neighbouring digits, thread 0 over the largest ones.
+__device__ void descend(const MassCutArgs& args, int round) {
   constexpr int kEach = kDigits / kThreads;
-  wait_for_earlier_kernels();
   SegmentSearch& both = args.searches[blockIdx.x];
   const bool first = round % kRounds == 0;
   MassSearch search = round >= kRounds ? both.id : both.weight;
@@ -145,6 +146,38 @@ __global__ void __launch_bounds__(kThreads) descent_kernel(const MassCutArgs arg
   if (round == kRounds - 1) both.id = search_of_ids(search);
 }
 
+// The descent of a round, one block per segment.
+__global__ void __launch_bounds__(kThreads) descent_kernel(const MassCutArgs args, int round) {
+  wait_for_earlier_kernels();
+  descend(args, round);
+}
+
+// All rounds after those for which there is another kernel, one block per segment. The list is short, and
+// most rounds find no digit, so this takes less time than two launches for each round.
+__global__ void __launch_bounds__(kThreads) later_rounds_kernel(const MassCutArgs args) {
+  constexpr int kEach = 4;  // items of a thread that are read at the same time
+  wait_for_earlier_kernels();
+  const std::int64_t count = args.listed[0];
+  for (int round = kListedRounds; round < 2 * kRounds; ++round) {
+    const bool scans = finds_digit(args.searches[blockIdx.x], round);
+    for (std::int64_t begin = threadIdx.x; scans && begin < count; begin += kEach * kThreads) {
+      ScanTerm terms[kEach];
+#pragma unroll
+      for (int i = 0; i < kEach; ++i) {
+        terms[i] = {false, 0, 0};
+        if (begin + i * kThreads >= count) continue;
+        const std::int64_t item = args.listed[1 + begin + i * kThreads];
+        if (args.segments[item] == static_cast<int>(blockIdx.x)) terms[i] = scan_term(args, round, item);
+      }
+#pragma unroll
+      for (const ScanTerm& term : terms) add_term(args, blockIdx.x, term);
+    }
+    __syncthreads();
+    descend(args, round);
+    __syncthreads();
+  }
+}
+
 // The last step: chosen [P], one thread per item.
 __global__ void __launch_bounds__(kThreads) choice_kernel(const MassCutArgs args) {
   wait_for_earlier_kernels();
@@ -155,7 +188,7 @@ __global__ void __launch_bounds__(kThreads) choice_kernel(const MassCutArgs args
 void scan(const MassCutArgs& args, int round, CudaStream stream) {
   const unsigned all = std::max(1u, blocks_for(args.n_items, kThreads));
   const unsigned resident = static_cast<unsigned>(4 * multiprocessors());
-  if (round > 1) {
+  if (round >= kListedRounds) {
     launch_early("mass_cut", scan_kernel, {std::min(all, resident / 4), kThreads, stream}, args, round);
   } else if (round == 1) {
     launch_early("mass_cut", second_scan_kernel, {std::min(all, resident), kThreads, stream}, args);
@@ -178,6 +211,10 @@ void scan(const MassCutArgs& args, int round, CudaStream stream) {
 void mass_cut(const MassCutArgs& args, int first_step, int last_step, CudaStream stream) {
   const auto segments = static_cast<unsigned>(args.n_segments);
   for (int step = first_step; step < std::min(last_step, kChoiceStep); ++step) {
+    if (step == 2 * kListedRounds && last_step >= kChoiceStep) {
+      launch_early("mass_cut", later_rounds_kernel, {segments, kThreads, stream}, args);
+      break;
+    }
     if (step % 2 == 0) {
       scan(args, step / 2, stream);
     } else {

@@ -123,7 +123,7 @@ class _Ops(TorchDispatchMode):
 
 
 @torch.no_grad()
-def test_the_log_adds_one_wait_and_few_kernels_to_an_event(tmp_path):
+def test_the_log_adds_few_kernels_and_no_wait_to_an_event(tmp_path):
     def calls(lineage):
         table = random_table(500)
         shaken(table, 1)
@@ -136,8 +136,8 @@ def test_the_log_adds_one_wait_and_few_kernels_to_an_event(tmp_path):
     lineage.close()
     # These ops wait for a GPU: the host must know a size or a value.
     waits = {name: added[name] for name in ("nonzero", "_local_scalar_dense", "masked_select", "item")}
-    assert waits == {"nonzero": 1, "_local_scalar_dense": 0, "masked_select": 0, "item": 0}
-    assert sum(n for name, n in added.items() if name not in VIEWS) <= 50, added
+    assert waits == {"nonzero": 0, "_local_scalar_dense": 0, "masked_select": 0, "item": 0}
+    assert sum(n for name, n in added.items() if name not in VIEWS) <= 20, added
 
 
 @needs_cuda
