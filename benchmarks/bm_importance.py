@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compares the importance sweep with forward renders of the same views, in one run.
 
-    python benchmarks/bm_importance.py [--gaussians 4000000] [--views 32] [--batch 4] [--json FILE]
+    python benchmarks/bm_importance.py [--gaussians 4000000] [--views 32] [--visits 8] [--batch 4]
+        [--json FILE]
 
 The views advance over one synthetic square kilometre (`scenes.aerial`), whose Gaussians are in Morton order,
-as the trainer keeps them. "renders": `pipeline.forward` of all views in batches, with colours of degree 3;
+as the trainer keeps them. They are visited several times, as if there were as many views, because a capture
+has some hundred. "renders": `pipeline.forward` of all views in batches, with colours of degree 3;
 "renders of what is visible": the same, but blocks of Gaussians outside the views are not read, as in an
 evaluation; "survey": the contribution of each Gaussian to the views; "sweep": the survey, the exact 99 % cut
 of each view, scores, phi and the cull matrix. Survey and sweep do not read blocks outside the views either.
@@ -38,12 +40,12 @@ from blitzgs.view.visible_scene import VisibleFinder
 OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e6)
 
 
-def batches_of(scene: BenchmarkScene, length: int) -> list[ViewBatch]:
-    """Return the scene's views, `length` at a time."""
+def batches_of(scene: BenchmarkScene, length: int, visits: int) -> list[ViewBatch]:
+    """Return the scene's views, `length` at a time, `visits` times with columns of their own."""
     count = len(scene.viewmats)
     return [
         ViewBatch(
-            list(range(begin, min(begin + length, count))),
+            list(range(visit * count + begin, visit * count + min(begin + length, count))),
             Views(
                 scene.viewmats[begin : begin + length],
                 scene.Ks[begin : begin + length],
@@ -51,6 +53,7 @@ def batches_of(scene: BenchmarkScene, length: int) -> list[ViewBatch]:
                 scene.height,
             ),
         )
+        for visit in range(visits)
         for begin in range(0, count, length)
     ]
 
@@ -72,12 +75,12 @@ def _wait(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def measure(scene: BenchmarkScene, length: int, repeats: int) -> list[dict[str, Any]]:
+def measure(scene: BenchmarkScene, length: int, visits: int, repeats: int) -> list[dict[str, Any]]:
     """Time renders, survey and sweep of all views, and the compositing of the first batch."""
-    table, batches = GaussianTable.create(scene.raw()), batches_of(scene, length)
+    table, batches = GaussianTable.create(scene.raw()), batches_of(scene, length, visits)
     table.permute(morton_order(table["means"]))
     ranks, transport = Ranks(device=table.device), LocalTransport()
-    n_views = len(scene.viewmats)
+    n_views = visits * len(scene.viewmats)
 
     def renders() -> None:
         for batch in batches:
@@ -135,15 +138,19 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the benchmark."""
     parser = make_parser(__doc__, repeats=5)
     parser.add_argument("--gaussians", type=int, default=4_000_000)
-    parser.add_argument("--views", type=int, default=32)
+    parser.add_argument("--views", type=int, default=32, help="different views (%(default)s)")
+    parser.add_argument("--visits", type=int, default=8, help="of each view (%(default)s)")
     parser.add_argument("--batch", type=int, default=4, help="views at a time")
     parser.add_argument("--size", type=int, nargs=2, default=(1600, 1064), metavar=("WIDTH", "HEIGHT"))
     options = parser.parse_args(arguments)
     width, height = options.size
     scene = aerial(options.gaussians, options.device, views=options.views, width=width, height=height)
     with torch.no_grad():
-        rows = measure(scene, options.batch, options.repeats)
-    title = f"Importance sweep: {scene.name}, {options.views} views of {width} x {height}"
+        rows = measure(scene, options.batch, options.visits, options.repeats)
+    title = (
+        f"Importance sweep: {scene.name}, {options.views * options.visits} views of {width} x {height}, "
+        f"{options.views} of them different"
+    )
     report(title, rows, options.json, options.device)
 
 

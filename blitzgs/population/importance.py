@@ -25,8 +25,10 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -169,7 +171,7 @@ class _NextSurvey:
 
     def __init__(self, device: torch.device, wanted: bool) -> None:
         """Open a stream on a GPU; on the CPU, or if not `wanted`, the work follows its survey as usual."""
-        self._stream = torch.cuda.Stream(device, priority=-1) if wanted and device.type == "cuda" else None
+        self._stream = _side_stream(device) if wanted and device.type == "cuda" else None
         self._held: object = None
         self._done: torch.cuda.Event | None = None
 
@@ -195,6 +197,12 @@ class _NextSurvey:
         with torch.cuda.stream(self._stream):
             yield
         self._done = self._stream.record_event()
+
+
+@lru_cache(maxsize=16)
+def _side_stream(device: torch.device) -> torch.cuda.Stream:
+    """Return one stream of a GPU for all sweeps: torch keeps freed memory for the stream that had it."""
+    return torch.cuda.Stream(device, priority=-1)
 
 
 class _Sums:
@@ -239,6 +247,7 @@ class _Sums:
 
 def _all_culled(n_views: int, device: torch.device) -> Tensor:
     """Return the row of a Gaussian that counts in no view, int32 [1, words]."""
-    bits = torch.arange(-(-n_views // WORD_BITS) * WORD_BITS, device=device)
-    words = ((bits < n_views).long() << bits % WORD_BITS).view(1, -1, WORD_BITS).sum(2)
-    return words.where(words < 1 << 31, words - (1 << 32)).int()
+    bits = np.zeros(-(-n_views // WORD_BITS) * WORD_BITS, dtype=np.uint8)
+    bits[:n_views] = 1
+    words = np.packbits(bits, bitorder="little").view("<i4")
+    return torch.from_numpy(words)[None].to(device)

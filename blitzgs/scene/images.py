@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -31,6 +31,7 @@ from blitzgs.formats.native import native_io
 from blitzgs.scene.cameras import Camera, same_shape
 from blitzgs.scene.capture import Capture
 from blitzgs.scene.image_files import UInt8, apply_orientation, decode_mask, decode_rgb, read_whole
+from blitzgs.scene.shared_images import SharedImages
 from blitzgs.scene.undistort import Rectification
 
 K = TypeVar("K")
@@ -92,7 +93,8 @@ class ImageMemory:
     Attributes:
         compressed_bytes: bytes of compressed images.
         compressed_budget: limit of these bytes.
-        decoded_bytes: bytes of decoded images and masks, without those that a caller holds.
+        decoded_bytes: bytes of decoded images and masks, without those that a caller holds, but with those
+            in memory that several processes share.
         decoded_budget: limit of these bytes at present; it may have been larger before (`ImageStore`).
         decoded: number of decodings of images and masks.
     """
@@ -119,6 +121,21 @@ class _Maps:
     seen: UInt8
 
 
+def has_mask(camera: Camera) -> bool:
+    """Tell whether some pixels of a camera's image may not count."""
+    return camera.mask_path is not None or camera.rectification.has_invalid
+
+
+def decoded_shapes(capture: Capture) -> dict[Hashable, tuple[int, ...]]:
+    """Return the shapes of all decoded images and masks of a capture, by the keys of `ImageStore`."""
+    shapes: dict[Hashable, tuple[int, ...]] = {}
+    for index, camera in enumerate(capture.cameras):
+        shapes["image", index] = (camera.height, camera.width, 3)
+        if has_mask(camera):
+            shapes["mask", index] = (camera.height, camera.width)
+    return shapes
+
+
 class ImageStore:
     """Decoded images and masks of a capture's cameras, by index; any thread may call any method.
 
@@ -135,6 +152,7 @@ class ImageStore:
         threads: int = 4,
         decoded_bytes: int | None = None,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        shared: SharedImages | None = None,
     ) -> None:
         """Read nothing yet.
 
@@ -145,8 +163,10 @@ class ImageStore:
             decoded_bytes: limit of the decoded images in memory; None: a quarter of `budget_bytes`, and
                 what the compressed images leave of `budget_bytes`.
             background: RGB in [0, 1] that images with an alpha channel are composited over.
+            shared: memory for `decoded_shapes` of the capture that other processes use too; decoded images
+                are kept there instead of in this process. None: in this process.
         """
-        self.capture = capture
+        self.capture, self._shared = capture, shared
         self._background = background if capture.has_alpha else None
         self.compressed: BoundedCache[Path | int, bytes] = BoundedCache(budget_bytes)
         self._decoded_bytes = decoded_bytes
@@ -173,38 +193,40 @@ class ImageStore:
 
         A pixel that mixes counted and excluded pixels of the file is excluded.
         """
-        return torch.from_numpy(self._result("mask", index)) if self._has_mask(index) else None
+        return (
+            torch.from_numpy(self._result("mask", index)) if has_mask(self.capture.cameras[index]) else None
+        )
 
     def prefetch(self, indices: Iterable[int], masks: Iterable[int] = ()) -> None:
-        """Start to decode what is needed next, in order, as much as the decoded budget holds.
+        """Start to decode what is needed next, in order, as much as the memory for decoded images holds.
 
         Args:
             indices: cameras whose images are needed.
             masks: cameras whose masks are needed, if they have one.
         """
-        wanted = [("mask", index, 1) for index in masks if self._has_mask(index)]
-        planned = 0
+        wanted = [("mask", index, 1) for index in masks if has_mask(self.capture.cameras[index])]
+        planned, budget = 0, self.decoded.budget + (0 if self._shared is None else self._shared.size)
         for kind, index, channels in [*wanted, *(("image", index, 3) for index in indices)]:
             camera = self.capture.cameras[index]
             planned += channels * camera.width * camera.height
-            if planned > self.decoded.budget:
+            if planned > budget:
                 return
             self._submit(kind, index)
 
     def memory(self) -> ImageMemory:
         """Return the memory that images have taken so far."""
-        compressed, decoded = self.compressed, self.decoded
+        compressed, decoded, shared = self.compressed, self.decoded, self._shared
         return ImageMemory(
-            compressed.most_bytes, compressed.budget, decoded.most_bytes, decoded.budget, self._times_decoded
+            compressed.most_bytes,
+            compressed.budget,
+            decoded.most_bytes + (0 if shared is None else shared.bytes),
+            decoded.budget + (0 if shared is None else shared.size),
+            self._times_decoded,
         )
 
     def close(self) -> None:
         """Stop the threads; images whose decoding has not begun are not decoded."""
         self._pool.shutdown(wait=True, cancel_futures=True)
-
-    def _has_mask(self, index: int) -> bool:
-        camera = self.capture.cameras[index]
-        return camera.mask_path is not None or camera.rectification.has_invalid
 
     def _decoded_budget(self) -> int:
         """Return how many bytes the decoded images may take now."""
@@ -225,24 +247,33 @@ class ImageStore:
         with self._pending_lock:
             if key in self._pending:
                 return self._pending[key]
-            found = self.decoded.get(key)
+            found = self._found(key)
             if found is not None:
                 return found
             future = self._pending[key] = self._pool.submit(self._produce, kind, index)
             return future
 
+    def _found(self, key: tuple[str, int]) -> UInt8 | None:
+        return self.decoded.get(key) if self._shared is None else self._shared.get(key)
+
     def _produce(self, kind: str, index: int) -> UInt8:
+        key = (kind, index)
         try:
-            make = self._make_image if kind == "image" else self._make_mask
-            pixels = make(index)
+            # Another process may have decoded it since the look-up.
+            found = self._found(key)
+            if found is not None:
+                return found
+            self._times_decoded += 1
+            pixels = self._make_image(index) if kind == "image" else self._make_mask(index)
+            if self._shared is not None:
+                return self._shared.put(key, pixels)
             with self._budget_lock:  # so that no thread restores a budget of before another one's image
                 self.decoded.resize(self._decoded_budget())
-            self.decoded.put((kind, index), pixels, pixels.nbytes)
+            self.decoded.put(key, pixels, pixels.nbytes)
             return pixels
         finally:
             with self._pending_lock:
-                del self._pending[(kind, index)]
-                self._times_decoded += 1
+                del self._pending[key]
 
     def _read(self, path: Path) -> bytes:
         data = self.compressed.get(path)

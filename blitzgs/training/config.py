@@ -29,7 +29,8 @@ class DataConfig:
             turns it, "ignore" never.
         allow_missing: drop views whose image is missing instead of failing.
         cache_bytes: memory for compressed images, of all ranks of a host together, at most half of the host's
-            memory; decoded images take what these leave, and up to a quarter of it in addition.
+            memory; decoded images take what these leave, and up to a quarter of it in addition. If all
+            decoded images fit into half of it, the ranks of a host share them.
         threads: decoder threads of each rank. 0: the cores that the process may use, shared by the ranks of
             the host, less two for each rank; at least 2, at most 32.
         prefetch: number of batches to upload ahead; photographs are decoded for more batches ahead.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import Any
 import blitzgs
 from blitzgs.distributed.group import Ranks
 from blitzgs.scene.capture import Capture, MissingImagesError, load_capture
-from blitzgs.scene.images import ImageStore
+from blitzgs.scene.images import ImageStore, decoded_shapes
+from blitzgs.scene.shared_images import SharedImages, size_of
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import ConfigError, to_dict
 from blitzgs.training.views import Space
@@ -27,7 +29,8 @@ def open_capture(
 ) -> tuple[Capture, ImageStore]:
     """Load the capture that a configuration names, and open its images.
 
-    The processes of one host share the budget for images in memory, which is at most half of its memory.
+    The processes of one host share the budget for images in memory, which is at most half of its memory, and
+    the decoded images if they all fit into half of that. Collective.
 
     Args:
         config: configuration of the run.
@@ -55,9 +58,36 @@ def open_capture(
         )
     except MissingImagesError as error:
         raise MissingImagesError(f"{error} ({remedy})") from error
-    budget = min(data.cache_bytes, _host_memory() // 2) // ranks.local_world_size
+    budget = min(data.cache_bytes, _host_memory() // 2)
+    shared = _share_decoded(capture, budget // 2, ranks)
+    left = budget if shared is None else budget - shared.size
     threads = data.threads or _decoder_threads(ranks.local_world_size)
-    return capture, ImageStore(capture, budget, threads, background=config.model.background)
+    background = config.model.background
+    return capture, ImageStore(
+        capture, left // ranks.local_world_size, threads, background=background, shared=shared
+    )
+
+
+def _share_decoded(capture: Capture, budget: int, ranks: Ranks) -> SharedImages | None:
+    """Open memory for all decoded images that the ranks of this host share. Collective.
+
+    Returns:
+        None if this is the host's only rank, the images would take more bytes than the budget, or the system
+        does not let the ranks share memory; then every rank keeps those that it needs for itself.
+    """
+    if ranks.world_size == 1:
+        return None
+    shapes = decoded_shapes(capture)
+    leader = ranks.rank - ranks.rank % ranks.local_world_size
+    shared, offer = None, None
+    if ranks.rank == leader and ranks.local_world_size > 1 and size_of(shapes) <= budget:
+        with contextlib.suppress(OSError):
+            shared, offer = SharedImages.create(shapes)
+    offer = ranks.all_gather_object(offer)[leader]
+    if ranks.rank != leader and offer is not None:
+        with contextlib.suppress(OSError):
+            shared = SharedImages.join(offer, shapes)
+    return shared
 
 
 def _decoder_threads(local_ranks: int) -> int:

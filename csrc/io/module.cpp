@@ -7,6 +7,7 @@
 #include <pybind11/stl.h>
 
 #include <algorithm>
+#include <atomic>
 #include <cerrno>
 #include <cstring>
 #include <fstream>
@@ -239,6 +240,18 @@ py::array_t<std::uint8_t> decode_qoi(const py::bytes& data) {
   return rgb;
 }
 
+// Flags in memory that several processes share: a process that sees a flag also sees all that was written
+// before the flag was set.
+std::atomic_ref<std::uint8_t> flag_of(py::array_t<std::uint8_t>& flags, py::ssize_t index) {
+  return std::atomic_ref(flags.mutable_at(index));
+}
+void set_flag(py::array_t<std::uint8_t> flags, py::ssize_t index) {
+  flag_of(flags, index).store(1, std::memory_order_release);
+}
+bool flag_is_set(py::array_t<std::uint8_t> flags, py::ssize_t index) {
+  return flag_of(flags, index).load(std::memory_order_acquire) != 0;
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_io, m) {
@@ -255,6 +268,8 @@ PYBIND11_MODULE(_io, m) {
   m.def("check_jpeg", &check_jpeg, "data"_a, "name"_a);
   m.def("encode_qoi", &encode_qoi, "rgb"_a);
   m.def("decode_qoi", &decode_qoi, "data"_a);
+  m.def("set_flag", &set_flag, "flags"_a.noconvert(), "index"_a);
+  m.def("flag_is_set", &flag_is_set, "flags"_a.noconvert(), "index"_a);
   m.def("read_ply", &read_ply, "path"_a);
   m.def("write_ply", &write_ply, "path"_a, "comments"_a, "properties"_a, "count"_a, "rows"_a);
 }

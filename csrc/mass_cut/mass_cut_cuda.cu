@@ -11,8 +11,10 @@ constexpr int kThreads = 512;
 constexpr int kWarps = kThreads / 32;
 // The number of segments whose first digits a block sums in shared memory, 8 KiB each.
 constexpr int kSegmentsAtOnce = 8;
-// The first round whose scan reads the list.
-constexpr int kListedRounds = 2;
+// The first round whose scan reads the list, and the first of those that one kernel takes together. Before
+// the latter, a threshold has the 36 bits after its first digit; few weights of 2^40 units, 2^8 whole pixels,
+// have more.
+constexpr int kListedRounds = 2, kLaterRounds = 4;
 
 // A 64-bit sum as two words, because shared memory has an atomic addition of 32-bit words but none of 64-bit
 // ones, which would be a loop.
@@ -152,25 +154,28 @@ __global__ void __launch_bounds__(kThreads) descent_kernel(const MassCutArgs arg
   descend(args, round);
 }
 
-// All rounds after those for which there is another kernel, one block per segment. The list is short, and
-// most rounds find no digit, so this takes less time than two launches for each round.
+// All rounds from kLaterRounds on, one block per segment. As a rule they find no digit, so this takes less
+// time than two launches for each of them.
 __global__ void __launch_bounds__(kThreads) later_rounds_kernel(const MassCutArgs args) {
   constexpr int kEach = 4;  // items of a thread that are read at the same time
   wait_for_earlier_kernels();
+  const int segment = static_cast<int>(blockIdx.x);
   const std::int64_t count = args.listed[0];
-  for (int round = kListedRounds; round < 2 * kRounds; ++round) {
-    const bool scans = finds_digit(args.searches[blockIdx.x], round);
-    for (std::int64_t begin = threadIdx.x; scans && begin < count; begin += kEach * kThreads) {
+  for (int round = kLaterRounds; round < 2 * kRounds; ++round) {
+    const bool finds = finds_digit(args.searches[segment], round);
+    if (!finds && round != kRounds - 1) continue;
+    for (std::int64_t begin = threadIdx.x; finds && begin < count; begin += kEach * kThreads) {
       ScanTerm terms[kEach];
 #pragma unroll
       for (int i = 0; i < kEach; ++i) {
         terms[i] = {false, 0, 0};
-        if (begin + i * kThreads >= count) continue;
-        const std::int64_t item = args.listed[1 + begin + i * kThreads];
-        if (args.segments[item] == static_cast<int>(blockIdx.x)) terms[i] = scan_term(args, round, item);
+        const std::int64_t at = begin + i * kThreads;
+        if (at >= count) continue;
+        const std::int64_t item = args.listed[1 + at];
+        if (args.segments[item] == segment) terms[i] = scan_term(args, round, item);
       }
 #pragma unroll
-      for (const ScanTerm& term : terms) add_term(args, blockIdx.x, term);
+      for (const ScanTerm& term : terms) add_term(args, segment, term);
     }
     __syncthreads();
     descend(args, round);
@@ -211,7 +216,7 @@ void scan(const MassCutArgs& args, int round, CudaStream stream) {
 void mass_cut(const MassCutArgs& args, int first_step, int last_step, CudaStream stream) {
   const auto segments = static_cast<unsigned>(args.n_segments);
   for (int step = first_step; step < std::min(last_step, kChoiceStep); ++step) {
-    if (step == 2 * kListedRounds && last_step >= kChoiceStep) {
+    if (step == 2 * kLaterRounds && last_step >= kChoiceStep) {
       launch_early("mass_cut", later_rounds_kernel, {segments, kThreads, stream}, args);
       break;
     }
