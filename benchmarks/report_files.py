@@ -13,10 +13,9 @@ COMMANDS = {
     "call": "python benchmarks/bm_render.py --scenes aerial1 aerial4",
     "step_1": "python benchmarks/bm_step.py --views 1",
     "step_4": "python benchmarks/bm_step.py --views 4",
-    "exchange": f"{EXCHANGE} --ranks 1 2",
+    "exchange": f"{EXCHANGE} --ranks 1 2 4",
     "training": f"python {TRAINING}",
     "training_2": f"torchrun --nproc-per-node=2 {TRAINING}",
-    "drop_in": "python benchmarks/bm_drop_in.py CAPTURE",
     "drop_in_full": "python benchmarks/bm_drop_in.py CAPTURE --steps 30000 --one-thread",
     "importance": "python benchmarks/bm_importance.py",
     "gate": "python benchmarks/bm_gate.py",
@@ -69,12 +68,12 @@ COMMANDS |= {
     "offload": "python benchmarks/bm_offload.py --ratios 2 4",
     "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 --popping --scale 0.6",
     "city_ranks": (
-        "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 2 --arms all_off "
+        "python benchmarks/bm_city.py CITY --out RESULTS --gpus 4 --ranks 4 --arms all_off "
         "--batch-sizes 4 16 --scale 0.6"
     ),
     "city_exchange": (
         "python benchmarks/bm_exchange.py --data CITY --downscale 1 --visible-threshold 0 "
-        "--device cuda --ranks 1 2"
+        "--device cuda --ranks 1 2 4"
     ),
 }
 # The files of a group are of one commit, and so are those that are in no group. Comparisons of whole
@@ -90,12 +89,10 @@ GROUPS = (
     ("gate_random",),
     ("town",),
     ("adaptive",),
-    ("call",),
+    ("call", "importance", "lineage", "lineage_training"),
     ("scratch",),
-    ("drop_in",),
-    ("exchange", "training", "training_2"),
-    ("city", "city_ranks"),
-    ("city_exchange",),
+    ("exchange", "training", "training_2", "city_ranks", "city_exchange", "drop_in_full"),
+    ("city",),
 )
 # bm_quality.py takes no --json: it collects all of its runs in one file.
 COPIED = {

@@ -343,7 +343,6 @@ SECTIONS = {
     "exchange": Section(("exchange",), exchange_lines),
     "training": Section(("training",), row_lines),
     "training_2": Section(("training_2",), row_lines),
-    "drop_in": Section(("drop_in",), row_lines),
     "drop_in_full": Section(("drop_in_full",), row_lines),
     "importance": Section(("importance",), row_lines),
     "gate": Section(("gate",), row_lines),

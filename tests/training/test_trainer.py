@@ -193,7 +193,7 @@ def test_a_batch_that_is_small_for_its_ranks_gets_a_hint(batch, ranks, enough):
     if enough is None:
         assert hint is None
     else:
-        assert hint.startswith(f"a step of {batch} views gains little from {ranks} ranks: ")
+        assert hint.startswith(f"a step of {batch} views may be no faster on {ranks} ranks than on one: ")
         assert f"try --schedule.batch_size={enough}," in hint
 
 
