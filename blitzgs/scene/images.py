@@ -93,8 +93,8 @@ class ImageMemory:
     Attributes:
         compressed_bytes: bytes of compressed images.
         compressed_budget: limit of these bytes.
-        decoded_bytes: bytes of decoded images and masks, without those that a caller holds, but with those
-            in memory that several processes share.
+        decoded_bytes: bytes of decoded images and masks, without those that a caller holds; in memory that
+            several processes share, those of all processes.
         decoded_budget: limit of these bytes at present; it may have been larger before (`ImageStore`).
         decoded: number of decodings of images and masks.
     """
@@ -163,8 +163,8 @@ class ImageStore:
             decoded_bytes: limit of the decoded images in memory; None: a quarter of `budget_bytes`, and
                 what the compressed images leave of `budget_bytes`.
             background: RGB in [0, 1] that images with an alpha channel are composited over.
-            shared: memory for `decoded_shapes` of the capture that other processes use too; decoded images
-                are kept there instead of in this process. None: in this process.
+            shared: memory for `decoded_shapes` of the capture that other processes use too. All images stay
+                decoded there, and none is kept in this process. None: they are kept in this process.
         """
         self.capture, self._shared = capture, shared
         self._background = background if capture.has_alpha else None
@@ -205,7 +205,7 @@ class ImageStore:
             masks: cameras whose masks are needed, if they have one.
         """
         wanted = [("mask", index, 1) for index in masks if has_mask(self.capture.cameras[index])]
-        planned, budget = 0, self.decoded.budget + (0 if self._shared is None else self._shared.size)
+        planned, budget = 0, self._room()
         for kind, index, channels in [*wanted, *(("image", index, 3) for index in indices)]:
             camera = self.capture.cameras[index]
             planned += channels * camera.width * camera.height
@@ -215,18 +215,17 @@ class ImageStore:
 
     def memory(self) -> ImageMemory:
         """Return the memory that images have taken so far."""
-        compressed, decoded, shared = self.compressed, self.decoded, self._shared
+        decoded = self.decoded.most_bytes if self._shared is None else self._shared.bytes
         return ImageMemory(
-            compressed.most_bytes,
-            compressed.budget,
-            decoded.most_bytes + (0 if shared is None else shared.bytes),
-            decoded.budget + (0 if shared is None else shared.size),
-            self._times_decoded,
+            self.compressed.most_bytes, self.compressed.budget, decoded, self._room(), self._times_decoded
         )
 
     def close(self) -> None:
         """Stop the threads; images whose decoding has not begun are not decoded."""
         self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _room(self) -> int:
+        return self.decoded.budget if self._shared is None else self._shared.size
 
     def _decoded_budget(self) -> int:
         """Return how many bytes the decoded images may take now."""
@@ -263,7 +262,8 @@ class ImageStore:
             found = self._found(key)
             if found is not None:
                 return found
-            self._times_decoded += 1
+            with self._pending_lock:
+                self._times_decoded += 1
             pixels = self._make_image(index) if kind == "image" else self._make_mask(index)
             if self._shared is not None:
                 return self._shared.put(key, pixels)
@@ -279,7 +279,8 @@ class ImageStore:
         data = self.compressed.get(path)
         if data is None:
             data = read_whole(path)
-            self.compressed.put(path, data, len(data))
+            if self._shared is None:  # an image in shared memory stays decoded
+                self.compressed.put(path, data, len(data))
         return data
 
     def _make_image(self, index: int) -> UInt8:
@@ -291,8 +292,9 @@ class ImageStore:
         if packed is not None:
             return _uint8(native_io().decode_qoi(packed))
         pixels = self._prepare(camera, self._decode(camera, read_whole(camera.image_path)))
-        packed = native_io().encode_qoi(pixels)
-        self.compressed.put(index, packed, len(packed))
+        if self._shared is None:
+            packed = native_io().encode_qoi(pixels)
+            self.compressed.put(index, packed, len(packed))
         return pixels
 
     def _prepare(self, camera: Camera, pixels: UInt8) -> UInt8:
