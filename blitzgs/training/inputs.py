@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +60,8 @@ def open_capture(
     except MissingImagesError as error:
         raise MissingImagesError(f"{error} ({remedy})") from error
     budget = min(data.cache_bytes, _host_memory() // 2)
-    shared = _share_decoded(capture, budget // 2, ranks)
-    left = budget if shared is None else budget - shared.size
+    shared, taken = _share_decoded(capture, budget // 2, ranks)
+    left = max(0, budget - taken)  # this rank's budget may be below that of the rank which made the memory
     threads = data.threads or _decoder_threads(ranks.local_world_size)
     background = config.model.background
     return capture, ImageStore(
@@ -68,26 +69,33 @@ def open_capture(
     )
 
 
-def _share_decoded(capture: Capture, budget: int, ranks: Ranks) -> SharedImages | None:
+def _share_decoded(capture: Capture, budget: int, ranks: Ranks) -> tuple[SharedImages | None, int]:
     """Open memory for all decoded images that the ranks of this host share. Collective.
 
     Returns:
-        None if this is the host's only rank, the images would take more bytes than the budget, or the system
-        does not let the ranks share memory; then every rank keeps those that it needs for itself.
+        The memory, and the bytes that it takes from this host. The memory is None if this is the host's only
+        rank, the images would take more bytes than the budget, or the system does not let the ranks share
+        memory; then every rank keeps those that it needs for itself. If the system only keeps this rank from
+        the memory, the bytes count all the same.
     """
     if ranks.world_size == 1:
-        return None
-    shapes = decoded_shapes(capture)
-    leader = ranks.rank - ranks.rank % ranks.local_world_size
+        return None, 0
+    shapes, host = decoded_shapes(capture), socket.gethostname()
     shared, offer = None, None
-    if ranks.rank == leader and ranks.local_world_size > 1 and size_of(shapes) <= budget:
+    # The numbers of a host's ranks follow one another, so exactly one of them is a multiple of their count,
+    # also where another host has another count.
+    makes = ranks.rank % ranks.local_world_size == 0 and ranks.local_world_size > 1
+    if makes and size_of(shapes) <= budget:
         with contextlib.suppress(OSError):
             shared, offer = SharedImages.create(shapes)
-    offer = ranks.all_gather_object(offer)[leader]
-    if ranks.rank != leader and offer is not None:
-        with contextlib.suppress(OSError):
-            shared = SharedImages.join(offer, shapes)
-    return shared
+    gathered = ranks.all_gather_object((host, offer))
+    # Containers on different hosts may have one name, so there may be several offers.
+    offers = [other for name, other in gathered if name == host and other is not None]
+    for other in offers:
+        if shared is None:
+            with contextlib.suppress(OSError):
+                shared = SharedImages.join(other, shapes)
+    return shared, size_of(shapes) if offers else 0
 
 
 def _decoder_threads(local_ranks: int) -> int:

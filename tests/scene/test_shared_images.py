@@ -3,6 +3,7 @@
 
 import dataclasses
 import os
+import socket
 
 import cv2
 import numpy as np
@@ -117,7 +118,7 @@ def test_ranks_decode_each_image_once_if_all_fit(tmp_path, shares):
     # A rank's own budget is too small for all, so some are decoded again.
     assert all(decoded == 4 if shares else decoded >= 12 for decoded, _, _ in results)
     assert all(sums == results[0][1] for _, sums, _ in results)
-    left = cache - 12 * 3 * 64 * 48 if shares else cache
+    left = cache - needed if shares else cache
     assert {budget for _, _, budget in results} == {left // 3}
 
 
@@ -125,14 +126,34 @@ def _refuse(*_args):
     raise OSError("no such memory")
 
 
-def _decode_without(ranks, folder, refused):
+def _decode_without(ranks, folder, refused, cache_bytes):
     if ranks.rank == refused:
         SharedImages.create = SharedImages.join = _refuse
-    return _decode_all(ranks, folder, 1 << 30)[:2]
+    return _decode_all(ranks, folder, cache_bytes)
 
 
 @pytest.mark.parametrize("refused", [0, 1])
 def test_a_rank_without_access_decodes_for_itself(tmp_path, refused):
-    results = run_ranks(_decode_without, 2, write_capture(tmp_path, NAMES), refused)
-    assert [decoded for decoded, _ in results] == [12, 12]
+    folder = write_capture(tmp_path, NAMES)
+    needed, cache = size_of(decoded_shapes(load_capture(folder))), 10_000_000
+    results = run_ranks(_decode_without, 2, folder, refused, cache)
+    assert [decoded for decoded, _, _ in results] == [12, 12]
     assert results[0][1] == results[1][1]
+    # The memory that one rank has made is taken from the budget of both.
+    left = cache if refused == 0 else cache - needed
+    assert [budget for _, _, budget in results] == [left // 2] * 2
+
+
+def _decode_on_unequal_hosts(ranks, folder):
+    # Ranks 0 and 1 are on a host that has too little memory to share, ranks 2 to 4 on another one.
+    first = ranks.rank < 2
+    socket.gethostname = lambda: "first" if first else "second"
+    ranks.local_world_size = 2 if first else 3
+    return _decode_all(ranks, folder, 200_000 if first else 10_000_000)[0]
+
+
+def test_hosts_may_have_different_numbers_of_ranks(tmp_path):
+    decoded = run_ranks(_decode_on_unequal_hosts, 5, write_capture(tmp_path, NAMES))
+    assert min(decoded[:2]) >= 12
+    # Any rank of the second host may decode those 6 images that the ranks of the first one decode first.
+    assert sum(decoded[2:]) >= 12 and max(decoded[2:]) <= 2 + 6
