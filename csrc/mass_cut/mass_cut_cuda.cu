@@ -12,8 +12,8 @@ constexpr int kWarps = kThreads / 32;
 // The number of segments whose first digits a block sums in shared memory, 8 KiB each.
 constexpr int kSegmentsAtOnce = 8;
 // The first round whose scan reads the list, and the first of those that one kernel takes together. Before
-// the latter, a threshold has the 36 bits after its first digit; few weights of 2^40 units, 2^8 whole pixels,
-// have more.
+// the latter, a threshold has the 36 bits after its first digit; only weights from 2^41 units on, 2^9 whole
+// pixels, have more.
 constexpr int kListedRounds = 2, kLaterRounds = 4;
 
 // A 64-bit sum as two words, because shared memory has an atomic addition of 32-bit words but none of 64-bit

@@ -64,12 +64,13 @@ def test_equals_sorting(device, n_segments, kind, share):
     assert not cut.sums.any()
 
 
-def test_largest_weights():
+@pytest.mark.parametrize("device", DEVICES)
+def test_largest_weights(device):
     weights = torch.tensor([(1 << 61) - 1, 1 << 60, (1 << 60) - 1, 1, 0])
     ids = torch.tensor([4, 0, 3, 2, 1])
     for share in ((1, 2), (3, 4), (999_999_999, 1_000_000_000), (1, 1)):
-        one = torch.zeros(5, dtype=torch.int32)
-        cut = MassCut.begin(weights, one, torch.arange(5, dtype=torch.int32), ids, 1)
+        items = weights, torch.zeros(5, dtype=torch.int32), torch.arange(5, dtype=torch.int32), ids
+        cut = MassCut.begin(*(t.to(device) for t in items), 1)
         cut.take_steps(share, 0, STEPS)
         assert cut.chosen.tolist() == by_sorting(weights.tolist(), [0] * 5, ids.tolist(), share)
 
