@@ -13,6 +13,7 @@ from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.selection import integer_mass_prefix
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.population import importance
 from blitzgs.population.importance import PHI_EPS, SCORE_EPS, ViewBatch, is_culled, sweep
 from blitzgs.population.pruning import sample_by_score, top_by_score
 from blitzgs.reference.importance import scores as by_definition
@@ -20,7 +21,7 @@ from blitzgs.reference.importance import top_mass
 from blitzgs.rendering import contributions
 from blitzgs.survey import survey
 from tests.distributed.rank_harness import on_cuda, on_each_device, run_ranks
-from tests.helpers import DEVICES
+from tests.helpers import DEVICES, needs_cuda
 from tests.training.tiny import look_at_origin, random_gaussians
 
 ALONE = Ranks()
@@ -158,6 +159,22 @@ def test_a_survey_reads_no_colours(device):
     after = survey(table, views, OPTIONS)
     assert before.weights.any() and len(after.splats.colors) == 0
     assert torch.equal(before.weights, after.weights) and torch.equal(before.pixels, after.pixels)
+
+
+@pytest.mark.cuda
+@needs_cuda
+def test_cuts_that_lag_behind_the_surveys_change_no_bit(monkeypatch):
+    ranks, add = Ranks(device=torch.device("cuda")), importance._Sums.add
+    table = population(ranks)
+    expected = sweep(table, view_batches("cuda"), N_VIEWS, OPTIONS, ranks)
+
+    def late(*arguments):
+        torch.cuda._sleep(20_000_000)  # longer than the next survey takes
+        add(*arguments)
+
+    monkeypatch.setattr(importance._Sums, "add", late)
+    found = sweep(table, view_batches("cuda"), N_VIEWS, OPTIONS, ranks)
+    assert all(torch.equal(getattr(found, n), getattr(expected, n)) for n in ("score", "phi", "cull"))
 
 
 def layouts(world_size):
