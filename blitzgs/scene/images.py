@@ -2,7 +2,8 @@
 """Keeps the images of a capture compressed in memory within a budget; threads decode them ahead.
 
 There are two bounded caches, for compressed and for decoded images; both drop the entries that were used
-longest ago. Decoded images take the memory that compressed ones leave. The compressed form is the file
+longest ago. Decoded images take the memory that compressed ones leave. If processes share memory for all
+decoded images (`shared_images`), it takes the place of both. The compressed form is the file
 itself if the file needs no processing. An image that must be undistorted or downscaled is processed once
 and kept as QOI, which is lossless. For an image of 1.9 megapixels, decoding the QOI takes 16 ms at full
 size and 1 ms at a quarter; decoding, undistorting and averaging the JPEG again takes 22 and 16 ms, and
