@@ -226,7 +226,8 @@ class ImageStore:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _room(self) -> int:
-        return self.decoded.budget if self._shared is None else self._shared.size
+        # All images have a place in shared memory, so there this limit is never reached.
+        return self.decoded.budget + (0 if self._shared is None else self._shared.size)
 
     def _decoded_budget(self) -> int:
         """Return how many bytes the decoded images may take now."""

@@ -74,7 +74,7 @@ def test_stores_with_shared_memory_return_the_same_images_and_decode_each_once(t
     for store in stores:
         store.close()
         memory = store.memory()
-        assert memory.decoded_bytes == memory.decoded_budget == 12 * 3 * 64 * 48
+        assert memory.decoded_bytes == 12 * 3 * 64 * 48 < memory.decoded_budget
         assert store.decoded.bytes == store.compressed.bytes == 0
     # Both may decode an image at the same time, but not one that the other has decoded.
     assert 12 <= sum(store.memory().decoded for store in stores) <= 24
