@@ -140,6 +140,7 @@ def test_the_log_adds_few_kernels_and_no_wait_to_an_event(tmp_path):
     assert sum(n for name, n in added.items() if name not in VIEWS) <= 20, added
 
 
+@pytest.mark.cuda
 @needs_cuda
 def test_rows_leave_the_gpu_without_keeping_the_host(tmp_path, monkeypatch):
     monkeypatch.setattr(lineage_parts, "_STAGING_BYTES", 1000)
