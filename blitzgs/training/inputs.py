@@ -98,6 +98,27 @@ def _share_decoded(capture: Capture, budget: int, ranks: Ranks) -> tuple[SharedI
     return shared, size_of(shapes) if offers else 0
 
 
+def sharing_hint(capture: Capture, cache_bytes: int, local_ranks: int) -> str | None:
+    """Return what to do if the decoded images are too many to be shared by the ranks of a host.
+
+    Args:
+        capture: the images.
+        cache_bytes: `DataConfig.cache_bytes`.
+        local_ranks: number of ranks of the host.
+
+    Returns:
+        None for a single rank, if the images fit already, or if they are too many for the host's memory.
+    """
+    size, memory = size_of(decoded_shapes(capture)), _host_memory() // 2
+    if local_ranks == 1 or size <= min(cache_bytes, memory) // 2 or size > memory // 2:
+        return None
+    gigabytes = -(-2 * size // 10**9)
+    return (
+        "each rank decodes the photographs for itself: with "
+        f"--data.cache_bytes={gigabytes}_000_000_000, the ranks of a host would share them"
+    )
+
+
 def _decoder_threads(local_ranks: int) -> int:
     """Return how many threads each rank of this host decodes with, see `DataConfig.threads`."""
     return min(max(len(os.sched_getaffinity(0)) // local_ranks - 2, 2), 32)

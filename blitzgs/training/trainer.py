@@ -28,6 +28,7 @@ from blitzgs.training.config import Config
 from blitzgs.training.config_io import config_hash, save_config
 from blitzgs.training.events import evaluate, events_left, handle_all, save
 from blitzgs.training.guard import LossGuard, ModelLostError
+from blitzgs.training.inputs import sharing_hint
 from blitzgs.training.lod import lod_gate
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
 from blitzgs.training.run_log import RunLog
@@ -285,9 +286,12 @@ class Trainer:
         state.log.event(
             state.images_seen, "start", {"origin": state.origin} | values, f"{state.origin}; {text}"
         )
-        hint = small_batch_hint(state.schedule.batch_size, ranks.world_size)
-        if hint and state.progress.step == 0:  # a resumed run keeps its batches
-            state.log.event(state.images_seen, "hint", {"hint": hint}, hint)
+        hints = [sharing_hint(state.capture, state.config.data.cache_bytes, ranks.local_world_size)]
+        if state.progress.step == 0:  # a resumed run keeps its batches
+            hints.append(small_batch_hint(state.schedule.batch_size, ranks.world_size))
+        for hint in hints:
+            if hint is not None:
+                state.log.event(state.images_seen, "hint", {"hint": hint}, hint)
 
     def finish(self, agreement: Agreement) -> dict[str, Any] | None:
         """Save and evaluate the trained model; return and write the summary.

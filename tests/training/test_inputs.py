@@ -29,3 +29,17 @@ def test_without_a_container_the_memory_of_the_host_counts(tmp_path, monkeypatch
     monkeypatch.setattr(inputs.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 100}[name])
     _, images = inputs.open_capture(tiny_config(f"data.path={tmp_path / 'capture'}"), Ranks())
     assert images.compressed.budget == 4096 * 50
+
+
+def test_ranks_whose_photographs_do_not_fit_get_a_hint(tmp_path, monkeypatch):
+    write_tiny_capture(tmp_path / "capture")
+    _, images = inputs.open_capture(tiny_config(f"data.path={tmp_path / 'capture'}"), Ranks())
+    capture, size = images.capture, inputs.size_of(inputs.decoded_shapes(images.capture))
+    monkeypatch.setattr(inputs, "_host_memory", lambda: 4 * size)
+    assert inputs.sharing_hint(capture, 2 * size, 2) is None
+    assert inputs.sharing_hint(capture, 2 * size - 2, 1) is None
+    hint = inputs.sharing_hint(capture, 2 * size - 2, 2)
+    assert "each rank decodes the photographs for itself" in hint
+    assert "--data.cache_bytes=1_000_000_000," in hint  # rounded up to whole gigabytes
+    monkeypatch.setattr(inputs, "_host_memory", lambda: 4 * size - 4)
+    assert inputs.sharing_hint(capture, 2 * size - 2, 2) is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -43,6 +44,7 @@ class Camera:
     world_to_camera: np.ndarray
     image_path: Path = Path("/nowhere")
     mask_path: Path | None = None
+    rectification: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(has_invalid=False))
 
 
 @dataclass
