@@ -147,10 +147,9 @@ class RecordedTrainer(Trainer):
             )
 
 
-def train_ours(spec: RunSpec) -> dict[str, Any]:
+def train_ours(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:
     """Train with BlitzGS."""
     config = spec.config()
-    ranks = Ranks.from_environment(spec.device)
     capture, images = open_capture(config, ranks)
     with tempfile.TemporaryDirectory() as folder:
         shared = Path(ranks.broadcast_object(folder))  # all ranks are on one host
@@ -164,11 +163,10 @@ def train_ours(spec: RunSpec) -> dict[str, Any]:
     return found | ({"placed": trainer.state.placed_times} if config.schedule.adaptive else {})
 
 
-def train_opponent(spec: RunSpec) -> dict[str, Any]:
+def train_opponent(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:
     """Train with one of gsplat's strategies."""
     assert spec.strategy is not None
     config, options = spec.config(), spec.options()
-    ranks = Ranks.from_environment(spec.device)
     capture, images = open_capture(config, ranks)
     trainer = GsplatTrainer(spec.strategy, options, capture, images, ranks.device, spec.seed)
     lpips, owners = load_lpips(spec.lpips), TileOwners(ranks)
@@ -192,11 +190,10 @@ def train_opponent(spec: RunSpec) -> dict[str, Any]:
     return figures(recorder, trainer.peak)
 
 
-def train_partition(spec: RunSpec) -> dict[str, Any]:
+def train_partition(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:
     """Train the blocks of a grid one after the other, and measure the model that they are merged to."""
     config, shape = spec.config(), spec.grid
     assert shape is not None
-    ranks = Ranks.from_environment(spec.device)
     capture, images = open_capture(config, ranks)
     begin = time.monotonic()
     grid = spatial_partition.Grid(capture, *shape)
@@ -268,7 +265,8 @@ def main(arguments: Sequence[str]) -> int:
     begin = time.monotonic()
     try:
         train = train_ours if spec.strategy is None else train_opponent
-        found = (train if spec.grid is None else train_partition)(spec)
+        with Ranks.from_environment(spec.device) as ranks:
+            found = (train if spec.grid is None else train_partition)(spec, ranks)
         result |= {"status": "done", "environment": environment(spec.device)} | found
     except Exception as error:
         traceback.print_exc()

@@ -11,6 +11,7 @@ as long as it keeps publishing.
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import sys
@@ -119,6 +120,8 @@ class Watchdog:
         self.thread = threading.Thread(target=self._run, name="blitzgs-watchdog", daemon=True)
         self._publish()
         self.thread.start()
+        # A process that ends without leaving its job would be aborted if the thread is inside the store then.
+        atexit.register(self.stop)
 
     @staticmethod
     def period_for(timeout_seconds: float) -> float:
@@ -172,6 +175,7 @@ class Watchdog:
 
     def stop(self) -> None:
         """Stop watching."""
+        atexit.unregister(self.stop)
         self.stopping.set()
         self.thread.join(timeout=5)
 

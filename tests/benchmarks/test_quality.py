@@ -20,6 +20,7 @@ from opponents import relocation  # noqa: E402
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer  # noqa: E402
 from quality_plan import RunSpec, read_plan, runs_of  # noqa: E402
 
+from blitzgs.distributed.group import Ranks  # noqa: E402
 from blitzgs.reference.gaussians import covariance_factors  # noqa: E402
 from blitzgs.training.schedule import PLACED  # noqa: E402
 from tests.helpers import DEVICES  # noqa: E402
@@ -90,10 +91,10 @@ def test_shipped_plans_can_be_run(name, capture, monkeypatch):
 
 def test_the_result_of_an_adaptive_run_has_the_placed_times(capture):
     adaptive = "--schedule.adaptive=true --population.importance=true --schedule.t1=40 --schedule.t2=95"
-    found = quality_run.train_ours(spec_of(capture, f"defaults {FLAGS} {adaptive}"))
+    found = quality_run.train_ours(spec_of(capture, f"defaults {FLAGS} {adaptive}"), Ranks())
     name, place = next(iter(found["placed"].items()))
     assert name == PLACED[0] and place["time"] > 0 and place["reason"]
-    assert "placed" not in quality_run.train_ours(spec_of(capture, f"defaults {FLAGS}"))
+    assert "placed" not in quality_run.train_ours(spec_of(capture, f"defaults {FLAGS}"), Ranks())
 
 
 def test_bad_plans_name_what_is_wrong(tmp_path, capture, capsys):
@@ -196,7 +197,7 @@ def test_gsplats_strategies_train(capture, strategy, device):
     # Times of 30,000 steps in 240: density from 4 on, every step; resets, where there are any, each 24.
     source = f"gsplat-{strategy} --steps_scaler=0.008 "
     source += "--cap_max=450" if strategy == "mcmc" else "--grow_grad2d=0.002"
-    result = quality_run.train_opponent(spec_of(capture, source, device))
+    result = quality_run.train_opponent(spec_of(capture, source, device), Ranks(device=torch.device(device)))
     # Training views are measured after 7,000 and 15,000 of 30,000 steps and at the end.
     assert [e["images"] for e in result["evaluations"]] == [40, 56, 120, 240]
     quoted = [e["images"] for e in result["evaluations"] if "train" in e]

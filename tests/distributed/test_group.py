@@ -4,7 +4,9 @@ import time
 
 import pytest
 import torch
+from torch.distributed import HashStore
 
+from blitzgs.distributed import watchdog
 from blitzgs.distributed.group import (
     ALLOCATOR_VARIABLES,
     MismatchError,
@@ -217,3 +219,16 @@ def test_processes_of_torchrun_share_the_cores(monkeypatch, variables, processes
         assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
+
+
+def test_a_process_that_ends_inside_its_job_stops_watching_first(monkeypatch):
+    at_exit = []
+    monkeypatch.setattr(watchdog, "open_store", lambda *_args, **_options: HashStore())
+    monkeypatch.setattr(watchdog.atexit, "register", at_exit.append)
+    monkeypatch.setattr(watchdog.atexit, "unregister", at_exit.remove)
+    dogs = [watchdog.Watchdog(0, 1, 10.0) for _ in range(2)]
+    assert at_exit == [dog.stop for dog in dogs]
+    dogs[0].stop()
+    assert at_exit == [dogs[1].stop] and not dogs[0].thread.is_alive() and dogs[1].thread.is_alive()
+    at_exit[0]()
+    assert not dogs[1].thread.is_alive() and not at_exit
