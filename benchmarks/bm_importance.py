@@ -6,7 +6,7 @@
 
 The views advance over one synthetic square kilometre (`scenes.aerial`), whose Gaussians are in Morton order,
 as the trainer keeps them. They are visited several times, as if there were as many views, because a capture
-has some hundred. "renders": `pipeline.forward` of all views in batches, with colours of degree 3;
+has hundreds of views. "renders": `pipeline.forward` of all views in batches, with colours of degree 3;
 "renders of what is visible": the same, but blocks of Gaussians outside the views are not read, as in an
 evaluation; "survey": the contribution of each Gaussian to the views; "sweep": the survey, the exact 99 % cut
 of each view, scores, phi and the cull matrix. Survey and sweep do not read blocks outside the views either.

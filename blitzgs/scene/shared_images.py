@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import mmap
 import os
+import weakref
 from collections.abc import Hashable, Mapping
 from typing import NamedTuple
 
@@ -41,7 +42,7 @@ class SharedImages:
 
     def __init__(self, file: int, shapes: Mapping[Hashable, tuple[int, ...]]) -> None:
         """Map a file of `size_of(shapes)` bytes, and take over its descriptor."""
-        self._file = open(file, "r+b", buffering=0)  # noqa: SIM115 (it is open as long as this object lives)
+        weakref.finalize(self, os.close, file)
         self._bytes = np.frombuffer(mmap.mmap(file, 0), dtype=np.uint8)
         self._flags = self._bytes[_TOKEN_BYTES : _TOKEN_BYTES + len(shapes)]
         self._places: dict[Hashable, tuple[int, UInt8]] = {}
