@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.selection import decimal_share, smallest
+from blitzgs.distributed.selection import decimal_share, sampling_keys, smallest
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.tree_sums import tree_sums
 from blitzgs.output import check_replaceable, write_file
@@ -177,6 +177,24 @@ class RankVeto:
     def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
         """Tell which candidates are vetoed, bool [M]; ties go to the smaller id. Collective."""
         return veto_lowest(self._gate.scores(candidates.features).float(), candidates, self._rate, ranks)
+
+
+class SampledVeto:
+    """Vetoes a share of clones, and of splits, at random, the likelier the lower a gate's scores.
+
+    The kept candidates are drawn without replacement, in proportion to the odds that the gate gives them. A
+    candidate of low rank, which `RankVeto` would withhold at event after event, is thus kept now and then.
+    """
+
+    def __init__(self, gate: SpawnGate, rate: float, seed: int) -> None:
+        """Veto by a gate's scores; `rate` is the vetoed share, in [0, 1]."""
+        self._gate, self._rate, self._seed = gate, rate, seed
+
+    def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
+        """Tell which candidates are vetoed, bool [M], the same ones at every world size. Collective."""
+        odds = (self._gate.scores(candidates.features).double() * 2.0**-_LEAF_BITS).exp().float()
+        keys = sampling_keys(odds, candidates.parents, self._seed, candidates.time)
+        return veto_lowest(-keys, candidates, self._rate, ranks)
 
 
 class RandomVeto:

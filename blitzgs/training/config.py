@@ -232,7 +232,8 @@ class PopulationConfig:
 
     Some fields have no effect on some runs. With "relocation": `grad_threshold`, `absolute_gradients`,
     `absolute_threshold`, `clone_scale`, `min_observations` and `phi`. With "density": `growth`. Without
-    `importance`: `score`, `pass1_keep`, `pass2_mass`, `pass2_keep` and `phi`. Without `gate`: `gate_rate`.
+    `importance`: `score`, `pass1_keep`, `pass2_mass`, `pass2_keep` and `phi`. Without `gate`: `gate_rate` and
+    `gate_rule`.
 
     Attributes:
         strategy: what a density event does: "density" (clone and split by gradients, prune) or "relocation"
@@ -274,6 +275,8 @@ class PopulationConfig:
             "random" to withhold as many at random, which a gate has to surpass; null: none.
         gate_rate: share of the candidates, clones and splits apart, that the gate withholds at each density
             event from `schedule.gate_from` on.
+        gate_rule: "rank" (BlitzGS): the gate withholds the candidates of lowest rank; "sample": those that it
+            lets pass are drawn in proportion to their odds to survive.
         lineage: log every birth and death as Parquet files in the run's folder `lineage` (needs pyarrow).
         pixels_per_gaussian: limits the population to the pixels of all training photographs divided by this.
             0: no limit.
@@ -304,6 +307,7 @@ class PopulationConfig:
     phi: bool = True
     gate: str | None = None
     gate_rate: float = 0.6
+    gate_rule: str = "rank"
     lineage: bool = False
     pixels_per_gaussian: float = 24.0
     gaussians_per_point: float = 0.0

@@ -137,6 +137,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "ranks.transport": get_args(Transport),
     "population.strategy": ("density", "relocation"),
     "population.score": get_args(ScoreRule),
+    "population.gate_rule": ("rank", "sample"),
 }
 
 

@@ -15,6 +15,7 @@ from blitzgs.population.spawn_gate import (
     GateError,
     RandomVeto,
     RankVeto,
+    SampledVeto,
     SpawnGate,
     gate_file,
     info_path,
@@ -28,7 +29,7 @@ from blitzgs.training.inputs import capture_fingerprint
 # `schedule.minutes` is in `schedule.pace`, once it is measured.
 _IDLE: dict[str, tuple[str, ...]] = {
     "schedule": ("checkpoint_every", "evaluate_every", "gate_from", "minutes", "adaptive_limit", "placed"),
-    "population": ("lineage", "gate", "gate_rate"),
+    "population": ("lineage", "gate", "gate_rate", "gate_rule"),
     "optimiser": (),
     "loss": (),
     "model": ("deterministic",),
@@ -91,6 +92,8 @@ def open_spawn_gate(config: Config, capture: Capture, ranks: Ranks, known: str) 
     if ranks.rank == 0:
         for problem in reasons_against(gate, config, capture):
             warnings.warn(f"spawn gate {path}: {problem}", stacklevel=2)
+    if population.gate_rule == "sample":
+        return SampledVeto(gate, population.gate_rate, config.seed), digest
     return RankVeto(gate, population.gate_rate), digest
 
 

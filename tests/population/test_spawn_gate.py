@@ -17,6 +17,7 @@ from blitzgs.population.spawn_gate import (
     GateError,
     RandomVeto,
     RankVeto,
+    SampledVeto,
     SpawnGate,
     gate_file,
     info_path,
@@ -128,7 +129,8 @@ def _veto(ranks, path):
     some = candidates()
     mine = torch.arange(1000) % 5 % ranks.world_size == ranks.rank
     own = Candidates(some.parents[mine], some.is_split[mine], some.features[mine], some.time)
-    vetoes = RankVeto(SpawnGate(path), 0.6), RandomVeto(0.6, 4)
+    known = SpawnGate(path)
+    vetoes = RankVeto(known, 0.6), RandomVeto(0.6, 4), SampledVeto(known, 0.6, 4)
     return [own.parents[veto(own, ranks)].tolist() for veto in vetoes]
 
 
@@ -138,7 +140,27 @@ def test_vetoes_do_not_depend_on_the_world_size(gate):
     for k, want in enumerate(alone):
         assert sorted(i for answer in answers for i in answer[k]) == sorted(want)
         assert 600 <= len(want) <= 602
-    assert set(alone[0]) != set(alone[1])
+    assert len({frozenset(vetoed) for vetoed in alone}) == len(alone)
+
+
+def test_a_sampled_veto_keeps_candidates_in_proportion_to_their_odds(gate):
+    """The share of kept candidates per score, against numpy's draws without replacement by the same odds."""
+    known, some, events = SpawnGate(gate[0]), candidates(60), 3000
+    odds = np.exp(known.scores(some.features).numpy() * 2.0**-32)
+    kept = np.zeros(60)
+    for event in range(events):
+        at = dataclasses.replace(some, time=event)
+        kept += ~SampledVeto(known, 0.6, 1)(at, Ranks()).numpy()
+    g, expected = np.random.default_rng(0), np.zeros(60)
+    for split in (False, True):
+        rows = np.flatnonzero(some.is_split.numpy() == split)
+        count = len(rows) - math.ceil(0.6 * len(rows))
+        for _ in range(events):
+            expected[g.choice(rows, count, replace=False, p=odds[rows] / odds[rows].sum())] += 1
+    assert len(set(odds.round(6))) > 5
+    # Each difference of two counts has a variance of at most events / 2.
+    assert np.abs(kept - expected).max() < 4.5 * math.sqrt(events / 2)
+    assert kept.std() > 3 * math.sqrt(events / 4)
 
 
 def test_auc_is_the_chance_to_rank_right():
