@@ -52,8 +52,9 @@ COMMANDS |= {
     "gate_random": (
         "python benchmarks/bm_quality.py --out runs/gate_random "
         '--capture "NAME=CAPTURE --schedule.scale=0.5" '
-        f'--recipe "learned_NAME={EARLY_GATE} --population.gate=GATE" '
-        f'--recipe "random={EARLY_GATE} --population.gate=random" --per-gpu 2'
+        f'--recipe "rank={EARLY_GATE} --population.gate=GATE" '
+        f'--recipe "sample={EARLY_GATE} --population.gate=GATE --population.gate_rule=sample" '
+        f'--recipe "random={EARLY_GATE} --population.gate=random" --seeds 0 1 2 3 4 --per-gpu 4'
     ),
     "town": (
         "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/town "

@@ -244,9 +244,9 @@ def town_lines(town: Json) -> list[str]:
 
 
 def gate_random_lines(gates: Json) -> list[str]:
-    """Tabulate the learned gate of each capture against a random veto."""
-    learned = {run["recipe"]: {"title": "learned gate"} for run in gates["runs"] if run["recipe"] != "random"}
-    return arm_lines(gates, learned | {"random": {"title": "random veto"}}, ABLATION_COLUMNS)
+    """Tabulate both rules of the learned gate against a random veto."""
+    arms = {"rank": "gate, by rank", "sample": "gate, sampled", "random": "random veto"}
+    return arm_lines(gates, {name: {"title": title} for name, title in arms.items()}, ABLATION_COLUMNS)
 
 
 def adaptive_lines(adaptive: Json) -> list[str]:

@@ -161,7 +161,8 @@ def main(arguments: list[str]) -> int:
 
     tests = [a for a in arguments if a != "--kernels"] or TESTS
     if "--kernels" not in arguments:
-        return pytest.main(["-q", "--no-header", *tests])
+        # A sanitizer makes tests many times slower.
+        return pytest.main(["-q", "--no-header", "--timeout", "3600", *tests])
     status, counts = launched(tests)
     times: dict[Kernel, list[int]] = {}
     for name, count in counts.items():

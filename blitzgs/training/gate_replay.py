@@ -7,7 +7,8 @@ All arms continue the same checkpoint, from before the gate's onset:
   and only if none of its children is in the final model.
 - oracle: vetoes exactly the candidates labelled non-surviving; oracle_rate: of these, at most the gate's
   share.
-- gate: vetoes by the learned ranking; random: vetoes as many at random.
+- gate: vetoes by the learned ranking; gate_sampled: draws those that pass by their odds; random: vetoes as
+  many at random.
 
 If training repeats bit for bit (on the CPU, or with model.deterministic), the oracle's first event has the
 same candidates as the reference's. Later events may differ, because each veto changes the rest of the run. An
@@ -35,7 +36,7 @@ from blitzgs.distributed.selection import decimal_share, smallest
 from blitzgs.ops.counter_random import hash_keys, uniform
 from blitzgs.population.candidates import Candidates, Veto
 from blitzgs.population.lineage_parts import read_lineage
-from blitzgs.population.spawn_gate import RandomVeto, RankVeto, SpawnGate
+from blitzgs.population.spawn_gate import RandomVeto, RankVeto, SampledVeto, SpawnGate
 from blitzgs.scene.capture import Capture
 from blitzgs.training import run_files
 from blitzgs.training.batches import Images
@@ -234,6 +235,7 @@ def replay(
         matched, seen = ranks.all_reduce(counts).tolist()
         yield result | {"matched": matched / max(1, seen)}
     yield train("gate", RankVeto(gate, rate))
+    yield train("gate_sampled", SampledVeto(gate, rate, config.seed))
     yield train("random", RandomVeto(rate, config.seed))
 
 

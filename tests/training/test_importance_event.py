@@ -20,7 +20,7 @@ from blitzgs.population.gate_fit import fit, read_spawns
 from blitzgs.population.importance import PHI, is_culled
 from blitzgs.population.lineage import ABOUT, Cause
 from blitzgs.population.lineage_parts import read_lineage
-from blitzgs.population.spawn_gate import GateError, GateInfo, RandomVeto, info_path
+from blitzgs.population.spawn_gate import GateError, GateInfo, RandomVeto, SampledVeto, info_path
 from blitzgs.training import run_files, run_log
 from blitzgs.training.batches import PhotographError
 from blitzgs.training.events import importance
@@ -245,12 +245,19 @@ def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
     assert figures["protocol"] == "a quarter of the parents held out"
     flags = [f"population.gate={path}", "schedule.gate_from=60", "population.gate_rate=0.5"]
     with pytest.warns(UserWarning) as warned:
-        train(tmp_path / "gated", *flags)
+        gated, _ = train(tmp_path / "gated", *flags)
     texts = [str(w.message) for w in warned if "spawn gate" in str(w.message)]
     assert any("fitted on this very capture" in text for text in texts)
     assert any("population.grad_threshold (0.0001, here 0.0002)" in text for text in texts)
     events = require_vetoes_from_60(tmp_path / "gated")
     assert events[60]["held_back"] == events[80]["held_back"] == 0
+    # The other rule withholds as many candidates, and other ones.
+    with pytest.warns(UserWarning, match="spawn gate"):
+        sampled, _ = train(tmp_path / "sampled", *flags, "population.gate_rule=sample")
+    assert isinstance(sampled.state.veto, SampledVeto)
+    others = require_vetoes_from_60(tmp_path / "sampled")
+    assert others[60]["vetoed"] == events[60]["vetoed"] and others[60]["split"] == events[60]["split"]
+    assert not torch.equal(sampled.state.table["id"].sort().values, gated.state.table["id"].sort().values)
     # The gate decides the result, so a run continues only with the gate's files that it began with.
     for file in (path, info_path(path)):
         content = file.read_text()
