@@ -56,6 +56,17 @@ COMMANDS |= {
         f'--recipe "sample={EARLY_GATE} --population.gate=GATE --population.gate_rule=sample" '
         f'--recipe "random={EARLY_GATE} --population.gate=random" --seeds 0 1 2 3 4 --per-gpu 4'
     ),
+    "gate_random_town": (
+        "python benchmarks/bm_quality.py --out runs/gate_random_town "
+        '--capture "town=DATA/town --schedule.scale=0.5" '
+        f'--recipe "rank={EARLY_GATE} --population.gate=GATE" '
+        f'--recipe "sample={EARLY_GATE} --population.gate=GATE --population.gate_rule=sample" '
+        f'--recipe "random={EARLY_GATE} --population.gate=random" --seeds 0 1 2 --per-gpu 9'
+    ),
+    "town_parts": (
+        "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/town_parts "
+        "--capture town=DATA/town --seeds 0 1 2"
+    ),
     "town": (
         "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/town "
         "--capture town=DATA/town --seeds 0 1"
@@ -88,6 +99,7 @@ GROUPS = (
     ("compact",),
     ("compact_later",),
     ("gate_random",),
+    ("gate_random_town", "town_parts"),
     ("town",),
     ("adaptive",),
     ("call", "importance", "lineage", "lineage_training"),
@@ -103,6 +115,8 @@ COPIED = {
     "compact": "cp runs/compact/quality.json benchmarks/results/compact.json",
     "compact_later": "cp runs/compact_later/quality.json benchmarks/results/compact_later.json",
     "gate_random": "cp runs/gate_random/quality.json benchmarks/results/gate_random.json",
+    "gate_random_town": ("cp runs/gate_random_town/quality.json benchmarks/results/gate_random_town.json"),
+    "town_parts": "cp runs/town_parts/quality.json benchmarks/results/town_parts.json",
     "town": "cp runs/town/quality.json benchmarks/results/town.json",
     "adaptive": "cp runs/adaptive/quality.json benchmarks/results/adaptive.json",
 }

@@ -237,6 +237,12 @@ def compact_lines(compact: Json) -> list[str]:
     return arm_lines(compact, arms, columns)
 
 
+def town_parts_lines(town: Json) -> list[str]:
+    """Tabulate the arms of the model level on the town, with times."""
+    ours = {name: {"title": title} for name, title in OUR_ARMS.items()}
+    return arm_lines(town, arms_of("ablation") | ours, (*ABLATION_COLUMNS, "images/s", "seconds"))
+
+
 def town_lines(town: Json) -> list[str]:
     """Tabulate compact.yaml, the whole model level and none of it; without times, as runs shared the host."""
     arms = {"half": "compact.yaml", "full_60": OUR_ARMS["full_60"], "all_off": "all off"}
@@ -361,6 +367,8 @@ SECTIONS = {
     "compact": Section(("compact",), compact_lines),
     "compact_later": Section(("compact_later",), compact_lines),
     "gate_random": Section(("gate_random",), gate_random_lines),
+    "gate_random_town": Section(("gate_random_town",), gate_random_lines),
+    "town_parts": Section(("town_parts",), town_parts_lines),
     "town": Section(("town",), town_lines),
     "adaptive": Section(("adaptive",), adaptive_lines),
     "offload": Section(("offload",), offload_lines),
