@@ -2,9 +2,10 @@
 """The spawn gate: withholds the candidates that a predictor ranks lowest (BlitzGS, section 3.2).
 
 A gate is a gradient-boosted tree model in XGBoost's JSON, `NAME.json`, and beside it `NAME.meta.json` with
-what it was fitted on (`GateInfo`). Only the order of its scores is used, so one predictor suits scenes with
-very different numbers of candidates. BlitzGS evaluates the trees itself, in integers, so the order is the
-same on every device and at every world size, and training does not need XGBoost.
+what it was fitted on (`GateInfo`). Scores are only compared with each other: by their order, or by the ratios
+of the odds. So one predictor suits scenes with very different numbers of candidates. BlitzGS evaluates the
+trees itself, in integers, so the scores are the same on every device and at every world size, and training
+does not need XGBoost.
 """
 
 from __future__ import annotations
