@@ -59,8 +59,10 @@ demo: venv build
 
 test: venv-test lint test-cxx test-python
 
+# Two processes, because many tests wait for processes of their own.
+TEST_JOBS ?= 2
 test-python: build
-	$(RUN) $(PYTHON) -m pytest -q tests
+	$(RUN) $(PYTHON) -m pytest -q -n $(TEST_JOBS) tests
 
 # The kernels and parsers without torch, under AddressSanitizer and UBSan.
 test-cxx:
