@@ -11,8 +11,12 @@ does not need XGBoost.
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import math
+import signal
+import subprocess
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,6 +39,23 @@ RANDOM = "random"
 _SHIPPED = Path(__file__).with_name("gates") / "compact.json"
 # Leaf values are rounded to integers in units of 2^-32.
 _LEAF_BITS = 32
+# XGBoost may crash when it reads a damaged file, so a process of its own reads the file, and writes the model
+# as JSON. It gets the search path of this one as its argument. A wrong length in the file must not fill the
+# host's memory either.
+_TO_JSON = """
+import json, resource, sys
+sys.path[:] = json.loads(sys.argv[1])
+result, sys.stdout = sys.stdout.buffer, sys.stderr  # XGBoost prints its messages
+import xgboost
+data = sys.stdin.buffer.read()
+most, hard = (4 << 30) + 100 * len(data), resource.getrlimit(resource.RLIMIT_DATA)[1]
+resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
+try:
+    result.write(xgboost.Booster(model_file=bytearray(data)).save_raw("json"))
+except xgboost.core.XGBoostError as error:
+    sys.exit(str(error).partition("\\n")[0])  # the lines after the first are the stack of the library
+"""
+_READING_SECONDS = 120
 
 
 class GateError(ValueError):
@@ -237,18 +258,25 @@ def _read_model(path: Path) -> dict[str, Any]:
     if path.suffix == ".json":
         content: dict[str, Any] = json.loads(path.read_text())
         return content
-    try:
-        import xgboost
-    except ImportError as error:
+    if importlib.util.find_spec("xgboost") is None:
         raise GateError(
             f"{path}: only .json is read without xgboost (pip install xgboost); save the model as .json"
-        ) from error
+        )
+    command = [sys.executable, "-c", _TO_JSON, json.dumps(sys.path)]
     try:
-        booster = xgboost.Booster(model_file=str(path))
-    except xgboost.core.XGBoostError as error:
-        # The lines after the first are the stack of the library.
-        raise ValueError(str(error).partition("\n")[0]) from error
-    content = json.loads(booster.save_raw("json"))
+        read = subprocess.run(
+            command, input=path.read_bytes(), capture_output=True, timeout=_READING_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise GateError(f"{path} is damaged: XGBoost did not read it within {_READING_SECONDS} s") from error
+    if read.returncode < 0:
+        raise GateError(
+            f"{path} is damaged: XGBoost crashed when it read it ({signal.strsignal(-read.returncode)})"
+        )
+    if read.returncode > 0:
+        lines = read.stderr.decode(errors="replace").strip().splitlines()
+        raise ValueError(lines[-1] if lines else f"XGBoost ended with status {read.returncode}")
+    content = json.loads(read.stdout)
     return content
 
 

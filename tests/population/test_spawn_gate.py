@@ -4,6 +4,7 @@
 import dataclasses
 import json
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -294,3 +295,43 @@ def test_a_bad_gate_in_ubjson_is_named_without_the_stack_of_xgboost(gate, tmp_pa
     assert "Stack trace" not in str(caught.value)
     with pytest.raises(GateError, match=r"^\.: no such gate"):
         SpawnGate(gate_file(""))
+
+
+def with_flipped_bit(data, place, bit):
+    changed = bytearray(data)
+    changed[place] ^= bit
+    return bytes(changed)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: b"",
+        lambda data: data[: len(data) // 2],
+        lambda data: data[:-1],
+        lambda data: with_flipped_bit(data, 0, 1),
+        lambda data: with_flipped_bit(data, 354, 128),
+        lambda data: data.replace(b"left_children", b"left_childrem", 1),
+    ],
+    ids=["empty", "half", "end", "first byte", "length", "name"],
+)
+def test_a_damaged_gate_in_ubjson_is_named_though_xgboost_crashes(tmp_path, damage):
+    """XGBoost aborts or reads beyond its memory for some of these files, which must not end this process."""
+    path, shipped = tmp_path / "gate.ubj", gate_file("default")
+    xgboost.Booster(model_file=str(shipped)).save_model(path)
+    info_path(path).write_text(info_path(shipped).read_text())
+    damaged = damage(path.read_bytes())
+    assert damaged != path.read_bytes()
+    path.write_bytes(damaged)
+    with pytest.raises(GateError, match=f"^{path} is "):
+        SpawnGate(path)
+
+
+def test_a_gate_in_ubjson_that_is_missing_is_named(gate, tmp_path, monkeypatch):
+    path = tmp_path / "gate.ubj"
+    info_path(path).write_text(info_path(gate[0]).read_text())
+    with pytest.raises(GateError, match=r"gate\.ubj cannot be read: No such file"):
+        SpawnGate(path)
+    monkeypatch.setitem(sys.modules, "xgboost", None)  # as if it were not installed
+    with pytest.raises(GateError, match=r"gate\.ubj: only \.json is read without xgboost .* save the model"):
+        SpawnGate(path)
