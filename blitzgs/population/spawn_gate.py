@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.selection import decimal_share, sampling_keys, smallest
+from blitzgs.distributed.selection import decimal_share, smallest
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.tree_sums import tree_sums
 from blitzgs.output import check_replaceable, write_file
@@ -214,9 +214,11 @@ class SampledVeto:
 
     def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
         """Tell which candidates are vetoed, bool [M], the same ones at every world size. Collective."""
-        odds = (self._gate.scores(candidates.features).double() * 2.0**-_LEAF_BITS).exp().float()
-        keys = sampling_keys(odds, candidates.parents, self._seed, candidates.time)
-        return veto_lowest(-keys, candidates, self._rate, ranks)
+        log_odds = self._gate.scores(candidates.features).double() * 2.0**-_LEAF_BITS
+        # The order of exponential races, whose keys are -log(u) / odds, by the logarithms of the keys: the
+        # odds themselves may exceed the range of numbers.
+        races = (-uniform(self._seed, candidates.time, candidates.parents).log()).log() - log_odds
+        return veto_lowest((-races).float(), candidates, self._rate, ranks)
 
 
 class RandomVeto:

@@ -164,6 +164,32 @@ def test_a_sampled_veto_keeps_candidates_in_proportion_to_their_odds(gate):
     assert kept.std() > 3 * math.sqrt(events / 4)
 
 
+class Known:
+    """A gate whose scores are known: the first feature is the log odds."""
+
+    def scores(self, features):
+        return (features[:, 0].double() * 2.0**32).long()
+
+
+def with_odds(log_odds):
+    features = torch.zeros(len(log_odds), len(FEATURES))
+    features[:, 0] = torch.tensor(log_odds)
+    # The parents of high ids have the best odds, so that ties by id would be wrong.
+    return Candidates(torch.arange(len(log_odds)), torch.zeros(len(log_odds)).bool(), features, 0)
+
+
+@pytest.mark.parametrize("low", [-4000.0, 1000.0])
+def test_a_sampled_veto_compares_odds_beyond_the_range_of_numbers(low):
+    """e^-4000 is rounded to 0 and e^1000 to infinity, but the order of such odds still decides."""
+    some = with_odds([low] * 50 + [low + 1000] * 50)
+    kept = []
+    for time in range(2):
+        vetoed = SampledVeto(Known(), 0.6, 1)(dataclasses.replace(some, time=time), Ranks())
+        assert vetoed[:50].all() and vetoed[50:].sum() == 10
+        kept.append(vetoed)
+    assert not torch.equal(*kept)  # among equal odds, chance decides
+
+
 def test_auc_is_the_chance_to_rank_right():
     g = np.random.default_rng(0)
     scores, positive = g.integers(0, 20, 300), g.random(300) < 0.3
