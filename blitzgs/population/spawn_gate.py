@@ -56,6 +56,9 @@ except xgboost.core.XGBoostError as error:
     sys.exit(str(error).partition("\\n")[0])  # the lines after the first are the stack of the library
 """
 _READING_SECONDS = 120
+# The draws of a veto are those of the event `time` + 2^40. An importance pass of the same time draws among the
+# same Gaussians by their ids and `time` itself, and would prune those that the veto has just withheld.
+_VETO_EVENTS = 1 << 40
 
 
 class GateError(ValueError):
@@ -217,7 +220,7 @@ class SampledVeto:
         log_odds = self._gate.scores(candidates.features).double() * 2.0**-_LEAF_BITS
         # The order of exponential races, whose keys are -log(u) / odds, by the logarithms of the keys: the
         # odds themselves may exceed the range of numbers.
-        races = (-uniform(self._seed, candidates.time, candidates.parents).log()).log() - log_odds
+        races = (-veto_draws(candidates, self._seed).log()).log() - log_odds
         return veto_lowest((-races).float(), candidates, self._rate, ranks)
 
 
@@ -230,8 +233,12 @@ class RandomVeto:
 
     def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
         """Tell which candidates are vetoed, bool [M]. Collective."""
-        draws = uniform(self._seed, candidates.time, candidates.parents).float()
-        return veto_lowest(draws, candidates, self._rate, ranks)
+        return veto_lowest(veto_draws(candidates, self._seed).float(), candidates, self._rate, ranks)
+
+
+def veto_draws(candidates: Candidates, seed: int) -> Tensor:
+    """Draw a number for each candidate, float64 [M] uniform in (0, 1), from (seed, time, parent) alone."""
+    return uniform(seed, candidates.time + _VETO_EVENTS, candidates.parents)
 
 
 def veto_lowest(scores: Tensor, candidates: Candidates, rate: float, ranks: Ranks) -> Tensor:

@@ -33,10 +33,10 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import decimal_share, smallest
-from blitzgs.ops.counter_random import hash_keys, uniform
+from blitzgs.ops.counter_random import hash_keys
 from blitzgs.population.candidates import Candidates, Veto
 from blitzgs.population.lineage_parts import read_lineage
-from blitzgs.population.spawn_gate import RandomVeto, RankVeto, SampledVeto, SpawnGate
+from blitzgs.population.spawn_gate import RandomVeto, RankVeto, SampledVeto, SpawnGate, veto_draws
 from blitzgs.scene.capture import Capture
 from blitzgs.training import run_files
 from blitzgs.training.batches import Images
@@ -99,7 +99,7 @@ class OracleVeto:
             total, dying = ranks.all_reduce(counts).tolist()
             most = math.ceil(decimal_share(self._rate) * total)
             rows = (group & dead).nonzero().squeeze(1)
-            draws = uniform(self._seed, candidates.time, candidates.parents[rows]).float()
+            draws = veto_draws(candidates, self._seed)[rows].float()
             vetoed[rows] = smallest(draws, candidates.parents[rows], min(most, dying), ranks)
         return vetoed
 

@@ -14,6 +14,7 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.candidates import FEATURES, Candidates
 from blitzgs.population.gate_fit import Spawns, auc, best_feature, fit, judge
+from blitzgs.population.pruning import sample_by_score
 from blitzgs.population.spawn_gate import (
     GateError,
     RandomVeto,
@@ -188,6 +189,15 @@ def test_a_sampled_veto_compares_odds_beyond_the_range_of_numbers(low):
         assert vetoed[:50].all() and vetoed[50:].sum() == 10
         kept.append(vetoed)
     assert not torch.equal(*kept)  # among equal odds, chance decides
+
+
+@pytest.mark.parametrize("veto", [RandomVeto(0.5, 7), SampledVeto(Known(), 0.5, 7)], ids=["random", "sample"])
+def test_vetoes_are_independent_of_the_draw_of_a_pass_at_the_same_time(veto):
+    """The first importance pass draws among the same Gaussians by the same seed and time."""
+    some = with_odds([0.0] * 2000)
+    vetoed = veto(some, Ranks())
+    kept = sample_by_score(torch.ones(2000), some.parents, 0.5, 7, some.time, Ranks())
+    assert 400 < int((vetoed & kept).sum()) < 600  # 500 are expected, with a standard deviation of 11
 
 
 def test_auc_is_the_chance_to_rank_right():
