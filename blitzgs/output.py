@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import secrets
 import stat
 from collections import Counter
@@ -22,6 +23,10 @@ MARK = ".blitzgs"
 _MARK_TEXT = "blitzgs wrote the files of this folder, and replaces them when it writes here again.\n"
 # Largest number of bytes in a file name on common file systems, minus those for a suffix and a number.
 _LONGEST_NAME = 200
+
+
+# Name of the temporary file of `new_file`.
+PARTIAL = re.compile(r"\.[0-9a-f]{12}\.partial")
 
 
 @contextmanager

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.counter_random import hash_keys
-from blitzgs.output import write_file
+from blitzgs.output import PARTIAL, write_file
 from blitzgs.population.candidates import FEATURES
 from blitzgs.population.lineage_parts import PART_NAME, TABLES, PartWriter
 
@@ -115,7 +115,7 @@ class Lineage:
             folder.mkdir(parents=True, exist_ok=True)
             for path in list(folder.iterdir()):
                 name = PART_NAME.fullmatch(path.name)
-                if path.name.startswith(".") or (name and _is_later(name, step, ledger)):
+                if PARTIAL.fullmatch(path.name) or (name and _is_later(name, step, ledger)):
                     path.unlink()
             self.describe(about or {})
         ranks.barrier()

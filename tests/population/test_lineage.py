@@ -213,3 +213,14 @@ def test_features_of_no_candidate(tmp_path):
     assert spawn_features(table, none, none.bool(), 5, 1.0, 4).shape == (0, len(FEATURES))
     with pytest.raises(FileNotFoundError, match="holds no lineage: train with --population.lineage=true"):
         read_lineage(tmp_path)
+
+
+def test_a_resumed_log_deletes_only_files_that_blitzgs_writes(tmp_path):
+    """Other programs keep hidden files and folders where they look at a run."""
+    (tmp_path / ".notes").mkdir()
+    (tmp_path / ".index").write_text("mine")
+    torn = tmp_path / ".0123456789ab.partial"  # of a process that was killed while it wrote
+    torn.write_text("torn")
+    Lineage(tmp_path, Ranks(), 0, Ledger()).close()
+    assert (tmp_path / ".notes").is_dir() and (tmp_path / ".index").read_text() == "mine"
+    assert not torn.exists()
