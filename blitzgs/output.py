@@ -23,8 +23,6 @@ MARK = ".blitzgs"
 _MARK_TEXT = "blitzgs wrote the files of this folder, and replaces them when it writes here again.\n"
 # Largest number of bytes in a file name on common file systems, minus those for a suffix and a number.
 _LONGEST_NAME = 200
-
-
 # Name of the temporary file of `new_file`.
 PARTIAL = re.compile(r"\.[0-9a-f]{12}\.partial")
 

@@ -18,6 +18,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -336,6 +337,9 @@ class _Trees:
                 leaves.append(round(value * 2**_LEAF_BITS) if left < 0 else 0)
         if not roots:
             raise ValueError("no trees")
+        # The sum of the leaves that a row reaches is an integer of 64 bits.
+        if sum(max(map(abs, leaves[first:end])) for first, end in pairwise([*roots, len(leaves)])) >= 2**63:
+            raise ValueError("the leaves of its trees may add up to 2^31 or more")
         bits = torch.tensor(thresholds, dtype=torch.float32).view(torch.int32)
         nodes = torch.cat((bits[:, None], torch.tensor(splits, dtype=torch.int32).view(-1, 3)), 1)
         return cls(torch.tensor(roots, dtype=torch.int32), nodes, torch.tensor(leaves), depth)

@@ -254,9 +254,9 @@ def test_a_fit_replaces_only_a_gate(tmp_path):
     assert SpawnGate(path).info.scenes == {"b": "b"}
 
 
-def spoil_tree(path, field, value, at="root"):
+def spoil_tree(path, field, value, at="root", tree=3):
     model = json.loads(path.read_text())
-    tree = model["learner"]["gradient_booster"]["model"]["trees"][3]
+    tree = model["learner"]["gradient_booster"]["model"]["trees"][tree]
     if at == "all":
         tree[field] = value
     else:
@@ -302,6 +302,11 @@ def without_trees(path):
             # In a leaf's place, `split_conditions` has its value.
             lambda path: spoil_tree(path, "split_conditions", math.inf, at="leaf"),
             "convert float infinity to integer",
+        ),
+        (
+            # One leaf fits into 64 bits in units of 2^-32, but not the sum over the trees.
+            lambda path: [spoil_tree(path, "split_conditions", 1.5e9, at="leaf", tree=tree) for tree in (0, 1)],
+            "the leaves of its trees may add up to 2.31 or more",
         ),
         (without_trees, "no trees"),
         (lambda path: path.write_text("[" * 100_000), "is not a binary classifier in XGBoost's JSON"),
