@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 import warnings
 from collections.abc import Iterator
@@ -42,11 +43,16 @@ from blitzgs.training import run_files
 from blitzgs.training.batches import Images
 from blitzgs.training.checkpoint import MANIFEST
 from blitzgs.training.config import Config
+from blitzgs.training.folder_checks import locked
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.trainer import Trainer
 
 REFERENCE = "reference"
+ARMS = (REFERENCE, "oracle", "oracle_rate", "gate", "gate_sampled", "random")
 FIGURES, TABLE = "replay.json", "replay.md"
+# An empty file in the folder of the reference until this arm is trained: a replay that ended before that
+# begins again.
+BEGUN = "replay_begun"
 
 
 class CandidateRecord:
@@ -186,24 +192,26 @@ def replay(
         ValueError: the run logged no lineage, was trained by the clock, ends before the gate's onset, or all
             pixels of the views that are measured are masked.
         FileNotFoundError: it has no checkpoint from before the onset.
-        FileExistsError: `out` holds a replay already.
+        FileExistsError: `out` holds a replay already, or another folder with the name of an arm. A replay
+            that ended before its first arm was trained is begun again.
+        FolderError: another process is training in the folder of an arm.
     """
     _check_comparable(config, capture, images, source)
-    # Rank 0 checks for all, because another rank might check after rank 0 has begun to write.
-    if ranks.broadcast_object(any((out / name).exists() for name in (REFERENCE, FIGURES, TABLE))):
-        raise FileExistsError(f"{out} already holds a replay: choose another --out, or delete it")
+    _check_unclaimed(out, ranks)
     point = branch_point(source, config)
 
     def train(name: str, veto: Veto | None) -> dict[str, Any]:
         folder = out / name
-        if ranks.rank == 0:
-            shutil.copytree(point, folder / run_files.CHECKPOINTS / point.name)
-        ranks.barrier()
-        trainer = Trainer(config, capture, images, folder, ranks, resume=True)
-        trainer.state.veto, began = veto, trainer.state.progress.seconds
-        if ranks.rank == 0:
-            print(f"arm {name}:", flush=True)
-        summary = trainer.train()
+        # Nobody else may train in the folder, least of all another replay that would begin again there.
+        with locked(folder, ranks):
+            if ranks.rank == 0:
+                _branch(point, folder)
+            ranks.barrier()
+            trainer = Trainer(config, capture, images, folder, ranks, resume=True)
+            trainer.state.veto, began = veto, trainer.state.progress.seconds
+            if ranks.rank == 0:
+                print(f"arm {name}:", flush=True)
+            summary = trainer.train()
         if summary is None:
             raise InterruptedError(f"arm {name} was stopped by a signal")
         return {
@@ -227,6 +235,8 @@ def replay(
             "pixels_per_gaussian, gaussians_per_point)",
             stacklevel=2,
         )
+    if ranks.rank == 0:
+        (out / REFERENCE / BEGUN).unlink()
     yield reference | {"dead": len(dead) / max(1, len(spawned)), "held_back": held_back}
     for name, cap in (("oracle", None), ("oracle_rate", rate)):
         oracle = OracleVeto(known, dead, cap, config.seed)
@@ -237,6 +247,40 @@ def replay(
     yield train("gate", RankVeto(gate, rate))
     yield train("gate_sampled", SampledVeto(gate, rate, config.seed))
     yield train("random", RandomVeto(rate, config.seed))
+
+
+def _check_unclaimed(out: Path, ranks: Ranks) -> None:
+    """Check that a replay will not replace anything in its folder, except a reference that was not trained.
+
+    Raises:
+        FileExistsError: on every rank; a replay has trained an arm there, or the folder has another file or
+            folder with the name of one that the replay writes.
+    """
+    found = None
+    # Rank 0 checks for all, because another rank might check after rank 0 has begun to write.
+    if ranks.rank == 0:
+        begun = (out / REFERENCE / BEGUN).is_file()
+        names = [FIGURES, TABLE, *ARMS[begun:]]
+        found = next((name for name in names if os.path.lexists(out / name)), None)
+    found = ranks.broadcast_object(found)
+    if found in (FIGURES, TABLE):
+        raise FileExistsError(f"{out} already holds a replay: choose another --out, or delete it")
+    if found is not None:
+        raise FileExistsError(f"{out} has {found}, which a replay would replace: choose another --out")
+
+
+def _branch(point: Path, folder: Path) -> None:
+    """Make a run in `folder` that continues from the checkpoint `point`.
+
+    Of a reference that was begun before, the checkpoints are deleted. Its other files are dealt with as those
+    of any run that is resumed from an early checkpoint.
+    """
+    checkpoints = folder / run_files.CHECKPOINTS
+    if folder.name == REFERENCE:
+        if (folder / BEGUN).exists() and checkpoints.exists():
+            shutil.rmtree(checkpoints)
+        (folder / BEGUN).touch()
+    shutil.copytree(point, checkpoints / point.name)
 
 
 def _check_comparable(config: Config, capture: Capture, images: Images, source: Path) -> None:

@@ -18,11 +18,12 @@ from blitzgs.population.gate_evaluation import correlation, region_rates, surviv
 from blitzgs.population.gate_fit import read_spawns
 from blitzgs.population.spawn_samples import read_sample
 from blitzgs.scene.colmap import read_model, write_model
+from blitzgs.training import folder_checks
 from blitzgs.training.config_io import save_config
 from blitzgs.training.gate_replay import OracleVeto, branch_point, event_keys, label_events
 from tests.population.test_spawn_gate import candidates, spawns
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, tiny_config, write_tiny_capture
-from tests.training.tiny_runs import events_of
+from tests.training.tiny_runs import at_step, events_of
 
 pyarrow = pytest.importorskip("pyarrow")
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -120,6 +121,55 @@ def test_a_replay_that_repeats_the_reference_matches_it_though_the_population_is
     held = sum(event["held_back"] for event in events)
     born = sum(event["cloned"] + event["split"] for event in events)
     assert arms["reference"]["held_back"] == pytest.approx(held / (born + held)) and born > 0
+
+
+def test_a_replay_begins_again_if_it_has_trained_no_arm(lineage_run, tmp_path, monkeypatch):
+    """Files that the replay did not write stay, and the arms are those of a replay without interruption."""
+    out, calls = tmp_path / "replay", []
+    arguments = ["gate", "replay", "default", str(lineage_run / "run"), "--out", str(out)]
+
+    def fails(_):
+        raise RuntimeError("no memory")
+
+    at_step(monkeypatch, 70, fails)
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="no memory"):
+            main(arguments)
+        calls.append(sorted(path.name for path in (out / "reference").iterdir()))
+    assert calls[0] == calls[1]
+    monkeypatch.undo()
+    notes = [out / "notes.txt", out / "reference" / "notes.txt"]
+    for path in notes:
+        path.write_text("mine")
+    assert main(arguments) == 0
+    assert [path.read_text() for path in notes] == ["mine", "mine"]
+    arms = {row["arm"]: row for row in json.loads((out / "replay.json").read_text())}
+    summary = json.loads((lineage_run / "run" / "summary.json").read_text())
+    assert arms["reference"]["psnr"] == summary["psnr"] and len(arms) == 6
+    assert [r["t"] for r in events_of(out / "reference", "densify")] == [60, 80]
+    assert main(arguments) == 1
+
+
+def test_a_replay_does_not_begin_where_another_one_is_training(lineage_run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(folder_checks, "LOCK_SECONDS", 0.1)
+    out = tmp_path / "replay"
+    arguments = ["gate", "replay", "default", str(lineage_run / "run"), "--out", str(out)]
+    with folder_checks.locked(out / "reference", Ranks()):
+        (out / "reference" / "replay_begun").touch()
+        assert main(arguments) == 1
+    assert "is in use by another run" in capsys.readouterr().err
+    assert not (out / "reference" / "checkpoints").exists()
+
+
+@pytest.mark.parametrize("name", ["reference", "oracle", "gate", "random"])
+def test_a_replay_leaves_runs_with_the_names_of_its_arms_alone(lineage_run, tmp_path, capsys, name):
+    """For example `gate`: the folder of a training with a gate, beside the run that is replayed."""
+    run = shutil.copytree(lineage_run / "run", tmp_path / name)
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    assert main(["gate", "replay", "default", str(lineage_run / "run"), "--out", str(tmp_path)]) == 1
+    assert "choose another --out" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_a_gate_can_be_fitted_on_samples(lineage_run, tmp_path, capsys):
