@@ -135,13 +135,21 @@ def branch_point(folder: Path, config: Config) -> Path:
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: the run ends before the gate's onset, or a checkpoint is damaged.
+        ValueError: the run or its densification ends before the gate's onset, or a checkpoint is damaged.
     """
     schedule, found = Schedule(config.schedule), []
     if not schedule.has_spawn_gate(schedule.iterations - 1):
         raise ValueError(
             f"{folder} ends before the gate's onset (schedule.gate_from {config.schedule.gate_from}, "
             f"{schedule.iterations} images): replay a run that goes on after it"
+        )
+    events = schedule.events(0, schedule.iterations)
+    last = max((event.time for event in events if event.kind == "densify"), default=0)
+    if not schedule.has_spawn_gate(last):
+        raise ValueError(
+            f"{folder} has no density event from the gate's onset on (schedule.gate_from "
+            f"{config.schedule.gate_from}, the last event {last}): all arms would be the same run. Replay one "
+            "with an earlier schedule.gate_from"
         )
     for manifest in (folder / run_files.CHECKPOINTS).glob(f"checkpoint_*/{MANIFEST}"):
         try:
@@ -189,8 +197,8 @@ def replay(
         that it knew (`matched`).
 
     Raises:
-        ValueError: the run logged no lineage, was trained by the clock, ends before the gate's onset, or all
-            pixels of the views that are measured are masked.
+        ValueError: the run logged no lineage, has no candidates from the gate's onset on, was trained by the
+            clock, ends before the onset, or all pixels of the views that are measured are masked.
         FileNotFoundError: it has no checkpoint from before the onset.
         FileExistsError: `out` holds a replay already, or another folder with the name of an arm. A replay
             that ended before its first arm was trained is begun again.
@@ -287,12 +295,17 @@ def _check_comparable(config: Config, capture: Capture, images: Images, source: 
     """Check that arms can be branched from a run and that their results can be compared.
 
     Raises:
-        ValueError: the run logged no lineage, was trained by the clock, or all pixels of the views that are
-            measured are masked.
+        ValueError: the run logged no lineage, has no candidates, was trained by the clock, or all pixels of
+            the views that are measured are masked.
     """
     if not config.population.lineage:
         raise ValueError(
             f"{source} was trained without --population.lineage=true: there is nothing to branch"
+        )
+    if config.population.strategy == "relocation":
+        raise ValueError(
+            f"{source} was trained with population.strategy=relocation, which has no candidates: replay a run "
+            "with population.strategy=density"
         )
     if config.schedule.minutes > 0:
         raise ValueError(

@@ -4,6 +4,8 @@
 import io
 import json
 import shutil
+from dataclasses import replace
+from unittest.mock import Mock
 from xml.etree import ElementTree
 
 import cv2
@@ -20,7 +22,8 @@ from blitzgs.population.spawn_samples import read_sample
 from blitzgs.scene.colmap import read_model, write_model
 from blitzgs.training import folder_checks
 from blitzgs.training.config_io import save_config
-from blitzgs.training.gate_replay import OracleVeto, branch_point, event_keys, label_events
+from blitzgs.training.gate_replay import OracleVeto, branch_point, event_keys, label_events, replay
+from blitzgs.training.inputs import open_capture
 from tests.population.test_spawn_gate import candidates, spawns
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, tiny_config, write_tiny_capture
 from tests.training.tiny_runs import at_step, events_of
@@ -393,6 +396,18 @@ def test_a_run_that_ends_before_the_gate_is_not_replayed(tmp_path):
     config = tiny_config("schedule.gate_from=1000000")
     with pytest.raises(ValueError, match=r"ends before the gate's onset \(schedule.gate_from 1000000, "):
         branch_point(tmp_path, config)
+
+
+def test_a_run_without_candidates_for_the_gate_is_not_replayed(lineage_run, tmp_path):
+    """Its arms would all be the same run."""
+    config = tiny_config(*SETTINGS, "schedule.gate_from=81")
+    with pytest.raises(ValueError, match=r"has no density event from .*gate_from 81, the last event 80\)"):
+        branch_point(lineage_run / "run", config)
+    capture, config = str(lineage_run / "capture"), tiny_config(*SETTINGS, "population.strategy=relocation")
+    opened = open_capture(replace(config, data=replace(config.data, path=capture)), Ranks())
+    with pytest.raises(ValueError, match="run was trained with population.strategy=relocation, which has no"):
+        next(replay(config, *opened, lineage_run / "run", tmp_path / "out", Mock(), 0.5, Ranks()))
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_is_missing_is_named(tmp_path, capsys):
