@@ -23,6 +23,7 @@ from blitzgs.population.lineage_parts import read_lineage
 from blitzgs.population.spawn_gate import GateError, GateInfo, RandomVeto, SampledVeto, info_path
 from blitzgs.training import run_files, run_log
 from blitzgs.training.batches import PhotographError
+from blitzgs.training.config_io import ConfigError
 from blitzgs.training.events import importance
 from blitzgs.training.guard import ModelLostError
 from blitzgs.training.spawn_gate import life_fields, reasons_against
@@ -266,6 +267,23 @@ def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
             train(tmp_path / "gated", *flags, resume=True)
         file.write_text(content)
     assert train(tmp_path / "gated", *flags, resume=True)[1] is not None
+
+
+@pytest.mark.parametrize("rule", ["rank", "sample"])
+def test_a_run_that_is_stopped_between_gated_events_resumes_exactly(tmp_path, monkeypatch, rule):
+    """The rule and the draws of the gate are those of the run; with another rule it is not resumed."""
+    flags = ["population.gate=default", f"population.gate_rule={rule}", "schedule.gate_from=40"]
+    other = [flags[0], f"population.gate_rule={'rank' if rule == 'sample' else 'sample'}", flags[2]]
+    with pytest.warns(UserWarning, match="spawn gate"):
+        whole, _ = train(tmp_path / "whole", *flags)
+        stop_at(monkeypatch, 65)
+        assert train(tmp_path / "cut", *flags)[1] is None
+        monkeypatch.undo()
+        with pytest.raises(ConfigError, match="population.gate_rule: the checkpoint was trained with"):
+            train(tmp_path / "cut", *other, resume=True)
+        resumed, _ = train(tmp_path / "cut", *flags, resume=True)
+    assert [event["vetoed"] > 0 for event in events_of(tmp_path / "cut", "densify")] == [False] + [True] * 3
+    assert_same_table(resumed.state.table, whole.state.table)
 
 
 def test_a_random_veto_takes_the_place_of_a_gate(tmp_path):
