@@ -102,7 +102,8 @@ def check_no_other(path: Path) -> None:
     """Check that a new gate would replace only the files of a gate, which its metadata show.
 
     Raises:
-        FileExistsError: there is a model file without metadata, or another file at the path of the metadata.
+        FileExistsError: there is a model file without metadata, another file at the path of the metadata, or
+            a gate in the other format, to which the metadata belong.
         OSError: one of the two is no regular file.
     """
     metadata = info_path(path)
@@ -118,6 +119,12 @@ def check_no_other(path: Path) -> None:
             foreign = path
     except (ValueError, RecursionError):
         foreign = metadata
+    for other in (path.with_suffix(suffix) for suffix in (".json", ".ubj") if suffix != path.suffix):
+        if other.exists():
+            raise FileExistsError(
+                f"{other} exists, whose metadata {metadata.name} the new gate would replace: choose another "
+                "--out"
+            )
     if foreign is not None:
         raise FileExistsError(f"{foreign} exists and does not belong to a gate: choose another --out")
 

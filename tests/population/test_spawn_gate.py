@@ -254,6 +254,15 @@ def test_a_fit_replaces_only_a_gate(tmp_path):
     assert SpawnGate(path).info.scenes == {"b": "b"}
 
 
+def test_a_fit_does_not_replace_the_metadata_of_a_gate_in_the_other_format(tmp_path):
+    """`g.json` and `g.ubj` would both have `g.meta.json`."""
+    fit([spawns("a")], tmp_path / "g.json")
+    before = info_path(tmp_path / "g.json").read_text()
+    with pytest.raises(FileExistsError, match=r"g.json exists, whose metadata g.meta.json .* choose another"):
+        fit([spawns("b", seed=1)], tmp_path / "g.ubj")
+    assert info_path(tmp_path / "g.json").read_text() == before and not (tmp_path / "g.ubj").exists()
+
+
 def spoil_tree(path, field, value, at="root", tree=3):
     model = json.loads(path.read_text())
     tree = model["learner"]["gradient_booster"]["model"]["trees"][tree]
