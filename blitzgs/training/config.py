@@ -233,7 +233,7 @@ class PopulationConfig:
     Some fields have no effect on some runs. With "relocation": `grad_threshold`, `absolute_gradients`,
     `absolute_threshold`, `clone_scale`, `min_observations` and `phi`. With "density": `growth`. Without
     `importance`: `score`, `pass1_keep`, `pass2_mass`, `pass2_keep` and `phi`. Without `gate`: `gate_rate` and
-    `gate_rule`.
+    `gate_rule`. With the gate "random": `gate_rule`.
 
     Attributes:
         strategy: what a density event does: "density" (clone and split by gradients, prune) or "relocation"
