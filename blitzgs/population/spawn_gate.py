@@ -57,8 +57,8 @@ except xgboost.core.XGBoostError as error:
     sys.exit(str(error).partition("\\n")[0])  # the lines after the first are the stack of the library
 """
 _READING_SECONDS = 120
-# The draws of a veto are those of the event `time` + 2^40. An importance pass of the same time draws among the
-# same Gaussians by their ids and `time` itself, and would prune those that the veto has just withheld.
+# The draws of a veto are those of the event `time` + 2^40. An importance pass of the same time draws among
+# the same Gaussians by their ids and `time` itself, and would prune those that the veto has just withheld.
 _VETO_EVENTS = 1 << 40
 
 

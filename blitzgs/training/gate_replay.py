@@ -148,8 +148,8 @@ def branch_point(folder: Path, config: Config) -> Path:
     if not schedule.has_spawn_gate(last):
         raise ValueError(
             f"{folder} has no density event from the gate's onset on (schedule.gate_from "
-            f"{config.schedule.gate_from}, the last event {last}): all arms would be the same run. Replay one "
-            "with an earlier schedule.gate_from"
+            f"{config.schedule.gate_from}, the last event {last}): all arms would be the same run. Replay a "
+            "run with an earlier schedule.gate_from"
         )
     for manifest in (folder / run_files.CHECKPOINTS).glob(f"checkpoint_*/{MANIFEST}"):
         try:
@@ -304,8 +304,8 @@ def _check_comparable(config: Config, capture: Capture, images: Images, source: 
         )
     if config.population.strategy == "relocation":
         raise ValueError(
-            f"{source} was trained with population.strategy=relocation, which has no candidates: replay a run "
-            "with population.strategy=density"
+            f"{source} was trained with population.strategy=relocation, which has no candidates: replay a "
+            "run with population.strategy=density"
         )
     if config.schedule.minutes > 0:
         raise ValueError(

@@ -314,7 +314,7 @@ def without_trees(path):
         ),
         (
             # One leaf fits into 64 bits in units of 2^-32, but not the sum over the trees.
-            lambda path: [spoil_tree(path, "split_conditions", 1.5e9, at="leaf", tree=tree) for tree in (0, 1)],
+            lambda path: [spoil_tree(path, "split_conditions", 1.5e9, "leaf", tree) for tree in (0, 1)],
             "the leaves of its trees may add up to 2.31 or more",
         ),
         (without_trees, "no trees"),
