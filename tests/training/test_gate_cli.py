@@ -5,6 +5,7 @@ import io
 import json
 import shutil
 from dataclasses import replace
+from itertools import islice
 from unittest.mock import Mock
 from xml.etree import ElementTree
 
@@ -18,12 +19,15 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.population.candidates import Candidates
 from blitzgs.population.gate_evaluation import correlation, region_rates, survival_by_cohort
 from blitzgs.population.gate_fit import read_spawns
+from blitzgs.population.spawn_gate import SpawnGate, gate_file
 from blitzgs.population.spawn_samples import read_sample
 from blitzgs.scene.colmap import read_model, write_model
 from blitzgs.training import folder_checks
-from blitzgs.training.config_io import save_config
+from blitzgs.training.config_io import load_config, save_config
 from blitzgs.training.gate_replay import OracleVeto, branch_point, event_keys, label_events, replay
 from blitzgs.training.inputs import open_capture
+from blitzgs.training.trainer import Trainer
+from tests.distributed.rank_harness import run_ranks
 from tests.population.test_spawn_gate import candidates, spawns
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, tiny_config, write_tiny_capture
 from tests.training.tiny_runs import at_step, events_of
@@ -151,6 +155,28 @@ def test_a_replay_begins_again_if_it_has_trained_no_arm(lineage_run, tmp_path, m
     assert arms["reference"]["psnr"] == summary["psnr"] and len(arms) == 6
     assert [r["t"] for r in events_of(out / "reference", "densify")] == [60, 80]
     assert main(arguments) == 1
+
+
+def _replay(ranks, run, capture, out, fails):
+    """The first arms of a replay: the names of those that were trained, and their Gaussians."""
+    config = load_config(run / "config.yaml")
+    opened = open_capture(replace(config, data=replace(config.data, path=str(capture))), ranks)
+    with pytest.MonkeyPatch.context() as patch:
+        if fails:
+            patch.setattr(Trainer, "train", lambda self: None)  # as if stopped by a signal
+        arms = replay(config, *opened, run, out, SpawnGate(gate_file("default")), 0.5, ranks)
+        try:
+            return [(arm["arm"], arm["final"]) for arm in islice(arms, 2)]
+        except InterruptedError as error:
+            return str(error)
+
+
+def test_two_ranks_replay_a_run_of_one_and_begin_again_together(lineage_run, tmp_path):
+    arguments = lineage_run / "run", lineage_run / "capture", tmp_path / "out"
+    assert run_ranks(_replay, 2, *arguments, True) == ["arm reference was stopped by a signal"] * 2
+    first, second = run_ranks(_replay, 2, *arguments, False)
+    assert first == second and [name for name, _ in first] == ["reference", "oracle"]
+    assert first[1][1] < first[0][1]
 
 
 def test_a_replay_does_not_begin_where_another_one_is_training(lineage_run, tmp_path, monkeypatch, capsys):
