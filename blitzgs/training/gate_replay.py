@@ -210,7 +210,7 @@ def replay(
 
     def train(name: str, veto: Veto | None) -> dict[str, Any]:
         folder = out / name
-        # Nobody else may train in the folder, least of all another replay that would begin again there.
+        # No other process may train in the folder, least of all a replay that would begin again there.
         with locked(folder, ranks):
             if ranks.rank == 0:
                 _branch(point, folder)
