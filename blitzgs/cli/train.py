@@ -87,6 +87,11 @@ def run(args: argparse.Namespace) -> int:
     if args.show_config:
         print(json.dumps(to_dict(config), indent=1))
         return 0
+    if args.resume and not config.data.path and not (args.out / run_files.CONFIG).exists():
+        raise FileNotFoundError(
+            f"{args.out} holds no run to continue (it has no config.yaml): check --out, or name the capture "
+            "of a new run with --data"
+        )
     job = config.ranks
     with Ranks.from_environment(
         args.device,

@@ -96,6 +96,7 @@ def test_torchrun_entry(trained, tmp_path):
     ("arguments", "status", "message"),
     [
         (["train", "--out", "x"], 1, "data.path: no capture given; use --data DIR"),
+        (["train", "--out", "x", "--resume"], 1, "x holds no run to continue (it has no config.yaml): check"),
         (["train", "--data", "/nowhere", "--out", "x"], 1, "/nowhere"),
         (
             ["train", "--data", "d", "--out", "x", "--loss.sim=1"],
