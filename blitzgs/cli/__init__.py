@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import io
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -61,6 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unknown = [text for text in rest if not (trains and text.startswith("--") and "=" in text)]
     if unknown:
         hint = " (configuration fields are written --section.field=value)" if trains else ""
+        if meant := _flag_meant(args.parser, unknown[0]):
+            hint = f"; did you mean {meant}?"
         args.parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
     args.overrides = rest
     # Our warnings are about the user's data, so they are shown without the line of code that raised them.
@@ -76,6 +80,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"blitzgs {args.command}: interrupted", file=sys.stderr)
         return 130
     return status
+
+
+def _flag_meant(parser: argparse.ArgumentParser, text: str) -> str | None:
+    """Return the command's flag that an unknown one resembles; None for a field and if no flag is like it."""
+    name = text.partition("=")[0]
+    flags = re.findall(r"--[\w-]+", parser.format_usage())
+    if not name.startswith("--") or "." in name:
+        return None
+    return next(iter(difflib.get_close_matches(name, flags, n=1, cutoff=0.75)), None)
 
 
 def _message(error: Exception) -> str:

@@ -125,7 +125,9 @@ def test_torchrun_entry(trained, tmp_path):
         (["synth", "."], 1, "the folder must be given by its name, got '.'"),
         (["synth", "city", "--processes=-2"], 1, "processes must be at least 1, got -2"),
         (["train", "--data", "loop", "--out", "x"], 1, "loop is not a folder"),
-        (["eval", "/nowhere", "--fast"], 2, "unrecognized arguments: --fast"),
+        (["eval", "/nowhere", "--fast"], 2, "unrecognized arguments: --fast\n"),
+        (["eval", "/nowhere", "--pictrues=3"], 2, "--pictrues=3; did you mean --pictures?"),
+        (["train", "--data", "d", "--ouut", "x"], 2, "--ouut x; did you mean --out?"),
     ],
 )
 def test_mistakes_get_a_message(arguments, status, message, capsys, tmp_path, monkeypatch):
