@@ -109,9 +109,9 @@ class ImageMemory:
     def __str__(self) -> str:
         """Return the figures as text, in gigabytes."""
         return (
-            f"host memory of images: at most {self.compressed_bytes / 1e9:.2f} GB compressed (budget "
-            f"{self.compressed_budget / 1e9:.2f}) and {self.decoded_bytes / 1e9:.2f} GB decoded (budget now "
-            f"{self.decoded_budget / 1e9:.2f}); decoded {self.decoded:,} times"
+            f"photographs held in host memory: {self.compressed_bytes / 1e9:.2f} GB compressed (limit "
+            f"{self.compressed_budget / 1e9:.2f}), {self.decoded_bytes / 1e9:.2f} GB decoded (limit "
+            f"{self.decoded_budget / 1e9:.2f}); decoded {self.decoded:,} of them, counting repetitions"
         )
 
 

@@ -119,7 +119,9 @@ class Budget:
         text = None
         if abs(total - self._shown) > SHOWN_CHANGE * total:
             self._shown = total
-            end = f"ends after {plan.seconds / 60:.3g} of {self._seconds / 60:.3g} minutes"
+            end = (
+                f"will end after about {plan.seconds / 60:.3g} minutes (--minutes: {self._seconds / 60:.3g})"
+            )
             text = (
                 f"{plan.images_per_second:.1f} images/s: {total:,} images in all, a scale of "
                 f"{values['scale']:.3g}; {end}"
