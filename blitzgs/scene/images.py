@@ -111,7 +111,7 @@ class ImageMemory:
         return (
             f"photographs held in host memory: {self.compressed_bytes / 1e9:.2f} GB compressed (limit "
             f"{self.compressed_budget / 1e9:.2f}), {self.decoded_bytes / 1e9:.2f} GB decoded (limit "
-            f"{self.decoded_budget / 1e9:.2f}); decoded {self.decoded:,} of them, counting repetitions"
+            f"{self.decoded_budget / 1e9:.2f}); {self.decoded:,} decodings"
         )
 
 
