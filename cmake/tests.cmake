@@ -26,7 +26,7 @@ else()
   target_include_directories(blitzgs_tests SYSTEM PRIVATE ${CATCH2_INCLUDE})
 endif()
 if(BLITZGS_SANITIZE)
-  # Lines alone: with variables (-g), GCC takes five minutes for the kernels of compositing instead of one.
+  # Lines alone: with variables (-g), GCC takes several times as long for the kernels of compositing.
   target_compile_options(blitzgs_tests PRIVATE -fsanitize=address,undefined -fno-omit-frame-pointer -g1)
   target_link_options(blitzgs_tests PRIVATE -fsanitize=address,undefined)
 endif()
