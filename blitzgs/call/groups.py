@@ -11,9 +11,9 @@ from torch import Tensor
 
 from blitzgs.call.arguments import Gaussians, Scene
 from blitzgs.call.covariances import Decomposed, shaped_by
+from blitzgs.call.queued import Rendered
 from blitzgs.ops.project import differentiable_splats, gaussian_tensors
 from blitzgs.ops.projection_types import MOST_VIEWS, ProjectedSplats, ProjectionInputs, ProjectionOptions
-from blitzgs.ops.render import Rendered
 
 
 class Group(NamedTuple):

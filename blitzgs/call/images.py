@@ -16,10 +16,10 @@ from blitzgs.call.finite import find_bad_cameras, watch_for_non_finite
 from blitzgs.call.groups import Group, groups_of, project_groups
 from blitzgs.call.layout import Layout
 from blitzgs.call.meta import Lists, make_meta
+from blitzgs.call.queued import Rendered, ShTables, render_queued
 from blitzgs.call.ranks import Job, send_splats
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import Through, rasterize
-from blitzgs.ops.render import Rendered, ShTables, render_queued
 
 # The tile size of the CUDA kernels. If the caller asks for another one, only meta's lists have it.
 CUDA_TILE_SIZE = 16

@@ -28,10 +28,10 @@ from blitzgs.call.arguments import (
 from blitzgs.call.groups import Group, groups_of
 from blitzgs.call.images import ImageOptions, may_queue, render
 from blitzgs.call.lazy_dict import LazyDict
+from blitzgs.call.queued import ShTables
 from blitzgs.ops.gather_rows import gather_rows, split_rows
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionOptions
-from blitzgs.ops.render import ShTables
 from blitzgs.ops.sparse_rows import HandOver, full_gradients
 
 

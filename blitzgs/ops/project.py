@@ -4,21 +4,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from blitzgs._library import below_autograd
-from blitzgs.ops.capacity import CapacityEstimate, Sizes
-from blitzgs.ops.host import HostCopy
+from blitzgs.ops.host import to_host
 from blitzgs.ops.project_gradient import Project, ProjectCall, TableRows
 from blitzgs.ops.projection_types import (
     VIEW_TOTALS,
     ProjectedSplats,
     ProjectionInputs,
     ProjectionOptions,
+    Sizes,
     splats_of,
 )
 
@@ -114,22 +113,8 @@ def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
         inputs: the inputs of the projection.
     """
     with below_autograd():
-        for attempt in capacity_for(inputs).attempts():
-            projected = inputs.run(attempt.sizes)
-            needed = Sizes(*HostCopy(projected.totals).read()[:3].tolist())
-            attempt.end(needed, attempt.sizes is None or attempt.sizes.holds(needed[:2]))
-        return splats_of(projected.splats, needed)
-
-
-def capacity_for(inputs: ProjectionInputs) -> CapacityEstimate:
-    """Return the capacity estimate shared by all calls of this size."""
-    means = inputs.gaussians[0]
-    return _estimate(means.device, means.shape[0], inputs.n_views)
-
-
-@lru_cache(maxsize=16)
-def _estimate(_device: torch.device, _gaussians: int, _views: int) -> CapacityEstimate:
-    return CapacityEstimate()
+        projected = inputs.run(None)
+        return splats_of(projected.splats, Sizes(*to_host(projected.totals)[:3].tolist()))
 
 
 def differentiable_splats(

@@ -13,12 +13,24 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
-from blitzgs.ops.capacity import Sizes
 
 # Largest number of views of one launch (kMaxViews of csrc/common/kernel.h): an int32 has a bit for each.
 MOST_VIEWS = 32
 # Where the splats of the views begin in `ProjectionOutputs.totals` (kTotalViews of csrc/project/project.h).
 VIEW_TOTALS = 4
+
+
+class Sizes(NamedTuple):
+    """Numbers of Gaussians, splats, tile entries and blocks that a frame needs, or has memory for."""
+
+    visible: int  # Gaussians seen by at least one view
+    splats: int  # pairs of a Gaussian and a view that sees it
+    isects: int  # entries of the tiles' lists
+    blocks: int = 0  # of rows of the table, of which some view may see a part
+
+    def holds(self, needed: Sequence[int]) -> bool:
+        """Tell whether these sizes suffice for `needed`, which has the first of these fields in order."""
+        return all(n <= size for n, size in zip(needed, self, strict=False))
 
 
 class ProjectedSplats(NamedTuple):

@@ -4,8 +4,7 @@
 import pytest
 import torch
 
-from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.projection_types import VIEW_TOTALS, splats_of
+from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, splats_of
 from tests.cuda.scenes import Scene, ops, relative_error
 
 NAMES = ("gaussian_ids", "camera_ids", "visible_ids", "splat_offsets")

@@ -4,10 +4,9 @@
 import pytest
 import torch
 
-from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.color_rows import colored_rows
 from blitzgs.ops.project import project_splats
-from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, splats_of
+from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Sizes, splats_of
 from tests.helpers import BACKENDS, needs_cuda, random_scene
 
 

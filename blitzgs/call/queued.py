@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from blitzgs._library import below_autograd
-from blitzgs.ops.capacity import Attempt, Sizes
+from blitzgs.frame.run import run
+from blitzgs.frame.transport.local import LocalExchange, LocalTransport
 from blitzgs.ops.color_rows import VisibleRows, colored_rows
-from blitzgs.ops.host import HostCopy
-from blitzgs.ops.project import capacity_for
 from blitzgs.ops.project_gradient import TableRows
 from blitzgs.ops.projection_types import (
     VIEW_TOTALS,
@@ -21,7 +20,6 @@ from blitzgs.ops.projection_types import (
     ProjectionInputs,
     ProjectionOutputs,
     first_rows,
-    lengths_of,
 )
 from blitzgs.ops.sparse_rows import HandOver
 
@@ -83,36 +81,51 @@ def render_queued(
         exact: wait for the number of splats, so that no column has spare capacity meanwhile.
         tables: the SH, if they are not part of `inputs`.
     """
-    options = inputs.options
+    options, means = inputs.options, inputs.gaussians[0]
     grid = [inputs.n_views, options.width, options.height, options.tile_size, 0, -1]
-    with below_autograd():
-        for attempt in (Attempt(None),) if exact else capacity_for(inputs).attempts():
-            capacity = attempt.sizes
-            projected = inputs.run(capacity)
-            copy = HostCopy(projected.totals)
-            splats, rows = projected.splats, None
-            if tables is not None:
-                splats, rows = _colored(projected, inputs, tables, spare=capacity is not None)
-            if capacity is None:
-                totals = copy.read().tolist()
-                sizes, n_splats = Sizes(*totals[:3]), None
-            else:
-                sizes, n_splats = capacity, projected.n_splats
-            isect_splats, tile_offsets, *composited = torch.ops.blitzgs.list_and_rasterize(
-                [splats.means2d, splats.conics, splats.opacities, channels(splats)], splats.depths,
-                splats.camera_ids, backgrounds, grid, sizes.isects, backward_follows, n_splats,
-            )  # fmt: skip
-            if capacity is not None:
-                totals = copy.read().tolist()
-                sizes = Sizes(*totals[:3])
-            attempt.end(sizes[:3], capacity is None or capacity.holds(sizes))
-        if capacity is not None:
-            splats, isect_splats, rows = _without_spare(splats, isect_splats, rows, sizes)
-        of_tables = None
-        if tables is not None and rows is not None:
-            of_tables = TableRows(rows, tables.parts, tables.hand_over)
-        in_views = totals[VIEW_TOTALS : VIEW_TOTALS + inputs.n_views]
-        return Rendered(splats, isect_splats, tile_offsets, composited, of_tables, 0 in in_views)
+    transport = LocalTransport() if exact else _transport(means.device, means.shape[0], inputs.n_views)
+
+    def composite(exchange: LocalExchange) -> tuple[LocalExchange, Tensor, list[Tensor], VisibleRows | None]:
+        _, n_splats, n_isects = exchange.arrived
+        splats, rows = exchange.projected.splats, None
+        if tables is not None:
+            splats, rows = _colored(exchange.projected, inputs, tables, spare=n_splats is not None)
+        isect_splats, *composited = torch.ops.blitzgs.list_and_rasterize(
+            [splats.means2d, splats.conics, splats.opacities, channels(splats)], splats.depths,
+            splats.camera_ids, backgrounds, grid, n_isects, backward_follows, n_splats,
+        )  # fmt: skip
+        return exchange, splats.colors, [isect_splats, *composited], rows
+
+    result, (exchange, colors, composited, rows) = run(transport, lambda _: inputs, None, composite)
+    splats = result.projected
+    isect_splats, tile_offsets, *images = composited
+    totals = exchange.totals()
+    own: list[Tensor] = [] if rows is None else [*rows.inputs.gaussians, rows.numbers, rows.indices]
+    columns = [isect_splats, colors, *own]
+    visible, count, isects, *_ = totals
+    if isect_splats.shape[0] > isects or colors.shape[0] > count:
+        # Cut spare capacity off, in one operation.
+        columns = first_rows(columns, [isects, count, *[visible] * len(own)])
+    isect_splats, colors, *own = columns
+    of_tables = None
+    if tables is not None and rows is not None:
+        *gaussians, numbers, indices = own
+        rows = VisibleRows(rows.inputs._replace(gaussians=gaussians), numbers, indices)
+        of_tables = TableRows(rows, tables.parts, tables.hand_over)
+    return Rendered(
+        splats._replace(colors=colors),
+        isect_splats,
+        tile_offsets,
+        images,
+        of_tables,
+        0 in totals[VIEW_TOTALS:],
+    )
+
+
+@lru_cache(maxsize=16)
+def _transport(_device: torch.device, _gaussians: int, _views: int) -> LocalTransport:
+    """Return the transport, with its estimate of sizes, of all calls of this size."""
+    return LocalTransport()
 
 
 def _colored(
@@ -124,17 +137,3 @@ def _colored(
     count = None if totals is None else totals.view(torch.int32)[:1]
     tables.before(splats.visible_ids, count)
     return colored_rows(splats, inputs, tables.parts, totals)
-
-
-def _without_spare(
-    splats: ProjectedSplats, isect_splats: Tensor, rows: VisibleRows | None, needed: Sizes
-) -> tuple[ProjectedSplats, Tensor, VisibleRows | None]:
-    """Cut spare capacity off all columns, in one operation."""
-    own: list[Tensor] = [] if rows is None else [*rows.inputs.gaussians, rows.numbers, rows.indices]
-    lengths = [*lengths_of(needed), needed.isects, *[needed.visible] * len(own)]
-    found = first_rows([*splats[:12], isect_splats, *own], lengths)
-    splats = ProjectedSplats._make((*found[:12], splats.counts))
-    if rows is not None:
-        *gaussians, numbers, indices = found[13:]
-        rows = VisibleRows(rows.inputs._replace(gaussians=gaussians), numbers, indices)
-    return splats, found[12], rows
