@@ -12,6 +12,7 @@ from torch import Tensor
 
 from blitzgs.frame.run import run
 from blitzgs.frame.transport.local import LocalExchange, LocalTransport
+from blitzgs.frame.transport.protocol import Exchange
 from blitzgs.ops.color_rows import VisibleRows, colored_rows
 from blitzgs.ops.project_gradient import TableRows
 from blitzgs.ops.projection_types import (
@@ -85,7 +86,8 @@ def render_queued(
     grid = [inputs.n_views, options.width, options.height, options.tile_size, 0, -1]
     transport = LocalTransport() if exact else _transport(means.device, means.shape[0], inputs.n_views)
 
-    def composite(exchange: LocalExchange) -> tuple[LocalExchange, Tensor, list[Tensor], VisibleRows | None]:
+    def composite(exchange: Exchange) -> tuple[LocalExchange, Tensor, list[Tensor], VisibleRows | None]:
+        assert isinstance(exchange, LocalExchange)
         _, n_splats, n_isects = exchange.arrived
         splats, rows = exchange.projected.splats, None
         if tables is not None:
@@ -112,14 +114,9 @@ def render_queued(
         *gaussians, numbers, indices = own
         rows = VisibleRows(rows.inputs._replace(gaussians=gaussians), numbers, indices)
         of_tables = TableRows(rows, tables.parts, tables.hand_over)
-    return Rendered(
-        splats._replace(colors=colors),
-        isect_splats,
-        tile_offsets,
-        images,
-        of_tables,
-        0 in totals[VIEW_TOTALS:],
-    )
+    has_blank_view = 0 in totals[VIEW_TOTALS:]
+    splats = splats._replace(colors=colors)
+    return Rendered(splats, isect_splats, tile_offsets, images, of_tables, has_blank_view)
 
 
 @lru_cache(maxsize=16)

@@ -11,8 +11,8 @@ frame, on every rank::
     result.way_back.check_still_valid()                      # before the backward pass of compositing
     gradients = result.way_back.return_gradients(gradients)  # gradients of this rank's own splats
 
-`blitzgs.frame.run` makes the first three. The last two may be repeated. `local`, `collective` and `peer` each have one transport; `way_back` returns the
-gradients for the last two.
+`blitzgs.frame.run` makes the first three, and the last two may be repeated. `local`, `collective` and `peer`
+each have one transport; `way_back` returns the gradients for the latter two.
 """
 
 from __future__ import annotations
