@@ -53,16 +53,19 @@ class ProjectedSplats(NamedTuple):
     counts: Tensor  # int64 [3] on the CPU: U, P, and at least the sum of tiles_touched
 
 
-def splats_of(allocated: Sequence[Tensor], sizes: Sizes) -> ProjectedSplats:
+def splats_of(allocated: Sequence[Tensor], sizes: Sizes, counts: Tensor | None = None) -> ProjectedSplats:
     """Return the valid splats of columns that were allocated with more capacity.
 
     Args:
         allocated: a `ProjectedSplats`; its `counts` are not read.
         sizes: numbers of valid Gaussians and splats; `blocks` is not read.
+        counts: the first three of `sizes` as a CPU tensor, if there is one.
     """
     if allocated[0].shape[0] > sizes.splats or allocated[2].shape[0] > sizes.visible:
         allocated = first_rows(allocated[:12], lengths_of(sizes))
-    return ProjectedSplats._make((*allocated[:12], torch.tensor(sizes[:3], device="cpu")))
+    if counts is None:
+        counts = torch.tensor(sizes[:3], device="cpu")
+    return ProjectedSplats._make((*allocated[:12], counts))
 
 
 def lengths_of(sizes: Sizes) -> list[int]:
@@ -247,6 +250,7 @@ class ProjectionOutputs(NamedTuple):
         colors = s.colors if s.colors.shape[0] == s.conics.shape[0] else s.conics
         return Splats(s.means2d, s.conics, s.opacities, colors, s.depths, s.camera_ids, self.ids)
 
-    def first(self, sizes: Sizes) -> ProjectionOutputs:
+    def first(self, sizes: Sizes, counts: Tensor | None = None) -> ProjectionOutputs:
         """Return only the valid splats, with their `counts`; `sizes` has the numbers in `totals`."""
-        return ProjectionOutputs(splats_of(self.splats, sizes), self.ids[: sizes.splats], self.totals)
+        ids = self.ids if self.ids.shape[0] <= sizes.splats else self.ids[: sizes.splats]
+        return ProjectionOutputs(splats_of(self.splats, sizes, counts), ids, self.totals)

@@ -44,7 +44,8 @@ class LocalExchange:
         # On the CPU the sizes are known at once, so no estimate is needed.
         self._capacity = sizes if inputs.gaussians[0].is_cuda else None
         self.projected = projected = inputs.run(self._capacity)
-        self._visible = projected.totals[VIEW_TOTALS : VIEW_TOTALS + inputs.n_views]
+        self._n_views = inputs.n_views
+        self._totals: list[int] | None = None
         splats = projected.for_compositing
         self._copy = HostCopy(projected.totals)
         mark("project")
@@ -57,12 +58,16 @@ class LocalExchange:
 
     def totals(self) -> list[int]:
         """Wait for `ProjectionOutputs.totals`."""
-        return self._copy.read().tolist()
+        if self._totals is None:
+            self._totals = self._copy.read().tolist()
+        return self._totals
 
     def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """See `Exchange.finish`."""
         needed = Sizes(*self.totals()[:VIEW_TOTALS])
         if self._capacity is not None and not self._capacity.holds(needed):
             return needed, None  # the splats are undefined
-        own = self.projected.first(needed)
-        return needed, ExchangeResult(own.splats, own.for_compositing, self._visible, None, None)
+        own = self.projected.first(needed, self._copy.read()[:3])
+        composited = self.arrived.splats if self._capacity is None else own.for_compositing
+        visible = own.totals[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
+        return needed, ExchangeResult(own.splats, composited, visible, None, None)
