@@ -6,7 +6,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
@@ -17,7 +16,6 @@ from blitzgs.call.arguments import (
     MAX_SH_DEGREE,
     RAW_DEFAULTS,
     Gaussians,
-    Scene,
     background_rows,
     check_further,
     check_options,
@@ -25,14 +23,11 @@ from blitzgs.call.arguments import (
     gaussians_of,
     warn_of_intrinsics,
 )
-from blitzgs.call.groups import Group, groups_of
+from blitzgs.call.groups import gathered_groups, groups_of
 from blitzgs.call.images import ImageOptions, may_queue, render
-from blitzgs.call.lazy_dict import LazyDict
 from blitzgs.call.queued import ShTables
-from blitzgs.ops.gather_rows import gather_rows, split_rows
-from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionOptions
-from blitzgs.ops.sparse_rows import HandOver, full_gradients
+from blitzgs.ops.sparse_rows import HandOver
 
 
 class CatchesUp(Protocol):
@@ -186,37 +181,9 @@ def raw_rasterization(
     tables = ShTables(harmonics if shaded else (), catch_up_sh, hand_over)
     if may_queue(groups):
         return render("raw_rasterization", gaussians, project, image, tables=tables, groups=groups)
-    # Several groups, no Gaussians, or another tile size.
-    ids, visible = _gather_visible(gaussians, groups, tables, sparse_grad)
-    renders, alphas, meta = render("raw_rasterization", visible, project, image._replace(sparse_grad=False))
-    assert isinstance(meta, LazyDict)
-    meta.change("gaussian_ids", lambda index_in_visible: ids.long()[index_in_visible])
-    return renders, alphas, meta
-
-
-def _gather_visible(
-    gaussians: Gaussians, groups: Sequence[Group], tables: ShTables, sparse_grad: bool
-) -> tuple[Tensor, Gaussians]:
-    """Return the Gaussians that a view of any group sees, int32 [U], and these Gaussians alone.
-
-    Args:
-        gaussians: all Gaussians, one scene.
-        groups: `groups_of` the Gaussians.
-        tables: the SH.
-        sparse_grad: whether the gradients of the parameters are sparse.
-    """
-    ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
-    tables.before(ids, None)
-    (scene,) = gaussians.scenes
-    read = (scene.means, scene.quats, scene.scales, scene.opacities, *tables.parts)
-    hand_over, ticket = tables.hand_over, None
-    if hand_over is not None:
-        read, ticket = tuple(table.detach() for table in read), hand_over.ticket
-    means, quats, scales, opacities, sh = _Visible.apply(  # type: ignore[no-untyped-call]
-        ids, sparse_grad, hand_over, ticket, *read
-    )
-    scene = Scene(means, quats, scales, opacities, sh, scene.viewmats, scene.Ks)
-    return ids, replace(gaussians, scenes=(scene,), colors=sh, opacities=opacities)
+    # Several groups, no Gaussians, or another tile size: gather the Gaussians that any group sees.
+    groups = gathered_groups(groups, tables)
+    return render("raw_rasterization", gaussians, project, image, groups=groups)
 
 
 def _check_leaves(params: Mapping[str, Tensor | None]) -> None:
@@ -306,45 +273,3 @@ def _checked_degree(harmonics: list[Tensor], count: int, degree: int | None, sha
     if shaded and (degree + 1) ** 2 > given:
         raise ValueError(f"sh_degree {degree} needs {(degree + 1) ** 2} SH coefficients, got {given}")
     return degree
-
-
-class _Visible(torch.autograd.Function):
-    """Gathers the rows `ids` of means, quats, scales and opacities, and of SH in any number of parts.
-
-    The result has the SH in one tensor, or None without parts. The gradients of the tables are sparse, or
-    dense if `sparse` is False, or go to `hand_over`.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        ids: Tensor,
-        sparse: bool,
-        hand_over: HandOver | None,
-        _ticket: Tensor | None,
-        *tables: Tensor,
-    ) -> tuple[Tensor | None, ...]:
-        ctx.save_for_backward(ids)
-        ctx.sparse, ctx.hand_over, ctx.shapes = sparse, hand_over, [table.shape for table in tables]
-        ctx.set_materialize_grads(False)
-        parts = tables[4:]
-        ctx.lengths = [part.shape[1] for part in parts]
-        rows = gather_rows(tables[:4], parts, ids)
-        return (*rows, *([] if parts else [None]))
-
-    @staticmethod
-    def backward(ctx: Any, *v_rows: Tensor | None) -> Any:
-        (ids,) = ctx.saved_tensors
-        *gradients, v_sh = v_rows
-        if len(ctx.lengths) == 1 or v_sh is None:
-            gradients += [v_sh] * len(ctx.lengths)
-        else:
-            gradients += split_rows(v_sh, ctx.lengths)
-        needed = ctx.needs_input_grad[4:] if ctx.hand_over is None else ctx.hand_over.needed
-        gradients = [gradient if need else None for gradient, need in zip(gradients, needed, strict=True)]
-        if ctx.hand_over is None:
-            gradients = full_gradients(ids, gradients, ctx.shapes, [ctx.sparse] * len(gradients))
-        else:
-            ctx.hand_over.give(ids.long(), gradients)
-            gradients = [None] * len(gradients)
-        return None, None, None, None, *gradients

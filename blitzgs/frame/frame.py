@@ -31,6 +31,7 @@ from blitzgs.frame.transport import (
     unmarked,
 )
 from blitzgs.ops.blocks import ActiveRows
+from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import (
     ProjectedSplats,
     ProjectionInputs,
@@ -195,13 +196,13 @@ def forward(
         splats, n_splats, n_isects = exchange.arrived
         geometry = (splats.means2d, splats.conics, splats.opacities)
         lists = torch.ops.blitzgs.intersect(
-            *geometry, splats.depths, splats.camera_ids, splats.ids, grid, n_isects, n_splats, True
+            *geometry, splats.depths, splats.camera_ids, splats.ids, *grid, n_isects, n_splats, True
         )
         mark("sort")
-        arguments = (*geometry, splats.colors, backgrounds, *lists, grid)
+        arguments = (*geometry, splats.colors, backgrounds, *lists, *grid)
         table = exchange.gradient_table
         if table is not None and backward_follows:
-            images = torch.ops.blitzgs.rasterize_fwd_packed_(*arguments, table, n_splats)
+            images = torch.ops.blitzgs.rasterize_fwd_(*arguments, table, n_splats)
             zeros = table
         else:
             *images, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, False, backward_follows, n_splats)
@@ -257,10 +258,10 @@ def inputs_of(
     return ProjectionInputs(gaussians, cameras, options.projection(views), active or (), table["id"], level)
 
 
-def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> list[int]:
-    """Return the grid of tiles, and the range of them that this rank composites, as the ops take both."""
+def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> TileGrid:
+    """Return the grid of tiles, with the range of them that this rank composites."""
     tiles = (0, -1) if assignment is None else assignment.composited_tiles
-    return [len(views), views.width, views.height, options.tile_size, *tiles]
+    return TileGrid(len(views), views.width, views.height, options.tile_size, *tiles)
 
 
 @lru_cache(maxsize=16)
@@ -285,18 +286,18 @@ def backward_splats(
     """
     views, options, way_back = frame.views, frame.options, frame.way_back
     tiles = (0, -1) if frame.assignment is None else frame.assignment.own_tiles
-    grid = [len(views), views.width, views.height, options.tile_size, *tiles]
+    grid = TileGrid(len(views), views.width, views.height, options.tile_size, *tiles)
     if way_back is not None:
         way_back.check_still_valid()
     if v_renders.is_cuda:
         packed = frame.gradients.take(frame.splats.means2d)
-        torch.ops.blitzgs.rasterize_bwd_packed_(
-            *frame.saved, v_renders, grid, options.deterministic, packed, absolute
+        torch.ops.blitzgs.rasterize_bwd(
+            *frame.saved, v_renders, None, *grid, absolute, options.deterministic, packed
         )
         gradients = SplatGradients([packed], None, absolute_column(packed) if absolute else None)
     else:
         *parts, v_abs = torch.ops.blitzgs.rasterize_bwd(
-            *frame.saved, v_renders, None, grid, absolute, options.deterministic
+            *frame.saved, v_renders, None, *grid, absolute, options.deterministic
         )
         gradients = SplatGradients(parts, None, v_abs if absolute else None)
     mark("raster back")

@@ -67,9 +67,9 @@ def survey(
         splats, n_splats, n_isects = exchange.arrived
         geometry = (splats.means2d, splats.conics, splats.opacities)
         lists = torch.ops.blitzgs.intersect(
-            *geometry, splats.depths, splats.camera_ids, splats.ids, grid, n_isects, n_splats, True
+            *geometry, splats.depths, splats.camera_ids, splats.ids, *grid, n_isects, n_splats, True
         )
-        return torch.ops.blitzgs.contributions(*geometry, *lists, grid, n_splats, squares)
+        return torch.ops.blitzgs.contributions(*geometry, *lists, *grid, n_splats, squares)
 
     result, sums = run(transport, lambda _: inputs, assignment, measure)
     columns = [column[: len(result.splats.depths)] for column in (sums if squares else sums[:2])]

@@ -13,6 +13,7 @@ from blitzgs._library import below_autograd
 from blitzgs.ops.host import to_host
 from blitzgs.ops.project_gradient import Project, ProjectCall, TableRows
 from blitzgs.ops.projection_types import (
+    N_OPTIONS,
     VIEW_TOTALS,
     ProjectedSplats,
     ProjectionInputs,
@@ -146,15 +147,7 @@ def differentiable_splats(
     if sparse_grad:
         raise ValueError("sparse_grad is not supported under torch.compile")
     *columns, _, totals = torch.ops.blitzgs.project_fwd(
-        list(inputs.gaussians),
-        [viewmats, Ks],
-        list(inputs.active),
-        inputs.options.ints,
-        inputs.options.floats,
-        [],
-        [],
-        None,
-        inputs.level,
+        list(inputs.gaussians), viewmats, Ks, *inputs.active_arguments, None, inputs.level, *inputs.options
     )
     return ProjectedSplats._make((*columns, totals.cpu()[:3]))
 
@@ -162,16 +155,20 @@ def differentiable_splats(
 @torch.library.register_fake("blitzgs::project_fwd")
 def _(
     gaussians: Sequence[Tensor],
-    cameras: Sequence[Tensor],
-    active: Sequence[Tensor],
-    ints: Sequence[int],
-    floats: Sequence[float],
-    rank_tiles: Sequence[int],
-    capacity: Sequence[int],
+    viewmats: Tensor,
+    Ks: Tensor,
+    active_ids: Tensor | None,
+    active_views: Tensor | None,
+    n_active: Tensor | None,
+    n_blocks: Tensor | None,
     ids: Tensor | None,
     level: Tensor | None,
+    *options: Any,
+    rank_tiles: Sequence[int] = (),
+    **_capacity: Any,
 ) -> tuple[Tensor, ...]:
     context, means = torch.library.get_ctx(), gaussians[0]
+    rank_tiles = options[N_OPTIONS] if len(options) > N_OPTIONS else rank_tiles
     U, P = context.new_dynamic_size(), context.new_dynamic_size()
 
     def ints_of(*shape: Any) -> Tensor:
@@ -191,5 +188,5 @@ def _(
         ints_of(P),
         means.new_empty(P if rank_tiles else 0, dtype=torch.int64),
         means.new_empty(0 if ids is None else P, dtype=torch.int64),
-        means.new_empty(VIEW_TOTALS + cameras[0].shape[0] + len(rank_tiles), dtype=torch.int64),
+        means.new_empty(VIEW_TOTALS + viewmats.shape[0] + len(rank_tiles), dtype=torch.int64),
     )

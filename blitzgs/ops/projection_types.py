@@ -116,7 +116,7 @@ class Splats(NamedTuple):
 
 
 class ProjectionOptions(NamedTuple):
-    """How Gaussians are projected; each field is the argument of `project` of this name."""
+    """How Gaussians are projected: the arguments of `project` of these names, in the order of the ops."""
 
     width: int
     height: int
@@ -130,31 +130,12 @@ class ProjectionOptions(NamedTuple):
     raw: bool = True
     fade: tuple[float, ...] = ()  # `blitzgs.view.gate.LodGate.fade`; empty: opacities do not fade
 
-    @classmethod
-    def of(cls, ints: Sequence[int], floats: Sequence[float]) -> ProjectionOptions:
-        """Return the options from which `ints` and `floats` were made."""
-        width, height, tile_size, sh_degree, antialiased, raw = ints
-        near_plane, far_plane, eps2d, radius_clip, *fade = floats
-        return cls(
-            width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip,
-            bool(antialiased), bool(raw), tuple(fade),
-        )  # fmt: skip
 
-    @property
-    def ints(self) -> list[int]:
-        """Return the integer options in the order in which the ops take them."""
-        return [
-            self.width, self.height, self.tile_size, self.sh_degree, int(self.antialiased), int(self.raw)
-        ]  # fmt: skip
-
-    @property
-    def floats(self) -> list[float]:
-        """Return the float options in the order in which the ops take them."""
-        return [self.near_plane, self.far_plane, self.eps2d, self.radius_clip, *self.fade]
+N_OPTIONS = len(ProjectionOptions._fields)
 
 
 class WeightedViews(NamedTuple):
-    """B views as the backward ops take them: cameras, and weights of regularisers.
+    """B views as the backward ops take them, in this order: cameras, and weights of regularisers.
 
     Attributes:
         viewmats: [B, 4, 4], world to camera.
@@ -172,8 +153,11 @@ class WeightedViews(NamedTuple):
     size_reg: Tensor | None = None
 
 
+_ALL_ROWS = (None, None, None, None)
+
+
 class ProjectionInputs(NamedTuple):
-    """The inputs of a projection, in the groups of arguments that the ops take.
+    """The inputs of a projection.
 
     Attributes:
         gaussians: means, quats, scales, opacities and, if given, sh.
@@ -197,6 +181,11 @@ class ProjectionInputs(NamedTuple):
         """The number of views B."""
         return self.cameras[0].shape[0]
 
+    @property
+    def active_arguments(self) -> Sequence[Tensor | None]:
+        """The four arguments of the op that tell which Gaussians to consider."""
+        return (*self.active, *_ALL_ROWS[len(self.active) :])
+
     def run(self, capacity: Sizes | None, rank_tiles: Sequence[tuple[int, int]] = ()) -> ProjectionOutputs:
         """Project the Gaussians, without gradients.
 
@@ -206,15 +195,14 @@ class ProjectionInputs(NamedTuple):
             rank_tiles: for each rank the [begin, end) of the tiles that it composites, in ascending order.
         """
         *columns, splat_ids, totals = torch.ops.blitzgs.project_fwd(
-            list(self.gaussians),
-            list(self.cameras),
-            [tensor for tensor in self.active if tensor is not None],
-            self.options.ints,
-            self.options.floats,
-            [tile for tiles in rank_tiles for tile in tiles],
-            [] if capacity is None else [capacity.visible, capacity.splats],
+            self.gaussians,
+            *self.cameras,
+            *self.active_arguments,
             self.ids,
             self.level,
+            *self.options,
+            [tile for tiles in rank_tiles for tile in tiles],
+            *((None, None) if capacity is None else capacity[:2]),
         )
         return ProjectionOutputs(ProjectedSplats._make((*columns, None)), splat_ids, totals)
 
