@@ -20,7 +20,7 @@ from torch import Tensor
 
 from blitzgs.ops.blocks import BLOCK_ROWS, cull_blocks, update_block_bounds_
 from blitzgs.ops.project import project_splats
-from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions, WeightedViews
 from blitzgs.table.blocks import morton_order
 
 COLUMNS = ("means", "quats", "scales", "opacities", "sh")
@@ -55,8 +55,8 @@ def backward_arguments(scene: BenchmarkScene, splats: ProjectedSplats) -> tuple[
     v = [torch.randn_like(getattr(splats, name)) for name in ("means2d", "conics", "opacities", "colors")]
     inputs = inputs_of(scene)
     return (
-        inputs.gaussians, list(inputs.cameras), [splats.camera_ids, splats.visible_ids, splats.splat_offsets],
-        inputs.options.ints, inputs.options.floats, v, None, False,
+        inputs.gaussians, *WeightedViews(*inputs.cameras), splats.camera_ids, splats.visible_ids,
+        splats.splat_offsets, None, *inputs.options, v, None, False,
     )  # fmt: skip
 
 

@@ -52,7 +52,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor? n_active, Tensor? n_blocks, Tensor? ids, Tensor? level, "
       "int width, int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, "
       "float radius_clip, bool antialiased, bool raw, float[] fade, "
-      "int[] rank_tiles=[], int? visible_capacity=None, int? splat_capacity=None) -> (Tensor gaussian_ids, "
+      "int[] rank_tiles, int? visible_capacity, int? splat_capacity) -> (Tensor gaussian_ids, "
       "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor means2d, Tensor conics, "
       "Tensor depths, Tensor splat_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
       "Tensor rank_masks, Tensor splat_ids, Tensor totals)");

@@ -147,8 +147,9 @@ def differentiable_splats(
     if sparse_grad:
         raise ValueError("sparse_grad is not supported under torch.compile")
     *columns, _, totals = torch.ops.blitzgs.project_fwd(
-        list(inputs.gaussians), viewmats, Ks, *inputs.active_arguments, None, inputs.level, *inputs.options
-    )
+        list(inputs.gaussians), viewmats, Ks, *inputs.active_arguments, None, inputs.level, *inputs.options,
+        [], None, None,
+    )  # fmt: skip
     return ProjectedSplats._make((*columns, totals.cpu()[:3]))
 
 
@@ -163,12 +164,10 @@ def _(
     n_blocks: Tensor | None,
     ids: Tensor | None,
     level: Tensor | None,
-    *options: Any,
-    rank_tiles: Sequence[int] = (),
-    **_capacity: Any,
+    *others: Any,
 ) -> tuple[Tensor, ...]:
     context, means = torch.library.get_ctx(), gaussians[0]
-    rank_tiles = options[N_OPTIONS] if len(options) > N_OPTIONS else rank_tiles
+    rank_tiles: Sequence[int] = others[N_OPTIONS]
     U, P = context.new_dynamic_size(), context.new_dynamic_size()
 
     def ints_of(*shape: Any) -> Tensor:

@@ -201,7 +201,8 @@ class Project(torch.autograd.Function):
 def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
     gaussians, viewmats, Ks, *others = inputs  # noqa: N806
     options = ProjectionOptions(*others[6 : 6 + N_OPTIONS])
-    ctx.no_gradients = [None] * (1 + len(others))
+    # To torch an empty list of numbers is one of tensors, which has an empty list of gradients.
+    ctx.no_gradients = [[] if isinstance(x, (list, tuple)) and not x else None for x in (Ks, *others)]
     *columns, _, _ = output
     _save(
         ctx,

@@ -121,7 +121,7 @@ def rasterize(
     if torch.compiler.is_compiling():
         if tell_absgrad is not None:
             raise ValueError("absolute gradients are not supported under torch.compile")
-        renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, *grid)
+        renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, *grid, True, False, None)
         alphas = 1 - transmittances
     else:
         geometry = (means2d, conics, splat_opacities) if through is None else through.columns

@@ -104,14 +104,14 @@ def _send(columns, masks, everyone, rank, buffers, capacity):
 
 def _intersect(*arguments):
     """Replaces `intersect` for a capacity below the number of entries, which the CPU op refuses."""
-    *splats, grid, _, n_splats, _ = arguments
-    return INTERSECT(*splats, grid, -1, n_splats, True)
+    *given, _, n_splats, _ = arguments
+    return INTERSECT(*given, -1, n_splats, True)
 
 
 @pytest.fixture(autouse=True)
 def without_gpu(monkeypatch):
     monkeypatch.setattr(torch.ops.blitzgs, "send_splats_", _send)
-    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
+    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_", rasterize_into)
     monkeypatch.setattr(torch.ops.blitzgs, "intersect", _intersect)
     monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
     monkeypatch.setattr(peer, "current_stream", lambda _: None)

@@ -194,7 +194,7 @@ def alone(monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
     monkeypatch.setattr(peer, "current_stream", lambda _: None)
-    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
+    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_", rasterize_into)
     return Ranks(memory=LoneMemory(64 * WORDS_PER_SPLAT))
 
 

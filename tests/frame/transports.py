@@ -89,7 +89,7 @@ class IdleEvent:
 
 
 def rasterize_into(*arguments):
-    """Replaces `rasterize_fwd_packed_` on a CPU."""
+    """Replaces `rasterize_fwd_` on a CPU."""
     *rest, table, n_splats = arguments
     table[: int(n_splats)] = 0
     return torch.ops.blitzgs.rasterize_fwd(*rest, False, False, n_splats)[:6]
