@@ -236,7 +236,8 @@ def summary_lines(render: Json, step: Json, exchange: Json) -> list[str]:
 
     for result in render["results"]:
         ours, theirs = result["blitzgs"], fastest_gsplat(result) or {}
-        add(f"render forward + backward, {result['scene']}", ours["total"], "gsplat", theirs.get("total"), "ms")
+        work = f"render forward + backward, {result['scene']}"
+        add(work, ours["total"], "gsplat", theirs.get("total"), "ms")
     last = max(render["results"], key=lambda result: result["blitzgs"]["peak_gb"])
     theirs = fastest_gsplat(last) or {}
     add(f"its memory, {last['scene']}", last["blitzgs"]["peak_gb"], "gsplat", theirs.get("peak_gb"), "GB")
