@@ -83,7 +83,7 @@ def load_results(folder: Path = RESULTS) -> Results:
 def machine_of(file: Json) -> str:
     """Return the hardware, versions and commit of a result as text."""
     about = file["environment"]
-    machine = f"{about['device']}, CUDA {about['cuda']}" if "device" in about else about["processor"]
+    machine = about.get("device", about["processor"])
     peers = f", gsplat {about['gsplat']}" if "gsplat" in about else ""
     return f"{machine}, torch {about['torch']}{peers}, commit {file['commit']}"
 
