@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from blitzgs.charts import line_chart
+from blitzgs.util.charts import line_chart
 
 NAMESPACE = "{http://www.w3.org/2000/svg}"
 

@@ -12,8 +12,8 @@ import torch
 
 import blitzgs
 from blitzgs import cli
-from blitzgs.training.config import Config
-from blitzgs.training.config_io import load_config, to_dict
+from blitzgs.config.fields import Config
+from blitzgs.config.files import load_config, to_dict
 from tests.training.tiny import OVERRIDES, write_tiny_capture
 
 ROOT = Path(__file__).resolve().parents[1]

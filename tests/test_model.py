@@ -2,7 +2,7 @@
 import pytest
 import torch
 
-from blitzgs.model import NO_PARENT, PARAMETERS, REQUIRED, ZERO_AT_BIRTH, GaussianTable, schema
+from blitzgs.table.table import NO_PARENT, PARAMETERS, REQUIRED, ZERO_AT_BIRTH, GaussianTable, schema
 
 
 def filled_table(count: int, seed: int = 0) -> GaussianTable:

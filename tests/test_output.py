@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from blitzgs.output import OutputFolder, new_file, write_file
+from blitzgs.util.output import OutputFolder, new_file, write_file
 
 PARTS = st.sampled_from(
     ["..", ".", "a", "A", "a.png", "a.jpg", "a.png.jpg", "b", "ä🏙", "x" * 300, "\udcff.png", ""]

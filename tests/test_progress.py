@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-from blitzgs.progress import image_progress
+from blitzgs.util.progress import image_progress
 
 
 def count(shown):

@@ -8,9 +8,9 @@ import pytest
 import torch
 import torch.utils.checkpoint
 
+from blitzgs.call.arguments import _warn_of_intrinsics
 from blitzgs.ops.photometric import photometric_loss
 from blitzgs.reference.gaussians import covariance_factors
-from blitzgs.rendering.arguments import _warn_of_intrinsics
 from tests.helpers import DEVICES, PARAMETERS, random_scene, rasterize_scene, relative_error
 from tests.test_raw_rasterization import raw, raw_parameters
 

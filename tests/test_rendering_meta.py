@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.utils._pytree import tree_map
 
-from blitzgs.rendering import finite
+from blitzgs.call import finite
 from tests.helpers import DEVICES, random_scene, rasterize_scene, reference_images, relative_error
 
 
@@ -298,7 +298,7 @@ def test_reading_all_of_meta_reads_no_parameter(monkeypatch):
     def fail(gaussians):
         raise AssertionError("non_finite was not looked into")
 
-    monkeypatch.setattr("blitzgs.rendering.meta.non_finite", fail)
+    monkeypatch.setattr("blitzgs.call.meta.non_finite", fail)
     _, _, meta = rasterize_scene(random_scene(n=30))
     assert len(list(meta.values())) == len(meta)
     with pytest.raises(AssertionError, match="looked into"):

@@ -20,14 +20,14 @@ def walk():
 
 def test_a_step_is_read_in_few_files_and_no_file_again_and_again(walk):
     assert walk.stops[0] == "blitzgs/training/step.py"
-    assert "blitzgs/pipeline.py" in walk.files and "blitzgs/ops/project_step.py" in walk.files
+    assert "blitzgs/frame/frame.py" in walk.files and "blitzgs/ops/project_step.py" in walk.files
     assert len(walk.files) <= MOST_PYTHON, walk.files
     assert max(walk.revisited.values()) <= MOST_VISITS, walk.revisited
 
 
 def test_a_step_of_two_ranks_goes_back_and_forth_little():
     walk = walk_of_ranks(2)
-    assert "blitzgs/distributed/transport/collective.py" in walk.files
+    assert "blitzgs/frame/transport/collective.py" in walk.files
     assert len(walk.stops) <= MOST_STOPS_OF_RANKS, walk.stops
     assert len(walk.files) <= MOST_PYTHON_OF_RANKS, walk.files
     assert max(walk.revisited.values()) <= MOST_VISITS, walk.revisited

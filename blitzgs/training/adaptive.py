@@ -24,10 +24,10 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
+from blitzgs.config.fields import ScheduleConfig
+from blitzgs.config.pace import Pace
+from blitzgs.config.schedule import PLACED, latest_times
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.training.config import ScheduleConfig
-from blitzgs.training.pace import Pace
-from blitzgs.training.schedule import PLACED, latest_times
 
 # Number of events over which demand is averaged.
 EVENTS = 3

@@ -7,8 +7,8 @@ import pytest
 import torch
 from cuda_scenes import Scene, ops
 
-from blitzgs.distributed.transport import Traffic
-from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, PeerBuffers
+from blitzgs.frame.transport import Traffic
+from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, PeerBuffers
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.host import HostCopy, PinnedNumbers
 from blitzgs.ops.projection_types import VIEW_TOTALS, splats_of

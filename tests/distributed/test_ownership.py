@@ -7,8 +7,8 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.distributed.ownership import TILE_COST, TileOwners, cost_balance
-from blitzgs.distributed.tiles import LOSS_HALO, TileRanges
+from blitzgs.frame.ownership import TILE_COST, TileOwners, cost_balance
+from blitzgs.frame.tiles import LOSS_HALO, TileRanges
 
 
 class FirstRank(Ranks):

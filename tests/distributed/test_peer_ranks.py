@@ -12,18 +12,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import Shared
-from blitzgs.distributed.tiles import LOSS_HALO, TileAssignment, TileRanges
-from blitzgs.distributed.transport import PeerTransport, peer
-from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, room_for
-from blitzgs.distributed.transport.way_back import PeerWayBack
-from blitzgs.model import GaussianTable
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.survey import survey
+from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
+from blitzgs.frame.transport import PeerTransport, peer
+from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, room_for
+from blitzgs.frame.transport.way_back import PeerWayBack
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
 from blitzgs.ops.projection_types import VIEW_TOTALS
 from blitzgs.ops.scatter import gather_splats, scatter_splats, words_of
-from blitzgs.survey import survey
+from blitzgs.table.table import GaussianTable
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
 from tests.distributed.transports import IdleEvent, rasterize_into
 from tests.helpers import sum_of_ranks

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs import pipeline
+from blitzgs.config.fields import LossConfig
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.distributed.pixels import collect_images
-from blitzgs.distributed.tiles import LOSS_HALO, TileAssignment, TileRanges
-from blitzgs.distributed.transport import open_transport
-from blitzgs.model import GaussianTable
-from blitzgs.pipeline import RenderOptions, Views
-from blitzgs.training.batches import Batch
-from blitzgs.training.config import LossConfig
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.pixels import collect_images
+from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
+from blitzgs.frame.transport import open_transport
+from blitzgs.table.table import GaussianTable
+from blitzgs.training.batch import Batch
 from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term, size_term
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.helpers import parameter_gradients, sum_parts

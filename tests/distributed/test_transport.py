@@ -6,19 +6,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.tiles import LOSS_HALO, TileAssignment, TileRanges
-from blitzgs.distributed.transport import (
-    CollectiveTransport,
-    LocalTransport,
-    PeerTransport,
-    open_transport,
-    peer,
-)
-from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT
-from blitzgs.distributed.transport.protocol import Traffic
-from blitzgs.distributed.transport.way_back import CollectiveWayBack
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
+from blitzgs.frame.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport, peer
+from blitzgs.frame.transport.peer import WORDS_PER_SPLAT
+from blitzgs.frame.transport.protocol import Traffic
+from blitzgs.frame.transport.way_back import CollectiveWayBack
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project_splats

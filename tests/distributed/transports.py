@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.shared_memory import Shared
-from blitzgs.distributed.tiles import TileAssignment
-from blitzgs.distributed.transport.protocol import Exchange, ExchangeResult, Mark, Transport, unmarked
+from blitzgs.frame.tiles import TileAssignment
+from blitzgs.frame.transport.protocol import Exchange, ExchangeResult, Mark, Transport, unmarked
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.projection_types import ProjectionInputs
 

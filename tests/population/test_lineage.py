@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.population.candidates import FEATURES, spawn_features
 from blitzgs.population.density import DensityRules, densify
-from blitzgs.population.lineage import (
+from blitzgs.population.redistribution import redistribute
+from blitzgs.spawn.candidates import FEATURES, spawn_features
+from blitzgs.spawn.lineage import (
     Births,
     Cause,
     Ledger,
@@ -20,8 +21,7 @@ from blitzgs.population.lineage import (
     LineageError,
     initial_births,
 )
-from blitzgs.population.lineage_parts import read_lineage
-from blitzgs.population.redistribution import redistribute
+from blitzgs.spawn.lineage_parts import read_lineage
 from tests.distributed.rank_harness import run_ranks
 from tests.population.test_density import random_table
 

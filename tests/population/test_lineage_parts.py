@@ -11,11 +11,11 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.population import lineage_parts
-from blitzgs.population.candidates import FEATURES
 from blitzgs.population.density import densify
-from blitzgs.population.lineage import Births, Cause, Ledger, Lineage
-from blitzgs.population.lineage_parts import PART_NAME, read_lineage
+from blitzgs.spawn import lineage_parts
+from blitzgs.spawn.candidates import FEATURES
+from blitzgs.spawn.lineage import Births, Cause, Ledger, Lineage
+from blitzgs.spawn.lineage_parts import PART_NAME, read_lineage
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import needs_cuda
 from tests.population.test_density import random_table

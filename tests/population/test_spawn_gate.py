@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.population.candidates import FEATURES, Candidates
-from blitzgs.population.gate_fit import Spawns, auc, best_feature, fit, judge
 from blitzgs.population.pruning import sample_by_score
-from blitzgs.population.spawn_gate import (
+from blitzgs.spawn.candidates import FEATURES, Candidates
+from blitzgs.spawn.fit import Spawns, auc, best_feature, fit, judge
+from blitzgs.spawn.gate import (
     GateError,
     RandomVeto,
     RankVeto,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pycolmap
 
-from blitzgs.scene import colmap
+from blitzgs.capture import colmap
 
 ROOT = Path(__file__).resolve().parents[2]
 

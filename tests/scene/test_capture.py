@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from blitzgs.scene import colmap
-from blitzgs.scene.cameras import camera_centres
-from blitzgs.scene.capture import load_capture
-from blitzgs.scene.files import find_mask
-from blitzgs.scene.image_files import ImageHeader, apply_orientation, read_header
-from blitzgs.scene.images import ImageStore
+from blitzgs.capture import colmap
+from blitzgs.capture.cameras import camera_centres
+from blitzgs.capture.capture import load_capture
+from blitzgs.capture.files import find_mask
+from blitzgs.capture.image_files import ImageHeader, apply_orientation, read_header
+from blitzgs.capture.images import ImageStore
 from tests.scene.helpers import edit_model, shared_data, smooth_image, write_capture, write_image
 
 pytestmark = [

@@ -3,8 +3,8 @@ import numpy as np
 import pycolmap
 import pytest
 
+from blitzgs.capture import colmap
 from blitzgs.formats.native import native_io
-from blitzgs.scene import colmap
 from tests.scene.helpers import reconstruction, shared_data
 
 NAMES = ["a.jpg", "sub/b c.png", "ü.jpg"]

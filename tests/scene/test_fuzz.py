@@ -15,10 +15,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from blitzgs.capture.image_files import decode_rgb, read_header, read_whole
+from blitzgs.capture.transforms import read_transforms
 from blitzgs.formats.native import native_io
 from blitzgs.formats.ply import read_ply
-from blitzgs.scene.image_files import decode_rgb, read_header, read_whole
-from blitzgs.scene.transforms import read_transforms
 from tests.formats.test_ply import gaussians, inria_file
 from tests.scene.helpers import ROOT, reconstruction, smooth_image, write_image
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs.scene.capture import load_capture
-from blitzgs.scene.image_files import decode_rgb, read_whole
-from blitzgs.scene.images import BoundedCache, ImageStore
+from blitzgs.capture.capture import load_capture
+from blitzgs.capture.image_files import decode_rgb, read_whole
+from blitzgs.capture.images import BoundedCache, ImageStore
 from tests.scene.helpers import smooth_image, write_capture, write_image
 
 pytestmark = pytest.mark.filterwarnings("ignore:all training cameras are in one place")

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from blitzgs.scene.capture import MissingImagesError, load_capture
-from blitzgs.scene.images import ImageStore
-from blitzgs.scene.transforms import read_transforms
+from blitzgs.capture.capture import MissingImagesError, load_capture
+from blitzgs.capture.images import ImageStore
+from blitzgs.capture.transforms import read_transforms
 from tests.scene.helpers import edit_model, smooth_image, write_capture, write_image
 
 pytestmark = [

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs.scene.pictures import comparison, error_map, save_image, strip, to_uint8
+from blitzgs.capture.pictures import comparison, error_map, save_image, strip, to_uint8
 
 
 def test_saved_pictures_are_rgb_rounded_and_clamped(tmp_path):

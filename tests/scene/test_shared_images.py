@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs.scene.capture import load_capture
-from blitzgs.scene.images import ImageStore, decoded_shapes
-from blitzgs.scene.shared_images import SharedImages, size_of
+from blitzgs.capture.capture import load_capture
+from blitzgs.capture.images import ImageStore, decoded_shapes
+from blitzgs.capture.shared_images import SharedImages, size_of
 from blitzgs.training import inputs
 from tests.distributed.rank_harness import run_ranks
 from tests.scene.helpers import write_capture

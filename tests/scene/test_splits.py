@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from blitzgs.scene.splits import split_views
+from blitzgs.capture.splits import split_views
 
 NAMES = ["a/1.jpg", "a/2.jpg", "b/1.jpg", "b/3.jpg"]
 ROOT = Path("/capture")

@@ -16,9 +16,9 @@ import pytest
 
 pytest.importorskip("embreex")
 
-from blitzgs.scene.colmap import quats_to_rotations, read_model
-from blitzgs.scene.synth import PRESETS, add_arguments, generate_city, run
-from blitzgs.scene.synth.processes import each
+from blitzgs.capture.colmap import quats_to_rotations, read_model
+from blitzgs_synth import PRESETS, add_arguments, generate_city, run
+from blitzgs_synth.processes import each
 
 SMALL = {"extent": 100.0, "views": 9, "width": 192, "height": 128, "points_per_view": 150}
 
@@ -168,7 +168,7 @@ def test_a_killed_generation_continues_and_redoes_torn_photographs(city, tmp_pat
     """The system kills a generation; a picture of it is torn, and a record is lost."""
     out = tmp_path / "city"
     script = (
-        "import os, sys, signal\nfrom blitzgs.scene.synth import generate_city\n"
+        "import os, sys, signal\nfrom blitzgs_synth import generate_city\n"
         "stop = lambda done, total: done == 5 and os.kill(os.getpid(), signal.SIGKILL)\n"
         f"generate_city(sys.argv[1], **{SMALL!r}, processes=2, progress=stop)\n"
     )

@@ -6,13 +6,13 @@ import pytest
 
 pytest.importorskip("embreex")
 
-from blitzgs.scene.synth.city import tower_height
-from blitzgs.scene.synth.flight import flight_height, plan_flight
-from blitzgs.scene.synth.noise import Noise, cell_random, inside, stripes
-from blitzgs.scene.synth.options import PRESETS, CityOptions
-from blitzgs.scene.synth.plan import Plan
-from blitzgs.scene.synth.raycast import RayCaster
-from blitzgs.scene.synth.tracks import ball, may_see
+from blitzgs_synth.city import tower_height
+from blitzgs_synth.flight import flight_height, plan_flight
+from blitzgs_synth.noise import Noise, cell_random, inside, stripes
+from blitzgs_synth.options import PRESETS, CityOptions
+from blitzgs_synth.plan import Plan
+from blitzgs_synth.raycast import RayCaster
+from blitzgs_synth.tracks import ball, may_see
 
 
 def test_stripes_and_intervals_are_box_filtered():

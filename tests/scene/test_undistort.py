@@ -6,9 +6,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from blitzgs.scene.cameras import scaled_matrix
-from blitzgs.scene.lens import Lens
-from blitzgs.scene.undistort import rectify
+from blitzgs.capture.cameras import scaled_matrix
+from blitzgs.capture.lens import Lens
+from blitzgs.capture.undistort import rectify
 
 DISTORTED = {
     "SIMPLE_RADIAL": [500, 320, 240, -0.12],

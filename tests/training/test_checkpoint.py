@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import load_file
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import checkpoint
+from blitzgs.runs import checkpoint
 from tests.distributed.rank_harness import CONTEXT, RankError, run_ranks
 
 ALONE = Ranks()

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from blitzgs.training.config import Config
-from blitzgs.training.config_io import ConfigError, config_hash, from_dict, load_config, save_config, to_dict
-from blitzgs.training.config_ranges import CHOICES, RANGES, flat_fields, problems
-from blitzgs.training.schedule import Schedule
+from blitzgs.config.fields import Config
+from blitzgs.config.files import ConfigError, config_hash, from_dict, load_config, save_config, to_dict
+from blitzgs.config.ranges import CHOICES, RANGES, flat_fields, problems
+from blitzgs.config.schedule import Schedule
 
 FOLDER = Path(__file__).parents[2] / "configs"
 CONFIGS, AERIAL = sorted(FOLDER.glob("*.yaml")), FOLDER / "aerial.yaml"

@@ -5,7 +5,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from blitzgs.training.evaluation import correct_colours, image_metrics, load_lpips
+from blitzgs.runs.evaluation import correct_colours, image_metrics, load_lpips
 
 
 def plain_ssim(x, y):

@@ -9,7 +9,7 @@ import pytest
 
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
-from blitzgs.training.folder_checks import FolderError, check_room, check_writable, locked
+from blitzgs.runs.folder_checks import FolderError, check_room, check_writable, locked
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import RankError, run_ranks
 from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
@@ -73,14 +73,14 @@ def test_a_capture_that_cannot_be_read_leaves_no_folder(tmp_path):
 
 
 def test_one_run_at_a_time(tmp_path, monkeypatch, capsys):
-    from blitzgs.training import folder_checks
+    from blitzgs.runs import folder_checks
 
     monkeypatch.setattr(folder_checks, "LOCK_SECONDS", 0.1)
     write_tiny_capture(tmp_path / "data")
     out = tmp_path / "run"
     program = (
         "import sys, time; from pathlib import Path; from blitzgs.distributed.group import Ranks;"
-        "from blitzgs.training.folder_checks import locked\n"
+        "from blitzgs.runs.folder_checks import locked\n"
         f"with locked(Path({str(out)!r}), Ranks()):\n  print('in', flush=True); time.sleep(60)"
     )
     holder = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, cwd=ROOT)

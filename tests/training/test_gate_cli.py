@@ -9,11 +9,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from blitzgs.capture.colmap import read_model, write_model
 from blitzgs.cli import main
-from blitzgs.population.gate_evaluation import correlation, region_rates, survival_by_cohort
-from blitzgs.population.gate_fit import read_spawns
-from blitzgs.population.spawn_samples import read_sample
-from blitzgs.scene.colmap import read_model, write_model
+from blitzgs.spawn.evaluation import correlation, region_rates, survival_by_cohort
+from blitzgs.spawn.fit import read_spawns
+from blitzgs.spawn.samples import read_sample
 from tests.population.test_spawn_gate import spawns
 from tests.training.conftest import LINEAGE
 from tests.training.tiny import OVERRIDES

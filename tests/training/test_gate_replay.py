@@ -13,14 +13,14 @@ import pytest
 import torch
 
 from blitzgs.cli import main
+from blitzgs.config.files import load_config, save_config
 from blitzgs.distributed.group import Ranks
-from blitzgs.population.candidates import Candidates
-from blitzgs.population.gate_fit import read_spawns
-from blitzgs.population.spawn_gate import SpawnGate, gate_file
-from blitzgs.training import folder_checks
-from blitzgs.training.config_io import load_config, save_config
-from blitzgs.training.gate_replay import OracleVeto, branch_point, event_keys, label_events, replay
+from blitzgs.runs import folder_checks
+from blitzgs.spawn.candidates import Candidates
+from blitzgs.spawn.fit import read_spawns
+from blitzgs.spawn.gate import SpawnGate, gate_file
 from blitzgs.training.inputs import open_capture
+from blitzgs.training.replay import OracleVeto, branch_point, event_keys, label_events, replay
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.population.test_spawn_gate import candidates

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training.guard import LossGuard, NonFiniteError
+from blitzgs.runs.guard import LossGuard, NonFiniteError
 from blitzgs.training.trainer import Trainer
 from tests.training.tiny import tiny_config, tiny_scene
 

@@ -9,11 +9,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from blitzgs.training.config import OptimiserConfig, ScheduleConfig
-from blitzgs.training.config_io import ConfigError, from_dict, load_config, save_config, to_dict
-from blitzgs.training.optimiser import TableAdam
-from blitzgs.training.pace import Pace
-from blitzgs.training.schedule import Schedule
+from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
+from blitzgs.config.files import ConfigError, from_dict, load_config, save_config, to_dict
+from blitzgs.config.pace import Pace
+from blitzgs.config.schedule import Schedule
+from blitzgs.optim.table_adam import TableAdam
 from tests.training.tiny import random_gaussians
 
 CHANGES = ((40, 0.5), (120, 2.5), (128, 0.01), (131, 3.0))

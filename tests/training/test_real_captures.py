@@ -22,8 +22,8 @@ from typing import Any
 
 import pytest
 
+from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks
-from blitzgs.training.config_io import load_config
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
 from tests.helpers import needs_cuda

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from blitzgs.cli import main
-from blitzgs.training.config_io import ConfigError, load_config, to_dict
-from blitzgs.training.recipes import default_recipe, recipe_names, recipe_path
+from blitzgs.config.files import ConfigError, load_config, to_dict
+from blitzgs.config.recipes import default_recipe, recipe_names, recipe_path
 
 
 def shown(capsys, *flags):

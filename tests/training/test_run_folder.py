@@ -19,8 +19,9 @@ import blitzgs
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
-from blitzgs.training import checkpoint, run_files
-from blitzgs.training.export import export_ply, without_antialiasing
+from blitzgs.runs import checkpoint
+from blitzgs.runs import files as run_files
+from blitzgs.runs.export import export_ply, without_antialiasing
 from blitzgs.training.trainer import Trainer
 from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene
 

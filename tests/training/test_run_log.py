@@ -4,8 +4,8 @@
 import json
 import time
 
-from blitzgs.training import run_log
-from blitzgs.training.run_log import LOG, RunLog
+from blitzgs.runs import log as run_log
+from blitzgs.runs.log import LOG, RunLog
 
 
 def records(folder):

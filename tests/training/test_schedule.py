@@ -4,8 +4,8 @@ import math
 import pytest
 import torch
 
-from blitzgs.training.config import OptimiserConfig, ScheduleConfig
-from blitzgs.training.schedule import Schedule, stretched
+from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
+from blitzgs.config.schedule import Schedule, stretched
 
 
 def all_events(config):

@@ -4,8 +4,8 @@
 import torch
 from torch import Tensor
 
-from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, lazy_adam_step_
+from blitzgs.table.table import PARAMETERS, GaussianTable
 
 
 def _state(table: GaussianTable) -> AdamState:

@@ -4,12 +4,12 @@ import math
 import pytest
 import torch
 
-from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from blitzgs.ops.blocks import cull_blocks, morton_keys
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_
 from blitzgs.ops.project import project
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
-from blitzgs.view.blocks import BlockIndex, morton_order
+from blitzgs.table.blocks import BlockIndex, morton_order
+from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from tests.helpers import DEVICES
 from tests.view.pending import caught_up, schedule_of, step_some
 

@@ -8,20 +8,20 @@ from itertools import pairwise
 import pytest
 import torch
 
-from blitzgs import pipeline
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.distributed.tiles import TileAssignment
-from blitzgs.model import CULL, GaussianTable
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.tiles import TileAssignment
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.view_gate import gate_views_
-from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.importance import ViewBatch, is_culled, sweep
-from blitzgs.training.batches import Batch
-from blitzgs.training.optimiser import TableAdam
-from blitzgs.training.schedule import Schedule
+from blitzgs.table.blocks import BlockIndex
+from blitzgs.table.table import CULL, GaussianTable
+from blitzgs.training.batch import Batch
 from blitzgs.training.step import Stepper
-from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.gate import SAMPLE, LodGate, SceneGate, ViewGate, centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.helpers import DEVICES

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import BLOCK_ROWS
 from blitzgs.ops.residence import seen_blocks
-from blitzgs.view import host_table
-from blitzgs.view.block_visibility import BlockVisibility, Cameras, culled_blocks
-from blitzgs.view.blocks import BlockIndex
-from blitzgs.view.host_table import HostMemoryError, HostTable
-from blitzgs.view.residence import Moved, Residence, ResidenceError
+from blitzgs.table import host_table
+from blitzgs.table.block_visibility import BlockVisibility, Cameras, culled_blocks
+from blitzgs.table.blocks import BlockIndex
+from blitzgs.table.host_table import HostMemoryError, HostTable
+from blitzgs.table.pool import Moved, Residence, ResidenceError
+from blitzgs.table.table import GaussianTable
 from tests.helpers import DEVICES
 from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
 

@@ -2,12 +2,12 @@
 import pytest
 import torch
 
-from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import GaussianTable
-from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import LodGate, SceneGate
-from blitzgs.view.visible_scene import VisibleFinder
+from blitzgs.view.visible import VisibleFinder
 from tests.helpers import DEVICES
 from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
 
