@@ -22,7 +22,7 @@
 // block without reading its rows.
 //
 // The test is conservative: every row that the projection would project is in the set
-// (tests/view/test_blocks.py). The cost is O(N / 256 + rows of mixed blocks + active rows) per view, the
+// (tests/table/test_blocks.py). The cost is O(N / 256 + rows of mixed blocks + active rows) per view, the
 // memory O(rows of the blocks that some view may see). The caller gives the capacity in blocks. If more
 // blocks are active, the lists are empty and n_blocks says how large the capacity has to be.
 #pragma once

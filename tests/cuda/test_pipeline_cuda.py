@@ -5,7 +5,6 @@ import dataclasses
 
 import pytest
 import torch
-from cuda_scenes import ops, relative_error
 
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.transport import LocalTransport
@@ -13,7 +12,8 @@ from blitzgs.ops.capacity import CapacityEstimate, Sizes
 from blitzgs.ops.splat_gradients import gradient_columns
 from blitzgs.table.blocks import BlockIndex, morton_order
 from blitzgs.table.table import GaussianTable
-from tests.distributed.test_sharded_rendering import OPTIONS, cameras
+from tests.cuda.scenes import ops, relative_error
+from tests.frame.test_sharded_rendering import OPTIONS, cameras
 from tests.helpers import parameter_gradients
 from tests.training.tiny import random_gaussians
 

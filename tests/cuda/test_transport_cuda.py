@@ -5,7 +5,6 @@ import weakref
 
 import pytest
 import torch
-from cuda_scenes import Scene, ops
 
 from blitzgs.frame.transport import Traffic
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, PeerBuffers
@@ -14,6 +13,7 @@ from blitzgs.ops.host import HostCopy, PinnedNumbers
 from blitzgs.ops.projection_types import VIEW_TOTALS, splats_of
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SplatGradients
+from tests.cuda.scenes import Scene, ops
 from tests.helpers import sum_of_ranks
 
 VIEWS, WIDTH, HEIGHT = 2, 150, 100

@@ -23,7 +23,7 @@ from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.table.table import GaussianTable
 from tests.distributed.rank_harness import RankError, on_cuda, run_ranks
-from tests.distributed.test_sharded_rendering import OPTIONS, cameras
+from tests.frame.test_sharded_rendering import OPTIONS, cameras
 from tests.helpers import parameter_gradients, sum_of_ranks
 from tests.training.tiny import random_gaussians
 

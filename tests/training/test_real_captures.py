@@ -26,8 +26,8 @@ from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
+from tests.capture.helpers import ROOT, shared_data
 from tests.helpers import needs_cuda
-from tests.scene.helpers import ROOT, shared_data
 
 CENTRES = Path(__file__).with_name("real_captures.json")
 BAND = {"psnr": 0.15, "ssim": 0.003}

@@ -15,7 +15,7 @@ from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
 from blitzgs.reference.render import render as reference_render
 from blitzgs.view.gate import LodGate, SceneGate, centres_of
 from tests.helpers import DEVICES
-from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_views
+from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_views
 from tests.view.test_gate import GATE, OPTIONS, make_scene
 
 SMOOTH = replace(GATE, smooth=True)

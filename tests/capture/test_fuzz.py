@@ -19,8 +19,8 @@ from blitzgs.capture.image_files import decode_rgb, read_header, read_whole
 from blitzgs.capture.transforms import read_transforms
 from blitzgs.formats.native import native_io
 from blitzgs.formats.ply import read_ply
+from tests.capture.helpers import ROOT, reconstruction, smooth_image, write_image
 from tests.formats.test_ply import gaussians, inria_file
-from tests.scene.helpers import ROOT, reconstruction, smooth_image, write_image
 
 SETTINGS = settings(max_examples=150, deadline=None, derandomize=True)
 
@@ -78,7 +78,7 @@ BLOCKS = 128
 
 def in_fresh_process(function, path: Path):
     """Call a function of this file on a path in a process of its own, which has no freed memory."""
-    program = f"from tests.scene import test_fuzz; test_fuzz.{function.__name__}({str(path)!r})"
+    program = f"from tests.capture import test_fuzz; test_fuzz.{function.__name__}({str(path)!r})"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

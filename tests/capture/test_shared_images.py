@@ -14,8 +14,8 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.capture.images import ImageStore, decoded_shapes
 from blitzgs.capture.shared_images import SharedImages, size_of
 from blitzgs.training import inputs
+from tests.capture.helpers import write_capture
 from tests.distributed.rank_harness import run_ranks
-from tests.scene.helpers import write_capture
 from tests.training.tiny import tiny_config
 
 pytestmark = pytest.mark.filterwarnings("ignore:all training cameras are in one place")

@@ -22,9 +22,9 @@ from blitzgs.spawn.gate import SpawnGate, gate_file
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.replay import OracleVeto, branch_point, event_keys, label_events, replay
 from blitzgs.training.trainer import Trainer
+from tests.conftest import LINEAGE
 from tests.distributed.rank_harness import run_ranks
-from tests.population.test_spawn_gate import candidates
-from tests.training.conftest import LINEAGE
+from tests.spawn.test_spawn_gate import candidates
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, tiny_config
 from tests.training.tiny_runs import at_step, events_of
 

@@ -17,7 +17,7 @@ from blitzgs.table.host_table import HostMemoryError, HostTable
 from blitzgs.table.pool import Moved, Residence, ResidenceError
 from blitzgs.table.table import GaussianTable
 from tests.helpers import DEVICES
-from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
+from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
 
 LIMITS = (NEAR, FAR, 0.3)
 BLOCK_BYTES = BLOCK_ROWS * (3 * 14 * 4 + 2 * 4 + 2 * 8 + 4 + 1 + 3 * 4)

@@ -9,8 +9,8 @@ import torch
 
 import blitzgs
 from blitzgs.optim import LazyAdam, step_together
+from tests.call.test_raw_rasterization import NAMES, activated, raw, raw_parameters
 from tests.helpers import random_scene, rasterize_scene, relative_error
-from tests.test_raw_rasterization import NAMES, activated, raw, raw_parameters
 
 gsplat = pytest.importorskip("gsplat", reason="needs gsplat, which pip installs without CUDA too")
 

@@ -14,8 +14,8 @@ from blitzgs.cli import main
 from blitzgs.spawn.evaluation import correlation, region_rates, survival_by_cohort
 from blitzgs.spawn.fit import read_spawns
 from blitzgs.spawn.samples import read_sample
-from tests.population.test_spawn_gate import spawns
-from tests.training.conftest import LINEAGE
+from tests.conftest import LINEAGE
+from tests.spawn.test_spawn_gate import spawns
 from tests.training.tiny import OVERRIDES
 from tests.training.tiny_runs import events_of
 

@@ -20,8 +20,8 @@ from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
 from blitzgs.ops.scatter import scatter_splats
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.distributed.rank_harness import run_ranks
-from tests.distributed.test_sharded_rendering import OPTIONS, cameras
-from tests.distributed.transports import IdleEvent, LoneMemory, RecordingTransport, rasterize_into
+from tests.frame.test_sharded_rendering import OPTIONS, cameras
+from tests.frame.transports import IdleEvent, LoneMemory, RecordingTransport, rasterize_into
 from tests.helpers import parameter_gradients, sum_of_ranks
 from tests.training.tiny import random_gaussians
 

@@ -9,7 +9,7 @@ from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import LodGate, SceneGate
 from blitzgs.view.visible import VisibleFinder
 from tests.helpers import DEVICES
-from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
+from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
 
 LIMITS = (NEAR, FAR, 0.3)
 OPTIONS = RenderOptions(sh_degree=0, near_plane=NEAR, far_plane=FAR)

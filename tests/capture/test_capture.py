@@ -13,7 +13,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.capture.files import find_mask
 from blitzgs.capture.image_files import ImageHeader, apply_orientation, read_header
 from blitzgs.capture.images import ImageStore
-from tests.scene.helpers import edit_model, shared_data, smooth_image, write_capture, write_image
+from tests.capture.helpers import edit_model, shared_data, smooth_image, write_capture, write_image
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:all training cameras are in one place"),

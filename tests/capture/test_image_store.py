@@ -14,7 +14,7 @@ import torch
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.image_files import decode_rgb, read_whole
 from blitzgs.capture.images import BoundedCache, ImageStore
-from tests.scene.helpers import smooth_image, write_capture, write_image
+from tests.capture.helpers import smooth_image, write_capture, write_image
 
 pytestmark = pytest.mark.filterwarnings("ignore:all training cameras are in one place")
 NAMES = [f"v{i:02d}.jpg" for i in range(12)]

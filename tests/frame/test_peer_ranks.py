@@ -24,8 +24,8 @@ from blitzgs.ops.capacity import CapacityEstimate, Sizes
 from blitzgs.ops.projection_types import VIEW_TOTALS
 from blitzgs.ops.scatter import gather_splats, scatter_splats, words_of
 from blitzgs.table.table import GaussianTable
-from tests.distributed.test_sharded_rendering import OPTIONS, cameras
-from tests.distributed.transports import IdleEvent, rasterize_into
+from tests.frame.test_sharded_rendering import OPTIONS, cameras
+from tests.frame.transports import IdleEvent, rasterize_into
 from tests.helpers import sum_of_ranks
 from tests.training.tiny import random_gaussians
 

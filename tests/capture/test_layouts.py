@@ -12,7 +12,7 @@ import pytest
 from blitzgs.capture.capture import MissingImagesError, load_capture
 from blitzgs.capture.images import ImageStore
 from blitzgs.capture.transforms import read_transforms
-from tests.scene.helpers import edit_model, smooth_image, write_capture, write_image
+from tests.capture.helpers import edit_model, smooth_image, write_capture, write_image
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:overflow encountered"),

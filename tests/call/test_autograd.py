@@ -11,8 +11,8 @@ import torch.utils.checkpoint
 from blitzgs.call.arguments import _warn_of_intrinsics
 from blitzgs.ops.photometric import photometric_loss
 from blitzgs.reference.gaussians import covariance_factors
+from tests.call.test_raw_rasterization import raw, raw_parameters
 from tests.helpers import DEVICES, PARAMETERS, random_scene, rasterize_scene, relative_error
-from tests.test_raw_rasterization import raw, raw_parameters
 
 
 def render_raw(scene):

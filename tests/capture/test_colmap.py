@@ -5,7 +5,7 @@ import pytest
 
 from blitzgs.capture import colmap
 from blitzgs.formats.native import native_io
-from tests.scene.helpers import reconstruction, shared_data
+from tests.capture.helpers import reconstruction, shared_data
 
 NAMES = ["a.jpg", "sub/b c.png", "ü.jpg"]
 

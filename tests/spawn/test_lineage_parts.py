@@ -19,7 +19,7 @@ from blitzgs.spawn.lineage_parts import PART_NAME, read_lineage
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import needs_cuda
 from tests.population.test_density import random_table
-from tests.population.test_lineage import RULES, shaken, some
+from tests.spawn.test_lineage import RULES, shaken, some
 
 parquet = pytest.importorskip("pyarrow.parquet")
 # Ops that only make another view of a tensor.
