@@ -89,8 +89,12 @@ class LazyAdam(torch.optim.Optimizer):
             eps: added to the root of the second moment.
             foreach: accepted and not needed: it selects how `torch.optim.Adam` computes, never the result.
             fused: accepted and not needed, as `foreach`: a step is always a fused kernel.
-            weight_decay, amsgrad, maximize, capturable, differentiable, decoupled_weight_decay: of
-                `torch.optim.Adam`; only its defaults are supported.
+            weight_decay: only 0 is supported, as `torch.optim.Adam` has it by default.
+            amsgrad: only False.
+            maximize: only False.
+            capturable: only False.
+            differentiable: only False.
+            decoupled_weight_decay: accepted, without effect if there is no weight decay.
 
         Raises:
             ValueError: an option is outside its range, or not supported.

@@ -59,7 +59,7 @@ def check_rows(param: Tensor, state: Mapping[str, Any]) -> None:
         if name != "step" and value.shape[0] != param.shape[0]:
             raise ValueError(
                 f"LazyAdam: a parameter has {len(param)} rows and its {name} {len(value)}; change both "
-                "together (append, keep, permute); after catch_up(moments=True) there are only Adam's own entries"
+                "together (append, keep, permute), or call catch_up(moments=True) before"
             )
 
 

@@ -281,7 +281,7 @@ def test_final_rules_replace_many_pending_steps(gap, dtype):
         end = begin + reach + gap
         state.catch_up(None, schedule, end)
         torch.ops.blitzgs.lazy_adam_catch_up_(
-            alone.tensors(), schedule.tables[:2], schedule.steps(end), schedule.decays, None
+            alone.tensors(), schedule.tables[:2], *schedule.constants(end), None
         )
         for with_rules, without in zip(state.params, alone.params, strict=True):
             assert torch.equal(with_rules, without)
@@ -295,7 +295,7 @@ def test_a_schedule_makes_its_tables_once(steps, dtype):
     assert [len(table) for table in schedule.tables] == [steps + 1, steps + 1, max(0, steps + 1 - reach)]
     assert schedule.tables[0] is schedule.table and schedule.tables[1] is schedule.lr_table
     assert schedule.tables[2].shape[1] == 28 * dtype.itemsize
-    assert schedule.steps(7) == [7, reach, 0]
+    assert schedule.constants(7) == (7, reach, False, BETA1, BETA2, EPS)
 
 
 def test_a_schedule_of_another_dtype_is_refused():
@@ -384,20 +384,20 @@ def test_errors_name_the_value():
 
 def test_opcheck():
     state, schedule = one_update(5, torch.float32)
-    tables, reach = schedule.tables, schedule.steps(0)[1]
+    tables, reach = schedule.tables, schedule.explicit_steps
     grads = [torch.randn(s) for s in shapes(2)]
     ids = torch.tensor([1, 3], dtype=torch.int32)
-    columns, decays = state.tensors(), [BETA1, BETA2, EPS]
+    columns = state.tensors()
     torch.library.opcheck(
-        torch.ops.blitzgs.lazy_adam_step_, (columns, tables, [2, reach, 0], decays, grads, ids)
+        torch.ops.blitzgs.lazy_adam_step_, (columns, tables, *schedule.constants(2), grads, ids)
     )
     torch.library.opcheck(
-        torch.ops.blitzgs.lazy_adam_catch_up_, (columns, tables, [9, reach, 0], decays, ids)
+        torch.ops.blitzgs.lazy_adam_catch_up_, (columns, tables, *schedule.constants(9), ids)
     )
     torch.library.opcheck(torch.ops.blitzgs.lazy_adam_final_rules, (tables[0], state.params[0], reach, EPS))
     bad = [*tables[:2], tables[2][1:]]
     with pytest.raises(RuntimeError, match=r"final_rules must have shape"):
-        torch.ops.blitzgs.lazy_adam_catch_up_(columns, bad, [9, reach, 0], decays, ids)
+        torch.ops.blitzgs.lazy_adam_catch_up_(columns, bad, *schedule.constants(9), ids)
 
 
 @pytest.mark.cuda

@@ -314,7 +314,7 @@ def test_opcheck():
     state, schedule = scene.state(), scene.schedule()
     torch.library.opcheck(
         torch.ops.blitzgs.project_bwd_step_,
-        (state.tensors, schedule.tables[:2], schedule.steps(STEP), schedule.decays, list(scene.views()),
+        (state.tensors, schedule.tables[:2], *schedule.constants(STEP), list(scene.views()),
          scene.splat_ids(), scene.options.ints, scene.options.floats, list(scene.v.parts)),
     )  # fmt: skip
     torch.library.opcheck(torch.ops.blitzgs.project_bwd, scene.backward_arguments(True))
