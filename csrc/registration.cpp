@@ -61,8 +61,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "color_rows_(Tensor[] tables, Tensor[] sh, Tensor[] cameras, Tensor[] splats, Tensor(a!)[] shown, "
       "int[] ints, float[] floats, Tensor? totals=None) -> Tensor[] rows");
-  // views: cameras and, of each view, weights of the Gaussians' smallest axes, opacities and mean axes:
-  // (viewmats, Ks[, scale_reg[, opacity_reg[, size_reg]]]). v_splats: (v_means2d, v_conics, v_opacities[,
+  // views: cameras and, of each view, weights of the Gaussians' smallest axes and opacities:
+  // (viewmats, Ks[, scale_reg[, opacity_reg]]). v_splats: (v_means2d, v_conics, v_opacities[,
   // v_colors]) or, on CUDA, one table of splat gradients.
   m.def(
       "project_bwd(Tensor[] gaussians, Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, "
@@ -74,9 +74,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Groups of the optimiser, as blitzgs/ops/lazy_adam.py names them: state (params, exp_avgs, exp_avg_sqs,
   // last_step, moment_step); tables (table, lr_table[, final_rules]).
   m.def(
-      "project_bwd_step_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, bool sparse, "
-      "float beta1, float beta2, float eps, Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, Tensor[] v_splats, "
-      "Tensor? level=None, Tensor(b!)? means2d_sums=None, bool absolute_sums=False) -> ()");
+      "project_bwd_step_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
+      "float beta2, float eps, Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, "
+      "Tensor[] v_splats, Tensor? level=None, Tensor(b!)? means2d_sums=None) -> ()");
   // The offsets of mean2d, conic, opacity, color and mean2d_abs in the floats of a splat gradient, then the
   // number of these floats.
   m.def("splat_gradient_layout() -> int[]");
@@ -193,11 +193,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // The optimiser: dense Adam over a list of rows, with the arguments of project_bwd_step_; and the
   // statistics of density control. current: the parameters of all rows are at the step before.
   m.def(
-      "lazy_adam_step_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, bool sparse, "
-      "float beta1, float beta2, float eps, Tensor[] grads, Tensor ids, bool current=False) -> ()");
+      "lazy_adam_step_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
+      "float beta2, float eps, Tensor[] grads, Tensor ids, bool current=False) -> ()");
   m.def(
-      "lazy_adam_catch_up_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, bool sparse, "
-      "float beta1, float beta2, float eps, Tensor? ids, Tensor? count=None) -> ()");
+      "lazy_adam_catch_up_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
+      "float beta2, float eps, Tensor? ids, Tensor? count=None) -> ()");
   // The rules of the total drift of a row, by the step of its parameters; `like` has the dtype of the
   // parameters.
   m.def("lazy_adam_final_rules(Tensor table, Tensor like, int explicit_steps, float eps) -> Tensor");

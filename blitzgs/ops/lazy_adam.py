@@ -59,20 +59,18 @@ class AdamTables:
     Attributes:
         betas: decay rates of the moments.
         eps: added to the root of the second moment.
-        sparse: plain sparse Adam: moments of unlisted rows keep their values and nothing drifts.
         explicit_steps: number of steps without a gradient for which a row still moves.
         tables: the group `tables` of the ops.
     """
 
     betas: tuple[float, float]
     eps: float
-    sparse: bool
     explicit_steps: int
     tables: list[Tensor]
 
-    def constants(self, step: int) -> tuple[int, int, bool, float, float, float]:
+    def constants(self, step: int) -> tuple[int, int, float, float, float]:
         """Return the arguments of the ops from `step` to `eps` for a row of the tables."""
-        return (step, self.explicit_steps, self.sparse, *self.betas, self.eps)
+        return (step, self.explicit_steps, *self.betas, self.eps)
 
 
 class AdamSchedule(AdamTables):
@@ -95,7 +93,6 @@ class AdamSchedule(AdamTables):
         beta1: float,
         beta2: float,
         eps: float,
-        sparse: bool = False,
         dtype: torch.dtype = torch.float32,
     ) -> None:
         """Make the tables.
@@ -106,13 +103,12 @@ class AdamSchedule(AdamTables):
             beta1: decay of the first moment, 0 <= beta1 < sqrt(beta2).
             beta2: decay of the second moment, in (0, 1).
             eps: as the attribute.
-            sparse: as the attribute.
             dtype: of the parameters.
 
         Raises:
             ValueError: decay rates outside their range.
         """
-        self.betas, self.eps, self.sparse = (beta1, beta2), eps, sparse
+        self.betas, self.eps = (beta1, beta2), eps
         self.lr_table, self.table = lr_table, _make_table(lr_table, beta1, beta2)
         self.explicit_steps = explicit_steps(beta1, beta2, dtype)
         rules = torch.ops.blitzgs.lazy_adam_final_rules(
@@ -145,7 +141,7 @@ class GrowingSchedule(AdamTables):
         Raises:
             ValueError: decay rates outside their range.
         """
-        self.betas, self.eps, self.sparse = betas, eps, False
+        self.betas, self.eps = betas, eps
         self.explicit_steps = explicit_steps(*betas, dtype)
         self.begin = self.last = self.current = begin
         table = table_without_rates(self.LENGTH + 1, *betas, begin)

@@ -19,7 +19,6 @@ inline constexpr std::size_t kAdamState = 3 * kAdamColumns + 2;
 // What the ops that move parameters take beside tensors.
 struct AdamConstants {
   std::int64_t step, explicit_steps;
-  bool sparse;
   double beta1, beta2, eps;
 };
 
@@ -82,7 +81,6 @@ struct AdamTensors {
     args.beta1 = constants.beta1;
     args.beta2 = constants.beta2;
     args.eps = constants.eps;
-    args.sparse = constants.sparse;
     return args;
   }
 

@@ -79,8 +79,6 @@ def _write(state: TrainingState) -> None:
         except OSError as error:
             raise CheckpointError(f"no checkpoint was written, because {error}.") from error
         state.progress = replace(state.progress, ledger=ledger_state(ledger))
-    if state.signals is not None:
-        state.progress = replace(state.progress, signals=state.signals.saved())
     # The division of tiles decides the order of sums, and therefore their last bits.
     shared = state.owners.columns() if state.ranks.world_size > 1 else None
     run_files.save(
