@@ -9,8 +9,9 @@ includes the kernels. On CUDA each pass ends with a synchronisation, so a figure
 device. Each figure is a median over repeats.
 
 The second table has the steps of a trainer made of `raw_rasterization`, `l1_ssim` and a `LazyAdam` for each
-parameter, or one for all, by part, without synchronisations; each figure is a mean over repeats. It also says how many of torch's operations a step takes. To compare with
-another version of the package, put its folder into PYTHONPATH.
+parameter, or one for all, by part, without synchronisations; each figure is a mean over repeats. It also
+says how many of torch's operations a step takes. To compare with another version of the package, put its
+folder into PYTHONPATH.
 """
 
 from __future__ import annotations
