@@ -37,9 +37,9 @@ photograph.
 """
 
 
-def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "eval", run, "measure PSNR and SSIM of a run's held-out views", HELP)
+    parser = add_command(commands, "eval", run, summary, HELP)
     add_run(parser)
     add_capture(parser)
     add_device(parser, shares_gpus=True)

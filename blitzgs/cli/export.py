@@ -31,9 +31,8 @@ of the training views; at other distances it is an approximation.
 """
 
 
-def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    summary = "write the model of a run as a PLY file for viewers"
     parser = add_command(commands, "export", run, summary, HELP)
     add_run(parser)
     add_device(parser)

@@ -53,9 +53,9 @@ With torchrun's --max-restarts=K and --resume, a job that loses a process contin
 """
 
 
-def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "train", run, "train a model of photographs with known cameras", HELP)
+    parser = add_command(commands, "train", run, summary, HELP)
     parser.add_argument(
         "--config",
         metavar="RECIPE",
