@@ -40,7 +40,7 @@ class RunCamera:
     world_to_camera: npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RunCameras:
     """All cameras of a run.
 
@@ -55,6 +55,11 @@ class RunCameras:
     train: list[int]
     test: list[int]
     inputs: list[Path]
+
+    def __repr__(self) -> str:
+        return (
+            f"RunCameras({len(self.cameras):,} cameras: {len(self.train):,} train, {len(self.test):,} test)"
+        )
 
 
 def checked_camera(
@@ -80,8 +85,8 @@ def checked_camera(
     return RunCamera(name, int(width), int(height), intrinsics, pose)
 
 
-def save_cameras(folder: Path, capture: Capture) -> None:
-    """Write the cameras of a capture into the folder of a run."""
+def save_cameras(folder: Path, capture: Capture, run_id: str = "") -> None:
+    """Write the cameras of a capture into the folder of a run; `run_id` tells its checkpoints from others."""
     views = [
         {
             "name": camera.name,
@@ -94,6 +99,7 @@ def save_cameras(folder: Path, capture: Capture) -> None:
     ]
     content = {
         "version": _VERSION,
+        "run": run_id,
         "train": list(capture.train),
         "test": list(capture.test),
         "inputs": [str(path.absolute()) for path in input_files(capture)],

@@ -10,7 +10,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator
-from typing import TextIO
+from typing import Any, TextIO, cast
 
 # Control characters except line feed and tab, and the marks that change the direction of text.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
@@ -92,6 +92,8 @@ def surviving_output() -> Iterator[dict[str, Output]]:
         buffer = getattr(stream, "buffer", None)
         raw = getattr(buffer, "raw", buffer)  # python -u has no buffer
         if type(stream) is not io.TextIOWrapper or not isinstance(raw, io.FileIO):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")
             continue
         with contextlib.suppress(OSError):
             stream.flush()
@@ -107,7 +109,7 @@ def surviving_output() -> Iterator[dict[str, Output]]:
 
 
 def _text(output: Output, stream: io.TextIOWrapper, is_error: bool) -> io.TextIOWrapper:
-    buffer = io.BufferedWriter(_Raw(output, stream.fileno()))
+    buffer = io.BufferedWriter(cast(Any, _Raw(output, stream.fileno())))
     by_line = is_error or stream.line_buffering
     return io.TextIOWrapper(
         buffer,
