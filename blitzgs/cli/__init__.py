@@ -99,7 +99,8 @@ def _run(given: list[str]) -> int:
 def _arguments(parser: Parser, command: Parser | None, chosen: str, given: list[str]) -> argparse.Namespace:
     """Parse the command line; exit with status 2 if it is wrong."""
     at = given.index(chosen) + 1 if command is not None else len(given)
-    own, fields = given[at:], []
+    own = given[at:]
+    fields: list[str] = []
     if command is not None and chosen == "train":
         own, fields = split_fields(command, own)
     args, unknown = parser.parse_known_args([*given[:at], *own])
@@ -125,7 +126,7 @@ def _parser(chosen: str) -> tuple[Parser, Parser | None]:
             import_module(module).add_to(commands, summary)
         else:
             commands.add_parser(name, help=summary)
-    return parser, cast(Parser | None, commands.choices[chosen] if chosen in COMMANDS else None)
+    return parser, commands.choices[chosen] if chosen in COMMANDS else None
 
 
 @contextmanager

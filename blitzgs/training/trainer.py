@@ -62,9 +62,11 @@ class Trainer:
         folder: Path,
         ranks: Ranks,
         resume: bool = False,
+        extend: float | None = None,
     ) -> None:
         """Set up the run; arguments and errors are those of `blitzgs.training.setup.set_up`."""
-        self.state = state = set_up(config, capture, images, folder, ranks, resume)
+        self.state = state = set_up(config, capture, images, folder, ranks, resume, extend)
+        self._saves_first = extend is not None
         self.loader = BatchLoader(
             images,
             state.views,
@@ -107,6 +109,8 @@ class Trainer:
                 agreement = Agreement(state.ranks, stop, state.save_clock)
                 state.stops = lambda: agreement.now(state.progress.step).signal is not None
                 self._announce()
+                if self._saves_first:  # so that --resume knows the longer schedule
+                    save.run(state)
                 budget = Budget(state)
                 if not handle_all(state, events_left(state.progress)):
                     self._stop(_stopped_by(agreement.now(done).signal))
@@ -277,6 +281,9 @@ class Trainer:
             f"{views['train']} training views, {views['test']} held out; "
             f"{images:,} images, {images / views['train']:,.0f} per view"
         )
+        found = state.progress.milestones.get("found", 0)
+        if state.progress.step == 0 and found > (kept := state.progress.milestones["initial"]):
+            text += f"; thinned from {found:,} to population.max_gaussians={kept}"
         if state.config.data.downscale > 1:
             factor = f"data.downscale={state.config.data.downscale:g}"
             text += f"; images of {_largest_size(state)} ({factor})"
