@@ -145,8 +145,8 @@ class ScheduleConfig:
         position_decay: length of the exponential decay of the position learning rate.
         checkpoint_every: a checkpoint is written at every multiple of this, in addition to those by
             `log.checkpoint_seconds`. 0: none.
-        evaluate_every: the held-out views are measured at every multiple of this, and at the end. 0: only at
-            the end.
+        evaluate_every: the held-out views are measured at every multiple of this, and at the end. 0: all of
+            them only at the end, and a few now and then, in less than 1 % of the time.
     """
 
     iterations: int = 30_000

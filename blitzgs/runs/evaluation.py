@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -257,6 +257,12 @@ def _over_all_ranks(
             result[metric] = sum(values) / len(values)
     result["views"] = views
     return result
+
+
+def worst_views(views: Mapping[str, Mapping[str, float]], count: int = 3) -> list[tuple[str, float]]:
+    """Return names and PSNR of the views of lowest PSNR, the worst first; none of a single view."""
+    ordered = sorted((view["psnr"], name) for name, view in views.items())
+    return [(name, psnr) for psnr, name in ordered[:count]] if len(ordered) > 1 else []
 
 
 class _Files:

@@ -33,6 +33,7 @@ from blitzgs.training.agreement import MOST_STEPS, Agreement, StopRequest
 from blitzgs.training.batches import MOST_MASKED, BatchLoader
 from blitzgs.training.budget import Budget
 from blitzgs.training.events import evaluate, events_left, handle_all, save
+from blitzgs.training.glances import Glances
 from blitzgs.training.inputs import sharing_hint
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
 from blitzgs.training.setup import set_up
@@ -111,7 +112,7 @@ class Trainer:
                 self._announce()
                 if self._saves_first:  # so that --resume knows the longer schedule
                     save.run(state)
-                budget = Budget(state)
+                budget, glances = Budget(state), Glances(state)
                 if not handle_all(state, events_left(state.progress)):
                     self._stop(_stopped_by(agreement.now(done).signal))
                     return None
@@ -128,6 +129,7 @@ class Trainer:
                         self._stop(_stopped_by(agreement.now(step).signal))
                         return None
                     budget.after(step)
+                    glances.after((step - 1) * size, step * size)
                     if step == state.schedule.steps:
                         break
                     decision = agreement.after(step, self.loader.lost is not None)
