@@ -62,13 +62,14 @@ def split_fields(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> t
 
 
 def check_given_once(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> None:
-    """Refuse a flag that is given twice, of which the last one would win without a word."""
+    """Refuse a value that is given twice, of which the last one would win without a word."""
     seen: set[str] = set()
+    switches = {flag for flag, has_value in flags_of(parser).items() if not has_value}
     for text in arguments:
         if text == "--":
             return
         name = text.partition("=")[0]
-        if name.startswith("--") and name in seen:
+        if name.startswith("--") and name in seen - switches:
             parser.error(f"{name} is given twice: leave out one of them")
         seen.add(name)
 

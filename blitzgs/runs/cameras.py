@@ -68,9 +68,13 @@ def checked_camera(
     """Return a camera with these values, in arrays of its own.
 
     Raises:
+        TypeError: a size is no number, or a matrix not made of numbers; the message names it.
         ValueError: a value is impossible; the message names it.
     """
-    intrinsics, pose = np.array(K, dtype=np.float64), np.array(world_to_camera, dtype=np.float64)
+    for argument, size in (("width", width), ("height", height)):
+        if isinstance(size, bool) or not isinstance(size, (int, float, np.integer, np.floating)):
+            raise TypeError(f"{argument} must be an integer, got {size!r} ({type(size).__name__})")
+    intrinsics, pose = _matrix("K", K), _matrix("world_to_camera", world_to_camera)
     for argument, matrix, shape in (("K", intrinsics, (3, 3)), ("world_to_camera", pose, (4, 4))):
         if matrix.shape != shape or not np.isfinite(matrix).all():
             raise ValueError(f"{argument} must be a finite matrix {shape}, got {matrix.tolist()}")
@@ -83,6 +87,16 @@ def checked_camera(
         if not 1 <= size <= MOST_SIDE or size != int(size):
             raise ValueError(f"{argument} must be an integer from 1 to {MOST_SIDE:,}, got {size}")
     return RunCamera(name, int(width), int(height), intrinsics, pose)
+
+
+def _matrix(argument: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return a copy of a matrix as float64."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"{argument} must be a matrix of numbers, got {type(value).__name__} ({error})"
+        ) from error
 
 
 def save_cameras(folder: Path, capture: Capture, run_id: str = "") -> None:

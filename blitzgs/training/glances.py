@@ -20,7 +20,7 @@ POINTS = 20
 MOST_SHARE = 0.008
 LEAST_VIEWS, MOST_VIEWS = 2, 16
 # Assumed before the first measurement: the time of a view is that of this number of training images.
-FIRST_COST = 4.0
+FIRST_COST = 1.0
 
 
 class Glances:

@@ -34,16 +34,13 @@ from blitzgs.training.batches import MOST_MASKED, BatchLoader
 from blitzgs.training.budget import Budget
 from blitzgs.training.events import evaluate, events_left, handle_all, save
 from blitzgs.training.glances import Glances
-from blitzgs.training.inputs import sharing_hint
+from blitzgs.training.hints import hints_of, largest_size
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
 from blitzgs.training.setup import set_up
-from blitzgs.training.state import TrainingState, never
+from blitzgs.training.state import never
 from blitzgs.training.step_report import StepRecord, log_step, measure_step
 from blitzgs.util.output import write_file
 from blitzgs.view.views import render_options
-
-# With fewer views for each rank, a step takes a rank's host longer than its GPU (docs/city.md).
-VIEWS_PER_RANK = 4
 
 
 class Trainer:
@@ -288,7 +285,7 @@ class Trainer:
             text += f"; thinned from {found:,} to population.max_gaussians={kept}"
         if state.config.data.downscale > 1:
             factor = f"data.downscale={state.config.data.downscale:g}"
-            text += f"; images of {_largest_size(state)} ({factor})"
+            text += f"; images of {largest_size(state.capture)} ({factor})"
         if ranks.world_size > 1:
             text += f"; {ranks.world_size} ranks, transport {ranks.transport}"
         if state.config.schedule.minutes > 0:
@@ -297,12 +294,8 @@ class Trainer:
         state.log.event(
             state.images_seen, "start", {"origin": state.origin} | values, f"{state.origin}; {text}"
         )
-        hints = [sharing_hint(state.capture, state.config.data.cache_bytes, ranks.local_world_size)]
-        if state.progress.step == 0:  # a resumed run keeps its batches
-            hints.append(small_batch_hint(state.schedule.batch_size, ranks.world_size))
-        for hint in hints:
-            if hint is not None:
-                state.log.event(state.images_seen, "hint", {"hint": hint}, hint)
+        for hint in hints_of(state):
+            state.log.event(state.images_seen, "hint", {"hint": hint}, hint)
 
     def finish(self, agreement: Agreement) -> dict[str, Any] | None:
         """Save and evaluate the trained model; return and write the summary.
@@ -360,25 +353,6 @@ class Trainer:
         if state.signals is not None:
             figures["placed"] = state.placed_times
         return figures
-
-
-def small_batch_hint(batch_size: int, world_size: int) -> str | None:
-    """Return what to do if a step has too few views for several ranks; None if it has enough."""
-    enough = VIEWS_PER_RANK * world_size
-    if world_size == 1 or batch_size >= enough:
-        return None
-    return (
-        f"a step of {batch_size} views may be no faster on {world_size} ranks than on one: try "
-        f"--schedule.batch_size={enough}, which also scales the learning rates"
-    )
-
-
-def _largest_size(state: TrainingState) -> str:
-    """Return the size of the training images, of the largest if they differ, as text."""
-    cameras = [state.capture.cameras[index] for index in state.capture.train]
-    sizes = {(camera.width, camera.height) for camera in cameras}
-    width, height = max(sizes, key=lambda size: size[0] * size[1])
-    return f"{'at most ' if len(sizes) > 1 else ''}{width} x {height}"
 
 
 def _stopped_by(signal: str | None) -> str:

@@ -355,7 +355,7 @@ def test_export_replaces_no_file_of_another_format(trained, tmp_path, capsys):
     path = tmp_path / "notes.txt"
     path.write_text("precious")
     assert main(["export", str(trained[1]), "--ply", str(path)]) == 1
-    assert "notes.txt exists and is not a PLY file: choose another --ply" in capsys.readouterr().err
+    assert "notes.txt exists and is not a PLY file: choose another name" in capsys.readouterr().err
     assert path.read_text() == "precious"
 
 
