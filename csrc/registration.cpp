@@ -61,8 +61,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "color_rows_(Tensor[] tables, Tensor[] sh, Tensor[] cameras, Tensor[] splats, Tensor(a!)[] shown, "
       "int[] ints, float[] floats, Tensor? totals=None) -> Tensor[] rows");
-  // views: cameras and, of each view, weights of the Gaussians' smallest axes, opacities and mean axes:
-  // (viewmats, Ks[, scale_reg[, opacity_reg[, size_reg]]]). v_splats: (v_means2d, v_conics, v_opacities[,
+  // views: cameras and, of each view, weights of the Gaussians' smallest axes and opacities:
+  // (viewmats, Ks[, scale_reg[, opacity_reg]]). v_splats: (v_means2d, v_conics, v_opacities[,
   // v_colors]) or, on CUDA, one table of splat gradients.
   m.def(
       "project_bwd(Tensor[] gaussians, Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, "
@@ -77,7 +77,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "project_bwd_step_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, "
       "Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, Tensor[] v_splats, "
-      "Tensor? level=None, Tensor(b!)? means2d_sums=None, bool absolute_sums=False) -> ()");
+      "Tensor? level=None, Tensor(b!)? means2d_sums=None) -> ()");
   // The offsets of mean2d, conic, opacity, color and mean2d_abs in the floats of a splat gradient, then the
   // number of these floats.
   m.def("splat_gradient_layout() -> int[]");

@@ -22,6 +22,10 @@ SMALLEST_SPACING = 1e-4
 _CELL_BITS = 21
 
 
+# Opacity of the initial Gaussians.
+INITIAL_OPACITY = 0.1
+
+
 @dataclass(frozen=True)
 class FirstGaussians:
     """What distinguishes the first Gaussians of a model from each other; the tensors are on the CPU.

@@ -19,8 +19,7 @@ def extended(config: Config, step: int, by: float) -> Config:
     """Return the configuration of a finished run with a longer schedule.
 
     The times of all events stay, so the new part of the run has no density events and no importance passes.
-    The position rate stays at its final value; the other rates fall to `optimiser.final_share` at the new
-    end.
+    The position rate stays at its final value.
 
     Args:
         config: the run's own configuration.
@@ -38,8 +37,8 @@ def extended(config: Config, step: int, by: float) -> Config:
         )
     images = by if by >= LEAST_IMAGES else (by - 1) * schedule.iterations
     iterations = config.schedule.iterations + math.ceil(images / schedule.pace.scale)
-    # The times that the run has placed and the pace that it has measured stay as they are.
-    longer = replace(config.schedule, iterations=iterations, minutes=0.0, images_per_view=0.0, adaptive=False)
+    # The pace that the run has measured stays as it is.
+    longer = replace(config.schedule, iterations=iterations, minutes=0.0, images_per_view=0.0)
     config = replace(config, schedule=longer)
     for problem in problems(config):
         raise ConfigError(problem)

@@ -18,7 +18,7 @@ from blitzgs.config.schedule import Schedule, stretched
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.population.initialisation import octree_gaussians
+from blitzgs.population.initialisation import INITIAL_OPACITY, octree_gaussians
 from blitzgs.population.position_noise import PositionNoise
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import CAMERAS, save_cameras
@@ -32,7 +32,6 @@ from blitzgs.table.blocks import morton_order
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Residence
 from blitzgs.table.table import GaussianTable
-from blitzgs.training.adaptive import Signals
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.extension import extended
 from blitzgs.training.inputs import check_alike, check_capture
@@ -135,7 +134,6 @@ def set_up(
         save_clock=SaveClock(config.log.checkpoint_seconds),
         veto=veto,
         lineage=_start_lineage(config, capture, folder, table, progress, ranks),
-        signals=Signals.of(progress.signals) if config.schedule.adaptive else None,
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )
 
@@ -213,7 +211,6 @@ def _stepper(
         owners,
         config.loss,
         extent,
-        config.ranks.half_exchange,
         _position_noise(config, extent),
     )
     if not isinstance(table, HostTable):
@@ -260,14 +257,14 @@ def first_gaussians(
     lod, device = config.lod, ranks.device
     points = torch.from_numpy(capture.points) / space.unit
     centres = trained_centres([capture.cameras[i] for i in capture.train], space).to(device)
-    levels = measure_levels(points.to(device), centres, lod.fork, lod.base_resolution)
+    levels = measure_levels(points.to(device), centres, lod.fork)
     colors, most = torch.from_numpy(capture.colors), config.population.max_gaussians
     first = octree_gaussians(
         points, colors, centres, levels, lod.visible_threshold, most=most, seed=config.seed
     )
     # A row of the table has some 750 bytes, so each rank makes only its own rows, on its device.
     share = slice(ranks.rank, None, ranks.world_size)
-    table = first.table(config.model.sh_degree, config.model.initial_opacity, home, share)
+    table = first.table(config.model.sh_degree, INITIAL_OPACITY, home, share)
     table.permute(morton_order(table["means"]))
     return table, Progress(
         step=0,

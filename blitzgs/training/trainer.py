@@ -209,9 +209,6 @@ class Trainer:
         self._write_record()  # whose figures were copied meanwhile
         names = [state.capture.cameras[i].name for i in batch.indices]
         self._guard.check(step, names, sums, state.stepper.table, frame)
-        if state.signals is not None:
-            pixels = batch.views.width * batch.views.height
-            state.signals.add(sums, len(names), pixels, end, len(state.capture.train))
         is_logged = end // config.log.every > begin // config.log.every
         if is_logged:
             self._unwritten = measure_step(state, frame, batch, sums)
@@ -220,7 +217,6 @@ class Trainer:
             frame,
             terms,
             keep_means2d=schedule.gathers_statistics(begin),
-            absolute=config.population.absolute_gradients,
         )
         if v_means2d is not None:
             self._add_statistics(frame, v_means2d)
@@ -321,7 +317,7 @@ class Trainer:
         if state.ranks.rank == 0:
             write_picture(state, population)
             try:
-                # Pace and placed times were measured after the run first wrote its configuration.
+                # The pace was measured after the run first wrote its configuration.
                 save_config(state.config, state.folder / run_files.CONFIG)
                 if state.lineage is not None:
                     state.lineage.describe(lineage_subject(state.config, state.capture))
@@ -350,8 +346,6 @@ class Trainer:
                 "budget_seconds": 60 * state.config.schedule.minutes,
                 "scale": state.images_seen / state.config.schedule.iterations,
             }
-        if state.signals is not None:
-            figures["placed"] = state.placed_times
         return figures
 
 

@@ -40,7 +40,6 @@ class Scene:
         self.degree = min(3, math.isqrt(k) - 1)
         self.scale_reg = torch.linspace(0.1, 0.2, views).to(device, dtype)
         self.opacity_reg = torch.linspace(0.3, -0.2, views).to(device, dtype)
-        self.size_reg = torch.linspace(-0.1, 0.4, views).to(device, dtype)
         self.seed = generator
 
     def columns(self):
@@ -66,7 +65,7 @@ class Scene:
         return [self.splats.camera_ids, self.splats.visible_ids, self.splats.splat_offsets]
 
     def views(self):
-        return WeightedViews(self.viewmats, self.Ks, self.scale_reg, self.opacity_reg, self.size_reg)
+        return WeightedViews(self.viewmats, self.Ks, self.scale_reg, self.opacity_reg)
 
     def schedule(self, sparse=False):
         return AdamSchedule(self.lr_table, BETA1, BETA2, EPS, sparse, self.params[0].dtype)
@@ -252,9 +251,9 @@ def test_regularisers_have_the_gradients_of_their_definitions(device):
     _, _, v_scales, v_opacities, *_ = scene.backward()
     scales, opacities = (scene.params[c].double().requires_grad_() for c in (2, 3))
     r = scene.splats
-    weights = [w.double()[r.camera_ids.long()] for w in (scene.scale_reg, scene.opacity_reg, scene.size_reg)]
+    weights = [w.double()[r.camera_ids.long()] for w in (scene.scale_reg, scene.opacity_reg)]
     axes = scales[r.gaussian_ids.long()].exp()
-    values = axes.amin(1), opacities[r.gaussian_ids.long()].sigmoid(), axes.mean(1)
+    values = axes.amin(1), opacities[r.gaussian_ids.long()].sigmoid()
     sum((w * value).sum() for w, value in zip(weights, values, strict=True)).backward()
     ids = r.visible_ids.long()
     assert len(ids) > 300
@@ -265,12 +264,14 @@ def test_regularisers_have_the_gradients_of_their_definitions(device):
 def test_errors_name_what_is_wrong_with_weights():
     scene = Scene(20, 16, 2, "cpu", torch.float32)
     scene.render(False)
-    weights = scene.size_reg
-    scene.size_reg = weights.double()
-    with pytest.raises(RuntimeError, match="project_bwd: size_reg must be Float, got Double"):
+    weights = scene.opacity_reg
+    scene.opacity_reg = weights.double()
+    with pytest.raises(RuntimeError, match="project_bwd: opacity_reg must be Float, got Double"):
         scene.backward()
-    scene.size_reg = weights[:1]
-    with pytest.raises(RuntimeError, match=r"project_bwd_step_: size_reg must have shape \[2\], got \[1\]"):
+    scene.opacity_reg = weights[:1]
+    with pytest.raises(
+        RuntimeError, match=r"project_bwd_step_: opacity_reg must have shape \[2\], got \[1\]"
+    ):
         scene.at_once(False)
 
 

@@ -260,7 +260,7 @@ def test_what_is_missing_is_named(tmp_path, capsys):
     assert main(["gate", "fit", str(tmp_path), "--gate-from=nan", "--out", str(tmp_path / "g.json")]) == 1
     assert "--gate-from: must be 0 or more, got nan" in capsys.readouterr().err
     assert main(["gate", "fit", str(tmp_path), "--out", str(tmp_path / "g.txt")]) == 1
-    assert "a gate's file ends in .json or .ubj" in capsys.readouterr().err
+    assert "a gate's file ends in .json" in capsys.readouterr().err
     assert main(["gate", "evaluate", str(tmp_path / "g.json"), "x", "--out", str(tmp_path)]) == 1
     assert "g.json: no such gate; `blitzgs gate fit` makes one" in capsys.readouterr().err
     (tmp_path / "g.json").write_text("{}")

@@ -108,8 +108,6 @@ def _write(state: TrainingState) -> None:
                 f"no checkpoint was written, because {error}.", is_lack_of_space(error)
             ) from error
         state.progress = replace(state.progress, ledger=ledger_state(ledger))
-    if state.signals is not None:
-        state.progress = replace(state.progress, signals=state.signals.saved())
     _save(state, state.folder)
     state.save_clock.restart()
 
