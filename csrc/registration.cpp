@@ -56,12 +56,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor means2d, Tensor conics, "
       "Tensor depths, Tensor splat_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
       "Tensor rank_masks, Tensor splat_ids, Tensor totals)");
-  // scale_reg, opacity_reg, size_reg: for each view, weights of the Gaussians' smallest axes, opacities and
-  // mean axes. v_splats: (v_means2d, v_conics, v_opacities[, v_colors]) or, on CUDA, one table of splat
-  // gradients.
+  // scale_reg, opacity_reg: for each view, weights of the Gaussians' smallest axes and opacities. v_splats:
+  // (v_means2d, v_conics, v_opacities[, v_colors]) or, on CUDA, one table of splat gradients.
   m.def(
       "project_bwd(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor? scale_reg, Tensor? opacity_reg, "
-      "Tensor? size_reg, Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor? level, "
+      "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor? level, "
       "int width, int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, "
       "float radius_clip, bool antialiased, bool raw, float[] fade, "
       "Tensor[] v_splats, Tensor? v_depths, bool need_viewmats, bool dense=False) -> ("
@@ -69,16 +68,14 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor v_viewmats)");
   // project_bwd, then lazy_adam_step_ of the visible Gaussians. With places, v_splats are the tables of the
   // ranks that composited the splats. Groups of the optimiser, as blitzgs/ops/lazy_adam.py names them: state
-  // (params, exp_avgs, exp_avg_sqs, last_step, moment_step); tables (table, lr_table[, final_rules]); steps
-  // (step, explicit_steps, sparse); decays (beta1, beta2, eps).
+  // (params, exp_avgs, exp_avg_sqs, last_step, moment_step); tables (table, lr_table[, final_rules]).
   m.def(
-      "project_bwd_step_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, "
-      "Tensor viewmats, Tensor Ks, Tensor? scale_reg, Tensor? opacity_reg, Tensor? size_reg, "
+      "project_bwd_step_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
+      "float beta2, float eps, Tensor viewmats, Tensor Ks, Tensor? scale_reg, Tensor? opacity_reg, "
       "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor? level, "
       "int width, int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, "
       "float radius_clip, bool antialiased, bool raw, float[] fade, "
-      "Tensor[] v_splats, Tensor? places=None, Tensor(b!)? means2d_sums=None, "
-      "bool absolute_sums=False) -> ()");
+      "Tensor[] v_splats, Tensor? places=None, Tensor(b!)? means2d_sums=None) -> ()");
   // The offsets of mean2d, conic, opacity, color and mean2d_abs in the floats of a splat gradient, then the
   // number of these floats.
   m.def("splat_gradient_layout() -> int[]");
@@ -204,25 +201,17 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor samples, float l1_factor, float ssim_factor, float offset) -> (Tensor loss, "
       "Tensor v_renders)");
 
-  // The optimiser: dense Adam over a list of rows, with the groups of arguments of project_bwd_step_; and the
-  // statistics of density control.
+  // The optimiser: dense Adam over a list of rows, with the arguments of project_bwd_step_; and the
+  // statistics of density control. current: the parameters of all rows are at the step before.
   m.def(
-      "lazy_adam_step_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, Tensor[] grads, "
-      "Tensor ids) -> ()");
+      "lazy_adam_step_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
+      "float beta2, float eps, Tensor[] grads, Tensor ids, bool current=False) -> ()");
   m.def(
-      "lazy_adam_catch_up_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, Tensor? ids, "
-      "Tensor? count=None) -> ()");
+      "lazy_adam_catch_up_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
+      "float beta2, float eps, Tensor? ids, Tensor? count=None) -> ()");
   // The rules of the total drift of a row, by the step of its parameters; `like` has the dtype of the
   // parameters.
   m.def("lazy_adam_final_rules(Tensor table, Tensor like, int explicit_steps, float eps) -> Tensor");
-  // Adds a step to the tables of T schedules and takes it, as lazy_adam_step_, for the same rows of the T
-  // tables of parameters that have these schedules. terms: (decays, shares); states and grads: of each table;
-  // rates: 6 T learning rates; indices: int64, of a sparse gradient; current: for each table, 1 if the
-  // parameters of all rows stand at the step before, so that none has to catch up.
-  m.def(
-      "drift_step_(Tensor(a!) tables, Tensor(b!) lr_tables, Tensor[] terms, Tensor(c!)[] states, int[] "
-      "steps, "
-      "float[] decays, float[] rates, Tensor[] grads, Tensor indices, int[] current) -> ()");
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
       "Tensor splat_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "

@@ -143,5 +143,5 @@ def _splats_of_rows(group: Group) -> tuple[ProjectedSplats, TableRows]:
     assert group.rows is not None
     splats, (ids, _, sh) = project_splats(group.inputs), group.rows
     indices = ids.long()[splats.visible_ids]
-    rows = TableRows(group.inputs, splats.visible_ids, indices, sh.parts, sh.hand_over)
+    rows = TableRows(group.inputs, splats.visible_ids, indices, sh.parts)
     return splats._replace(gaussian_ids=ids[splats.gaussian_ids], visible_ids=indices.int()), rows

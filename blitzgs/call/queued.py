@@ -15,7 +15,6 @@ from blitzgs.frame.transport.local import LocalExchange, LocalTransport
 from blitzgs.frame.transport.protocol import Exchange
 from blitzgs.ops.project_gradient import TableRows
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, first_rows
-from blitzgs.ops.sparse_rows import HandOver
 
 # What the op `render` returns before the colours and rows.
 _LISTS, _IMAGES = 2, 8
@@ -48,12 +47,10 @@ class ShTables(NamedTuple):
         parts: the SH of all Gaussians in parts, [N, L, 3] each; empty: no SH are rendered.
         before: called before rows are read, with the rows, int32 [A], and the number of those that are
             valid, int32 [1] on the device, or None if all are.
-        hand_over: takes the gradients of all tables, if autograd is not to have them.
     """
 
     parts: Sequence[Tensor]
     before: Callable[[Tensor, Tensor | None], object]
-    hand_over: HandOver | None
 
 
 def render_queued(
@@ -110,7 +107,7 @@ def render_queued(
     if tables is not None:
         colors, numbers, indices, *found = of_rows
         splats = splats._replace(colors=colors)
-        rows = TableRows(inputs._replace(gaussians=found), numbers, indices, sh, tables.hand_over)
+        rows = TableRows(inputs._replace(gaussians=found), numbers, indices, sh)
     has_blank_view = 0 in rest[VIEW_TOTALS - 3 :]
     return Rendered(splats, isect_splats, tile_offsets, images, rows, has_blank_view)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.projection_types import N_OPTIONS, ProjectedSplats, ProjectionInputs, ProjectionOptions
-from blitzgs.ops.sparse_rows import HandOver, full_gradients
+from blitzgs.ops.sparse_rows import full_gradients
 from blitzgs.ops.splat_gradients import packed_table
 
 
@@ -23,21 +23,18 @@ class TableRows(NamedTuple):
         numbers: int32 [U], the rows of `inputs` that are visible.
         indices: int64 [U], their numbers in the tables, as the indices of sparse gradients.
         sh: the SH of all Gaussians in parts, from which the rows' SH were joined; empty: without SH.
-        hand_over: takes the gradients of the tables, if autograd is not to have them.
     """
 
     inputs: ProjectionInputs
     numbers: Tensor
     indices: Tensor
     sh: Sequence[Tensor]
-    hand_over: HandOver | None
 
 
 def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats, rows: TableRows | None = None) -> None:
     """Save what `_gradients` needs: the rows that were projected, their splats, and the shapes of tables."""
     ctx.set_materialize_grads(False)
     read, visible_ids, ids, ctx.tables, ctx.parts = inputs, splats.visible_ids, None, None, []
-    ctx.hand_over = None if rows is None else rows.hand_over
     if rows is not None:
         read, visible_ids, ids = rows[:3]
         # The tables are not saved: the gradient does not depend on their values, which may change.
@@ -126,7 +123,7 @@ def _first_gradients(
     # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
     dense = all_dense and not complete and all(needed)
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
-        saved.gaussians, *saved.cameras, None, None, None, *saved.splats, saved.level, *ctx.options,
+        saved.gaussians, *saved.cameras, None, None, *saved.splats, saved.level, *ctx.options,
         _splat_gradients(saved, v), v.depths, need_viewmats, dense,
     )  # fmt: skip
     found: list[Tensor | None] = gradients[: len(saved.gaussians)]
@@ -135,10 +132,7 @@ def _first_gradients(
         found[4:] = [part.contiguous() for part in gradients[4].split(ctx.parts, 1)]
     if not dense:
         found = [gradient if wanted else None for gradient, wanted in zip(found, needed, strict=True)]
-    if ctx.hand_over is not None:
-        ctx.hand_over.give(saved.ids, found)
-        found = [None]  # of the ticket
-    elif not dense and not complete:
+    if not dense and not complete:
         ids = visible_ids if saved.ids is None else saved.ids
         shapes = [table.shape for table in ctx.tables or saved.gaussians]
         found = full_gradients(ids, found, shapes, sparse)
@@ -189,10 +183,6 @@ class Project(torch.autograd.Function):
     def backward(ctx: Any, *v_output: Tensor | None) -> Any:
         """Return the gradients of viewmats and of the tables, from those of the columns."""
         need_viewmats, _, *needed = ctx.needs_input_grad
-        if ctx.hand_over is not None:
-            # Autograd runs the ticket's node unless it was asked for other gradients only, as of viewmats.
-            wanted = torch._C._will_engine_execute_node(ctx.next_functions[-1][0])
-            needed = [wanted and need for need in ctx.hand_over.needed]
         v = _Differentiable(*v_output)
         v_viewmats, *gradients = _gradients(ctx, needed, need_viewmats, ctx.sparse, v)
         return (v_viewmats, None, *gradients)
@@ -229,7 +219,6 @@ def _(
     Ks: Tensor,
     scale_reg: Tensor | None,
     opacity_reg: Tensor | None,
-    size_reg: Tensor | None,
     camera_ids: Tensor,
     visible_ids: Tensor,
     splat_offsets: Tensor,

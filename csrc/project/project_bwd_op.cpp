@@ -14,12 +14,10 @@ namespace blitzgs {
 
 class HeldSplatGradients {
  public:
-  // splats: P. sums: none, or [P, 2], to which the kernel writes the gradients of means2d summed over ranks
-  // or, with `absolute`, those of mean2d_abs.
+  // splats: P. sums: none, or [P, 2], to which the kernel writes the gradients of means2d summed over ranks.
   HeldSplatGradients(const char* op, ScalarType dtype, std::int64_t splats,
                      const std::vector<Tensor>& v_splats, const std::optional<Tensor>& v_depths,
-                     const std::optional<Tensor>& places, const std::optional<Tensor>& sums,
-                     bool absolute = false)
+                     const std::optional<Tensor>& places, const std::optional<Tensor>& sums)
       : held_(v_splats), depths_(v_depths), in_tables_(places || v_splats.size() == 1) {
 #ifndef BLITZGS_BACKEND_CUDA
     STD_TORCH_CHECK(!in_tables_, "blitzgs::", op, ": tables of gradients need CUDA; give columns");
@@ -30,7 +28,6 @@ class HeldSplatGradients {
       for (const Tensor& table : held_) check_table(op, table);
       if (!places) check_shape(op, "v_splats[0]", held_[0], {splats, kSplatGradient});
       if (places) hold_ranks(op, splats, *places, sums);
-      ranks_.absolute = absolute;
       return;
     }
     STD_TORCH_CHECK(v_splats.size() == 3 || v_splats.size() == 4, "blitzgs::", op,
@@ -94,19 +91,17 @@ namespace {
 // object holds the tensors, so that the raw pointers stay valid.
 struct BackwardSplats {
   Tensor camera_ids, visible_ids, splat_offsets;
-  OptionalTensor scale_reg, opacity_reg, size_reg;
+  OptionalTensor scale_reg, opacity_reg;
 
   BackwardSplats(const char* op, const ProjectArguments& p, const Tensor& camera_ids_in,
                  const Tensor& visible_ids_in, const Tensor& splat_offsets_in,
-                 const OptionalTensor& scale_reg_in, const OptionalTensor& opacity_reg_in,
-                 const OptionalTensor& size_reg_in) {
+                 const OptionalTensor& scale_reg_in, const OptionalTensor& opacity_reg_in) {
     camera_ids = checked(op, "camera_ids", camera_ids_in, ScalarType::Int, {-1});
     visible_ids = checked(op, "visible_ids", visible_ids_in, ScalarType::Int, {-1});
     splat_offsets = checked(op, "splat_offsets", splat_offsets_in, ScalarType::Int, {visible() + 1});
     const ScalarType dtype = p.means.scalar_type();
     scale_reg = checked(op, "scale_reg", scale_reg_in, dtype, {p.n_views});
     opacity_reg = checked(op, "opacity_reg", opacity_reg_in, dtype, {p.n_views});
-    size_reg = checked(op, "size_reg", size_reg_in, dtype, {p.n_views});
   }
 
   std::int64_t visible() const { return visible_ids.numel(); }
@@ -117,7 +112,7 @@ struct BackwardSplats {
   }
   template <class T>
   Regularisers<T> regularisers() const {
-    return {data_or_null<T>(scale_reg), data_or_null<T>(opacity_reg), data_or_null<T>(size_reg)};
+    return {data_or_null<T>(scale_reg), data_or_null<T>(opacity_reg)};
   }
 };
 
@@ -125,8 +120,7 @@ using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
 
 BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
                             const OptionalTensor& scale_reg, const OptionalTensor& opacity_reg,
-                            const OptionalTensor& size_reg, const Tensor& camera_ids,
-                            const Tensor& visible_ids, const Tensor& splat_offsets,
+                            const Tensor& camera_ids, const Tensor& visible_ids, const Tensor& splat_offsets,
                             const OptionalTensor& level, std::int64_t width, std::int64_t height,
                             std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
                             double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
@@ -137,7 +131,7 @@ BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats,
                            checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
                                            eps2d, radius_clip, antialiased, raw, fade),
                            fade, level);
-  const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg, size_reg);
+  const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
                              std::nullopt);
   const std::int64_t length = dense ? p.count : b.visible();
@@ -165,25 +159,25 @@ BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats,
   return {v_means, v_quats, v_scales, v_opacities, v_sh, v_viewmats};
 }
 
-void project_bwd_step(const TensorList& state_in, const TensorList& tables, const IntList& steps,
-                      const FloatList& decays, const Tensor& viewmats, const Tensor& Ks,
-                      const OptionalTensor& scale_reg, const OptionalTensor& opacity_reg,
-                      const OptionalTensor& size_reg, const Tensor& camera_ids, const Tensor& visible_ids,
+void project_bwd_step(const TensorList& state_in, const TensorList& tables, std::int64_t step,
+                      std::int64_t explicit_steps, double beta1, double beta2, double eps,
+                      const Tensor& viewmats, const Tensor& Ks, const OptionalTensor& scale_reg,
+                      const OptionalTensor& opacity_reg, const Tensor& camera_ids, const Tensor& visible_ids,
                       const Tensor& splat_offsets, const OptionalTensor& level, std::int64_t width,
                       std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
                       double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
                       const FloatList& fade, const TensorList& v_splats, const OptionalTensor& places,
-                      const OptionalTensor& means2d_sums, bool absolute_sums) {
+                      const OptionalTensor& means2d_sums) {
   constexpr const char* kOp = "project_bwd_step_";
-  AdamTensors state(kOp, state_in, tables, steps, decays);
-  STD_TORCH_CHECK(state.step >= 1, "blitzgs::project_bwd_step_: steps count from 1, got ", state.step);
+  AdamTensors state(kOp, state_in, tables, {step, explicit_steps, beta1, beta2, eps});
+  state.check_takes_step();
   const ProjectArguments p(kOp, state.params, viewmats, Ks,
                            checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
                                            eps2d, radius_clip, antialiased, raw, fade),
                            fade, level);
-  const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg, size_reg);
+  const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt, places,
-                             means2d_sums, absolute_sums);
+                             means2d_sums);
   if (b.visible() == 0) return;
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&](auto zero) {
