@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from blitzgs._torch import saved_tensors_are_hooked
 from blitzgs.call.arguments import Gaussians, Scene
 from blitzgs.call.finite import find_bad_cameras, watch_for_non_finite
 from blitzgs.call.groups import Group, groups_of, project_groups
@@ -135,7 +136,7 @@ def _queued(group: Group, gaussians: Gaussians, image: ImageOptions, tables: ShT
     """Queue all work, on CUDA before the host knows the number of splats."""
     inputs = group.inputs
     # Hooks on saved tensors (checkpointing) need the same shapes each time, without spare capacity.
-    hooked = torch._C._autograd._top_saved_tensors_default_hooks(True) is not None
+    hooked = saved_tensors_are_hooked()
     exact = hooked or not inputs.gaussians[0].is_cuda
     read = [*inputs.gaussians, *inputs.cameras, gaussians.colors, *(() if tables is None else tables.parts)]
     differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in read)

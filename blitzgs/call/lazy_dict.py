@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from torch.utils import _pytree as pytree
+from blitzgs._torch import register_mapping
 
 
 class Later:
@@ -119,8 +119,4 @@ class LateMapping(Mapping[str, Any]):
 
 # Register the classes, so that tree_map visits their values: unregistered, they would be leaves.
 for _class in (LazyDict, LateMapping):
-    pytree.register_pytree_node(
-        _class,
-        lambda values: (list(values.values()), list(values)),
-        lambda values, keys: dict(zip(keys, values, strict=True)),
-    )
+    register_mapping(_class, dict)
