@@ -37,22 +37,28 @@ class Job(NamedTuple):
     views: int
 
 
-def gather_views(gaussians: Gaussians, same: Sequence[Any]) -> tuple[Gaussians, Job | None]:
+def gather_views(gaussians: Gaussians, absgrad: bool, same: Sequence[Any]) -> tuple[Gaussians, Job | None]:
     """Return this rank's Gaussians with the views of all ranks, M C, in the order of ranks.
 
     Collective.
 
     Args:
         gaussians: one scene, with the rank's own views.
+        absgrad: whether absolute gradients are asked for, which ranks do not exchange.
         same: values that must be equal on all ranks.
 
     Returns:
         The Gaussians, and the job; None if there is one rank.
 
     Raises:
-        ValueError: on every rank: the ranks differ in `same`, in their number of views, or in whether
+        ValueError: there are batch dimensions, colours per view or absolute gradients; or, on every rank: the
+            ranks differ in `same`, in their number of views, or in whether
             Gaussians or poses need gradients. Some ranks would then wait for others forever.
     """
+    if len(gaussians.lead) > 1 or gaussians.per_view or absgrad:
+        raise ValueError(
+            "distributed=True supports no batch dimensions, colours per view or absgrad, as gsplat's does not"
+        )
     if not dist.is_initialized() or dist.get_world_size() == 1:
         return gaussians, None
     job = Job(dist.get_rank(), dist.get_world_size(), gaussians.views)
