@@ -30,7 +30,7 @@ def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """View a table of splat gradients as columns.
 
     Args:
-        packed: [P, 12], of the op `rasterize_bwd_packed_`.
+        packed: [P, 12], as the op `rasterize_bwd` fills it.
 
     Returns:
         Gradients of means2d [P, 2], conics [P, 3], opacities [P] and colors [P, 3].
