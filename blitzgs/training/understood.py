@@ -14,6 +14,7 @@ from blitzgs.capture.lengths import NEAR_OF_EXTENT, depths_seen, sampled
 from blitzgs.config.fields import Config
 from blitzgs.config.schedule import Schedule, stretched
 from blitzgs.population.growth import growth_limit
+from blitzgs.util.terminal import printable
 
 # Photographs that are decoded before the training, and views that are compared with the points.
 _DECODED, _PROJECTED = 16, 100
@@ -81,7 +82,7 @@ def understood(config: Config, capture: Capture, images: Images) -> list[str]:
         *(("note", note) for note in capture.about.source.notes),
     ]
     # A name may have characters that a terminal would obey.
-    return [f"{name + ':':15}{_printable(text)}" for name, text in lines]
+    return [f"{name + ':':15}{printable(text)}" for name, text in lines]
 
 
 def estimate(config: Config, capture: Capture, on_gpu: bool, cores: int) -> str:
@@ -116,10 +117,6 @@ def estimate(config: Config, capture: Capture, on_gpu: bool, cores: int) -> str:
 def _rounded(count: int) -> int:
     digits = max(0, len(str(count)) - 2)
     return round(count / 10**digits) * 10**digits
-
-
-def _printable(text: str) -> str:
-    return "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode() for c in text)
 
 
 def _look(capture: Capture, images: Images) -> Pictures:
