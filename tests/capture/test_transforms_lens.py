@@ -29,7 +29,7 @@ def by_angle(angle, size):
 
 
 def expected_focal(root, frame):
-    """The formula: the first level with any focal field decides on both axes; pixels are square by default."""
+    """The formula: the first level with a focal field decides on both axes; pixels are square by default."""
     for level in (frame, root):
         axes = []
         for axis, size in (("x", W), ("y", H)):
