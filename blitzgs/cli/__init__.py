@@ -23,7 +23,7 @@ from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.folder_checks import FolderError
 from blitzgs.runs.guard import ModelLostError, NonFiniteError
 from blitzgs.table.host_table import HostMemoryError
-from blitzgs.table.pool import ResidenceError
+from blitzgs.table.pool import PoolError
 from blitzgs_synth import command as synth
 
 HELP = """\
@@ -48,7 +48,7 @@ USER_ERRORS = (
     ModelLostError,
     NonFiniteError,
     PhotographError,
-    ResidenceError,
+    PoolError,
 )
 
 

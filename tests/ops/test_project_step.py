@@ -269,7 +269,7 @@ def test_errors_name_what_is_wrong_with_weights():
     with pytest.raises(RuntimeError, match="project_bwd: opacity_reg must be Float, got Double"):
         scene.backward()
     scene.opacity_reg = weights[:1]
-    with pytest.raises(RuntimeError, match=r"project_bwd_step_: opacity_reg must have shape \[2\], got \[1\]"):
+    with pytest.raises(RuntimeError, match=r"opacity_reg must have shape \[2\], got \[1\]"):
         scene.at_once(False)
 
 
