@@ -54,8 +54,7 @@ def project_bwd_step_(
         torch.ops.blitzgs.project_bwd_step_(
             state.tensors,
             [schedule.table, schedule.lr_table],
-            schedule.steps(step),
-            schedule.decays,
+            *schedule.constants(step),
             list(views),
             of_splats,
             options.ints,

@@ -173,13 +173,14 @@ BackwardTensors project_bwd(const TensorList& gaussians, const OptionalTensorLis
   return {v_means, v_quats, v_scales, v_opacities, v_sh, v_viewmats};
 }
 
-void project_bwd_step(const TensorList& state_in, const TensorList& tables, const IntList& steps,
-                      const FloatList& decays, const OptionalTensorList& views_in, const TensorList& splats,
-                      const IntList& ints, const FloatList& floats, const TensorList& v_splats,
-                      const OptionalTensor& level, const OptionalTensor& means2d_sums) {
+void project_bwd_step(const TensorList& state_in, const TensorList& tables, std::int64_t step,
+                      std::int64_t explicit_steps, double beta1, double beta2, double eps,
+                      const OptionalTensorList& views_in, const TensorList& splats, const IntList& ints,
+                      const FloatList& floats, const TensorList& v_splats, const OptionalTensor& level,
+                      const OptionalTensor& means2d_sums) {
   constexpr const char* kOp = "project_bwd_step_";
-  AdamTensors state(kOp, state_in, tables, steps, decays);
-  STD_TORCH_CHECK(state.step >= 1, "blitzgs::project_bwd_step_: steps count from 1, got ", state.step);
+  AdamTensors state(kOp, state_in, tables, {step, explicit_steps, beta1, beta2, eps});
+  state.check_takes_step();
   const WeightedViews views(kOp, views_in);
   const ProjectArguments p(kOp, state.params, views.cameras, ints, floats, level);
   const BackwardSplats b(kOp, p, views, splats, /*reads_places=*/true);
