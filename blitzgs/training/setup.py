@@ -30,7 +30,7 @@ from blitzgs.spawn.lineage import Lineage, initial_births, ledger_of
 from blitzgs.spawn.rules import lineage_subject, open_spawn_gate
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.host_table import HostTable
-from blitzgs.table.pool import Residence
+from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.extension import extended
@@ -222,8 +222,8 @@ def _stepper(
     if not isinstance(table, HostTable):
         return Stepper(table, *shared)
     budget = int(config.memory.resident_gb * 1e9)
-    residence = Residence(table, owners.ranks.device, budget, optimiser.pending_table)
-    return OffloadingStepper(residence, upcoming, *shared)
+    pool = Pool(table, owners.ranks.device, budget, optimiser.pending_table)
+    return OffloadingStepper(pool, upcoming, *shared)
 
 
 def _position_noise(config: Config, extent: float) -> PositionNoise | None:
