@@ -37,11 +37,11 @@ from timing import median_ms
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.tiles import TileAssignment, TileRanges
-from blitzgs.distributed.transport import CollectiveTransport, LocalTransport, Transport
-from blitzgs.model import PARAMETERS, GaussianTable, schema
+from blitzgs.frame.frame import Frame, RenderOptions, Views, forward
+from blitzgs.frame.tiles import TileAssignment, TileRanges
+from blitzgs.frame.transport import CollectiveTransport, LocalTransport, Transport
 from blitzgs.ops.intersect import tile_counts
-from blitzgs.pipeline import Frame, RenderOptions, Views, forward
+from blitzgs.table.table import PARAMETERS, GaussianTable, schema
 
 IMAGE_BOUND, GRADIENT_BOUND = 2e-5, 1e-4  # largest errors of the default setting
 

@@ -12,11 +12,11 @@ from scenes import aerial
 from timing import median_ms
 from torch import Tensor
 
-from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.lazy_adam import AdamSchedule
 from blitzgs.ops.project import project
-from blitzgs.view.blocks import BlockIndex, morton_order
+from blitzgs.table.blocks import BlockIndex, morton_order
+from blitzgs.table.table import PARAMETERS, GaussianTable
 
 
 def main() -> None:

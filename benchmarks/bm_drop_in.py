@@ -40,9 +40,9 @@ from step_parts import Parts, TracedParts, trace
 from torch import Tensor
 
 import blitzgs
+from blitzgs.capture.capture import load_capture
+from blitzgs.capture.images import ImageStore
 from blitzgs.optim import LazyAdam, step_together
-from blitzgs.scene.capture import load_capture
-from blitzgs.scene.images import ImageStore
 
 
 class OneImport(GsplatTrainer):

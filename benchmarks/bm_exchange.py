@@ -36,26 +36,26 @@ from gradients import parameter_gradients
 from harness import make_parser, write_json
 from scenes import aerial
 
-from blitzgs import pipeline
+from blitzgs.capture.capture import load_capture
+from blitzgs.config.fields import Config
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TILE_COST, TileOwners, cost_balance
-from blitzgs.distributed.pixels import collect_images
-from blitzgs.distributed.tiles import LOSS_HALO, TileAssignment, TileRanges
-from blitzgs.distributed.transport import Mark, Traffic, open_transport, unmarked
-from blitzgs.model import GaussianTable
-from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.ownership import TILE_COST, TileOwners, cost_balance
+from blitzgs.frame.pixels import collect_images
+from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
+from blitzgs.frame.transport import Mark, Traffic, open_transport, unmarked
+from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import octree_gaussians
-from blitzgs.scene.capture import load_capture
-from blitzgs.training.batches import Batch
-from blitzgs.training.config import Config
-from blitzgs.training.guard import LossGuard
+from blitzgs.runs.guard import LossGuard
+from blitzgs.table.blocks import morton_order
+from blitzgs.table.table import GaussianTable
+from blitzgs.training.batch import Batch
 from blitzgs.training.loss import loss_terms
-from blitzgs.training.optimiser import TableAdam
-from blitzgs.training.schedule import Schedule
 from blitzgs.training.step import Stepper
-from blitzgs.training.views import Space, ViewSet, render_options, trained_centres
-from blitzgs.view.blocks import morton_order
 from blitzgs.view.levels import measure_levels
+from blitzgs.view.views import Space, ViewSet, render_options, trained_centres
 
 STAGES = (
     "project",

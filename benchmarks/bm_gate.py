@@ -20,9 +20,9 @@ from harness import make_parser, report
 from scenes import aerial
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import GaussianTable
-from blitzgs.population.candidates import FEATURES, Candidates, spawn_features
-from blitzgs.population.spawn_gate import GateInfo, RankVeto, SpawnGate, write_info
+from blitzgs.spawn.candidates import FEATURES, Candidates, spawn_features
+from blitzgs.spawn.gate import GateInfo, RankVeto, SpawnGate, write_info
+from blitzgs.table.table import GaussianTable
 
 DEPTH = 6
 

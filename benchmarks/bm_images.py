@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from harness import make_parser, write_json
 
-from blitzgs.scene.capture import Capture, load_capture
-from blitzgs.scene.colmap import ColmapCamera, ColmapImages, ColmapModel, write_model
-from blitzgs.scene.images import ImageStore
+from blitzgs.capture.capture import Capture, load_capture
+from blitzgs.capture.colmap import ColmapCamera, ColmapImages, ColmapModel, write_model
+from blitzgs.capture.images import ImageStore
 
 
 def make_capture(root: Path, count: int = 24, width: int = 2000, height: int = 1500) -> None:

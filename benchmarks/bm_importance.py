@@ -27,15 +27,16 @@ import torch
 from harness import make_parser, report
 from scenes import BenchmarkScene, aerial
 
-from blitzgs import pipeline
+from blitzgs.config.fields import ScoreRule
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.transport import LocalTransport
-from blitzgs.model import GaussianTable
-from blitzgs.pipeline import RenderOptions, Views
-from blitzgs.population.importance import ScoreRule, ViewBatch, sweep
-from blitzgs.survey import survey
-from blitzgs.view.blocks import morton_order
-from blitzgs.view.visible_scene import VisibleFinder
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.survey import survey
+from blitzgs.frame.transport import LocalTransport
+from blitzgs.population.importance import ViewBatch, sweep
+from blitzgs.table.blocks import morton_order
+from blitzgs.table.table import GaussianTable
+from blitzgs.view.visible import VisibleFinder
 
 OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e6)
 

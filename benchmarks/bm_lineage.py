@@ -33,19 +33,19 @@ import torch
 from harness import make_parser, report
 from scenes import aerial
 
-from blitzgs.distributed.group import Ranks, Transport
-from blitzgs.model import GaussianTable
+from blitzgs.capture.capture import Capture
+from blitzgs.capture.images import Images
+from blitzgs.config.fields import Config, Transport
+from blitzgs.config.files import load_config
+from blitzgs.config.schedule import Schedule
+from blitzgs.distributed.group import Ranks
 from blitzgs.population.density import DensityRules, densify
-from blitzgs.population.lineage import Ledger, Lineage, initial_births
-from blitzgs.scene.capture import Capture
+from blitzgs.runs.log import RunLog
+from blitzgs.spawn.lineage import Ledger, Lineage, initial_births
+from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import Agreement, StopRequest
-from blitzgs.training.batches import Images
-from blitzgs.training.config import Config
-from blitzgs.training.config_io import load_config
 from blitzgs.training.events import handle_all
 from blitzgs.training.inputs import open_capture
-from blitzgs.training.run_log import RunLog
-from blitzgs.training.schedule import Schedule
 from blitzgs.training.trainer import Trainer
 
 RULES = DensityRules(grad_threshold=0.5, clone_scale=1.0, min_opacity=0.005)

@@ -24,17 +24,17 @@ import torch
 from harness import make_parser, report
 from torch import Tensor
 
+from blitzgs.capture.cameras import Camera
+from blitzgs.capture.images import ImageMemory
+from blitzgs.capture.lens import Lens
+from blitzgs.capture.undistort import rectify
+from blitzgs.config.fields import ScheduleConfig
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.scene.cameras import Camera
-from blitzgs.scene.images import ImageMemory
-from blitzgs.scene.lens import Lens
-from blitzgs.scene.undistort import rectify
+from blitzgs.frame.ownership import TileOwners
 from blitzgs.training.batches import BatchLoader
-from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.sampler import BatchSampler
-from blitzgs.training.schedule import Schedule
-from blitzgs.training.views import Space, ViewSet
+from blitzgs.view.views import Space, ViewSet
 
 WIDTH, HEIGHT, BATCH, AHEAD, TILE = 1024, 684, 4, 3, 16
 T = TypeVar("T")

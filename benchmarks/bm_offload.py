@@ -27,20 +27,20 @@ from bm_step import LOSS, OPTIONS, RATE, make_table
 from harness import make_parser, markdown_table, write_json
 from scenes import BenchmarkScene, aerial, look_at
 
+from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.model import GaussianTable
-from blitzgs.training.batches import Batch
-from blitzgs.training.config import OptimiserConfig, ScheduleConfig
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.optim.table_adam import TableAdam
+from blitzgs.table.blocks import morton_order
+from blitzgs.table.host_table import HostTable
+from blitzgs.table.pool import Residence, ResidenceError
+from blitzgs.table.table import GaussianTable
+from blitzgs.training.batch import Batch
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
-from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.sampler import BatchSampler
-from blitzgs.training.schedule import Schedule
 from blitzgs.training.step import Stepper
-from blitzgs.training.views import Space, ViewSet
-from blitzgs.view.blocks import morton_order
-from blitzgs.view.host_table import HostTable
-from blitzgs.view.residence import Residence, ResidenceError
+from blitzgs.view.views import Space, ViewSet
 
 LINES, VIEWS_A_LINE = 12, 20
 HEIGHT, LOOKS_DOWN = 150.0, math.radians(60)

@@ -29,18 +29,18 @@ import torch
 from harness import make_parser, report
 from torch import Tensor
 
-from blitzgs import pipeline
-from blitzgs.charts import line_chart
+from blitzgs.capture.pictures import to_uint8
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import GaussianTable
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.pipeline import RenderOptions, Views
-from blitzgs.scene.pictures import to_uint8
-from blitzgs.training import run_files
-from blitzgs.training.run_cameras import load_cameras
-from blitzgs.training.run_files import TrainedModel
-from blitzgs.training.views import CameraLike, ViewSet, render_options
+from blitzgs.runs import files as run_files
+from blitzgs.runs.cameras import load_cameras
+from blitzgs.runs.files import TrainedModel
+from blitzgs.table.table import GaussianTable
+from blitzgs.util.charts import line_chart
 from blitzgs.view.gate import LodGate, SceneGate, centres_of
+from blitzgs.view.views import CameraLike, ViewSet, render_options
 
 MODES = ("full", "gated", "smooth")
 FRAMES_PER_SECOND = 30.0

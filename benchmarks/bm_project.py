@@ -21,7 +21,7 @@ from torch import Tensor
 from blitzgs.ops.blocks import BLOCK_ROWS, cull_blocks, update_block_bounds_
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
-from blitzgs.view.blocks import morton_order
+from blitzgs.table.blocks import morton_order
 
 COLUMNS = ("means", "quats", "scales", "opacities", "sh")
 CULL_BYTES = 4 * (3 + 3 + 1)  # bytes of mean, scales and opacity, read for every Gaussian

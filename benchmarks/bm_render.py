@@ -3,7 +3,7 @@
 
     python benchmarks/bm_render.py [--scenes aerial1 aerial4 aerial16 garden] [--repeats 30] [--json FILE]
 
-Gradients for every parameter; SH degree 3, float32. Ours: the training step's own render (`blitzgs.pipeline`,
+Gradients for every parameter; SH degree 3, float32. Ours: the training step's own render (`blitzgs.frame`,
 whose host does not wait between projection and compositing) and the gradients of its projection, in compact
 splats. Then the same through `blitzgs.rasterization` and autograd: with dense gradients, with sparse ones,
 and with every entry of meta read. gsplat: `rasterization` and autograd, packed and not. Torch's autograd
@@ -25,10 +25,11 @@ from scenes import BenchmarkScene, aerial, garden_like
 from timing import Clock
 from torch import Tensor
 
-from blitzgs import pipeline, rasterization
-from blitzgs.distributed.transport import LocalTransport
-from blitzgs.model import GaussianTable
-from blitzgs.pipeline import Mark, RenderOptions, Views, unmarked
+from blitzgs import rasterization
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import Mark, RenderOptions, Views, unmarked
+from blitzgs.frame.transport import LocalTransport
+from blitzgs.table.table import GaussianTable
 
 try:
     import gsplat
@@ -38,7 +39,7 @@ except ImportError:
 ops = torch.ops.blitzgs
 OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e10)
 WARM_UP = 5
-# The stages by their marks in `blitzgs.pipeline`; the exchange of a single rank does nothing.
+# The stages by their marks in `blitzgs.frame.frame`; the exchange of a single rank does nothing.
 STAGES = {
     "project": "project",
     "sort": "intersect",
@@ -55,7 +56,7 @@ SCENES: dict[str, Callable[[], BenchmarkScene]] = {
 
 
 class OurRender:
-    """The training step's own render, `blitzgs.pipeline`, and the gradients of the projection, by stage.
+    """The training step's own render, `blitzgs.frame.frame`, and the gradients of the projection, by stage.
 
     From the second call on, the host queues all stages of the forward pass with the sizes of earlier calls,
     and reads the true sizes while the device composites.

@@ -21,7 +21,7 @@ from bm_step import OurStep, measure
 from harness import make_parser, report
 from scenes import BenchmarkScene, aerial
 
-from blitzgs.view.blocks import morton_order
+from blitzgs.table.blocks import morton_order
 
 SEEN, APART = 4_000_000, 5000.0
 COLUMNS = ("means", "quats", "scales", "opacities", "sh")

@@ -24,17 +24,17 @@ from harness import make_parser, write_json
 from scenes import BenchmarkScene, aerial, garden_like
 from timing import Clock
 
+from blitzgs.config.fields import LossConfig, OptimiserConfig, ScheduleConfig
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, GaussianTable
+from blitzgs.frame.frame import Views
+from blitzgs.frame.ownership import TileOwners
 from blitzgs.ops.photometric import photometric_fwd_bwd
-from blitzgs.pipeline import Views
-from blitzgs.training.batches import Batch
-from blitzgs.training.config import LossConfig, OptimiserConfig, ScheduleConfig
-from blitzgs.training.optimiser import TableAdam
-from blitzgs.training.schedule import Schedule
+from blitzgs.optim.table_adam import TableAdam
+from blitzgs.table.blocks import morton_order
+from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, GaussianTable
+from blitzgs.training.batch import Batch
 from blitzgs.training.step import Stepper
-from blitzgs.view.blocks import morton_order
 
 LOSS = LossConfig(ssim=0.2, scale=0)
 STEP, RATE, BEHIND, WARM_UP = 2000, 1e-6, 40, 5

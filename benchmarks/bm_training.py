@@ -35,14 +35,15 @@ import torch
 from harness import make_parser, markdown_table, report
 from torch.profiler import ProfilerActivity, profile
 
-from blitzgs.distributed.group import Ranks, Transport
+from blitzgs.config.fields import Transport
+from blitzgs.config.files import load_config
+from blitzgs.config.schedule import Schedule
+from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.watchdog import NoWatchdog, Watchdog
+from blitzgs.runs.log import RunLog
 from blitzgs.training.agreement import Agreement, StopRequest
-from blitzgs.training.config_io import load_config
 from blitzgs.training.events import densify
 from blitzgs.training.inputs import open_capture
-from blitzgs.training.run_log import RunLog
-from blitzgs.training.schedule import Schedule
 from blitzgs.training.trainer import Trainer
 
 LEAST_GAP = 3.0  # us; the usual gap between two kernels that were queued long before

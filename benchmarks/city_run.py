@@ -30,14 +30,14 @@ from harness import environment
 from quality_plan import RunSpec
 from quality_run import describe, means_of, synchronize, write
 
+from blitzgs.config.fields import Config
 from blitzgs.distributed.group import Ranks
+from blitzgs.runs.files import TrainedModel
+from blitzgs.runs.log import LOG
 from blitzgs.training.agreement import Agreement
-from blitzgs.training.config import Config
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.population_report import population_report
-from blitzgs.training.run_files import TrainedModel
-from blitzgs.training.run_log import LOG
 from blitzgs.training.trainer import Trainer
 
 # A training stops so long before its process ends itself, in seconds; it is then evaluated.

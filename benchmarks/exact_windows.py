@@ -13,8 +13,8 @@ import torch
 from scenes import BenchmarkScene
 from torch import Tensor
 
-from blitzgs.model import PARAMETERS
 from blitzgs.reference import Composite, Splats, composite, project_splats
+from blitzgs.table.table import PARAMETERS
 
 NEAR, FAR, EPS2D = 0.01, 1e10, 0.3
 

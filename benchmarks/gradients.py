@@ -6,9 +6,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from blitzgs import pipeline
-from blitzgs.model import GaussianTable
+from blitzgs.frame import frame as pipeline
 from blitzgs.ops.splat_gradients import SplatGradients
+from blitzgs.table.table import GaussianTable
 
 
 def sum_of_ranks(gradients: SplatGradients, splats: int) -> Tensor:

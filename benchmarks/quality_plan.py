@@ -15,8 +15,8 @@ from typing import Any
 import yaml
 from opponents.gsplat_training import STRATEGIES, GsplatOptions
 
-from blitzgs.training.config import Config
-from blitzgs.training.config_io import ConfigError, load_config, to_dict
+from blitzgs.config.fields import Config
+from blitzgs.config.files import ConfigError, load_config, to_dict
 
 OPPONENT = "gsplat-"
 PARTITION = "partition-"

@@ -14,7 +14,7 @@ from typing import Any
 from harness import markdown_table
 from quality_run import write
 
-from blitzgs.training.evaluation import METRICS
+from blitzgs.runs.evaluation import METRICS
 
 RUNS = "runs"
 Run = dict[str, Any]

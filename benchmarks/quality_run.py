@@ -23,15 +23,15 @@ from opponents.gsplat_training import GsplatTrainer
 from quality_plan import RunSpec
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.training import run_files
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.runs import files as run_files
+from blitzgs.runs.evaluation import METRICS, evaluate, load_lpips
 from blitzgs.training.agreement import Agreement
-from blitzgs.training.evaluation import METRICS, evaluate, load_lpips
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.population_report import population_report
 from blitzgs.training.trainer import Trainer
-from blitzgs.training.views import Space, ViewSet, render_options
+from blitzgs.view.views import Space, ViewSet, render_options
 
 # Image counts at which gsplat's results are commonly quoted. Training views are measured there and at the
 # end.

@@ -44,7 +44,7 @@ import torch
 import yaml
 from quality_plan import parse_named, runs_of
 
-from blitzgs.training.config_io import load_config
+from blitzgs.config.files import load_config
 
 HERE = Path(__file__).parent
 PAPER = HERE / "paper_tables.yaml"

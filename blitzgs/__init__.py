@@ -14,10 +14,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
     from blitzgs import optim
-    from blitzgs.losses import l1_ssim
-    from blitzgs.rendering import contributions, rasterization, raw_rasterization
-    from blitzgs.training.run_folder import open_run
-    from blitzgs.view.blocks import morton_order
+    from blitzgs.call import contributions, rasterization, raw_rasterization
+    from blitzgs.call.losses import l1_ssim
+    from blitzgs.runs.folder import open_run
+    from blitzgs.table.blocks import morton_order
 
 __version__ = "0.1.0"
 __all__ = [
@@ -31,12 +31,12 @@ __all__ = [
 ]
 
 _MODULES = {
-    "contributions": "blitzgs.rendering",
-    "l1_ssim": "blitzgs.losses",
-    "morton_order": "blitzgs.view.blocks",
-    "open_run": "blitzgs.training.run_folder",
-    "rasterization": "blitzgs.rendering",
-    "raw_rasterization": "blitzgs.rendering",
+    "contributions": "blitzgs.call",
+    "l1_ssim": "blitzgs.call.losses",
+    "morton_order": "blitzgs.table.blocks",
+    "open_run": "blitzgs.runs.folder",
+    "rasterization": "blitzgs.call",
+    "raw_rasterization": "blitzgs.call",
 }
 
 

@@ -18,11 +18,11 @@ import torch
 from torch import Tensor
 
 import blitzgs
+from blitzgs.capture.capture import Capture, load_capture
+from blitzgs.capture.images import ImageStore
 from blitzgs.formats.ply import write_ply
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.optim import LazyAdam
-from blitzgs.scene.capture import Capture, load_capture
-from blitzgs.scene.images import ImageStore
 
 RATES = {"quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
 MEANS_RATE, MEANS_DECAY = 1.6e-4, 0.01  # relative to the extent; factor at the end of the training

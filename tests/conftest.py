@@ -1,2 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
-import blitzgs  # noqa: F401  (before torch: it sets how OpenMP threads wait)
+import blitzgs  # isort: skip  # noqa: F401  (before torch: it sets how OpenMP threads wait)
+
+import pytest
+import torch
+
+from blitzgs.cli import main
+from tests.training.tiny import OVERRIDES, write_tiny_capture
+
+# Folders of tests with tiny trainings.
+_TRAININGS = ("config", "runs", "spawn", "training")
+
+# Of `lineage_run`: density events at 20, 40, 60 and 80; the gate judges from 60 on, a checkpoint lies at 50.
+LINEAGE = (
+    "population.lineage=true",
+    "population.grad_threshold=1e-4",
+    "population.importance=true",
+    "schedule.t1=40",
+    "schedule.t2=90",
+    "schedule.gate_from=60",
+    "schedule.checkpoint_every=50",
+    "log.keep_checkpoints=9",
+    "log.pictures=0",
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread(request):
+    """Use one thread in the tests of trainings, which compare bits and have tiny models."""
+    before = torch.get_num_threads()
+    if request.path.parent.name in _TRAININGS:
+        torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A capture and a short run of it, made by the command line."""
+    data, folder = tmp_path_factory.mktemp("capture"), tmp_path_factory.mktemp("runs") / "run"
+    write_tiny_capture(data)
+    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES)]
+    assert main(["train", "--data", str(data), "--out", str(folder), "--schedule.scale=0.4", *flags]) == 0
+    return data, folder
+
+
+@pytest.fixture(scope="module")
+def lineage_run(tmp_path_factory):
+    """A folder with a capture and a run of it that has lineage."""
+    folder = tmp_path_factory.mktemp("gate")
+    write_tiny_capture(folder / "capture")
+    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, *LINEAGE)]
+    assert main(["train", "--data", str(folder / "capture"), "--out", str(folder / "run"), *flags]) == 0
+    return folder

@@ -17,7 +17,7 @@ INTERSECT, PROJECT, RASTERIZE, IMPORTANCE, TRANSPORT = (
     f"tests/cuda/test_{name}_cuda.py::test_"
     for name in ("intersect", "project", "rasterize", "importance", "transport")
 )
-OPS, BLOCKS = "tests/ops/test_", "tests/view/test_blocks.py::test_"
+OPS, BLOCKS = "tests/ops/test_", "tests/table/test_blocks.py::test_"
 TESTS = [
     *(INTERSECT + test for test in (
         "lists_match_the_cpu[False-8]", "lists_match_the_cpu[True-16]", "more_tiles_than_16_bits_hold",

@@ -2,7 +2,6 @@
 """The error measures and the cut detector must fail where they should."""
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -103,9 +102,3 @@ def test_a_decision_that_flips_on_a_cut_pixel_is_excluded_and_would_matter():
     below = one_row([0.0], [(1 - 1e-9) / 255], [1.0])
     assert (above.values - below.values).abs().max() > 1e-3
     assert above.cut.item() and below.cut.item()
-
-
-def test_every_test_file_has_a_name_of_its_own():
-    # pytest imports them as top-level modules: two of one name cannot be collected together.
-    names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
-    assert sorted(set(names)) == sorted(names)

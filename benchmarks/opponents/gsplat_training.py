@@ -24,14 +24,14 @@ import numpy as np
 import torch
 
 from blitzgs import rasterization
-from blitzgs.model import GaussianTable
+from blitzgs.capture.capture import Capture
+from blitzgs.capture.images import Images
+from blitzgs.frame.frame import RenderOptions
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.photometric import photometric_loss
-from blitzgs.pipeline import RenderOptions
 from blitzgs.population.initialisation import SH_C0
-from blitzgs.scene.capture import Capture
-from blitzgs.training.batches import Images
-from blitzgs.training.views import Space, ViewSet
+from blitzgs.table.table import GaussianTable
+from blitzgs.view.views import Space, ViewSet
 from opponents import relocation
 
 STRATEGIES = ("default", "default-reset", "mcmc")

@@ -28,13 +28,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from blitzgs.capture.cameras import camera_centres
+from blitzgs.capture.capture import Capture
+from blitzgs.capture.images import Images
+from blitzgs.config.fields import Config
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import REQUIRED, GaussianTable
-from blitzgs.scene.cameras import camera_centres
-from blitzgs.scene.capture import Capture
+from blitzgs.table.table import REQUIRED, GaussianTable
 from blitzgs.training.agreement import Agreement
-from blitzgs.training.batches import Images
-from blitzgs.training.config import Config
 from blitzgs.training.trainer import Trainer
 
 Float64 = npt.NDArray[np.float64]

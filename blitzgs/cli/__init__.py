@@ -15,16 +15,16 @@ from pathlib import Path
 from rich.console import Console
 
 from blitzgs import __version__
+from blitzgs.capture.images import PhotographError
 from blitzgs.cli import evaluate, export, gate, render, train
 from blitzgs.cli.arguments import add_command
 from blitzgs.distributed.group import MismatchError
-from blitzgs.scene.synth import command as synth
-from blitzgs.training.batches import PhotographError
-from blitzgs.training.checkpoint import CheckpointError
-from blitzgs.training.folder_checks import FolderError
-from blitzgs.training.guard import ModelLostError, NonFiniteError
-from blitzgs.view.host_table import HostMemoryError
-from blitzgs.view.residence import ResidenceError
+from blitzgs.runs.checkpoint import CheckpointError
+from blitzgs.runs.folder_checks import FolderError
+from blitzgs.runs.guard import ModelLostError, NonFiniteError
+from blitzgs.table.host_table import HostMemoryError
+from blitzgs.table.pool import ResidenceError
+from blitzgs_synth import command as synth
 
 HELP = """\
 Train 3D Gaussian Splatting models of photographs with known cameras: models of a desk, or of a whole city.

@@ -8,9 +8,9 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from blitzgs.scene.capture import Capture
-from blitzgs.training.config_ranges import RANGES
-from blitzgs.training.run_cameras import RunCameras
+from blitzgs.capture.capture import Capture
+from blitzgs.config.ranges import RANGES
+from blitzgs.runs.cameras import RunCameras
 
 Commands = argparse._SubParsersAction  # argparse has no public name for it
 

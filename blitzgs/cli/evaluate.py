@@ -20,14 +20,14 @@ from blitzgs.cli.arguments import (
     named_path,
 )
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.progress import image_progress
-from blitzgs.training import run_files
-from blitzgs.training.evaluation import evaluate, load_lpips
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.runs import files as run_files
+from blitzgs.runs.cameras import input_files
+from blitzgs.runs.evaluation import evaluate, load_lpips
+from blitzgs.runs.lod import lod_gate, scene_gate
 from blitzgs.training.inputs import check_capture, open_capture
-from blitzgs.training.lod import lod_gate, scene_gate
-from blitzgs.training.run_cameras import input_files
-from blitzgs.training.views import ViewSet, render_options
+from blitzgs.util.progress import image_progress
+from blitzgs.view.views import ViewSet, render_options
 
 HELP = """\
 Compare renders of a run's held-out views with their photographs. Prints the mean PSNR and SSIM as JSON, and

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from blitzgs.cli.arguments import Commands, add_command, add_device, add_run, named_path
 from blitzgs.distributed.group import Ranks
-from blitzgs.output import check_replaceable
-from blitzgs.training.export import COORDINATES, Exported, export_ply, without_antialiasing
-from blitzgs.training.run_folder import open_run
+from blitzgs.runs.export import COORDINATES, Exported, export_ply, without_antialiasing
+from blitzgs.runs.folder import open_run
+from blitzgs.util.output import check_replaceable
 
 HELP = """\
 Write the model of a run as a PLY file in INRIA's layout, which most viewers read.

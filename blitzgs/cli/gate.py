@@ -11,17 +11,19 @@ from pathlib import Path
 from typing import Any
 
 from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, named_path
+from blitzgs.config.fields import ScheduleConfig
+from blitzgs.config.files import ConfigError, load_config
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.output import OutputFolder
-from blitzgs.population import gate_evaluation, gate_fit, spawn_samples
-from blitzgs.population.spawn_gate import SpawnGate, gate_file
-from blitzgs.training import run_files
-from blitzgs.training.config import ScheduleConfig
-from blitzgs.training.config_io import ConfigError, load_config
-from blitzgs.training.gate_replay import FIGURES, TABLE, replay
+from blitzgs.runs import files as run_files
+from blitzgs.runs.folder import open_run
+from blitzgs.spawn import evaluation as gate_evaluation
+from blitzgs.spawn import fit as gate_fit
+from blitzgs.spawn import samples as spawn_samples
+from blitzgs.spawn.gate import SpawnGate, gate_file
 from blitzgs.training.inputs import open_capture
-from blitzgs.training.run_folder import open_run
-from blitzgs.training.schedule import Schedule
+from blitzgs.training.replay import FIGURES, TABLE, replay
+from blitzgs.util.output import OutputFolder
 
 HELP = """\
 A spawn gate is a predictor. Among the Gaussians about to be cloned or split (the candidates), it withholds

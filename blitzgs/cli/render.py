@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
+from blitzgs.capture.pictures import encode_image
 from blitzgs.cli.arguments import (
     Commands,
     add_command,
@@ -21,17 +22,16 @@ from blitzgs.cli.arguments import (
     named_path,
 )
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.output import OutputFolder
-from blitzgs.progress import image_progress
-from blitzgs.scene.pictures import encode_image
-from blitzgs.training import run_files
-from blitzgs.training.evaluation import render_view
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.runs import files as run_files
+from blitzgs.runs.cameras import CAMERAS, RunCameras, input_files, load_cameras
+from blitzgs.runs.evaluation import render_view
+from blitzgs.runs.lod import lod_gate, scene_gate
 from blitzgs.training.inputs import check_capture, open_capture
-from blitzgs.training.lod import lod_gate, scene_gate
-from blitzgs.training.run_cameras import CAMERAS, RunCameras, input_files, load_cameras
-from blitzgs.training.views import CameraLike, ViewSet, render_options
-from blitzgs.view.visible_scene import VisibleFinder
+from blitzgs.util.output import OutputFolder
+from blitzgs.util.progress import image_progress
+from blitzgs.view.views import CameraLike, ViewSet, render_options
+from blitzgs.view.visible import VisibleFinder
 
 
 def add_to(commands: Commands[argparse.ArgumentParser]) -> None:

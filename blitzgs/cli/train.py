@@ -17,13 +17,13 @@ from rich.console import Console
 from rich.table import Table
 
 from blitzgs.cli.arguments import Commands, add_command, add_device, named_path
-from blitzgs.distributed.group import Ranks, Transport
-from blitzgs.training import run_files
-from blitzgs.training.config import Config
-from blitzgs.training.config_io import ConfigError, load_config, to_dict
-from blitzgs.training.folder_checks import locked
+from blitzgs.config.fields import Config, Transport
+from blitzgs.config.files import ConfigError, load_config, to_dict
+from blitzgs.config.recipes import default_recipe, recipe_path
+from blitzgs.distributed.group import Ranks
+from blitzgs.runs import files as run_files
+from blitzgs.runs.folder_checks import locked
 from blitzgs.training.inputs import open_capture
-from blitzgs.training.recipes import default_recipe, recipe_path
 from blitzgs.training.trainer import Trainer
 
 HELP = """\
@@ -35,7 +35,7 @@ own split: the model is not trained on these views, and its quality is measured 
 
 A GPU trains with the recipe aerial, a CPU with aerial_cpu. --config takes another recipe (compact: fewer
 Gaussians; smoke: a first model in minutes; city: thousands of photographs; paper: the paper's values), a YAML
-file of yours, or "defaults" (the defaults of all fields; blitzgs/training/config.py describes them). Every
+file of yours, or "defaults" (the defaults of all fields; blitzgs/config/fields.py describes them). Every
 field is also a flag, for example --data.downscale=2 --population.max_gaussians=2000000. --show-config prints
 the resulting configuration and stops.
 

@@ -16,12 +16,12 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from blitzgs.config.fields import Transport
 from blitzgs.distributed.shared_memory import SharedMemory, connect
 from blitzgs.distributed.watchdog import BUSY_SECONDS, NoWatchdog, Watchdog, open_store
 
 T = TypeVar("T")
 ReduceOp = Literal["sum", "min", "max"]
-Transport = Literal["auto", "peer", "collective"]
 _REDUCE_OPS = {"sum": dist.ReduceOp.SUM, "min": dist.ReduceOp.MIN, "max": dist.ReduceOp.MAX}
 
 DEFAULT_TIMEOUT_SECONDS = 120.0

@@ -5,7 +5,7 @@ Each rank owns memory that all others have mapped (NVLink or PCIe peer access):
 
 - a few control words: the number of the last barrier that each rank reached, and the numbers that it wrote
   for this barrier;
-- a buffer that grows, for the transport of splats (`blitzgs.distributed.transport.peer`);
+- a buffer that grows, for the transport of splats (`blitzgs.frame.transport.peer`);
 - a board, on which ranks publish numbers for the hosts (`HostSum`); it has its own stream and its own
   barriers.
 

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.formats.native import native_io
-from blitzgs.output import new_file
+from blitzgs.util.output import new_file
 
 LEVEL = "level"
 _REST_TO_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}

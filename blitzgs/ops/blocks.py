@@ -143,7 +143,7 @@ def cull_blocks(
 
     The set is conservative: it contains every row that projection would project, however many of its pending
     steps have been applied by then. A row is dropped from a view only if it certainly misses that view
-    (csrc/blocks/blocks.h).
+    (csrc/active/blocks.h).
 
     Args:
         bounds: from `update_block_bounds_`, of the same rows.
@@ -179,7 +179,7 @@ def cull_blocks(
 
 
 def _rows(means: Tensor, scales: Tensor, pending: PendingSteps | None) -> list[Tensor]:
-    """Return the group `rows` of the ops (`hold_rows` of csrc/blocks/blocks_op.cpp)."""
+    """Return the group `rows` of the ops (`hold_rows` of csrc/active/blocks_op.cpp)."""
     return [means, scales, *(pending or ())]
 
 

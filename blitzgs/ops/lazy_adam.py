@@ -13,7 +13,7 @@ from torch import Tensor
 
 from blitzgs._library import below_autograd
 
-# Columns of the schedule's table, as in csrc/lazy_adam/lazy_adam.h: tails of 4 orders for 6 groups, powers of
+# Columns of the schedule's table, as in csrc/adam/lazy_adam.h: tails of 4 orders for 6 groups, powers of
 # the decay rates, bias corrections.
 ORDERS, GROUPS = 4, 6
 _TAILS, _POWERS, CORRECTION1, CORRECTION2, _COLUMNS = slice(0, ORDERS * GROUPS), 24, 28, 29, 30
@@ -40,7 +40,7 @@ class AdamState(NamedTuple):
 
     @property
     def tensors(self) -> list[Tensor]:
-        """The group `state` of the ops (`AdamTensors` of csrc/lazy_adam/lazy_adam_op.h)."""
+        """The group `state` of the ops (`AdamTensors` of csrc/adam/lazy_adam_op.h)."""
         return [*self.params, *self.exp_avgs, *self.exp_avg_sqs, self.last_step, self.moment_step]
 
 
@@ -52,7 +52,7 @@ class AdamSchedule:
     Attributes:
         lr_table: float32 [S + 1, 6], the learning rates of every step.
         table: float64 [S + 1, 30] on the device of `lr_table`: for each step, the sums that give a row's
-            movement over the steps it misses after that one (csrc/lazy_adam/lazy_adam.h).
+            movement over the steps it misses after that one (csrc/adam/lazy_adam.h).
         tables: the group `tables` of the ops: `table`, `lr_table`, and the rules for rows that are
             `explicit_steps` or more steps behind. A rule applies all missed steps of a row; rules are indexed
             by the row's last step: uint8 [max(0, S + 1 - explicit_steps), bytes], in a layout that only the
@@ -103,7 +103,7 @@ def lazy_adam_step_(
 
     Equals ``torch.optim.Adam`` (bias-corrected; Kingma & Ba 2015, Algorithm 1) over all rows, with zero
     gradients for the rows not listed, once `lazy_adam_catch_up_` has been called; see
-    csrc/lazy_adam/lazy_adam.h for the closed form. All tensors on one device; float32 (CPU also float64).
+    csrc/adam/lazy_adam.h for the closed form. All tensors on one device; float32 (CPU also float64).
 
     Args:
         state: of N rows; `last_step` and `moment_step` become `step` for `ids`.

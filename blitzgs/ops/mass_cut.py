@@ -10,7 +10,7 @@ from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-# As in csrc/mass_cut/mass_cut.h.
+# As in csrc/importance/mass_cut.h.
 DIGITS = 1 << 12
 ROUNDS = 6
 TIES_STEP, CHOICE_STEP = 2 * ROUNDS, 4 * ROUNDS
@@ -20,7 +20,7 @@ _MISSING_ID = 6  # index into a search's 8 numbers: how many items remain to be 
 
 
 class MassCut(NamedTuple):
-    """A search for the threshold weight of each of S segments; see `csrc/mass_cut/mass_cut.h`.
+    """A search for the threshold weight of each of S segments; see `csrc/importance/mass_cut.h`.
 
     A search has rounds of two steps. Step 2 r of round r scans this rank's items and fills `sums`. The caller
     then adds up `sums` over the ranks. Step 2 r + 1 reads and clears them. Steps from `TIES_STEP` on do

@@ -11,7 +11,7 @@ from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-# Splats that share an entry of `places`, see csrc/scatter/places.h.
+# Splats that share an entry of `places`, see csrc/exchange/places.h.
 RUN = 32
 
 

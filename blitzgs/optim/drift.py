@@ -37,7 +37,7 @@ class Drift:
     Attributes:
         begin: the step at which the tables begin.
         betas: decay rates of the moments.
-        tables: T of float64 [CAPACITY + 1, 30], see csrc/lazy_adam/lazy_adam.h.
+        tables: T of float64 [CAPACITY + 1, 30], see csrc/adam/lazy_adam.h.
         lr_tables: T of float32 [CAPACITY + 1, 6].
         reach: number of steps for which a row without a gradient still moves.
     """

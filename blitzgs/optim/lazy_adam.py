@@ -29,12 +29,12 @@ class LazyAdam(torch.optim.Optimizer):
     """`torch.optim.Adam` for tables of rows, whose cost follows the rows that have a gradient.
 
     Use it in a training loop of your own, whose learning rates may follow any scheduler; the trainer, which
-    has a `GaussianTable` and knows its schedule in advance, uses `blitzgs.training.optimiser.TableAdam`.
+    has a `GaussianTable` and knows its schedule in advance, uses `blitzgs.optim.table_adam.TableAdam`.
 
     Rows that are missing in a sparse gradient (`rasterization(..., sparse_grad=True)`) have the gradient
     zero. `step` does not touch them, so they fall behind. `catch_up` applies the steps that they missed, in
     closed form whatever their number, and gives them the values of `torch.optim.Adam` to rounding
-    (csrc/lazy_adam/lazy_adam.h). Call it before the parameters are read: before a view is rendered and before
+    (csrc/adam/lazy_adam.h). Call it before the parameters are read: before a view is rendered and before
     evaluation. Call `bring_up_to_date` before a strategy replaces parameters and their state. With a dense
     gradient, `step` is a step of plain Adam.
 

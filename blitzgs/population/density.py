@@ -12,11 +12,11 @@ from torch.nn.functional import softplus
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
-from blitzgs.model import PARAMETERS, GaussianTable, opacity_logit
 from blitzgs.ops.counter_random import hash_keys, normal
-from blitzgs.population.candidates import Candidates, Veto, spawn_features
-from blitzgs.population.lineage import Births, Cause, Lineage
-from blitzgs.view.blocks import morton_order
+from blitzgs.spawn.candidates import Candidates, Veto, spawn_features
+from blitzgs.spawn.lineage import Births, Cause, Lineage
+from blitzgs.table.blocks import morton_order
+from blitzgs.table.table import PARAMETERS, GaussianTable, opacity_logit
 
 SPLIT_SHRINK = 1.6
 CHILDREN_OF_A_SPLIT = 2

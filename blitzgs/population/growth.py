@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import GaussianTable
-from blitzgs.view.host_table import available_bytes
+from blitzgs.table.host_table import available_bytes
+from blitzgs.table.table import GaussianTable
 
 # Share of the memory that growth may fill; the rest is a reserve for the largest needs of a step.
 MEMORY_SHARE = 0.9

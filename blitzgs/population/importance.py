@@ -26,24 +26,24 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from blitzgs.config.fields import ScoreRule
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.selection import integer_mass_prefix
-from blitzgs.distributed.tiles import TileAssignment
-from blitzgs.distributed.transport import open_transport
-from blitzgs.model import CULL, GaussianTable
+from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.survey import Survey, survey
+from blitzgs.frame.tiles import TileAssignment
+from blitzgs.frame.transport import open_transport
 from blitzgs.ops.cull_mask import WORD_BITS
 from blitzgs.ops.view_sums import ViewSums, view_sums_
-from blitzgs.pipeline import RenderOptions, Views
-from blitzgs.survey import Survey, survey
+from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.view.gate import SceneGate
-from blitzgs.view.visible_scene import Scene, VisibleFinder, VisibleScene, table_of
+from blitzgs.view.visible import Scene, VisibleFinder, VisibleScene, table_of
 
 # The constants of the formulas above. PHI_EPS and VIEW_MASS are the paper's values; the paper calls the
 # epsilon of the score small and gives no value.
@@ -52,7 +52,6 @@ PHI_EPS = 0.1
 VIEW_MASS = 0.99
 # Column of a table from the first pass on, beside `CULL`.
 PHI = "phi"
-ScoreRule = Literal["density", "root", "weight", "energy"]
 # Bits before the binary point of a view's term, for a < 2^31 pixels: w < a < 2^31, so w / a < 1 and
 # w / sqrt(a) < sqrt(a) < 2^16. A sum of squares is less than w.
 _TERM_BITS: dict[ScoreRule, int] = {"density": 0, "root": 16, "weight": 31, "energy": 31}

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from blitzgs.model import GaussianTable, opacity_logit
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.voxel_keys import voxel_keys
+from blitzgs.table.table import GaussianTable, opacity_logit
 from blitzgs.view.levels import Levels
 from blitzgs.view.point_blocks import PointBlocks
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from blitzgs.model import GaussianTable
 from blitzgs.ops.position_noise import position_noise_
+from blitzgs.table.table import GaussianTable
 
 
 class PositionNoise:

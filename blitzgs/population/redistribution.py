@@ -7,7 +7,7 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.sharding import global_positions, imbalance, shard_sizes
-from blitzgs.model import GaussianTable
+from blitzgs.table.table import GaussianTable
 
 
 def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = 1.1) -> bool:

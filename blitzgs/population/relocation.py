@@ -11,8 +11,6 @@ from torch.nn.functional import softplus
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import sampling_keys, smallest
-from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable, opacity_logit
-from blitzgs.population.candidates import spawn_features
 from blitzgs.population.density import (
     CHILDREN_OF_A_SPLIT,
     DensityReport,
@@ -20,8 +18,10 @@ from blitzgs.population.density import (
     child_ids,
     death_causes,
 )
-from blitzgs.population.lineage import Births, Cause, Lineage
-from blitzgs.view.blocks import morton_order
+from blitzgs.spawn.candidates import spawn_features
+from blitzgs.spawn.lineage import Births, Cause, Lineage
+from blitzgs.table.blocks import morton_order
+from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable, opacity_logit
 
 # Largest number of copies of one Gaussian in one event, itself included; 3DGS-MCMC's code has the same limit.
 MOST_COPIES = 51

@@ -13,8 +13,8 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from blitzgs.model import GaussianTable
-from blitzgs.pipeline import Views
+from blitzgs.frame.frame import Views
+from blitzgs.table.table import GaussianTable
 
 FLOOR = "scale_floor"
 # A mean may be outside the image by this share of its size and still count as sampled.

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loop with its schedule, loss, checkpoints, logging and configuration."""
+"""The training loop with its schedule, loss and events."""

@@ -24,15 +24,15 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
+from blitzgs.config.fields import ScheduleConfig
+from blitzgs.config.pace import Pace
+from blitzgs.config.schedule import PLACED, latest_times
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.training.config import ScheduleConfig
-from blitzgs.training.pace import Pace
-from blitzgs.training.schedule import PLACED, latest_times
 
 # Number of events over which demand is averaged.
 EVENTS = 3
 # Demand relative to its highest value: at T1, and at the end of densification. No other values were measured
-# (docs/performance.md, "The adaptive schedule").
+# (docs/decisions/population.md).
 FALLEN, GONE = 0.5, 0.1
 # The loss is compared between neighbouring spans of whole epochs, each at least this share of the schedule.
 SPAN = 1 / 60

@@ -5,70 +5,26 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.distributed.tiles import LOSS_HALO, TileRanges
+from blitzgs.capture.images import Images
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.tiles import LOSS_HALO, TileRanges
 from blitzgs.ops.host import current_stream
-from blitzgs.pipeline import Views
-from blitzgs.scene.images import ImageMemory
+from blitzgs.training.batch import Batch
 from blitzgs.training.sampler import BatchSampler
-from blitzgs.training.views import VIEW_NUMBERS, ViewSet, unpack_views
+from blitzgs.view.views import VIEW_NUMBERS, ViewSet, unpack_views
 
 # Photographs are decoded further ahead than batches are uploaded: for every batch that is uploaded ahead,
 # those of this number of later batches. Decoding one takes as long as several steps on a fast GPU.
 _DECODED_AHEAD = 4
 # A view of which masks exclude a larger share is counted in `BatchLoader.views_masked`.
 MOST_MASKED = 0.95
-
-
-class PhotographError(RuntimeError):
-    """A photograph cannot be read; the message names the file."""
-
-
-class Images(Protocol):
-    """What training reads of an image store (`blitzgs.scene.images.ImageStore`)."""
-
-    def get(self, index: int) -> Tensor:
-        """Return an image, uint8 [H, W, 3]."""
-
-    def mask(self, index: int) -> Tensor | None:
-        """Return the image's mask, uint8 [H, W] with 0 = excluded, or None."""
-
-    def prefetch(self, indices: Sequence[int], masks: Sequence[int] = ()) -> None:
-        """Decode images and masks in the background."""
-
-    def memory(self) -> ImageMemory:
-        """Return how much host memory the images have taken."""
-
-
-@dataclass(frozen=True)
-class Batch:
-    """One step's views and photographs on the device.
-
-    Attributes:
-        indices: the B cameras of the batch, as indices into the capture.
-        views: the same cameras as the renderer takes them.
-        targets: uint8 [B, H, W, 3]; on several ranks, undefined outside the pixels that this rank's loss
-            reads.
-        masks: uint8 [B, H, W], 0 = excluded pixel; None when no view of the batch has a mask.
-        samples: float32 [B], number of values in a view's mean: 3 x its pixels that count, at least 1.
-        ranges: the tiles of each rank; None on one rank.
-    """
-
-    indices: list[int]
-    views: Views
-    targets: Tensor
-    masks: Tensor | None
-    samples: Tensor
-    ranges: TileRanges | None
 
 
 class _Plan(NamedTuple):

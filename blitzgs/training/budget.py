@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from blitzgs.training.config import ScheduleConfig
-from blitzgs.training.config_ranges import MOST_IMAGES, SCALE
+from blitzgs.config.fields import ScheduleConfig
+from blitzgs.config.ranges import MOST_IMAGES, SCALE
 from blitzgs.training.state import TrainingState
 
 # The first steps of a process are slow (memory, kernels, photographs), so they are not measured. Intervals

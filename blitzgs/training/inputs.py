@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import blitzgs
+from blitzgs.capture.capture import Capture, MissingImagesError, load_capture
+from blitzgs.capture.fingerprint import capture_fingerprint
+from blitzgs.capture.images import ImageStore, decoded_shapes
+from blitzgs.capture.shared_images import SharedImages, size_of
+from blitzgs.config.fields import Config
+from blitzgs.config.files import ConfigError, to_dict
 from blitzgs.distributed.group import Ranks
-from blitzgs.scene.capture import Capture, MissingImagesError, load_capture
-from blitzgs.scene.images import ImageStore, decoded_shapes
-from blitzgs.scene.shared_images import SharedImages, size_of
-from blitzgs.training.config import Config
-from blitzgs.training.config_io import ConfigError, to_dict
-from blitzgs.training.views import Space
+from blitzgs.view.views import Space
 
 # Fields that may differ between the hosts of a job.
 HOST_FIELDS = ("data.path", "data.cache_bytes", "data.threads")
@@ -171,23 +172,6 @@ def code_fingerprint() -> str:
         digest.update(str(path.relative_to(root)).encode())
         digest.update(path.read_bytes())
     return f"{blitzgs.__version__}+{digest.hexdigest()[:12]}"
-
-
-def capture_fingerprint(capture: Capture) -> str:
-    """Return a digest of the cameras, the points and the split."""
-    digest = hashlib.sha256()
-    for camera in capture.cameras:
-        digest.update(os.fsencode(f"{camera.name} {camera.width} {camera.height}"))
-        digest.update(camera.K.tobytes() + camera.world_to_camera.tobytes())
-    digest.update(capture.points.tobytes() + capture.colors.tobytes())
-    digest.update(repr((capture.train, capture.test)).encode())
-    return digest.hexdigest()[:12]
-
-
-def train_views_fingerprint(capture: Capture) -> str:
-    """Return a digest of the names of the training views, in their order."""
-    names = [capture.cameras[index].name for index in capture.train]
-    return hashlib.sha256(repr(names).encode()).hexdigest()[:12]
 
 
 def _flatten(fields: dict[str, Any], where: str = "") -> list[tuple[str, object]]:

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.tiles import LOSS_HALO
-from blitzgs.model import GaussianTable
+from blitzgs.config.fields import LEAST_OPACITY, MOST_OPACITY, LossConfig
+from blitzgs.frame.frame import Frame
+from blitzgs.frame.tiles import LOSS_HALO
 from blitzgs.ops.photometric import photometric_fwd_bwd
-from blitzgs.pipeline import Frame
-from blitzgs.training.batches import Batch
-from blitzgs.training.config import LEAST_OPACITY, MOST_OPACITY, LossConfig
+from blitzgs.table.table import GaussianTable
+from blitzgs.training.batch import Batch
 
 
 class LossTerms(NamedTuple):

@@ -9,23 +9,23 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from blitzgs.config.fields import LossConfig
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.distributed.transport import Mark, unmarked
+from blitzgs.frame.frame import Frame, RenderOptions
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.transport import Mark, unmarked
 from blitzgs.ops.host import to_device
 from blitzgs.ops.projection_types import MOST_VIEWS
-from blitzgs.pipeline import Frame, RenderOptions
+from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.position_noise import PositionNoise
-from blitzgs.training.batches import Batch
-from blitzgs.training.config import LossConfig
+from blitzgs.table.block_visibility import Cameras
+from blitzgs.table.pool import Residence
+from blitzgs.training.batch import Batch
 from blitzgs.training.loss import LossTerms
-from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
-from blitzgs.training.views import ViewSet
-from blitzgs.view.block_visibility import Cameras
 from blitzgs.view.gate import ViewGate
-from blitzgs.view.residence import Residence
+from blitzgs.view.views import ViewSet
 
 
 class UpcomingCameras:

@@ -11,11 +11,11 @@ from typing import Any
 
 import torch
 
-from blitzgs.charts import line_chart
-from blitzgs.output import write_file
-from blitzgs.training.run_files import peak_memory_bytes
-from blitzgs.training.run_log import LOG
+from blitzgs.runs.files import peak_memory_bytes
+from blitzgs.runs.log import LOG
 from blitzgs.training.state import TrainingState
+from blitzgs.util.charts import line_chart
+from blitzgs.util.output import write_file
 
 PICTURE = "trajectory.svg"
 _STAGES = ("before_pass_1", "after_pass_1", "peak", "before_pass_2", "after_pass_2", "final")

@@ -9,40 +9,41 @@ from pathlib import Path
 
 import torch
 
+from blitzgs.capture.capture import Capture
+from blitzgs.capture.fingerprint import train_views_fingerprint
+from blitzgs.capture.images import Images
+from blitzgs.config.fields import Config
+from blitzgs.config.files import save_config
+from blitzgs.config.schedule import Schedule, stretched
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.model import GaussianTable
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import octree_gaussians
-from blitzgs.population.lineage import Lineage, initial_births, ledger_of
 from blitzgs.population.position_noise import PositionNoise
-from blitzgs.scene.capture import Capture
-from blitzgs.training import run_files
+from blitzgs.runs import files as run_files
+from blitzgs.runs.cameras import CAMERAS, save_cameras
+from blitzgs.runs.evaluation import load_lpips
+from blitzgs.runs.files import Progress
+from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
+from blitzgs.runs.log import LOG, RunLog
+from blitzgs.spawn.lineage import Lineage, initial_births, ledger_of
+from blitzgs.spawn.rules import lineage_subject, open_spawn_gate
+from blitzgs.table.blocks import morton_order
+from blitzgs.table.host_table import HostTable
+from blitzgs.table.pool import Residence
+from blitzgs.table.table import GaussianTable
 from blitzgs.training.adaptive import Signals
 from blitzgs.training.agreement import SaveClock
-from blitzgs.training.batches import Images
-from blitzgs.training.config import Config
-from blitzgs.training.config_io import save_config
-from blitzgs.training.evaluation import load_lpips
-from blitzgs.training.folder_checks import check_room, check_unclaimed, check_writable
-from blitzgs.training.inputs import check_alike, check_capture, train_views_fingerprint
+from blitzgs.training.inputs import check_alike, check_capture
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
-from blitzgs.training.optimiser import TableAdam
 from blitzgs.training.population_report import PICTURE
-from blitzgs.training.run_cameras import CAMERAS, save_cameras
-from blitzgs.training.run_files import Progress
-from blitzgs.training.run_log import LOG, RunLog
 from blitzgs.training.sampler import BatchSampler
-from blitzgs.training.schedule import Schedule, stretched
-from blitzgs.training.spawn_gate import lineage_subject, open_spawn_gate
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
 from blitzgs.training.view_level import keep_to_views
-from blitzgs.training.views import Space, ViewSet, trained_centres
-from blitzgs.view.blocks import morton_order
-from blitzgs.view.host_table import HostTable
 from blitzgs.view.levels import measure_levels
-from blitzgs.view.residence import Residence
+from blitzgs.view.views import Space, ViewSet, trained_centres
 
 
 def set_up(

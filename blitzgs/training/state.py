@@ -13,27 +13,27 @@ from typing import Any
 
 import torch
 
+from blitzgs.capture.capture import Capture
+from blitzgs.capture.images import Images
+from blitzgs.config.fields import Config
+from blitzgs.config.schedule import PLACED, Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.model import GaussianTable
-from blitzgs.pipeline import RenderOptions
-from blitzgs.population.candidates import Veto
-from blitzgs.population.lineage import Lineage
-from blitzgs.scene.capture import Capture
+from blitzgs.frame.frame import RenderOptions
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.optim.table_adam import TableAdam
+from blitzgs.runs.evaluation import Lpips
+from blitzgs.runs.files import Progress
+from blitzgs.runs.lod import lod_gate
+from blitzgs.runs.log import RunLog
+from blitzgs.spawn.candidates import Veto
+from blitzgs.spawn.lineage import Lineage
+from blitzgs.table.blocks import morton_order
+from blitzgs.table.table import GaussianTable
 from blitzgs.training.adaptive import Signals
 from blitzgs.training.agreement import SaveClock
-from blitzgs.training.batches import Images
-from blitzgs.training.config import Config
-from blitzgs.training.evaluation import Lpips
-from blitzgs.training.lod import lod_gate
-from blitzgs.training.optimiser import TableAdam
-from blitzgs.training.run_files import Progress
-from blitzgs.training.run_log import RunLog
 from blitzgs.training.sampler import BatchSampler
-from blitzgs.training.schedule import PLACED, Schedule
 from blitzgs.training.step import Stepper
-from blitzgs.training.views import Space, ViewSet, render_options
-from blitzgs.view.blocks import morton_order
+from blitzgs.view.views import Space, ViewSet, render_options
 
 
 def never() -> bool:

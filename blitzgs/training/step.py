@@ -6,23 +6,23 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from blitzgs import pipeline
+from blitzgs.config.fields import LossConfig
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.distributed.tiles import TileAssignment
-from blitzgs.distributed.transport import Mark, open_transport, unmarked
-from blitzgs.model import GaussianTable
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import Frame, RenderOptions
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.tiles import TileAssignment
+from blitzgs.frame.transport import Mark, open_transport, unmarked
 from blitzgs.ops.view_gate import gate_views_
-from blitzgs.pipeline import Frame, RenderOptions
+from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.position_noise import PositionNoise
 from blitzgs.population.scale_floor import FLOOR, raise_scales
-from blitzgs.training.batches import Batch
-from blitzgs.training.config import LossConfig
+from blitzgs.table.blocks import BlockIndex
+from blitzgs.table.table import GaussianTable
+from blitzgs.training.batch import Batch
 from blitzgs.training.loss import LossTerms, loss_terms
-from blitzgs.training.optimiser import TableAdam
-from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.gate import ViewGate
-from blitzgs.view.visible_scene import Scene
+from blitzgs.view.visible import Scene
 
 
 class Stepper:

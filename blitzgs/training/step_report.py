@@ -9,10 +9,10 @@ from typing import NamedTuple
 import torch
 
 from blitzgs.distributed.host_sum import HostSum
+from blitzgs.frame.frame import Frame
 from blitzgs.ops.host import HostCopy
-from blitzgs.pipeline import Frame
-from blitzgs.training.batches import Batch
-from blitzgs.training.guard import check_table, find_bad
+from blitzgs.runs.guard import check_table, find_bad
+from blitzgs.training.batch import Batch
 from blitzgs.training.loss import batch_psnr, opacity_term, photometric, scale_term, size_term
 from blitzgs.training.state import TrainingState
 

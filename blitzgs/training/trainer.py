@@ -14,30 +14,32 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from blitzgs.capture.capture import Capture
+from blitzgs.capture.images import Images, PhotographError
+from blitzgs.config.fields import Config
+from blitzgs.config.files import config_hash, save_config
 from blitzgs.distributed.group import Ranks
+from blitzgs.frame.frame import Frame
 from blitzgs.ops.density_stats import density_stats_
-from blitzgs.output import write_file
-from blitzgs.pipeline import Frame
 from blitzgs.population.importance import PHI
-from blitzgs.scene.capture import Capture
-from blitzgs.training import run_files, view_level
+from blitzgs.runs import files as run_files
+from blitzgs.runs.guard import LossGuard, ModelLostError
+from blitzgs.runs.lod import lod_gate
+from blitzgs.runs.log import RunLog
+from blitzgs.spawn.rules import lineage_subject
+from blitzgs.table.pool import ResidenceError
+from blitzgs.training import view_level
 from blitzgs.training.agreement import MOST_STEPS, Agreement, StopRequest
-from blitzgs.training.batches import MOST_MASKED, BatchLoader, Images, PhotographError
+from blitzgs.training.batches import MOST_MASKED, BatchLoader
 from blitzgs.training.budget import Budget
-from blitzgs.training.config import Config
-from blitzgs.training.config_io import config_hash, save_config
 from blitzgs.training.events import evaluate, events_left, handle_all, save
-from blitzgs.training.guard import LossGuard, ModelLostError
 from blitzgs.training.inputs import sharing_hint
-from blitzgs.training.lod import lod_gate
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
-from blitzgs.training.run_log import RunLog
 from blitzgs.training.setup import set_up
-from blitzgs.training.spawn_gate import lineage_subject
 from blitzgs.training.state import TrainingState, never
 from blitzgs.training.step_report import StepRecord, log_step, measure_step
-from blitzgs.training.views import render_options
-from blitzgs.view.residence import ResidenceError
+from blitzgs.util.output import write_file
+from blitzgs.view.views import render_options
 
 # With fewer views for each rank, a step takes a rank's host longer than its GPU (docs/city.md).
 VIEWS_PER_RANK = 4

@@ -7,12 +7,12 @@ import dataclasses
 import math
 import warnings
 
+from blitzgs.capture.capture import Capture
+from blitzgs.capture.fingerprint import train_views_fingerprint
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import CULL, GaussianTable
-from blitzgs.scene.capture import Capture
-from blitzgs.training.inputs import train_views_fingerprint
-from blitzgs.training.lod import lod_gate, scene_gate
-from blitzgs.training.run_files import Progress
+from blitzgs.runs.files import Progress
+from blitzgs.runs.lod import lod_gate, scene_gate
+from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.training.state import TrainingState
 from blitzgs.view.gate import ViewGate, lod_bits
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The view level: which Gaussians a view needs, and where they are in memory."""
+"""The view level: which Gaussians a view needs."""

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.view_gate import gate_views_
+from blitzgs.table.table import GaussianTable
 from blitzgs.view.levels import farthest
 
 # Number of sampled Gaussians that predict the share that a view keeps; the standard error is at most 0.4 %.

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from blitzgs.view.blocks import morton_order
+from blitzgs.table.blocks import morton_order
 
 BLOCK_POINTS = 256
 # Bounds are widened by this share, far more than the rounding of a float64 distance.

@@ -255,7 +255,7 @@ bool flag_is_set(py::array_t<std::uint8_t> flags, py::ssize_t index) {
 }  // namespace
 
 PYBIND11_MODULE(_io, m) {
-  m.doc() = "Host-side I/O of BlitzGS; blitzgs.scene.colmap and blitzgs.formats.ply are its public face.";
+  m.doc() = "Host-side I/O of BlitzGS; blitzgs.capture.colmap and blitzgs.formats.ply are its public face.";
   py::register_exception<io::FormatError>(m, "FormatError", PyExc_ValueError);
   py::register_exception<WriteError>(m, "WriteError", PyExc_OSError);
   m.def("camera_models", &camera_models);

@@ -36,11 +36,11 @@
 #include <cstdint>
 #include <variant>
 
+#include "adam/lazy_adam.h"
 #include "common/kernel.h"
-#include "lazy_adam/lazy_adam.h"
+#include "exchange/places.h"
 #include "math/tiles.h"
 #include "project/project_splat.h"
-#include "scatter/places.h"
 
 // Smooth levels: the LOD gate (view_gate.h) drops an octree level from a view beyond a certain distance, the
 // reach of the level. With smooth levels the opacity of a Gaussian falls to zero towards this distance, so

@@ -4,11 +4,11 @@
 #include <tuple>
 #include <vector>
 
+#include "adam/lazy_adam_op.h"
 #include "common/op.h"
-#include "lazy_adam/lazy_adam_op.h"
+#include "exchange/places_op.h"
 #include "project/project.h"
 #include "project/project_op.h"
-#include "scatter/places_op.h"
 
 namespace blitzgs {
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "project/project.h"
 
-#include "lazy_adam/lazy_adam_device.cuh"
+#include "adam/lazy_adam_device.cuh"
 #include "project/project_bwd_device.cuh"
 
 namespace blitzgs::cuda {

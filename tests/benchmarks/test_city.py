@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from blitzgs.training.config_io import load_config
+from blitzgs.config.files import load_config
 from tests.training.tiny import write_tiny_capture
 
 ROOT = Path(__file__).resolve().parents[2]

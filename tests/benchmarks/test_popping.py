@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run_files
+from blitzgs.runs import files as run_files
 from blitzgs.training.trainer import Trainer
 from tests.helpers import DEVICES
 from tests.training.tiny import tiny_config, tiny_scene

@@ -20,9 +20,9 @@ from opponents import relocation  # noqa: E402
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer  # noqa: E402
 from quality_plan import RunSpec, read_plan, runs_of  # noqa: E402
 
+from blitzgs.config.schedule import PLACED  # noqa: E402
 from blitzgs.distributed.group import Ranks  # noqa: E402
 from blitzgs.reference.gaussians import covariance_factors  # noqa: E402
-from blitzgs.training.schedule import PLACED  # noqa: E402
 from tests.helpers import DEVICES  # noqa: E402
 from tests.training.tiny import OVERRIDES, tiny_scene, write_tiny_capture  # noqa: E402
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from cuda_scenes import Scene
+
+from tests.cuda.scenes import Scene
 
 HERE = Path(__file__).parent
 

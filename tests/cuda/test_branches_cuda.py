@@ -5,9 +5,9 @@ import ctypes
 
 import pytest
 import torch
-from cuda_scenes import Scene, ops
 
 from blitzgs import _library
+from tests.cuda.scenes import Scene, ops
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,8 @@
 
 import pytest
 import torch
-from cuda_scenes import Scene, ops, relative_error
+
+from tests.cuda.scenes import Scene, ops, relative_error
 
 
 def survey(scene, device="cuda", dtype=torch.float32, tile_size=16, begin=0, end=-1):

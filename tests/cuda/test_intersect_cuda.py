@@ -3,7 +3,8 @@
 
 import pytest
 import torch
-from cuda_scenes import Scene, ops
+
+from tests.cuda.scenes import Scene, ops
 
 
 def lists(splats, grid, device, ids=None, count=-1):

@@ -2,9 +2,9 @@
 """Kernels that are launched while the kernel before them still ends (csrc/common/cuda.cuh)."""
 
 import torch
-from cuda_scenes import Scene, ops
 
 from blitzgs.ops.photometric import photometric_fwd_bwd
+from tests.cuda.scenes import Scene, ops
 
 SIZES = (3000, 40, 30_000, 700)
 

@@ -5,15 +5,15 @@ import dataclasses
 
 import pytest
 import torch
-from cuda_scenes import ops, relative_error
 
-from blitzgs import pipeline
-from blitzgs.distributed.transport import LocalTransport
-from blitzgs.model import GaussianTable
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.transport import LocalTransport
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
 from blitzgs.ops.splat_gradients import gradient_columns
-from blitzgs.view.blocks import BlockIndex, morton_order
-from tests.distributed.test_sharded_rendering import OPTIONS, cameras
+from blitzgs.table.blocks import BlockIndex, morton_order
+from blitzgs.table.table import GaussianTable
+from tests.cuda.scenes import ops, relative_error
+from tests.frame.test_sharded_rendering import OPTIONS, cameras
 from tests.helpers import parameter_gradients
 from tests.training.tiny import random_gaussians
 

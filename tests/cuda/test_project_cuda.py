@@ -3,10 +3,10 @@
 
 import pytest
 import torch
-from cuda_scenes import Scene, ops, relative_error
 
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.projection_types import VIEW_TOTALS, splats_of
+from tests.cuda.scenes import Scene, ops, relative_error
 
 NAMES = ("gaussian_ids", "camera_ids", "visible_ids", "splat_offsets")
 NAMES += ("means2d", "conics", "depths", "opacities", "colors")

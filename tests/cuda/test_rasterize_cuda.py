@@ -3,10 +3,10 @@
 
 import pytest
 import torch
-from cuda_scenes import Scene, ops, relative_error
 
 from blitzgs.ops.rasterize import RasterizeSaved
 from blitzgs.ops.splat_gradients import absolute_column
+from tests.cuda.scenes import Scene, ops, relative_error
 
 # Where rounding decides whether a splat takes part, the images differ by up to about alpha = 1/255.
 CUT_SHARE = 2e-3

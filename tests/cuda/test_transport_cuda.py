@@ -5,15 +5,15 @@ import weakref
 
 import pytest
 import torch
-from cuda_scenes import Scene, ops
 
-from blitzgs.distributed.transport import Traffic
-from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, PeerBuffers
+from blitzgs.frame.transport import Traffic
+from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, PeerBuffers
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.host import HostCopy, PinnedNumbers
 from blitzgs.ops.projection_types import VIEW_TOTALS, splats_of
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SplatGradients
+from tests.cuda.scenes import Scene, ops
 from tests.helpers import sum_of_ranks
 
 VIEWS, WIDTH, HEIGHT = 2, 150, 100

@@ -4,11 +4,11 @@
 import pytest
 import torch
 
-from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.view_gate import gate_views_
+from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import ViewGate
-from tests.view.test_blocks import make_views
+from tests.table.test_blocks import make_views
 from tests.view.test_gate import GATE, bits, kept_by_definition, make_scene
 
 

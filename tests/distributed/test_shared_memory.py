@@ -9,21 +9,21 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from blitzgs import pipeline
+from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed import shared_memory
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.shared_memory import MAX_VALUES, SharedMemory, control_words
-from blitzgs.distributed.tiles import TileAssignment
-from blitzgs.distributed.transport import CollectiveTransport, PeerTransport
-from blitzgs.model import GaussianTable
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.tiles import TileAssignment
+from blitzgs.frame.transport import CollectiveTransport, PeerTransport
 from blitzgs.ops.capacity import CapacityEstimate
 from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
-from blitzgs.training.config import OptimiserConfig, ScheduleConfig
-from blitzgs.training.optimiser import TableAdam
-from blitzgs.training.schedule import Schedule
+from blitzgs.optim.table_adam import TableAdam
+from blitzgs.table.table import GaussianTable
 from tests.distributed.rank_harness import RankError, on_cuda, run_ranks
-from tests.distributed.test_sharded_rendering import OPTIONS, cameras
+from tests.frame.test_sharded_rendering import OPTIONS, cameras
 from tests.helpers import parameter_gradients, sum_of_ranks
 from tests.training.tiny import random_gaussians
 

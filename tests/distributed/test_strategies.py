@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run_files
+from blitzgs.runs import files as run_files
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.distributed.test_training import sorted_table
@@ -140,8 +140,8 @@ def test_the_second_pass_follows_relocation(whole):
 
 def test_births_less_deaths_are_the_living(whole, tmp_path):
     pytest.importorskip("pyarrow")
-    from blitzgs.population.lineage import Cause
-    from blitzgs.population.lineage_parts import read_lineage
+    from blitzgs.spawn.lineage import Cause
+    from blitzgs.spawn.lineage_parts import read_lineage
 
     options, _, _ = whole
     _train(Ranks(), tmp_path, "population.lineage=true", *options)

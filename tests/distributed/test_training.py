@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run_files
+from blitzgs.runs import files as run_files
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
 from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture

@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run_files
+from blitzgs.runs import files as run_files
 from tests.training.tiny import OVERRIDES, write_tiny_capture
 
 ROOT = Path(__file__).parents[2]

@@ -10,9 +10,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import blitzgs
+from blitzgs.capture.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints, write_model
+from blitzgs.capture.pictures import save_image
 from blitzgs.formats.ply import read_ply
-from blitzgs.scene.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints, write_model
-from blitzgs.scene.pictures import save_image
 from tests.helpers import DEVICES, orbit_camera
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "minimal_trainer.py"
@@ -72,4 +72,4 @@ def test_it_learns_a_capture(device, tmp_path, capsys):
 def test_it_is_short_and_needs_no_trainer():
     text = EXAMPLE.read_text()
     assert len(text.splitlines()) <= 150
-    assert "blitzgs.training" not in text and "blitzgs.pipeline" not in text
+    assert "blitzgs.training" not in text and "blitzgs.frame.frame" not in text

@@ -2,8 +2,8 @@
 import pytest
 import torch
 
-from blitzgs.model import CULL
 from blitzgs.ops.cull_mask import rows_of_sectors, sectors_of_rows
+from blitzgs.table.table import CULL
 from tests.helpers import DEVICES
 from tests.training.tiny import random_gaussians
 

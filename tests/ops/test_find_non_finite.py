@@ -2,7 +2,7 @@
 import pytest
 import torch
 
-import blitzgs.rendering.finite  # noqa: F401  (registers the fake kernel)
+import blitzgs.call.finite  # noqa: F401  (registers the fake kernel)
 from tests.helpers import BACKENDS
 
 find_non_finite = torch.ops.blitzgs.find_non_finite

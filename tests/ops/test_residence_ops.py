@@ -4,9 +4,9 @@ import torch
 
 from blitzgs.ops.blocks import BLOCK_ROWS
 from blitzgs.ops.residence import seen_blocks, swap_blocks_
-from blitzgs.view.blocks import BlockIndex
+from blitzgs.table.blocks import BlockIndex
 from tests.helpers import DEVICES
-from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
+from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
 
 SHAPES = [((3,), torch.float32), ((), torch.float32), ((4, 3), torch.float32), ((), torch.int64),
           ((), torch.uint8), ((5,), torch.int32)]  # fmt: skip

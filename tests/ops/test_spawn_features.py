@@ -4,8 +4,8 @@
 import pytest
 import torch
 
-from blitzgs.model import GaussianTable
-from blitzgs.population.candidates import FEATURES, spawn_features
+from blitzgs.spawn.candidates import FEATURES, spawn_features
+from blitzgs.table.table import GaussianTable
 from tests.helpers import DEVICES
 from tests.population.test_density import LEVELS, random_table
 

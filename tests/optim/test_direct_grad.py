@@ -9,8 +9,8 @@ import torch
 
 import blitzgs
 from blitzgs.optim import LazyAdam, step_together
+from tests.call.test_raw_rasterization import NAMES, raw, raw_parameters, spread
 from tests.helpers import BACKENDS, random_scene, relative_error
-from tests.test_raw_rasterization import NAMES, raw, raw_parameters, spread
 
 CPU = ("cpu", torch.float64)
 CAMERAS = 40

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.ops.counter_random import hash_keys, normal
 from blitzgs.population.density import (
     DensityRules,
@@ -17,6 +16,7 @@ from blitzgs.population.density import (
     densify,
     rotations,
 )
+from blitzgs.table.table import PARAMETERS, GaussianTable
 
 TIME, STEP, SEED, LEVELS = 1200, 300, 9, 4
 

@@ -8,18 +8,18 @@ import pytest
 import torch
 
 from blitzgs import rasterization
+from blitzgs.call import contributions
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.selection import integer_mass_prefix
-from blitzgs.model import GaussianTable
-from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.survey import survey
 from blitzgs.population import importance
 from blitzgs.population.importance import PHI_EPS, SCORE_EPS, ViewBatch, is_culled, sweep
 from blitzgs.population.pruning import sample_by_score, top_by_score
 from blitzgs.reference.importance import scores as by_definition
 from blitzgs.reference.importance import top_mass
-from blitzgs.rendering import contributions
-from blitzgs.survey import survey
+from blitzgs.table.table import GaussianTable
 from tests.distributed.rank_harness import on_cuda, on_each_device, run_ranks
 from tests.helpers import DEVICES, needs_cuda
 from tests.training.tiny import look_at_origin, random_gaussians

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.ops.counter_random import hash_keys
 from blitzgs.population.density import DensityRules
-from blitzgs.population.lineage import Cause
 from blitzgs.population.relocation import MOST_COPIES, draw, relocate, shared
+from blitzgs.spawn.lineage import Cause
+from blitzgs.table.table import PARAMETERS, GaussianTable
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import needs_cuda
 from tests.population.test_density import LEVELS, SEED, STEP, TIME, random_table

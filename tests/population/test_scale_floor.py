@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import GaussianTable
-from blitzgs.pipeline import Views
+from blitzgs.frame.frame import Views
 from blitzgs.population.scale_floor import FLOOR, raise_scales, scale_floors
+from blitzgs.table.table import GaussianTable
 from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
 from tests.training.tiny import random_gaussians, tiny_cameras, tiny_config, tiny_scene

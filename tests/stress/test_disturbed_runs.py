@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run_files
+from blitzgs.runs import files as run_files
 from tests.distributed.rank_harness import CONTEXT
 from tests.training.tiny import OVERRIDES, write_tiny_capture
 from tests.training.tiny_runs import steps_of

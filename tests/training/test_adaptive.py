@@ -10,13 +10,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from blitzgs.config.fields import ScheduleConfig
+from blitzgs.config.files import ConfigError
+from blitzgs.config.pace import Pace
+from blitzgs.config.schedule import Schedule, latest_times
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.training.adaptive import SETTLED, Signals
-from blitzgs.training.config import ScheduleConfig
-from blitzgs.training.config_io import ConfigError
-from blitzgs.training.pace import Pace
-from blitzgs.training.schedule import Schedule, latest_times
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training import tiny_runs

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs.scene.images import ImageMemory
+from blitzgs.capture.images import ImageMemory
 from blitzgs.training.batches import BatchLoader
 from blitzgs.training.sampler import BatchSampler
-from blitzgs.training.views import Space, ViewSet
+from blitzgs.view.views import Space, ViewSet
 from tests.helpers import DEVICES
 from tests.training.tiny import Camera, Images, look_at_origin
 

@@ -14,14 +14,14 @@ import pytest
 import torch
 
 from blitzgs.cli import main
+from blitzgs.config.fields import Config, ScheduleConfig
+from blitzgs.config.files import ConfigError, load_config
+from blitzgs.config.ranges import problems
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run_files
+from blitzgs.runs import files as run_files
 from blitzgs.training.budget import Budget
-from blitzgs.training.config import Config, ScheduleConfig
-from blitzgs.training.config_io import ConfigError, load_config
-from blitzgs.training.config_ranges import problems
-from blitzgs.training.gate_replay import replay
-from blitzgs.training.schedule import Schedule
+from blitzgs.training.replay import replay
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs.capture.capture import load_capture
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
-from blitzgs.scene.capture import load_capture
-from blitzgs.training import run_files
+from blitzgs.runs import files as run_files
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, write_tiny_capture
 
 ROOT = Path(__file__).parents[2]

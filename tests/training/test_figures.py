@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training.guard import ModelLostError
+from blitzgs.runs.guard import ModelLostError
 from blitzgs.training.trainer import Trainer
 from tests.training.tiny import tiny_config, tiny_scene
 

@@ -23,8 +23,8 @@ from typing import Any
 import pytest
 import torch
 
+from blitzgs.config.files import from_dict, to_dict
 from blitzgs.distributed.group import Ranks
-from blitzgs.training.config_io import from_dict, to_dict
 from blitzgs.training.trainer import Trainer
 from tests.training.tiny import tiny_config, tiny_scene
 from tests.training.tiny_runs import events_of, read_log, steps_of

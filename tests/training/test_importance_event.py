@@ -13,20 +13,21 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs.capture.images import PhotographError
+from blitzgs.config.files import ConfigError
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import CULL
-from blitzgs.population.candidates import FEATURES
-from blitzgs.population.gate_fit import fit, read_spawns
 from blitzgs.population.importance import PHI, is_culled
-from blitzgs.population.lineage import ABOUT, Cause
-from blitzgs.population.lineage_parts import read_lineage
-from blitzgs.population.spawn_gate import GateError, GateInfo, RandomVeto, SampledVeto, info_path
-from blitzgs.training import run_files, run_log
-from blitzgs.training.batches import PhotographError
-from blitzgs.training.config_io import ConfigError
+from blitzgs.runs import files as run_files
+from blitzgs.runs import log as run_log
+from blitzgs.runs.guard import ModelLostError
+from blitzgs.spawn.candidates import FEATURES
+from blitzgs.spawn.fit import fit, read_spawns
+from blitzgs.spawn.gate import GateError, GateInfo, RandomVeto, SampledVeto, info_path
+from blitzgs.spawn.lineage import ABOUT, Cause
+from blitzgs.spawn.lineage_parts import read_lineage
+from blitzgs.spawn.rules import life_fields, reasons_against
+from blitzgs.table.table import CULL
 from blitzgs.training.events import importance
-from blitzgs.training.guard import ModelLostError
-from blitzgs.training.spawn_gate import life_fields, reasons_against
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training import tiny_runs

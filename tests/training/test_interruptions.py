@@ -14,13 +14,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from blitzgs.capture.images import PhotographError
 from blitzgs.distributed.group import Ranks
-from blitzgs.population.lineage_parts import read_lineage
-from blitzgs.training import checkpoint, run_files
+from blitzgs.runs import checkpoint
+from blitzgs.runs import files as run_files
+from blitzgs.runs.guard import NonFiniteError
+from blitzgs.spawn.lineage_parts import read_lineage
 from blitzgs.training.agreement import MOST_STEPS, Agreement, SaveClock, StopRequest
-from blitzgs.training.batches import PhotographError
 from blitzgs.training.events import save
-from blitzgs.training.guard import NonFiniteError
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.training.tiny import tiny_config, tiny_scene

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import PARAMETERS, GaussianTable
-from blitzgs.pipeline import RenderOptions
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import RenderOptions
+from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.training.trainer import Trainer
-from blitzgs.training.views import Space, ViewSet
+from blitzgs.view.views import Space, ViewSet
 from tests.helpers import needs_cuda
 from tests.training.tiny import Camera, Capture, Images, tiny_config
 

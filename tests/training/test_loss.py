@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs import pipeline
+from blitzgs.config.fields import LossConfig
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import GaussianTable
-from blitzgs.pipeline import RenderOptions, Views
-from blitzgs.training.batches import Batch
-from blitzgs.training.config import LossConfig
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.table.table import GaussianTable
+from blitzgs.training.batch import Batch
 from blitzgs.training.loss import loss_terms, opacity_term, scale_term, size_term, weighted
 from blitzgs.training.trainer import Trainer
 from tests.helpers import DEVICES, parameter_gradients

@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.model import GaussianTable
-from blitzgs.training import run_files
-from blitzgs.training.evaluation import render_view
-from blitzgs.training.lod import scene_gate
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.runs import files as run_files
+from blitzgs.runs.evaluation import render_view
+from blitzgs.runs.lod import scene_gate
+from blitzgs.table.pool import Residence, ResidenceError
+from blitzgs.table.table import GaussianTable
 from blitzgs.training.trainer import Trainer
-from blitzgs.view.residence import Residence, ResidenceError
-from blitzgs.view.visible_scene import VisibleFinder
+from blitzgs.view.visible import VisibleFinder
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import DEVICES
 from tests.training.tiny import HEIGHT, WIDTH, Camera, photographed, random_gaussians, tiny_config

@@ -8,7 +8,7 @@ The band's centres are in real_captures.json. A change that is meant to alter qu
 
 On a GPU sums are added up in another order every time. Three trainings of `sheffield` with different seeds
 ended at 30.53, 30.82 and 30.82 dB, so a single failure there may be chance; several are not. The centre of
-`sheffield` is that of one training, of seed 0 (docs/decisions/recipe.md, sixth round).
+`sheffield` is that of one training, of seed 0 (docs/decisions/recipe.md).
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from typing import Any
 
 import pytest
 
+from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks
-from blitzgs.training.config_io import load_config
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
+from tests.capture.helpers import ROOT, shared_data
 from tests.helpers import needs_cuda
-from tests.scene.helpers import ROOT, shared_data
 
 CENTRES = Path(__file__).with_name("real_captures.json")
 BAND = {"psnr": 0.15, "ssim": 0.003}

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.model import GaussianTable
-from blitzgs.pipeline import RenderOptions, Views
-from blitzgs.training.batches import Batch
-from blitzgs.training.optimiser import TableAdam
-from blitzgs.training.schedule import Schedule
+from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.optim.table_adam import TableAdam
+from blitzgs.table.blocks import morton_order
+from blitzgs.table.table import GaussianTable
+from blitzgs.training.batch import Batch
 from blitzgs.training.step import Stepper
-from blitzgs.view.blocks import morton_order
 from blitzgs.view.gate import ViewGate
 from tests.helpers import DEVICES
 from tests.training.tiny import look_at_origin, random_gaussians, tiny_config

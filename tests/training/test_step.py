@@ -2,13 +2,13 @@
 import numpy as np
 import torch
 
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.pipeline import RenderOptions, Views
-from blitzgs.training.batches import Batch
+from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.optim.table_adam import TableAdam
+from blitzgs.training.batch import Batch
 from blitzgs.training.loss import photometric
-from blitzgs.training.optimiser import TableAdam
-from blitzgs.training.schedule import Schedule
 from blitzgs.training.step import Stepper
 from tests.training.tiny import look_at_origin, random_gaussians, tiny_config
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs.config.files import ConfigError
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run_files
-from blitzgs.training.config_io import ConfigError
-from blitzgs.training.guard import NonFiniteError
+from blitzgs.runs import files as run_files
+from blitzgs.runs.guard import NonFiniteError
 from blitzgs.training.trainer import Trainer, small_batch_hint
 from tests.helpers import DEVICES, needs_cuda
 from tests.training.tiny import tiny_config, tiny_scene

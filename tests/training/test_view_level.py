@@ -8,19 +8,19 @@ import pytest
 import torch
 
 import blitzgs
-from blitzgs import pipeline
 from blitzgs.cli import main
+from blitzgs.config.fields import ScheduleConfig
+from blitzgs.config.files import ConfigError
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply, write_ply
-from blitzgs.model import CULL, GaussianTable
+from blitzgs.frame import frame as pipeline
 from blitzgs.population.importance import is_culled
-from blitzgs.training import run_files
-from blitzgs.training.config import ScheduleConfig
-from blitzgs.training.config_io import ConfigError
-from blitzgs.training.evaluation import image_metrics
+from blitzgs.runs import files as run_files
+from blitzgs.runs.evaluation import image_metrics
+from blitzgs.runs.lod import scene_gate
+from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.training.events import evaluate
-from blitzgs.training.lod import scene_gate
-from blitzgs.training.schedule import Schedule
 from blitzgs.training.step import Stepper
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.gate import centres_of

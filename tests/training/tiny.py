@@ -10,12 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from blitzgs import pipeline
-from blitzgs.model import GaussianTable
-from blitzgs.pipeline import RenderOptions, Views
-from blitzgs.scene.images import ImageMemory
-from blitzgs.training.config import Config
-from blitzgs.training.config_io import load_config
+from blitzgs.capture.images import ImageMemory
+from blitzgs.config.fields import Config
+from blitzgs.config.files import load_config
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.table.table import GaussianTable
 
 WIDTH, HEIGHT, COUNT = 48, 32, 400
 
@@ -152,7 +152,7 @@ def write_tiny_capture(folder: Path) -> None:
 
     import cv2
 
-    from blitzgs.scene.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints, write_model
+    from blitzgs.capture.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints, write_model
 
     capture, images = tiny_scene()
     (folder / "images").mkdir(parents=True)

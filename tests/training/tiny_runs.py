@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import GaussianTable
+from blitzgs.table.table import GaussianTable
 from blitzgs.training.trainer import Trainer
 from tests.training.tiny import tiny_config, tiny_scene
 

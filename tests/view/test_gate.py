@@ -8,26 +8,26 @@ from itertools import pairwise
 import pytest
 import torch
 
-from blitzgs import pipeline
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.distributed.tiles import TileAssignment
-from blitzgs.model import CULL, GaussianTable
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.tiles import TileAssignment
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.view_gate import gate_views_
-from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.importance import ViewBatch, is_culled, sweep
-from blitzgs.training.batches import Batch
-from blitzgs.training.optimiser import TableAdam
-from blitzgs.training.schedule import Schedule
+from blitzgs.table.blocks import BlockIndex
+from blitzgs.table.table import CULL, GaussianTable
+from blitzgs.training.batch import Batch
 from blitzgs.training.step import Stepper
-from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.gate import SAMPLE, LodGate, SceneGate, ViewGate, centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.helpers import DEVICES
+from tests.table.pending import caught_up, schedule_of, step_some
+from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
 from tests.training.tiny import random_gaussians, tiny_config
-from tests.view.pending import caught_up, schedule_of, step_some
-from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
 
 # Distances of `make_table` are up to 60 or so: the gate cuts through the scene at every level.
 GATE = LodGate(reference_distance=45.0, fork=2.0, count=6, finest=4)

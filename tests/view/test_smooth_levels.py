@@ -7,15 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import Views
 from blitzgs.ops.project import differentiable_splats, gaussian_tensors, project
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
-from blitzgs.pipeline import Views
 from blitzgs.reference.render import render as reference_render
 from blitzgs.view.gate import LodGate, SceneGate, centres_of
 from tests.helpers import DEVICES
-from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_views
+from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_views
 from tests.view.test_gate import GATE, OPTIONS, make_scene
 
 SMOOTH = replace(GATE, smooth=True)

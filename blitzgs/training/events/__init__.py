@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The events that happen between two steps, one file per event with a function `run(state, event)`.
 
-To add an event, name it in `blitzgs.training.schedule.EventKind`, say there when it happens, and list its
+To add an event, name it in `blitzgs.config.schedule.EventKind`, say there when it happens, and list its
 function in `HANDLERS`.
 """
 
@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, replace
 
+from blitzgs.config.schedule import Event, EventKind
 from blitzgs.population.importance import SweepStoppedError
+from blitzgs.runs.files import Progress
+from blitzgs.table.pool import ResidenceError
 from blitzgs.training.events import clear_cull, densify, evaluate, importance, place, reset_opacities, save
-from blitzgs.training.run_files import Progress
-from blitzgs.training.schedule import Event, EventKind
 from blitzgs.training.state import TrainingState
-from blitzgs.view.residence import ResidenceError
 
 HANDLERS: Mapping[EventKind, Callable[[TrainingState, Event], object]] = {
     "densify": densify.run,

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from blitzgs.model import CULL
-from blitzgs.training.schedule import Event
+from blitzgs.config.schedule import Event
+from blitzgs.table.table import CULL
 from blitzgs.training.state import TrainingState
 
 

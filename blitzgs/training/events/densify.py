@@ -8,13 +8,13 @@ from typing import Any
 
 import torch
 
+from blitzgs.config.schedule import Event
 from blitzgs.population.density import STATISTICS, DensityReport, DensityRules, decay_opacities, densify
 from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit
 from blitzgs.population.redistribution import redistribute
 from blitzgs.population.relocation import relocate
 from blitzgs.population.scale_floor import FLOOR, scale_floors
-from blitzgs.training.guard import ModelLostError, check_table
-from blitzgs.training.schedule import Event
+from blitzgs.runs.guard import ModelLostError, check_table
 from blitzgs.training.state import TrainingState
 
 

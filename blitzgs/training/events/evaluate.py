@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from blitzgs.distributed.ownership import TileOwners
-from blitzgs.training import run_files
-from blitzgs.training.evaluation import EvaluationStoppedError, evaluate
-from blitzgs.training.lod import scene_gate
-from blitzgs.training.schedule import Event
+from blitzgs.config.schedule import Event
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.runs import files as run_files
+from blitzgs.runs.evaluation import EvaluationStoppedError, evaluate
+from blitzgs.runs.lod import scene_gate
 from blitzgs.training.state import TrainingState
 
 
@@ -41,7 +41,7 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
 
 
 def measure(state: TrainingState, indices: Sequence[int], folder: Path | None) -> dict[str, Any]:
-    """Compare the model with the photographs of some cameras; see `blitzgs.training.evaluation.evaluate`.
+    """Compare the model with the photographs of some cameras; see `blitzgs.runs.evaluation.evaluate`.
 
     Args:
         state: state of the run; every rank calls this.

@@ -10,17 +10,18 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from blitzgs.model import opacity_logit
-from blitzgs.population.importance import Importance, ScoreRule, ViewBatch, sweep
-from blitzgs.population.lineage import Cause
+from blitzgs.config.fields import ScoreRule
+from blitzgs.config.schedule import Event
+from blitzgs.population.importance import Importance, ViewBatch, sweep
 from blitzgs.population.pruning import sample_by_score, top_by_score
 from blitzgs.population.redistribution import redistribute
-from blitzgs.progress import Report
+from blitzgs.runs.guard import ModelLostError, check_table
+from blitzgs.runs.lod import scene_gate
+from blitzgs.spawn.lineage import Cause
+from blitzgs.table.table import opacity_logit
 from blitzgs.training import view_level
-from blitzgs.training.guard import ModelLostError, check_table
-from blitzgs.training.lod import scene_gate
-from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
+from blitzgs.util.progress import Report
 
 # Smallest number of views to survey together; with fewer, a GPU would wait for the host.
 LEAST_VIEWS = 4

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from blitzgs.training.schedule import PLACED, Event, Schedule
+from blitzgs.config.schedule import PLACED, Event, Schedule
 from blitzgs.training.state import TrainingState
 
 

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
+from blitzgs.config.schedule import Event
 from blitzgs.population.density import cap_opacities
-from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
 
 

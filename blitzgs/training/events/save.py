@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from blitzgs.population.lineage import ledger_state
-from blitzgs.training import run_files
-from blitzgs.training.checkpoint import CheckpointError
-from blitzgs.training.schedule import Event
+from blitzgs.config.schedule import Event
+from blitzgs.runs import files as run_files
+from blitzgs.runs.checkpoint import CheckpointError
+from blitzgs.spawn.lineage import ledger_state
 from blitzgs.training.state import TrainingState
 
 # If a checkpoint cannot be written, training continues and tries again after this time.

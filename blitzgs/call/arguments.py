@@ -1,0 +1,400 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks the arguments of `blitzgs.rasterization` and folds their batch dimensions."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from numbers import Integral, Real
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from blitzgs.call.covariances import Decomposed, decompose
+from blitzgs.capture.cameras import MOST_SIDE
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+RASTERIZE_MODES = ("classic", "antialiased")
+MAX_SH_DEGREE = 3
+DEFAULT_TILE_SIZE = 16
+# What the kernels can composite (csrc/rasterize/rasterize_op.cpp).
+_MAX_CHANNELS = 4096
+# Further arguments of gsplat's calls (1.5.3 and later) and their defaults; no other values are supported.
+GSPLAT_DEFAULTS: dict[str, Any] = {
+    "with_ut": False,
+    "with_eval3d": False,
+    "return_normals": False,
+    "global_z_order": True,
+    "rays": None,
+    "radial_coeffs": None,
+    "tangential_coeffs": None,
+    "thin_prism_coeffs": None,
+    "ftheta_coeffs": None,
+    "lidar_coeffs": None,
+    "external_distortion_coeffs": None,
+    "rolling_shutter": None,
+    "viewmats_rs": None,
+    "ut_params": None,
+    "extra_signals": None,
+    "extra_signals_sh_degree": None,
+    "renderer_config": None,
+}
+_ANY = object()  # in place of a default: no value changes the result
+# The same for `blitzgs.raw_rasterization`, which has fewer of gsplat's arguments.
+RAW_DEFAULTS: dict[str, Any] = {
+    **GSPLAT_DEFAULTS,
+    "packed": True,
+    "distributed": False,
+    "camera_model": "pinhole",
+    "covars": None,
+    "channel_chunk": _ANY,
+    "segmented": _ANY,
+}
+
+
+class Scene(NamedTuple):
+    """N Gaussians and C views of them.
+
+    Attributes:
+        means: [N, 3].
+        quats: [N, 4].
+        scales: [N, 3].
+        opacities: [N].
+        colors: SH [N, K, 3] or [C, N, K, 3], values [N, D] or [C, N, D]; None: depth alone.
+        viewmats: [C, 4, 4].
+        Ks: [C, 3, 3].
+        covariances: covariances given instead of quats and scales; quats and scales then are their
+            decomposition.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor | None
+    viewmats: Tensor
+    Ks: Tensor
+    covariances: Decomposed | None = None
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """The checked arguments of a call: S scenes of N Gaussians and C views each, I = S C images.
+
+    Attributes:
+        scenes: the scenes, S >= 1. Without batch dimensions it has the caller's own tensors, so that a leaf
+            stays a leaf.
+        colors: colours of all scenes, as given by the caller.
+        opacities: opacities of all scenes, as given by the caller.
+        sh_degree: degree of the SH that are evaluated; None: colours are values, or not rendered.
+        per_view: whether every view has its own colours.
+        lead: the batch dimensions, and C.
+        raw: whether scales and opacities are before their activation.
+        given: the arguments that `named` returns, if they are not the tensors of the scenes.
+    """
+
+    scenes: tuple[Scene, ...]
+    colors: Tensor | None
+    opacities: Tensor
+    sh_degree: int | None
+    per_view: bool
+    lead: tuple[int, ...]
+    raw: bool
+    given: Mapping[str, tuple[Tensor, ...]] | None = None
+
+    @property
+    def named(self) -> Mapping[str, tuple[Tensor, ...]]:
+        """The arguments of the call that have to be finite, a tensor for each scene."""
+        if self.given is not None:
+            return self.given
+        columns = zip(Scene._fields, zip(*self.scenes, strict=True), strict=True)
+        return {name: own for name, own in columns if name != "covariances" and own[0] is not None}
+
+    @property
+    def views(self) -> int:
+        """Number of views C of each scene."""
+        return self.lead[-1]
+
+    @property
+    def images(self) -> int:
+        """Number of images I."""
+        return math.prod(self.lead)
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians N of each scene."""
+        return self.opacities.shape[-1]
+
+
+def check_further(
+    function: str, further: Mapping[str, Any], defaults: Mapping[str, Any] = GSPLAT_DEFAULTS
+) -> None:
+    """Check further keyword arguments: only gsplat's names with gsplat's default values are accepted.
+
+    Args:
+        function: name of the public function.
+        further: the arguments by name.
+        defaults: the names and the only values that the function takes.
+
+    Raises:
+        TypeError: gsplat has no such argument.
+        ValueError: the value is not gsplat's default.
+    """
+    for name, value in further.items():
+        if name not in defaults:
+            raise TypeError(f"{function}() got an unexpected keyword argument {name!r}")
+        default = defaults[name]
+        # gsplat's RollingShutterType.GLOBAL, an enumeration that only gsplat has.
+        shutter_is_global = name == "rolling_shutter" and getattr(value, "name", value) == "GLOBAL"
+        is_default = value is default or (isinstance(value, str) and value == default)
+        if not (value is None or is_default or default is _ANY or shutter_is_global):
+            raise ValueError(f"blitzgs.{function} does not support {name}={value!r}; leave it out")
+
+
+def check_options(
+    width: int,
+    height: int,
+    near_plane: float,
+    far_plane: float,
+    radius_clip: float,
+    eps2d: float,
+    sh_degree: int | None,
+    tile_size: int,
+    render_mode: str,
+    rasterize_mode: str,
+    camera_model: str,
+) -> None:
+    """Check the arguments that are not tensors.
+
+    Raises:
+        TypeError: a size or the degree is not a whole number, or another option not a number.
+        ValueError: one is out of range or has an unknown value.
+    """
+    for name, size in (("width", width), ("height", height)):
+        _check_whole(name, size)
+        if not 1 <= size <= MOST_SIDE:
+            raise ValueError(f"{name} must be 1 to 2^20 px, got {size}")
+    _check_whole("tile_size", tile_size)
+    if not 1 <= tile_size <= 64:
+        raise ValueError(f"tile_size must be 1 to 64 px, got {tile_size}")
+    if sh_degree is not None:
+        _check_whole("sh_degree", sh_degree)
+        if not 0 <= sh_degree <= MAX_SH_DEGREE:
+            raise ValueError(f"sh_degree must be 0 to {MAX_SH_DEGREE}, got {sh_degree}")
+    _check_number("near_plane", near_plane)
+    _check_number("far_plane", far_plane)
+    _check_number("eps2d", eps2d)
+    _check_number("radius_clip", radius_clip)
+    # NaN fails each of these comparisons.
+    if not near_plane < far_plane:
+        raise ValueError(f"near_plane must be less than far_plane, got {near_plane} and {far_plane}")
+    if not 0 <= eps2d < math.inf:
+        raise ValueError(f"eps2d must be a finite number of px^2 of at least 0, got {eps2d}")
+    if not radius_clip >= 0:
+        raise ValueError(f"radius_clip must be at least 0 px, got {radius_clip}")
+    if render_mode not in RENDER_MODES:
+        raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}")
+    if rasterize_mode not in RASTERIZE_MODES:
+        raise ValueError(f"rasterize_mode must be 'classic' or 'antialiased', got {rasterize_mode!r}")
+    if camera_model != "pinhole":
+        raise ValueError(
+            f"blitzgs.rasterization does not support camera_model={camera_model!r}; leave it out"
+        )
+
+
+def _check_whole(name: str, value: object) -> None:
+    # int comes first, because asking an abstract class takes longer; torch traces a function with SymInt.
+    if not isinstance(value, (int, Integral, torch.SymInt)):
+        raise TypeError(f"{name} must be a whole number, got {value!r}")
+
+
+def _check_number(name: str, value: object) -> None:
+    # YAML reads 1e10 as a string. A tensor of one number is taken as torch's own functions take it.
+    if not isinstance(value, (float, Real, torch.SymFloat, Tensor)):
+        raise TypeError(f"{name} must be a number, got {value!r}")
+
+
+def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]) -> None:
+    """Check that arguments are tensors on one device, all float32 or all float64.
+
+    Args:
+        required: arguments by name.
+        optional: further arguments by name, which may be None.
+
+    Raises:
+        RuntimeError: the call is inside a transform of `torch.func`.
+        TypeError: an argument is not a tensor, but for example an array of another library, or has a dtype
+            that the kernels do not compute in.
+        ValueError: an argument has another dtype, or is on another device, whose memory the kernels could not
+            read.
+    """
+    if torch._C._are_functorch_transforms_active():
+        raise RuntimeError(
+            "blitzgs does not support the transforms of torch.func (grad, vjp, jvp, jacrev, vmap, ...): use "
+            "torch.autograd or backward(), and batch dimensions of the arguments in place of vmap"
+        )
+    device, dtype, first = None, None, ""
+    for name, value in (*required.items(), *optional.items()):
+        if value is None and name in optional:
+            continue
+        if not isinstance(value, Tensor):
+            raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
+        if device is None:
+            device, dtype, first = value.device, value.dtype, name
+            if dtype not in (torch.float32, torch.float64):
+                raise TypeError(f"{name} must be float32 or float64, got {dtype}: convert all arguments")
+        if value.device != device:
+            raise ValueError(f"{name} is on {value.device} and {first} on {device}; move one")
+        if value.dtype != dtype:
+            raise ValueError(f"{name} is {value.dtype} and {first} {dtype}; convert {name} to {dtype}")
+
+
+def warn_of_intrinsics(function: str, Ks: Tensor) -> None:
+    """Warn once if the caller expects a gradient of the intrinsics, of which there is none, as in gsplat."""
+    if Ks.requires_grad and torch.is_grad_enabled() and not torch.compiler.is_compiling():
+        _warn_of_intrinsics(function)
+
+
+@cache
+def _warn_of_intrinsics(function: str) -> None:
+    warnings.warn(
+        f"blitzgs.{function}: Ks requires a gradient and gets none, as in gsplat; pass Ks.detach()",
+        RuntimeWarning,
+        stacklevel=4,
+    )
+
+
+def gaussians_of(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    sh_degree: int | None,
+    render_mode: str,
+    raw: bool = False,
+) -> Gaussians:
+    """Check shapes and fold the batch dimensions into one.
+
+    Args:
+        means: [..., N, 3].
+        quats: [..., N, 4].
+        scales: [..., N, 3].
+        opacities: [..., N].
+        colors: with `sh_degree` [..., N, K, 3] or per view [..., C, N, K, 3], otherwise [..., N, D] or per
+            view [..., C, N, D].
+        viewmats: [..., C, 4, 4].
+        Ks: [..., C, 3, 3].
+        sh_degree: degree to evaluate; None when `colors` holds values.
+        render_mode: as for `blitzgs.rasterization`; without "RGB", colours are not rendered.
+        raw: whether scales and opacities are before their activation.
+
+    Raises:
+        ValueError: a shape that does not fit, by name.
+    """
+    if means.dim() < 2 or viewmats.dim() < 3:
+        raise ValueError(
+            f"means must be [..., N, 3] and viewmats [..., C, 4, 4], got {list(means.shape)} and "
+            f"{list(viewmats.shape)}"
+        )
+    batch, N, C = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
+    _require("means", means, (*batch, N, 3), "[..., N, 3]")
+    _require("quats", quats, (*batch, N, 4), "[..., N, 4]")
+    _require("scales", scales, (*batch, N, 3), "[..., N, 3]")
+    _require("opacities", opacities, (*batch, N), "[..., N]")  # another shape might broadcast
+    _require("viewmats", viewmats, (*batch, C, 4, 4), "[..., C, 4, 4]")
+    _require("Ks", Ks, (*batch, C, 3, 3), "[..., C, 3, 3]")
+    with_colors = "RGB" in render_mode
+    if colors is None and with_colors:
+        raise ValueError("colors may be None for the render modes D and ED alone")
+    per_view = colors is not None and _per_view(colors, batch, C, N, sh_degree)
+    colors = colors if with_colors else None
+    most = _MAX_CHANNELS - (render_mode != "RGB")  # the depth is a channel too
+    if colors is not None and not 1 <= colors.shape[-1] <= most:
+        raise ValueError(f"colors must have 1 to {most} channels, got {colors.shape[-1]}")
+    whole = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
+    degree = sh_degree if with_colors else None
+    return Gaussians(_scenes(whole, batch), colors, opacities, degree, per_view, (*batch, C), raw)
+
+
+def _scenes(whole: Scene, batch: tuple[int, ...]) -> tuple[Scene, ...]:
+    if not batch:
+        return (whole,)
+    count = math.prod(batch)
+    if count == 0:
+        raise ValueError(f"the batch {[*batch]} is empty")
+    # Unbind each tensor once: the gradient of this is one stack, not a sum of tensors as large as the batch.
+    columns = (
+        [None] * count if t is None else t.reshape(count, *t.shape[len(batch) :]).unbind(0) for t in whole[:7]
+    )
+    return tuple(Scene(*tensors) for tensors in zip(*columns, strict=True))
+
+
+def with_covariances(gaussians: Gaussians, covars: Tensor) -> Gaussians:
+    """Return Gaussians whose quats and scales are those of covariances.
+
+    Args:
+        gaussians: with any quats and scales.
+        covars: as for `blitzgs.rasterization`.
+
+    Raises:
+        ValueError: the shape does not fit.
+    """
+    batch = gaussians.lead[:-1]
+    _require("covars", covars, (*batch, gaussians.count, 3, 3), "[..., N, 3, 3]")
+    scenes, uppers = [], []
+    for scene, own in zip(
+        gaussians.scenes, covars.reshape(len(gaussians.scenes), *covars.shape[-3:]).unbind(0), strict=True
+    ):
+        found = decompose(own)
+        uppers.append(found.upper)
+        scenes.append(scene._replace(quats=found.quats, scales=found.scales, covariances=found))
+    named = {name: given for name, given in gaussians.named.items() if name not in ("quats", "scales")}
+    named["covars"] = tuple(uppers)
+    return replace(gaussians, scenes=tuple(scenes), given=named)
+
+
+def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree: int | None) -> bool:
+    """Check the shape of colours; return whether each view has its own."""
+    wanted = "[..., N, D] or [..., C, N, D]"
+    shape = tuple(colors.shape[:-1])
+    if sh_degree is not None:
+        wanted = "SH coefficients [..., N, K, 3] or [..., C, N, K, 3] when sh_degree is given"
+        shape = tuple(colors.shape[:-2]) if colors.dim() > 2 and colors.shape[-1] == 3 else ()
+    if shape not in ((*batch, N), (*batch, C, N)) or colors.dim() < 2:
+        raise ValueError(
+            f"colors must be {wanted}, here with {[*batch]} before N = {N}, C = {C}, got {list(colors.shape)}"
+        )
+    if sh_degree is not None and (sh_degree + 1) ** 2 > colors.shape[-2]:
+        raise ValueError(
+            f"sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} SH coefficients, got {colors.shape[-2]}"
+        )
+    return shape != (*batch, N)
+
+
+def background_rows(backgrounds: Tensor | None, gaussians: Gaussians, render_mode: str) -> Tensor | None:
+    """Return the background of each image, [I, D + depth], from `backgrounds`, [..., C, D].
+
+    Raises:
+        ValueError: the shape does not fit.
+    """
+    if backgrounds is None or "RGB" not in render_mode:
+        return None
+    assert gaussians.colors is not None
+    channels = gaussians.colors.shape[-1]
+    _require("backgrounds", backgrounds, (*gaussians.lead, channels), "[..., C, D]")
+    rows = backgrounds.reshape(gaussians.images, channels)
+    if render_mode == "RGB":
+        return rows
+    return torch.cat([rows, torch.zeros_like(rows[:, :1])], dim=1)
+
+
+def _require(name: str, tensor: Tensor, shape: tuple[int, ...], described: str) -> None:
+    if tensor.shape != shape:
+        raise ValueError(f"{name} must be {described} = {[*shape]}, got {list(tensor.shape)}")

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds NaN and infinite input, whose Gaussians or views are not rendered, and warns the caller."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from itertools import count
+
+import torch
+from torch import Tensor
+
+from blitzgs._library import below_autograd
+from blitzgs.call.arguments import Gaussians
+from blitzgs.call.layout import Layout
+from blitzgs.ops.host import HostCopy
+
+# On CUDA, the first of this many calls of a size checks all arguments: the check is a pass over all
+# Gaussians, and their values that are not finite stay so. Cameras differ from call to call, so every call
+# looks for bad ones.
+EVERY_CUDA_CALLS = 32
+COLOURS = ("colors", "sh0", "shN")
+
+
+@torch.no_grad()
+def non_finite(gaussians: Gaussians) -> dict[str, Tensor]:
+    """Return, by argument, the indices int64 [M] of Gaussians or views whose values are not finite.
+
+    Indices count through all scenes of a batch. Arguments whose values are all finite have no entry.
+
+    One sum over each argument tells whether its rows have to be looked at, so finite arguments are read once
+    and need no memory of their size.
+    """
+    activated = {
+        name: [_activated(t, name, gaussians.raw) for t in tensors]
+        for name, tensors in _evaluated(gaussians).items()
+    }
+    totals = [torch.stack([t.sum() for t in tensors]).sum() for tensors in activated.values()]
+    found = {}
+    for (name, tensors), finite in zip(
+        activated.items(), torch.stack(totals).isfinite().tolist(), strict=True
+    ):
+        if finite:
+            continue
+        # Of colours per view, a Gaussian's are those of all views.
+        rows = [t.movedim(1, 0) for t in tensors] if name == "colors" and gaussians.per_view else tensors
+        bad = torch.cat([_rows_not_finite(t) for t in rows]).nonzero()[:, 0]
+        if len(bad):
+            found[name] = bad
+    return found
+
+
+def _evaluated(gaussians: Gaussians) -> Mapping[str, Sequence[Tensor]]:
+    """Return the arguments without the SH above the degree, which the image does not depend on."""
+    named: dict[str, Sequence[Tensor]] = dict(gaussians.named)
+    if gaussians.sh_degree is not None:
+        left = (gaussians.sh_degree + 1) ** 2
+        for name in COLOURS:  # in the order of the coefficients
+            if name in named:
+                count = min(left, named[name][0].shape[-2])
+                named[name] = [part.narrow(-2, 0, count) for part in named[name]]
+                left -= count
+    return named
+
+
+def _activated(values: Tensor, name: str, raw: bool) -> Tensor:
+    """Return the values that have to be finite: those after the activation, if there is one."""
+    if raw and name == "opacities":
+        return values.sigmoid()
+    return values.exp() if raw and name == "scales" else values
+
+
+def _rows_not_finite(values: Tensor) -> Tensor:
+    """Return which rows of [N, ...] have a value that is not finite, bool [N]."""
+    flat = values.reshape(len(values), -1)
+    bad = ~flat.sum(dim=1).isfinite()
+    rows = bad.nonzero()[:, 0]
+    bad[rows] = ~flat[rows].isfinite().all(dim=1)  # the sum of finite values may overflow
+    return bad
+
+
+def find_bad_cameras(gaussians: Gaussians) -> HostCopy:
+    """Start to look for views whose cameras are not finite; the copy reads 0 if all are finite, int64 [1]."""
+    named = gaussians.named
+    with below_autograd():
+        return HostCopy(
+            torch.ops.blitzgs.find_non_finite([*named["viewmats"], *named["Ks"]], []).view(1).long()
+        )
+
+
+def watch_for_non_finite(
+    gaussians: Gaussians, layout: Layout, function: str, colours: Sequence[Tensor], suspects_cameras: bool
+) -> None:
+    """Warn about arguments of a renderer with values that are not finite, after a cheap check for any.
+
+    On CUDA most calls check the cameras alone, see `EVERY_CUDA_CALLS`. SH coefficients, the largest part of a
+    Gaussian, are only checked for visible Gaussians.
+
+    Args:
+        gaussians: the arguments of a call.
+        layout: its splats.
+        function: name of the public function.
+        colours: a value for each Gaussian, NaN if its colours are values that are not finite.
+        suspects_cameras: whether a camera may be not finite.
+    """
+    named = gaussians.named
+    first = named["means"][0]
+    if first.is_cuda and next(_calls(first.device, first.shape[0])) % EVERY_CUDA_CALLS:
+        if not suspects_cameras:
+            return
+        columns, opacities = [*named["viewmats"], *named["Ks"]], []
+    else:
+        columns = [*(t for name, given in named.items() if name not in COLOURS for t in given), *colours]
+        # Splats whose SH are not finite have no opacity, and no other splat is below 1/255.
+        opacities = [layout.splats.opacities]
+    # One pass over the columns tells whether a closer check is needed.
+    with below_autograd():
+        if not torch.ops.blitzgs.find_non_finite(columns, opacities).item():
+            return
+    if names := ", ".join(non_finite(gaussians)):
+        ending = "are not rendered. meta['non_finite'] has their indices."
+        _warn(function, names, ending, stacklevel=5)
+
+
+def warn_of_non_finite(gaussians: Gaussians, function: str, stacklevel: int) -> None:
+    """Check all arguments, warn of values that are not finite, and name the first Gaussians or views.
+
+    Args:
+        gaussians: the arguments of a call, without colours.
+        function: name of the public function.
+        stacklevel: how many calls away the public function's caller is, from 1 for this function.
+    """
+    found = {name: indices[:5].tolist() for name, indices in non_finite(gaussians).items()}
+    if found:
+        shown = "; ".join(f"{name}, first at {', '.join(map(str, at))}" for name, at in found.items())
+        _warn(function, shown, "contribute nothing", stacklevel + 1)
+
+
+def _warn(function: str, where: str, ending: str, stacklevel: int) -> None:
+    warnings.warn(
+        f"blitzgs.{function}: NaN or infinite values in {where}; the Gaussians or views that have them "
+        f"{ending}",
+        RuntimeWarning,
+        stacklevel=stacklevel,
+    )
+
+
+@torch.library.register_fake("blitzgs::find_non_finite")
+def _(columns: Sequence[Tensor], nonzero: Sequence[Tensor]) -> Tensor:
+    return columns[0].new_empty((), dtype=torch.int32)
+
+
+@lru_cache(maxsize=64)
+def _calls(_device: torch.device, _gaussians: int) -> count[int]:
+    """Return the counter of calls with this number of Gaussians."""
+    return count()

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Projects any number of scenes and views, in groups of what one launch can take."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from blitzgs.call.arguments import Gaussians, Scene
+from blitzgs.call.covariances import Decomposed, shaped_by
+from blitzgs.ops.project import differentiable_splats, gaussian_tensors
+from blitzgs.ops.projection_types import MOST_VIEWS, ProjectedSplats, ProjectionInputs, ProjectionOptions
+from blitzgs.ops.render import Rendered
+
+
+class Group(NamedTuple):
+    """Views of one scene that are projected together.
+
+    Attributes:
+        inputs: of the projection.
+        first_image: number of its first view among the images of the call.
+        covariances: the covariances that the caller gave instead of quats and scales; None: none.
+    """
+
+    inputs: ProjectionInputs
+    first_image: int
+    covariances: Decomposed | None
+
+
+def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
+    """Divide the views into groups; one scene of up to 32 views with common colours is one group."""
+    groups = []
+    sh_per_view = gaussians.per_view and gaussians.sh_degree is not None
+    most = 1 if sh_per_view else MOST_VIEWS
+    for s, scene in enumerate(gaussians.scenes):
+        # Do not split a single group: the split would add a node to autograd's graph.
+        views = [(scene.viewmats, scene.Ks)]
+        if gaussians.views > most:
+            views = list(zip(scene.viewmats.split(most), scene.Ks.split(most), strict=True))
+        sh = _sh_of_views(gaussians, scene, len(views))
+        for part, (viewmats, Ks) in enumerate(views):
+            means, quats, scales, opacities, *_ = scene
+            inputs = ProjectionInputs(
+                gaussian_tensors(means, quats, scales, opacities, sh[part]), (viewmats, Ks), options
+            )
+            groups.append(Group(inputs, s * gaussians.views + part * most, scene.covariances))
+    return groups
+
+
+def _sh_of_views(gaussians: Gaussians, scene: Scene, parts: int) -> Sequence[Tensor | None]:
+    """Return the SH that each part of a scene's views is rendered with."""
+    if gaussians.sh_degree is None or scene.colors is None:
+        return (None,) * parts
+    if not gaussians.per_view:
+        return (scene.colors,) * parts
+    # Without views there is still one part, and the sum over no views is a zero for each coefficient.
+    return scene.colors.unbind(0) if gaussians.views else (scene.colors.sum(dim=0),)
+
+
+def project_groups(groups: Sequence[Group], sparse_grad: bool, ready: Rendered | None) -> ProjectedSplats:
+    """Return the splats of all images, those of a group after those of the groups before.
+
+    Args:
+        groups: the groups to project.
+        sparse_grad: see `blitzgs.ops.project.project`.
+        ready: what `render_queued` returned for the only group; None: project the groups.
+
+    Returns:
+        Splats whose camera_ids number all images of the call. Of several groups, visible_ids and
+        splat_offsets are those of the first.
+    """
+    parts = []
+    for group in groups:
+        done = () if ready is None else (ready.splats, ready.rows)
+        splats = differentiable_splats(group.inputs, sparse_grad, *done)
+        if group.covariances is not None:
+            splats = shaped_by(splats, group.inputs, group.covariances)
+        parts.append(splats)
+    if len(parts) == 1:
+        return parts[0]
+    images = [splats.camera_ids + group.first_image for splats, group in zip(parts, groups, strict=True)]
+    joined = parts[0]._asdict()
+    for name in (
+        "gaussian_ids",
+        "means2d",
+        "conics",
+        "depths",
+        "opacities",
+        "colors",
+        "radii",
+        "tiles_touched",
+    ):
+        joined[name] = torch.cat([getattr(splats, name) for splats in parts])
+    joined["camera_ids"] = torch.cat(images)
+    joined["counts"] = torch.stack([splats.counts for splats in parts]).sum(dim=0)
+    return ProjectedSplats(**joined)

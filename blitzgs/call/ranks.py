@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`rasterization(distributed=True)`: each rank has some of the Gaussians and some of the views.
+
+As in gsplat (and Grendel-GS, Zhao et al. 2024), every rank projects its Gaussians into the views of all ranks
+and sends each splat to the rank that renders its view; gradients are sent back. The collectives use the
+process group that the program has started. (The trainer of BlitzGS divides images by tiles instead, with the
+transports of `blitzgs.distributed`.)
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from blitzgs.call.arguments import Gaussians
+from blitzgs.ops.projection_types import ProjectedSplats
+
+
+class Job(NamedTuple):
+    """The ranks of a call.
+
+    Attributes:
+        rank: rank of this process.
+        size: number of ranks M.
+        views: number of views C of each rank.
+    """
+
+    rank: int
+    size: int
+    views: int
+
+
+def gather_views(gaussians: Gaussians, same: Sequence[Any]) -> tuple[Gaussians, Job | None]:
+    """Return this rank's Gaussians with the views of all ranks, M C, in the order of ranks.
+
+    Collective.
+
+    Args:
+        gaussians: one scene, with the rank's own views.
+        same: values that must be equal on all ranks.
+
+    Returns:
+        The Gaussians, and the job; None if there is one rank.
+
+    Raises:
+        ValueError: on every rank: the ranks differ in `same`, in their number of views, or in whether
+            Gaussians or poses need gradients. Some ranks would then wait for others forever.
+    """
+    if not dist.is_initialized() or dist.get_world_size() == 1:
+        return gaussians, None
+    job = Job(dist.get_rank(), dist.get_world_size(), gaussians.views)
+    scene, recorded = gaussians.scenes[0], torch.is_grad_enabled()
+    *inputs, _, _ = scene  # without Ks and covariances
+    need = recorded and any(t is not None and t.requires_grad for t in inputs)
+    need_poses = recorded and scene.viewmats.requires_grad
+    _require_same((gaussians.views, *same, need, need_poses), scene.viewmats.device)
+    viewmats: Tensor = _GatherViews.apply(scene.viewmats, job)  # type: ignore[no-untyped-call]
+    Ks = _gathered(scene.Ks.detach(), job)
+    scene = scene._replace(viewmats=viewmats, Ks=Ks)
+    gathered = replace(gaussians, scenes=(scene,), lead=(job.size * job.views,), given=gaussians.named)
+    return gathered, job
+
+
+def _require_same(given: tuple[Any, ...], device: torch.device) -> None:
+    """Compare a hash of the values over the ranks; exchange all values only if the hashes differ."""
+    own = torch.tensor([zlib.crc32(repr(given).encode())], device=device)
+    sums = [torch.empty_like(own) for _ in range(dist.get_world_size())]
+    dist.all_gather(sums, own)
+    if len(set(torch.cat(sums).tolist())) == 1:
+        return
+    everyone: list[Any] = [None] * len(sums)
+    dist.all_gather_object(everyone, given)
+    raise ValueError(
+        "distributed=True: all ranks have to give the same number of views, width, height, tile size, render "
+        f"mode, channels, and need of gradients of Gaussians and of poses; they gave {everyone}"
+    )
+
+
+def send_splats(splats: ProjectedSplats, channels: Tensor, job: Job) -> tuple[ProjectedSplats, Tensor]:
+    """Send each splat to the rank that renders its view. Collective, as is its backward pass.
+
+    Args:
+        splats: of this rank's Gaussians in the views of all ranks.
+        channels: channels to composite, [P, D].
+        job: the ranks.
+
+    Returns:
+        The splats of this rank's views, ordered by (rank, Gaussian, view), and their channels. Only the
+        columns that tile lists and images need are valid.
+    """
+    images = splats.camera_ids.long()
+    ranks = images // job.views
+    order = torch.argsort(ranks, stable=True)
+    sent = torch.bincount(ranks, minlength=job.size)
+    received = torch.empty_like(sent)
+    dist.all_to_all_single(received, sent)
+    sizes = sent.tolist(), received.tolist()
+    widths = (2, 3, 1, 1, channels.shape[1])
+    columns = (splats.means2d, splats.conics, splats.opacities[:, None], splats.depths[:, None], channels)
+    table = torch.cat(columns, dim=1).index_select(0, order)
+    arrived: Tensor = _SendSplats.apply(table, *sizes)  # type: ignore[no-untyped-call]
+    means2d, conics, opacities, depths, own_channels = arrived.split(widths, dim=1)
+    own_views = _all_to_all((images % job.views).index_select(0, order), *sizes).int()
+    return splats._replace(
+        camera_ids=own_views,
+        means2d=means2d.contiguous(),
+        conics=conics.contiguous(),
+        opacities=opacities[:, 0].contiguous(),
+        depths=depths[:, 0].contiguous(),
+    ), own_channels.contiguous()
+
+
+def _all_to_all(table: Tensor, sent: list[int], received: list[int]) -> Tensor:
+    arrived = table.new_empty(sum(received), *table.shape[1:])
+    dist.all_to_all_single(arrived, table.contiguous(), received, sent)
+    return arrived
+
+
+def _gathered(values: Tensor, job: Job) -> Tensor:
+    parts = [torch.empty_like(values, memory_format=torch.contiguous_format) for _ in range(job.size)]
+    dist.all_gather(parts, values.contiguous())
+    return torch.cat(parts)
+
+
+class _SendSplats(torch.autograd.Function):
+    """Sends splats to other ranks; the backward pass sends their gradients back."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, sent: list[int], received: list[int]) -> Tensor:
+        ctx.sizes = sent, received
+        return _all_to_all(table, sent, received)
+
+    @staticmethod
+    def backward(ctx: Any, v_arrived: Tensor) -> Any:
+        sent, received = ctx.sizes
+        return _all_to_all(v_arrived, received, sent), None, None
+
+
+class _GatherViews(torch.autograd.Function):
+    """Gathers the poses of all ranks; the gradient of a pose is the sum over all ranks."""
+
+    @staticmethod
+    def forward(ctx: Any, viewmats: Tensor, job: Job) -> Tensor:
+        ctx.job = job
+        return _gathered(viewmats, job)
+
+    @staticmethod
+    def backward(ctx: Any, v_viewmats: Tensor) -> Any:
+        job, total = ctx.job, v_viewmats.contiguous().clone()
+        dist.all_reduce(total)
+        return total[job.rank * job.views :][: job.views], None

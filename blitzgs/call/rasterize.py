@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs.rasterization`: gsplat's call for pinhole 3DGS, over the ops of BlitzGS."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from blitzgs.call.arguments import (
+    DEFAULT_TILE_SIZE,
+    Gaussians,
+    background_rows,
+    check_further,
+    check_options,
+    check_tensors,
+    gaussians_of,
+    warn_of_intrinsics,
+    with_covariances,
+)
+from blitzgs.call.images import ImageOptions, render
+from blitzgs.call.ranks import gather_views
+from blitzgs.ops.projection_types import ProjectionOptions
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor,
+    colors: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int | None = DEFAULT_TILE_SIZE,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
+    **further: Any,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render N Gaussians into C pinhole views; the argument names, shapes and meta keys are gsplat's.
+
+    docs/image.md defines the image (EWA splatting, Zwicker et al. 2001; 3DGS, Kerbl et al. 2023). It differs
+    from gsplat 1.5.3's in the cap of alpha, which is 0.99 here and 0.999 there. Differentiable, once, in
+    means, quats, scales, covars, opacities, colors, viewmats and backgrounds; a second derivative is an
+    error. Works under `torch.compile(fullgraph=True)`, except with sparse_grad, absgrad or distributed.
+
+    Leading dimensions `...`, the same for all, are a batch of independent scenes.
+
+    Args:
+        means: [..., N, 3] in world units, float32, or float64 on the CPU.
+        quats: [..., N, 4] (w, x, y, z), of any length; zero is rendered as the identity (in gsplat it becomes
+            NaN) and has the gradient zero. Not read, and may be None, with `covars`.
+        scales: [..., N, 3] standard deviations (after the exponential); their signs do not matter. Not read,
+            and may be None, with `covars`.
+        opacities: [..., N] in [0, 1] (after the sigmoid).
+        colors: with `sh_degree`, SH coefficients [..., N, K, 3], or per view [..., C, N, K, 3], which is
+            slower; otherwise values of 1 to 4096 channels (a rendered depth counts), [..., N, D] or per view
+            [..., C, N, D]. May be None for the render modes D and ED.
+        viewmats: [..., C, 4, 4] world to camera, a rotation and a translation.
+        Ks: [..., C, 3, 3] intrinsics in px, without skew. They get no gradient.
+        width: image width in px.
+        height: image height in px.
+        near_plane: Gaussians have z > near_plane, world units; less than far_plane.
+        far_plane: Gaussians have z <= far_plane, world units.
+        radius_clip: drop splats that reach no further than this, px, at least 0.
+        eps2d: variance added to both screen axes, px^2, at least 0.
+        sh_degree: degree to evaluate, 0 to 3; None when `colors` holds values.
+        packed: whether meta's per-splat tensors hold only what is visible ([nnz, ...]) or all
+            ([..., C, N, ...], zero where invisible). The image is the same.
+        tile_size: edge of a tile in px, 1 to 64; None: 16. The image is the same, on CUDA to rounding; 16 is
+            fastest there.
+        backgrounds: [..., C, D] behind everything; None for zero. Depth channels have none.
+        render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
+        sparse_grad: whether means, quats and scales, and with `sh_degree` also opacities and colors (not
+            per view) that are leaves, get sparse gradients, which have only the visible Gaussians. Dense
+            gradients cost a pass over all N. Not with covars or batch dimensions.
+        absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
+        rasterize_mode: "classic" or "antialiased".
+        channel_chunk: accepted and not needed: all channels are rendered in one pass.
+        distributed: whether Gaussians and views are divided among the ranks of the process group. Each rank
+            passes its own Gaussians and views, the same number of views as the others, and gets the images of
+            its own views, which show the Gaussians of all ranks. Every rank must make this call and run its
+            backward pass. As in gsplat, meta's splats are those of this rank's Gaussians in the views of all
+            ranks, and its tile lists belong to this rank's images.
+        camera_model: only "pinhole" is supported.
+        segmented: accepted and not needed: it selects a sort in gsplat, never the result.
+        covars: [..., N, 3, 3] covariances instead of quats and scales; only their upper triangles are read.
+            They are decomposed, which costs more than the rest of the call; quats and scales are faster.
+        further: gsplat's arguments that are not supported; only their default values are accepted.
+
+    Returns:
+        Images [..., C, H, W, D] (depth last), alphas [..., C, H, W, 1], and meta: batch_ids, camera_ids,
+        gaussian_ids (None unless packed; ordered by image, then Gaussian), radii, means2d, depths, conics,
+        opacities, tile_width, tile_height, tiles_per_gauss, isect_ids, flatten_ids, isect_offsets (int64),
+        width, height, tile_size, n_batches, n_cameras. The image depends on means2d, conics, opacities and,
+        where depth is rendered, depths, so `retain_grad()` works on them. Splats whose alpha is below 1/255
+        at all pixels of the image are left out, though gsplat counts some of them as visible (0.1 % more).
+        `meta["non_finite"]` is a mapping from the names of arguments to the indices of Gaussians or views
+        that were not rendered because they are NaN or infinite; they are looked for when the mapping is first
+        looked into. Meta is a `LazyDict`: entries that the image does not need are computed when they are
+        first read.
+
+    Warns:
+        RuntimeWarning: an argument has values that are NaN or infinite. On CUDA every call looks for them in
+            the cameras, and every 32nd call in the Gaussians. Or Ks requires a gradient (once).
+
+    Raises:
+        TypeError: an argument is not a tensor, or not the kind of number it should be, or gsplat has no such
+            argument; or the tensors are neither float32 nor float64.
+        ValueError: an argument is not supported, has a wrong shape or value, or another dtype or device than
+            the others; the message names it.
+        RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
+    """
+    check_further("rasterization", further)
+    tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
+    check_options(
+        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, render_mode,
+        rasterize_mode, camera_model,
+    )  # fmt: skip
+    required: dict[str, object] = {"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks}
+    if covars is None:
+        required |= {"quats": quats, "scales": scales}
+    check_tensors(required, {"colors": colors, "backgrounds": backgrounds, "covars": covars})
+    warn_of_intrinsics("rasterization", Ks)
+    if covars is not None:
+        # Placeholders, which the decomposition of the covariances replaces.
+        quats, scales = (means.new_zeros(()).expand(*means.shape[:-1], length) for length in (4, 3))
+    assert quats is not None and scales is not None
+    gaussians = gaussians_of(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, render_mode)
+    if sparse_grad and len(gaussians.lead) > 1:
+        raise ValueError("sparse_grad does not support batch dimensions; leave one of them out")
+    if sparse_grad and covars is not None:
+        raise ValueError("sparse_grad does not support covars; leave one of them out")
+    if covars is not None:
+        gaussians = with_covariances(gaussians, covars)
+    antialiased = rasterize_mode == "antialiased"
+    project = ProjectionOptions(
+        width,
+        height,
+        tile_size,
+        sh_degree or 0,
+        near_plane,
+        far_plane,
+        eps2d,
+        radius_clip,
+        antialiased,
+        False,
+    )
+    background = background_rows(backgrounds, gaussians, render_mode)
+    image = ImageOptions(render_mode, background, packed, sparse_grad, absgrad)
+    job = None
+    if distributed:
+        _check_distributed(gaussians, absgrad)
+        channels = None if gaussians.colors is None else gaussians.colors.shape[-1]
+        gaussians, job = gather_views(gaussians, (width, height, tile_size, render_mode, channels))
+    return render("rasterization", gaussians, project, image, job=job)
+
+
+def _check_distributed(gaussians: Gaussians, absgrad: bool) -> None:
+    if len(gaussians.lead) > 1 or gaussians.per_view or absgrad:
+        raise ValueError(
+            "distributed=True supports no batch dimensions, colours per view or absgrad, as gsplat's does not"
+        )

@@ -1,0 +1,350 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs.raw_rasterization`: renders raw parameters, at a cost that follows the visible Gaussians."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from blitzgs.call.arguments import (
+    DEFAULT_TILE_SIZE,
+    MAX_SH_DEGREE,
+    RAW_DEFAULTS,
+    Gaussians,
+    Scene,
+    background_rows,
+    check_further,
+    check_options,
+    check_tensors,
+    gaussians_of,
+    warn_of_intrinsics,
+)
+from blitzgs.call.groups import Group, groups_of
+from blitzgs.call.images import ImageOptions, may_queue, render
+from blitzgs.call.lazy_dict import LazyDict
+from blitzgs.ops.gather_rows import gather_rows, split_rows
+from blitzgs.ops.project import project_splats
+from blitzgs.ops.projection_types import ProjectionOptions
+from blitzgs.ops.render import ShTables
+from blitzgs.ops.sparse_rows import HandOver, full_gradients
+
+
+class CatchesUp(Protocol):
+    """An optimiser that may have pending steps, such as `blitzgs.optim.LazyAdam`."""
+
+    def catch_up(
+        self,
+        params: Iterable[Tensor] | None = None,
+        rows: Tensor | None = None,
+        count: Tensor | None = None,
+    ) -> None:
+        """Apply the pending steps of rows of parameters, see `blitzgs.optim.LazyAdam.catch_up`."""
+
+
+class TakesGradients(CatchesUp, Protocol):
+    """An optimiser that takes gradients of its parameters from the backward pass, such as `LazyAdam`."""
+
+    def param_ids(self) -> set[int]:
+        """Return the `id` of every parameter."""
+
+    def receive(self, rows: Tensor, gradients: Mapping[Tensor, Tensor]) -> None:
+        """Take gradients, see `blitzgs.optim.LazyAdam.receive`."""
+
+
+def raw_rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    tile_size: int | None = DEFAULT_TILE_SIZE,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = True,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    optimizers: CatchesUp | Iterable[Any] | Mapping[str, Any] = (),
+    direct_grad: bool = False,
+    **further: Any,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render Gaussians from the parameters that gsplat's trainer learns, before their activation.
+
+    The result is that of `blitzgs.rasterization` with `exp(scales)`, `sigmoid(opacities)` and `cat([sh0,
+    shN], 1)`, but none of these tensors is made: the function first finds the visible Gaussians, and only
+    gathers, activates and renders these. Gradients are sparse and have only the visible Gaussians, so the
+    parameters must be leaves, or `sparse_grad` False.
+
+    Args:
+        means: [N, 3] in world units, float32, or float64 on the CPU.
+        quats: [N, 4] (w, x, y, z), of any length; zero counts as the identity, with the gradient zero.
+        scales: [N, 3] logarithms of standard deviations.
+        opacities: [N] logits.
+        sh0: [N, 1, 3], the first SH coefficient; or all of them, [N, K, 3], with shN None.
+        shN: [N, K - 1, 3], the other SH coefficients.
+        viewmats: [C, 4, 4] world to camera, a rotation and a translation.
+        Ks: [C, 3, 3] intrinsics in px, without skew. They get no gradient.
+        width: image width in px.
+        height: image height in px.
+        near_plane: Gaussians have z > near_plane, world units; less than far_plane.
+        far_plane: Gaussians have z <= far_plane, world units.
+        radius_clip: drop splats that reach no further than this, px, at least 0.
+        eps2d: variance added to both screen axes, px^2, at least 0.
+        sh_degree: degree to evaluate, 0 to 3; None: the highest degree that the coefficients have.
+        tile_size: edge of a tile in px, 1 to 64; None: 16. The image is the same, on CUDA to rounding.
+        backgrounds: [C, D] behind everything; None for zero. Depth channels have none.
+        render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
+        sparse_grad: False: dense gradients, for parameters that are not leaves (`means + offsets`), and for
+            optimisers and gradient clipping that take no others.
+        absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
+        rasterize_mode: "classic" or "antialiased".
+        optimizers: the parameters' optimisers: one, a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
+            among them catches up the rows that this call reads: the geometry of all Gaussians, and the SH of
+            the visible ones.
+        direct_grad: whether the backward pass hands the parameters' gradients to `optimizers`, in less time
+            than autograd needs for sparse tensors. The optimisers then do what they do with `.grad`, but
+            `.grad` of the parameters stays None: hooks on parameters, gradient clipping and `GradScaler` do
+            not see the gradients, `torch.autograd.grad` does not return them, and `p.grad = None` does not
+            remove them (`zero_grad` of the optimisers does). It needs `sparse_grad`, and a `LazyAdam` for
+            each parameter that requires a gradient.
+        further: gsplat's other arguments; only those values are accepted that do not change the result
+            (`packed=True`, `distributed=False`, `camera_model="pinhole"`, `covars=None`, ...).
+
+    Returns:
+        As `blitzgs.rasterization(..., packed=True)`.
+
+    Warns:
+        RuntimeWarning: as `blitzgs.rasterization`.
+
+    Raises:
+        TypeError: an argument is not a tensor, or not the kind of number it should be, or gsplat has no such
+            argument; or the tensors are neither float32 nor float64.
+        ValueError: an argument is not supported, has a wrong shape or value, or another dtype or device than
+            the others; a parameter is not a leaf, but would get a sparse gradient; or `direct_grad` is not
+            possible. The message names it.
+        RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
+    """
+    check_further("raw_rasterization", further, RAW_DEFAULTS)
+    tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
+    check_options(
+        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, render_mode,
+        rasterize_mode, "pinhole",
+    )  # fmt: skip
+    tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0}
+    check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {"shN": shN, "backgrounds": backgrounds})
+    warn_of_intrinsics("raw_rasterization", Ks)
+    if means.dim() != 2:
+        raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
+    harmonics = [sh0] if shN is None else [sh0, shN]
+    shaded = "RGB" in render_mode
+    sh_degree = _checked_degree(harmonics, len(means), sh_degree, shaded)
+    antialiased = rasterize_mode == "antialiased"
+    project = ProjectionOptions(
+        width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, True
+    )
+    geometry = (means, quats, scales, opacities)
+    whole = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, "D", raw=True)
+    if sparse_grad and torch.is_grad_enabled():
+        sh = {"sh0": sh0, "shN": shN} if shaded else {}
+        _check_leaves({"means": means, "quats": quats, "scales": scales, "opacities": opacities, **sh})
+    lazy = _lazy(optimizers)
+    for optimizer in lazy:
+        optimizer.catch_up(geometry)
+    hand_over = None
+    if direct_grad and torch.is_grad_enabled():
+        hand_over = _hand_over(lazy, (*geometry, *(harmonics if shaded else ())), sparse_grad)
+    given = {**tensors, "viewmats": viewmats, "Ks": Ks, "shN": shN}
+    if not shaded:
+        del given["sh0"], given["shN"]
+    named = {name: (tensor,) for name, tensor in given.items() if tensor is not None}
+    colors, degree = (sh0, sh_degree) if shaded else (None, None)
+    gaussians = Gaussians(whole.scenes, colors, opacities, degree, False, whole.lead, True, named)
+    image = ImageOptions(
+        render_mode, background_rows(backgrounds, gaussians, render_mode), True, sparse_grad, absgrad
+    )
+
+    def catch_up_sh(rows: Tensor, count: Tensor | None) -> None:
+        for optimizer in lazy:
+            optimizer.catch_up(harmonics, rows, count)
+
+    groups = groups_of(gaussians, project)
+    tables = ShTables(harmonics if shaded else (), catch_up_sh, hand_over)
+    if may_queue(groups):
+        return render("raw_rasterization", gaussians, project, image, tables=tables, groups=groups)
+    # Several groups, no Gaussians, or another tile size.
+    ids, visible = _gather_visible(gaussians, groups, tables, sparse_grad)
+    renders, alphas, meta = render("raw_rasterization", visible, project, image._replace(sparse_grad=False))
+    assert isinstance(meta, LazyDict)
+    meta.change("gaussian_ids", lambda index_in_visible: ids.long()[index_in_visible])
+    return renders, alphas, meta
+
+
+def _gather_visible(
+    gaussians: Gaussians, groups: Sequence[Group], tables: ShTables, sparse_grad: bool
+) -> tuple[Tensor, Gaussians]:
+    """Return the Gaussians that a view of any group sees, int32 [U], and these Gaussians alone.
+
+    Args:
+        gaussians: all Gaussians, one scene.
+        groups: `groups_of` the Gaussians.
+        tables: the SH.
+        sparse_grad: whether the gradients of the parameters are sparse.
+    """
+    ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
+    tables.before(ids, None)
+    (scene,) = gaussians.scenes
+    read = (scene.means, scene.quats, scene.scales, scene.opacities, *tables.parts)
+    hand_over, ticket = tables.hand_over, None
+    if hand_over is not None:
+        read, ticket = tuple(table.detach() for table in read), hand_over.ticket
+    means, quats, scales, opacities, sh = _Visible.apply(  # type: ignore[no-untyped-call]
+        ids, sparse_grad, hand_over, ticket, *read
+    )
+    scene = Scene(means, quats, scales, opacities, sh, scene.viewmats, scene.Ks)
+    return ids, replace(gaussians, scenes=(scene,), colors=sh, opacities=opacities)
+
+
+def _check_leaves(params: Mapping[str, Tensor | None]) -> None:
+    """Check that parameters with gradients are leaves: few operations accept a sparse gradient."""
+    for name, param in params.items():
+        if param is not None and param.requires_grad and not param.is_leaf:
+            raise ValueError(
+                f"{name} is not a leaf, and its gradient would be sparse: pass the parameter itself, or "
+                "sparse_grad=False"
+            )
+
+
+def _lazy(optimizers: Any) -> list[CatchesUp]:
+    """Return the optimisers that may have pending steps; those that step together are one."""
+    if isinstance(optimizers, torch.optim.Optimizer) or hasattr(optimizers, "catch_up"):
+        optimizers = [optimizers]
+    if not isinstance(optimizers, Iterable):
+        raise TypeError(
+            "optimizers must be an optimiser, or a mapping or a sequence of them, got "
+            f"{type(optimizers).__name__}"
+        )
+    given = optimizers.values() if isinstance(optimizers, Mapping) else optimizers
+    found: list[CatchesUp] = []
+    for optimizer in given:
+        joint = getattr(optimizer, "joint", None)
+        # A mapping may have an optimiser under several names; it would take the gradients as often.
+        if joint in found or optimizer in found:
+            continue
+        if joint is not None and joint.follow():
+            found.append(joint)
+        elif hasattr(optimizer, "catch_up"):
+            found.append(optimizer)
+    return found
+
+
+def _hand_over(lazy: Sequence[Any], params: Sequence[Tensor], sparse_grad: bool) -> HandOver | None:
+    """Return what hands the gradients of means, quats, scales, opacities and SH to their optimisers.
+
+    None: no parameter requires a gradient.
+    """
+    if not sparse_grad:
+        raise ValueError("direct_grad=True needs sparse_grad=True; leave one of them out")
+    needed = [param.requires_grad for param in params]
+    wanted = set(map(id, itertools.compress(params, needed)))
+    owners: list[TakesGradients] = []
+    found: set[int] = set()
+    for optimizer in lazy:
+        if hasattr(optimizer, "param_ids") and (own := wanted & optimizer.param_ids()):
+            owners.append(optimizer)
+            found |= own
+    if found != wanted:
+        names = zip(("means", "quats", "scales", "opacities", "sh0", "shN"), params, strict=False)
+        missing = [name for name, param in names if id(param) in wanted - found]
+        raise ValueError(
+            f"direct_grad=True: no LazyAdam in `optimizers` has {', '.join(missing)}; pass the optimisers of "
+            "all parameters, call requires_grad_(False) for parameters that are not learned, or leave "
+            "direct_grad out"
+        )
+
+    def give(rows: Tensor, gradients: Sequence[Tensor | None]) -> None:
+        # As autograd does, leave out parameters that were frozen after the call.
+        given = {
+            param: gradient
+            for param, gradient in zip(params, gradients, strict=True)
+            if gradient is not None and param.requires_grad
+        }
+        if given:
+            for owner in owners:
+                owner.receive(rows, given)
+
+    if not wanted:
+        return None
+    return HandOver(torch.empty(0, device=params[0].device, requires_grad=True), needed, give)
+
+
+def _checked_degree(harmonics: list[Tensor], count: int, degree: int | None, shaded: bool) -> int:
+    """Check the SH and return the degree to evaluate."""
+    for name, part in zip(("sh0", "shN"), harmonics, strict=False):
+        if part.dim() != 3 or part.shape[0] != count or part.shape[2] != 3:
+            raise ValueError(f"{name} must be [N, K, 3] with N = {count}, got {list(part.shape)}")
+    given = sum(part.shape[1] for part in harmonics)
+    if degree is None:
+        degree = math.isqrt(given) - 1
+        if shaded and not 0 <= degree <= MAX_SH_DEGREE:
+            raise ValueError(f"sh_degree=None needs 1 to 24 SH coefficients, got {given}")
+        return degree
+    if shaded and (degree + 1) ** 2 > given:
+        raise ValueError(f"sh_degree {degree} needs {(degree + 1) ** 2} SH coefficients, got {given}")
+    return degree
+
+
+class _Visible(torch.autograd.Function):
+    """Gathers the rows `ids` of means, quats, scales and opacities, and of SH in any number of parts.
+
+    The result has the SH in one tensor, or None without parts. The gradients of the tables are sparse, or
+    dense if `sparse` is False, or go to `hand_over`.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        ids: Tensor,
+        sparse: bool,
+        hand_over: HandOver | None,
+        _ticket: Tensor | None,
+        *tables: Tensor,
+    ) -> tuple[Tensor | None, ...]:
+        ctx.save_for_backward(ids)
+        ctx.sparse, ctx.hand_over, ctx.shapes = sparse, hand_over, [table.shape for table in tables]
+        ctx.set_materialize_grads(False)
+        parts = tables[4:]
+        ctx.lengths = [part.shape[1] for part in parts]
+        rows = gather_rows(tables[:4], parts, ids)
+        return (*rows, *([] if parts else [None]))
+
+    @staticmethod
+    def backward(ctx: Any, *v_rows: Tensor | None) -> Any:
+        (ids,) = ctx.saved_tensors
+        *gradients, v_sh = v_rows
+        if len(ctx.lengths) == 1 or v_sh is None:
+            gradients += [v_sh] * len(ctx.lengths)
+        else:
+            gradients += split_rows(v_sh, ctx.lengths)
+        needed = ctx.needs_input_grad[4:] if ctx.hand_over is None else ctx.hand_over.needed
+        gradients = [gradient if need else None for gradient, need in zip(gradients, needed, strict=True)]
+        if ctx.hand_over is None:
+            gradients = full_gradients(ids, gradients, ctx.shapes, [ctx.sparse] * len(gradients))
+        else:
+            ctx.hand_over.give(ids.long(), gradients)
+            gradients = [None] * len(gradients)
+        return None, None, None, None, *gradients

@@ -1,0 +1,387 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keeps the images of a capture compressed in memory within a budget; threads decode them ahead.
+
+There are two bounded caches, for compressed and for decoded images; both drop the entries that were used
+longest ago. Decoded images take the memory that compressed ones leave. If processes share memory for all
+decoded images (`shared_images`), it takes the place of both. The compressed form is the file
+itself if the file needs no processing. An image that must be undistorted or downscaled is processed once
+and kept as QOI, which is lossless. For an image of 1.9 megapixels, decoding the QOI takes 16 ms at full
+size and 1 ms at a quarter; decoding, undistorting and averaging the JPEG again takes 22 and 16 ms, and
+PNG 46 and 3 ms. Nothing is written to disk. The images do not depend on budgets, threads or the order of
+calls.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Hashable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Generic, Protocol, TypeVar
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from blitzgs.capture.cameras import Camera, same_shape
+from blitzgs.capture.capture import Capture
+from blitzgs.capture.image_files import UInt8, apply_orientation, decode_mask, decode_rgb, read_whole
+from blitzgs.capture.shared_images import SharedImages
+from blitzgs.capture.undistort import Rectification
+from blitzgs.formats.native import native_io
+
+K = TypeVar("K")
+V = TypeVar("V")
+DEFAULT_BUDGET = 4 << 30
+_MAPS_KEPT = 4
+
+
+class BoundedCache(Generic[K, V]):
+    """A least-recently-used cache with a budget of bytes; an entry larger than the budget is not stored.
+
+    Attributes:
+        budget: the largest size, in bytes.
+        bytes: the size now.
+        most_bytes: the largest size so far.
+    """
+
+    def __init__(self, budget: int) -> None:
+        """Hold at most `budget` bytes."""
+        self.budget = budget
+        self.bytes = 0
+        self.most_bytes = 0
+        self._entries: OrderedDict[K, tuple[V, int]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: K) -> V | None:
+        """Return the entry and mark it as the most recently used; None if it is not stored."""
+        with self._lock:
+            if key not in self._entries:
+                return None
+            self._entries.move_to_end(key)
+            return self._entries[key][0]
+
+    def put(self, key: K, value: V, size: int) -> None:
+        """Add or replace an entry of `size` bytes, dropping the oldest until all fit."""
+        with self._lock:
+            if key in self._entries:
+                self.bytes -= self._entries.pop(key)[1]
+            if size > self.budget:
+                return
+            while self.bytes + size > self.budget:
+                self.bytes -= self._entries.popitem(last=False)[1][1]
+            self._entries[key] = (value, size)
+            self.bytes += size
+            self.most_bytes = max(self.most_bytes, self.bytes)
+
+    def resize(self, budget: int) -> None:
+        """Change the budget, dropping the oldest entries until the others fit."""
+        with self._lock:
+            self.budget = budget
+            while self.bytes > budget:
+                self.bytes -= self._entries.popitem(last=False)[1][1]
+
+
+@dataclass(frozen=True)
+class ImageMemory:
+    """The largest host memory that images have taken so far, its limits, and the number of decodings.
+
+    Attributes:
+        compressed_bytes: bytes of compressed images.
+        compressed_budget: limit of these bytes.
+        decoded_bytes: bytes of decoded images and masks, without those that a caller holds; in memory that
+            several processes share, those of all processes.
+        decoded_budget: limit of these bytes at present; it may have been larger before (`ImageStore`).
+        decoded: number of decodings of images and masks.
+    """
+
+    compressed_bytes: int
+    compressed_budget: int
+    decoded_bytes: int
+    decoded_budget: int
+    decoded: int
+
+    def __str__(self) -> str:
+        """Return the figures as text, in gigabytes."""
+        return (
+            f"photographs held in host memory: {self.compressed_bytes / 1e9:.2f} GB compressed (limit "
+            f"{self.compressed_budget / 1e9:.2f}), {self.decoded_bytes / 1e9:.2f} GB decoded (limit "
+            f"{self.decoded_budget / 1e9:.2f}); {self.decoded:,} decodings"
+        )
+
+
+class PhotographError(RuntimeError):
+    """A photograph cannot be read; the message names the file."""
+
+
+class Images(Protocol):
+    """What training reads of an image store (`blitzgs.capture.images.ImageStore`)."""
+
+    def get(self, index: int) -> Tensor:
+        """Return an image, uint8 [H, W, 3]."""
+
+    def mask(self, index: int) -> Tensor | None:
+        """Return the image's mask, uint8 [H, W] with 0 = excluded, or None."""
+
+    def prefetch(self, indices: Sequence[int], masks: Sequence[int] = ()) -> None:
+        """Decode images and masks in the background."""
+
+    def memory(self) -> ImageMemory:
+        """Return how much host memory the images have taken."""
+
+
+@dataclass(frozen=True)
+class _Maps:
+    columns: npt.NDArray[np.float32]
+    rows: npt.NDArray[np.float32]
+    seen: UInt8
+
+
+def has_mask(camera: Camera) -> bool:
+    """Tell whether some pixels of a camera's image may not count."""
+    return camera.mask_path is not None or camera.rectification.has_invalid
+
+
+def decoded_shapes(capture: Capture) -> dict[Hashable, tuple[int, ...]]:
+    """Return the shapes of all decoded images and masks of a capture, by the keys of `ImageStore`."""
+    shapes: dict[Hashable, tuple[int, ...]] = {}
+    for index, camera in enumerate(capture.cameras):
+        shapes["image", index] = (camera.height, camera.width, 3)
+        if has_mask(camera):
+            shapes["mask", index] = (camera.height, camera.width)
+    return shapes
+
+
+class ImageStore:
+    """Decoded images and masks of a capture's cameras, by index; any thread may call any method.
+
+    Attributes:
+        capture: the capture that has the images.
+        compressed: the compressed images in memory.
+        decoded: the decoded images and masks in memory.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        budget_bytes: int = DEFAULT_BUDGET,
+        threads: int = 4,
+        decoded_bytes: int | None = None,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        shared: SharedImages | None = None,
+    ) -> None:
+        """Read nothing yet.
+
+        Args:
+            capture: the capture that has the images.
+            budget_bytes: limit of the compressed images in memory.
+            threads: number of threads that decode ahead.
+            decoded_bytes: limit of the decoded images in memory; None: a quarter of `budget_bytes`, and
+                what the compressed images leave of `budget_bytes`.
+            background: RGB in [0, 1] that images with an alpha channel are composited over.
+            shared: memory for `decoded_shapes` of the capture that other processes use too. All images stay
+                decoded there, and none is kept in this process. None: they are kept in this process.
+        """
+        self.capture, self._shared = capture, shared
+        self._background = background if capture.has_alpha else None
+        self.compressed: BoundedCache[Path | int, bytes] = BoundedCache(budget_bytes)
+        self._decoded_bytes = decoded_bytes
+        self.decoded: BoundedCache[tuple[str, int], UInt8] = BoundedCache(self._decoded_budget())
+        self._maps: OrderedDict[Rectification, _Maps] = OrderedDict()
+        self._maps_lock = threading.Lock()
+        self._pending: dict[tuple[str, int], Future[UInt8]] = {}
+        self._pending_lock = threading.Lock()
+        self._budget_lock = threading.Lock()
+        self._times_decoded = 0
+        self._pool = ThreadPoolExecutor(max(1, threads), thread_name_prefix="blitzgs-images")
+
+    def get(self, index: int) -> Tensor:
+        """Return a camera's image, uint8 RGB [height, width, 3] on the CPU. It is shared: do not write to it.
+
+        Raises:
+            ValueError: the file is damaged or its size changed; names it.
+            OSError: the file cannot be read.
+        """
+        return torch.from_numpy(self._result("image", index))
+
+    def mask(self, index: int) -> Tensor | None:
+        """Return which pixels count, uint8 0 or 1 [height, width]; None: all. Shared: do not write to it.
+
+        A pixel that mixes counted and excluded pixels of the file is excluded.
+        """
+        return (
+            torch.from_numpy(self._result("mask", index)) if has_mask(self.capture.cameras[index]) else None
+        )
+
+    def prefetch(self, indices: Iterable[int], masks: Iterable[int] = ()) -> None:
+        """Start to decode what is needed next, in order, as much as the memory for decoded images holds.
+
+        Args:
+            indices: cameras whose images are needed.
+            masks: cameras whose masks are needed, if they have one.
+        """
+        wanted = [("mask", index, 1) for index in masks if has_mask(self.capture.cameras[index])]
+        planned, budget = 0, self._room()
+        for kind, index, channels in [*wanted, *(("image", index, 3) for index in indices)]:
+            camera = self.capture.cameras[index]
+            planned += channels * camera.width * camera.height
+            if planned > budget:
+                return
+            self._submit(kind, index)
+
+    def memory(self) -> ImageMemory:
+        """Return the memory that images have taken so far."""
+        decoded = self.decoded.most_bytes if self._shared is None else self._shared.bytes
+        return ImageMemory(
+            self.compressed.most_bytes, self.compressed.budget, decoded, self._room(), self._times_decoded
+        )
+
+    def close(self) -> None:
+        """Stop the threads; images whose decoding has not begun are not decoded."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _room(self) -> int:
+        # All images have a place in shared memory, so there this limit is never reached.
+        return self.decoded.budget + (0 if self._shared is None else self._shared.size)
+
+    def _decoded_budget(self) -> int:
+        """Return how many bytes the decoded images may take now."""
+        if self._decoded_bytes is not None:
+            return self._decoded_bytes
+        budget = self.compressed.budget
+        return budget // 4 + budget - self.compressed.bytes
+
+    def _result(self, kind: str, index: int) -> UInt8:
+        found = self._submit(kind, index)
+        return found.result() if isinstance(found, Future) else found
+
+    def _submit(self, kind: str, index: int) -> UInt8 | Future[UInt8]:
+        """Return the images that are decoded or waiting to be decoded."""
+        key = (kind, index)
+        # An image that is no longer pending is decoded. Both lists are looked up under one lock; otherwise a
+        # thread that is delayed between the two look-ups would decode the image again.
+        with self._pending_lock:
+            if key in self._pending:
+                return self._pending[key]
+            found = self._found(key)
+            if found is not None:
+                return found
+            future = self._pending[key] = self._pool.submit(self._produce, kind, index)
+            return future
+
+    def _found(self, key: tuple[str, int]) -> UInt8 | None:
+        return self.decoded.get(key) if self._shared is None else self._shared.get(key)
+
+    def _produce(self, kind: str, index: int) -> UInt8:
+        key = (kind, index)
+        try:
+            # Another process may have decoded it since the look-up.
+            found = self._found(key)
+            if found is not None:
+                return found
+            with self._pending_lock:
+                self._times_decoded += 1
+            pixels = self._make_image(index) if kind == "image" else self._make_mask(index)
+            if self._shared is not None:
+                return self._shared.put(key, pixels)
+            with self._budget_lock:  # so that no thread restores a budget of before another one's image
+                self.decoded.resize(self._decoded_budget())
+            self.decoded.put(key, pixels, pixels.nbytes)
+            return pixels
+        finally:
+            with self._pending_lock:
+                del self._pending[key]
+
+    def _read(self, path: Path) -> bytes:
+        data = self.compressed.get(path)
+        if data is None:
+            data = read_whole(path)
+            if self._shared is None:  # an image in shared memory stays decoded
+                self.compressed.put(path, data, len(data))
+        return data
+
+    def _make_image(self, index: int) -> UInt8:
+        camera = self.capture.cameras[index]
+        lens = camera.rectification.lens
+        if camera.rectification.is_identity and (lens.width, lens.height) == (camera.width, camera.height):
+            return self._decode(camera, self._read(camera.image_path))
+        packed = self.compressed.get(index)
+        if packed is not None:
+            return _uint8(native_io().decode_qoi(packed))
+        pixels = self._prepare(camera, self._decode(camera, read_whole(camera.image_path)))
+        if self._shared is None:
+            packed = native_io().encode_qoi(pixels)
+            self.compressed.put(index, packed, len(packed))
+        return pixels
+
+    def _prepare(self, camera: Camera, pixels: UInt8) -> UInt8:
+        """Undistort and downscale."""
+        if not camera.rectification.is_identity:
+            maps = self._maps_of(camera.rectification)
+            remap = partial(cv2.remap, pixels, maps.columns, maps.rows, cv2.INTER_LINEAR)
+            pixels = _uint8(remap(borderMode=cv2.BORDER_REPLICATE))
+        return _shrunk(pixels, camera)
+
+    def _make_mask(self, index: int) -> UInt8:
+        camera = self.capture.cameras[index]
+        lens = camera.rectification.lens
+        mask = np.ones((lens.height, lens.width), dtype=np.uint8)
+        if camera.mask_path is not None:
+            mask = self._file_mask(camera, camera.mask_path)
+        if not camera.rectification.is_identity:
+            maps = self._maps_of(camera.rectification)
+            mask = _uint8(cv2.remap(mask, maps.columns, maps.rows, cv2.INTER_NEAREST)) * maps.seen
+        return _uint8(_shrunk(mask * np.uint8(255), camera) == 255)
+
+    def _file_mask(self, camera: Camera, path: Path) -> UInt8:
+        lens = camera.rectification.lens
+        mask = decode_mask(self._read(path), str(path))
+        stored = (lens.width, lens.height) if camera.orientation < 5 else (lens.height, lens.width)
+        if (mask.shape[1], mask.shape[0]) == stored:
+            mask = apply_orientation(mask, camera.orientation)
+        height, width = mask.shape
+        if not same_shape((width, height), (lens.width, lens.height)):
+            raise ValueError(
+                f"{path} is {width} x {height}, which does not fit the image of {lens.width} x {lens.height} "
+                f"that it masks, {camera.image_path}"
+            )
+        if (width, height) != (lens.width, lens.height):  # the mask has another resolution
+            mask = _uint8(cv2.resize(mask, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST))
+        return mask
+
+    def _decode(self, camera: Camera, data: bytes) -> UInt8:
+        lens, path = camera.rectification.lens, camera.image_path
+        pixels = apply_orientation(decode_rgb(data, str(path), self._background), camera.orientation)
+        if pixels.shape[:2] != (lens.height, lens.width):
+            raise ValueError(
+                f"{path} is {pixels.shape[1]} x {pixels.shape[0]} now but was {lens.width} x {lens.height} "
+                "when the capture was loaded"
+            )
+        return pixels
+
+    def _maps_of(self, plan: Rectification) -> _Maps:
+        """Return a camera's maps. Only a few are kept, because those of a 12-megapixel image take 100 MB."""
+        with self._maps_lock:
+            if plan not in self._maps:
+                columns, rows, seen = plan.maps()
+                self._maps[plan] = _Maps(columns, rows, seen.astype(np.uint8))
+                if len(self._maps) > _MAPS_KEPT:
+                    self._maps.popitem(last=False)
+            self._maps.move_to_end(plan)
+            return self._maps[plan]
+
+
+def _uint8(pixels: npt.ArrayLike) -> UInt8:
+    return np.asarray(pixels, dtype=np.uint8)
+
+
+def _shrunk(pixels: UInt8, camera: Camera) -> UInt8:
+    """Average down to the camera's size."""
+    if pixels.shape[:2] == (camera.height, camera.width):
+        return pixels
+    return _uint8(cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA))

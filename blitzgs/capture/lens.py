@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Camera models: map directions to pixels, for every camera model of COLMAP.
+
+A lens maps normalised coordinates (u, v) = (x/z, y/z) of a point in front of the camera to pixels:
+(fx u' + cx, fy v' + cy) with (u', v') = distort(u, v). The formulas are those that COLMAP documents for its
+camera models; parameters keep COLMAP's order. Pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.capture.colmap import camera_models
+
+Array = npt.NDArray[np.float64]
+_Distort = Callable[[Array, Array, Sequence[float]], tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera model with its image size (pixels) and parameters in COLMAP's order."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        names = camera_models().get(self.model)
+        if names is None:
+            raise ValueError(f"unknown camera model {self.model!r}; known: {', '.join(camera_models())}")
+        if self.model == "EQUIRECTANGULAR":
+            raise ValueError(
+                "EQUIRECTANGULAR images show all directions and cannot be made into one perspective image; "
+                "cut them into perspective views first"
+            )
+        if len(names) != len(self.params):
+            raise ValueError(f"{self.model} has the parameters {names}, got {len(self.params)} values")
+        if not np.isfinite(self.params).all() or min(self.intrinsics[:2]) <= 0:
+            raise ValueError(
+                f"{self.model} needs finite parameters and a positive focal length, got {self.params}"
+            )
+
+    @property
+    def _shared_focal(self) -> bool:
+        return camera_models()[self.model][0] == "f"
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """Return fx, fy, cx, cy in pixels."""
+        if self._shared_focal:
+            f, cx, cy = self.params[:3]
+            return f, f, cx, cy
+        fx, fy, cx, cy = self.params[:4]
+        return fx, fy, cx, cy
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """Return the parameters after the intrinsics."""
+        return self.params[3 if self._shared_focal else 4 :]
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether straight lines stay straight: the model is a pinhole, or its distortion is zero."""
+        if self.model in ("SIMPLE_PINHOLE", "PINHOLE"):
+            return True
+        return self.model in _ZERO_IS_PINHOLE and not any(self.distortion)
+
+    @property
+    def matrix(self) -> Array:
+        """Return the matrix K [3, 3] of the intrinsics."""
+        fx, fy, cx, cy = self.intrinsics
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+    def scaled(self, width: int, height: int) -> Lens:
+        """Return this lens for an image resized to width x height (each axis by its own ratio)."""
+        if (width, height) == (self.width, self.height):
+            return self
+        sx, sy = width / self.width, height / self.height
+        fx, fy, cx, cy = self.intrinsics
+        intrinsics = (fx * sx, fy * sy, cx * sx, cy * sy)
+        return Lens(_WITH_TWO_FOCALS.get(self.model, self.model), width, height, (*intrinsics, *self._full()))
+
+    def _full(self) -> tuple[float, ...]:
+        """Return the distortion parameters of the model with two focal lengths."""
+        padding = {"SIMPLE_RADIAL": 3, "RADIAL": 2, "SIMPLE_RADIAL_FISHEYE": 3, "RADIAL_FISHEYE": 2}
+        return self.distortion + (0.0,) * padding.get(self.model, 0)
+
+    def distort(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Map normalised coordinates to distorted ones; NaN if the model does not see the direction."""
+        if self.model in ("SIMPLE_PINHOLE", "PINHOLE"):
+            return u, v
+        with np.errstate(all="ignore"):
+            return _DISTORT[self.model](u, v, self.distortion)
+
+    def project(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Map normalised coordinates to pixels."""
+        fx, fy, cx, cy = self.intrinsics
+        u, v = self.distort(u, v)
+        return fx * u + cx, fy * v + cy
+
+
+def _polynomial(r2: Array, coefficients: Sequence[float]) -> Array:
+    """Return 1 + c0 r2 + c1 r2^2 + ..."""
+    value = np.zeros_like(r2)
+    for c in reversed(coefficients):
+        value = (value + c) * r2
+    return 1 + value
+
+
+def _tangential(u: Array, v: Array, p1: float, p2: float) -> tuple[Array, Array]:
+    r2 = u * u + v * v
+    return 2 * p1 * u * v + p2 * (r2 + 2 * u * u), 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+
+
+def _radial(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
+    scale = _polynomial(u * u + v * v, k)
+    return u * scale, v * scale
+
+
+def _opencv(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
+    scale = _polynomial(u * u + v * v, k[:2])
+    du, dv = _tangential(u, v, k[2], k[3])
+    return u * scale + du, v * scale + dv
+
+
+def _full_opencv(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
+    r2 = u * u + v * v
+    scale = _polynomial(r2, (k[0], k[1], k[4])) / _polynomial(r2, k[5:8])
+    du, dv = _tangential(u, v, k[2], k[3])
+    return u * scale + du, v * scale + dv
+
+
+def _fov(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
+    omega = k[0]
+    r = np.hypot(u, v)
+    if omega * omega < 1e-8:
+        return u, v
+    scale = np.where(
+        r > 1e-8, np.arctan(2 * r * np.tan(omega / 2)) / (r * omega), 2 * np.tan(omega / 2) / omega
+    )
+    return u * scale, v * scale
+
+
+def _equidistant(u: Array, v: Array) -> tuple[Array, Array]:
+    """Map directions to the plane in which the distance from the centre is the angle to the axis."""
+    r = np.hypot(u, v)
+    scale = np.where(r > 1e-8, np.arctan(r) / np.maximum(r, 1e-8), 1.0)
+    return u * scale, v * scale
+
+
+def _fisheye(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
+    return _radial(*_equidistant(u, v), k)
+
+
+def _thin_prism_fisheye(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
+    k1, k2, p1, p2, k3, k4, sx1, sy1 = k
+    u, v = _equidistant(u, v)
+    r2 = u * u + v * v
+    scale = _polynomial(r2, (k1, k2, k3, k4))
+    du, dv = _tangential(u, v, p1, p2)
+    return u * scale + du + sx1 * r2, v * scale + dv + sy1 * r2
+
+
+def _rad_tan_thin_prism_fisheye(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
+    u, v = _radial(*_equidistant(u, v), k[:6])
+    p0, p1, s0, s1, s2, s3 = k[6:]
+    r2 = u * u + v * v
+    du, dv = _tangential(u, v, p1, p0)
+    return u + du + r2 * (s0 + s1 * r2), v + dv + r2 * (s2 + s3 * r2)
+
+
+def _division(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
+    scale = 2 / (1 + np.sqrt(1 - 4 * k[0] * (u * u + v * v)))
+    return u * scale, v * scale
+
+
+def _eucm(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
+    alpha, beta = k
+    scale = 1 / (alpha * np.sqrt(beta * (u * u + v * v) + 1) + 1 - alpha)
+    return u * scale, v * scale
+
+
+_DISTORT: dict[str, _Distort] = {
+    "SIMPLE_RADIAL": _radial,
+    "RADIAL": _radial,
+    "OPENCV": _opencv,
+    "FULL_OPENCV": _full_opencv,
+    "FOV": _fov,
+    "OPENCV_FISHEYE": _fisheye,
+    "SIMPLE_RADIAL_FISHEYE": _fisheye,
+    "RADIAL_FISHEYE": _fisheye,
+    "SIMPLE_FISHEYE": _fisheye,
+    "FISHEYE": _fisheye,
+    "THIN_PRISM_FISHEYE": _thin_prism_fisheye,
+    "RAD_TAN_THIN_PRISM_FISHEYE": _rad_tan_thin_prism_fisheye,
+    "SIMPLE_DIVISION": _division,
+    "DIVISION": _division,
+    "EUCM": _eucm,
+}
+_ZERO_IS_PINHOLE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "FOV", "SIMPLE_DIVISION", "DIVISION")
+# Models with one focal length, and the one that holds their distortion with two (zeros appended).
+_WITH_TWO_FOCALS = {
+    "SIMPLE_PINHOLE": "PINHOLE",
+    "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV",
+    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "SIMPLE_FISHEYE": "FISHEYE",
+    "SIMPLE_DIVISION": "DIVISION",
+}

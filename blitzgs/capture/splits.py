@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chooses the held-out views: every n-th, those of a list file, or those in Mega-NeRF's `val/` folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+
+from blitzgs.capture.files import read_lines
+
+DEFAULT_EVERY = 8
+
+
+def every_nth(count: int, n: int) -> list[int]:
+    """Return the test views 0, n, 2n, ... of `count` (views sorted by name); none if n is 0."""
+    if n < 0 or n == 1:
+        raise ValueError(f"data.split: must be 0 (no view is held out) or at least 2, got {n}")
+    return list(range(0, count, n)) if n else []
+
+
+def from_list(names: Sequence[str], path: Path) -> list[int]:
+    """Return the test views that a text file names, one per line, with or without folder and suffix.
+
+    Raises:
+        ValueError: a line names no view, or several.
+    """
+    lookup: dict[str, set[int]] = {}
+    for index, name in enumerate(names):
+        pure = PurePath(name)
+        for key in {name, pure.name, pure.stem, str(pure.with_suffix(""))}:
+            lookup.setdefault(key, set()).add(index)
+    test: set[int] = set()
+    for number, line in enumerate(read_lines(path), start=1):
+        entry = line.split("#")[0].strip()
+        if not entry:
+            continue
+        found = lookup.get(entry, set())
+        exact = {index for index in found if names[index] == entry}
+        found = exact or found
+        if len(found) != 1:
+            problem = f"names {len(found)} views" if found else "names no view of the capture"
+            raise ValueError(
+                f"{path}: line {number}: '{entry}' {problem} (views are called like '{names[0]}')"
+            )
+        test |= found
+    return sorted(test)
+
+
+def is_val(name: str, image_path: Path, root: Path) -> bool:
+    """Tell whether an image is in Mega-NeRF's `val/` folder of the capture."""
+    inside = image_path.relative_to(root) if image_path.is_relative_to(root) else PurePath(name)
+    return ("val",) in (inside.parts[:1], PurePath(name).parts[:1])
+
+
+def split_views(
+    names: Sequence[str], paths: Sequence[Path], root: Path, spec: int | str | Path = "auto"
+) -> tuple[list[int], list[int]]:
+    """Return train and test views, both ascending.
+
+    Args:
+        names: of all views, in their order.
+        paths: of their image files.
+        root: folder of the capture.
+        spec: n (every n-th), "val" (Mega-NeRF's layout), a list file (relative to `root` or as it is), or
+            "auto": "val" if such a folder has views, else every 8th.
+
+    Raises:
+        ValueError: the list names unknown views, or no training view is left.
+    """
+    if isinstance(spec, str) and spec.removeprefix("-").isdigit():
+        spec = int(spec)
+    if isinstance(spec, int):
+        test = every_nth(len(names), spec)
+    else:
+        test = [i for i in range(len(names)) if is_val(names[i], paths[i], root)]
+        if spec == "val" and not test:
+            raise ValueError(f"split 'val': no view's image is in {root / 'val'}")
+        if spec == "auto" and not test:
+            test = every_nth(len(names), DEFAULT_EVERY) if len(names) > 1 else []
+        if spec not in ("val", "auto"):
+            candidates = [root / spec, Path(spec)]
+            found = next((path for path in candidates if path.is_file()), None)
+            if found is None:
+                raise ValueError(
+                    f"split '{spec}': must be a whole number n (every n-th view is held out; 0: none), "
+                    f"'auto', 'val' or a file in {root}"
+                )
+            test = from_list(names, found)
+    held_out = set(test)
+    train = [i for i in range(len(names)) if i not in held_out]
+    if not train:
+        raise ValueError(f"split '{spec}' leaves no training view of {len(names)}")
+    return train, test

@@ -1,0 +1,423 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The configuration of a run: one dataclass per section, with its fields' meaning and defaults.
+
+Times are counted in images and are multiplied by `schedule.scale`. Lengths are relative to the scene's
+`extent` (1.1 x the largest distance of a training camera from the mean camera centre), never absolute.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+# How splats travel between ranks, and how an importance pass scores Gaussians.
+Transport = Literal["auto", "peer", "collective"]
+ScoreRule = Literal["density", "root", "weight", "energy"]
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which capture is trained on, how its images are read, and which views are held out.
+
+    Attributes:
+        path: folder of the capture.
+        images: image folder inside the capture.
+        downscale: integer factor by which images are reduced (1: original size).
+        masks: mask folder inside the capture; null uses `masks/` where there is one, true requires it, false
+            uses none.
+        split: which views are held out: a number n (every n-th; 0: none), "val" (Mega-NeRF's `val/` layout),
+            a text file with one image name a line, or "auto": the capture's own split if it has one, else
+            every 8th.
+        undistort: what happens to the part of a pinhole image that the distorted image does not cover: "crop"
+            cuts it off, "mask" masks it.
+        exif: "auto" turns an image by its EXIF tag if only the turned image fits its camera; "apply" always
+            turns it, "ignore" never.
+        allow_missing: drop views whose image is missing instead of failing.
+        cache_bytes: memory for compressed images, of all ranks of a host together, at most half of the host's
+            memory; decoded images take what these leave, and up to a quarter of it in addition. If all
+            decoded images fit into half of it, the ranks of a host share them.
+        threads: decoder threads of each rank. 0: the cores that the process may use, shared by the ranks of
+            the host, less two for each rank; at least 2, at most 32.
+        prefetch: number of batches to upload ahead; photographs are decoded for more batches ahead.
+    """
+
+    path: str = ""
+    images: str = "images"
+    downscale: int = 1
+    masks: str | bool | None = None
+    split: str = "auto"
+    undistort: str = "crop"
+    exif: str = "auto"
+    allow_missing: bool = False
+    cache_bytes: int = 8_000_000_000
+    threads: int = 0
+    prefetch: int = 3
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """How Gaussians are rendered, and how they begin.
+
+    Attributes:
+        sh_degree: highest spherical-harmonics degree, 0..3.
+        background: colour behind everything, RGB in [0, 1].
+        antialiased: scale opacities to compensate the screen-space blur (Mip-Splatting's 2D filter); false:
+            classic 3DGS.
+        near: near plane, relative to extent.
+        far: far plane, relative to extent.
+        eps2d: screen-space blur added to the projected covariance, pixels squared.
+        deterministic: make a run repeat bit for bit on CUDA too, at some cost in time (the CPU always does).
+        initial_opacity: opacity of the initial Gaussians.
+        scale_floor: smallest standard deviation of a Gaussian, in pixels of the training view that samples it
+            most finely, which is found anew at every tenth density event; 0: none. Mip-Splatting's 3D filter
+            has 0.447.
+    """
+
+    sh_degree: int = 3
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    antialiased: bool = False
+    near: float = 0.01
+    far: float = 1e6
+    eps2d: float = 0.3
+    deterministic: bool = False
+    initial_opacity: float = 0.1
+    scale_floor: float = 0.0
+
+
+@dataclass(frozen=True)
+class LodConfig:
+    """The octree of the initial Gaussians: multi-resolution voxels of the SfM cloud.
+
+    Attributes:
+        fork: ratio f of the voxel sizes of neighbouring levels.
+        visible_threshold: a voxel is kept when its level is resolvable in more than this share of the
+            cameras.
+        base_resolution: finest sensible voxel relative to the scene's box; sets the coarsest level's size.
+    """
+
+    fork: float = 2.0
+    visible_threshold: float = 0.9
+    base_resolution: float = 0.001
+
+
+# The largest factor by which `schedule.images_per_view` makes a run longer.
+MOST_STRETCH = 4.0
+
+# The limits of the `loss.opacity` that a run computes from `loss.opacity_total`: about the range that was
+# measured (docs/decisions/recipe.md).
+LEAST_OPACITY, MOST_OPACITY = 0.005, 0.05
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """The times of all events, counted in images; `scale` multiplies every time below.
+
+    Attributes:
+        iterations: length of the run.
+        scale: stretches or compresses the whole schedule without changing its shape.
+        images_per_view: how often a new run sees each training view on average, at least: it multiplies
+            `scale` by the factor that is needed for this, from 1 to `MOST_STRETCH`. The run's own
+            configuration has the product in `scale`, and 0 here. With 0 or with `minutes` the length does not
+            depend on the number of views.
+        minutes: wall time of training that the schedule is fitted into (`blitzgs train --minutes`): the run
+            measures its speed and changes its pace; `scale` stays 1. 0: no limit.
+        pace: pairs (image of the run, factor): from that image on, `scale` is multiplied by the factor. A run
+            with `minutes` writes its changes of pace here; a run without `minutes` repeats them.
+        adaptive: the run places `t1`, `densify_until` and `t2`, in this order, by the demand of density
+            control and by its loss (`blitzgs/training/adaptive.py`). `t1` and `t2` have no effect without
+            `population.importance`. With "relocation", the demand hardly changes: `t1` comes at its latest
+            time, and the loss decides on the others.
+        adaptive_limit: largest change of these times by `adaptive`, earlier or later, as a share of each.
+        placed: the times placed so far, up to three. A run with `adaptive` writes them here; a run without it
+            repeats them.
+        batch_size: B, views per optimiser step; a step advances the clock by B images.
+        densify_from, densify_until, densify_every: density events happen at from, from + every, ... < until.
+        size_prune_after: density events later than this also prune by size.
+        reset_every: all opacities are capped at `population.reset_opacity` at every multiple of this before
+            `densify_until`; 0: never.
+        gate_from: from here on `population.gate` judges the candidates of density events; no effect without a
+            gate.
+        t1, t2: times of the first and the second importance pass, if `population.importance` is set; 0: no
+            pass. A pass happens after the density event of the same time.
+        levels_until: from here on `view.lod` may keep all octree levels; at the start it keeps those up to
+            `view.first_levels`. 0: `densify_until`.
+        sh_every: the spherical-harmonics degree grows by one at every multiple of this.
+        position_decay: length of the exponential decay of the position learning rate.
+        checkpoint_every: a checkpoint is written at every multiple of this, in addition to those by
+            `log.checkpoint_seconds`. 0: none.
+        evaluate_every: the held-out views are measured at every multiple of this, and at the end. 0: only at
+            the end.
+    """
+
+    iterations: int = 30_000
+    scale: float = 1.0
+    images_per_view: float = 0.0
+    minutes: float = 0.0
+    pace: tuple[tuple[int, float], ...] = ()
+    adaptive: bool = False
+    adaptive_limit: float = 0.4
+    placed: tuple[int, ...] = ()
+    batch_size: int = 1
+    densify_from: int = 500
+    densify_until: int = 15_000
+    densify_every: int = 100
+    size_prune_after: int = 3_000
+    reset_every: int = 0
+    gate_from: int = 11_250
+    t1: int = 7_500
+    t2: int = 16_000
+    levels_until: int = 0
+    sh_every: int = 1_000
+    position_decay: int = 30_000
+    checkpoint_every: int = 0
+    evaluate_every: int = 0
+
+
+@dataclass(frozen=True)
+class OptimiserConfig:
+    """Adam with batch scaling: lr sqrt(B), beta^B, eps / sqrt(B).
+
+    Attributes:
+        position, position_final: learning rates of the means, relative to extent, at the start and after
+            `schedule.position_decay`.
+        sh_dc, sh_rest, opacity, scale, rotation: learning rates.
+        position_noise: strength of the random steps of almost transparent Gaussians, relative to the position
+            rate (3DGS-MCMC's noise, with lengths relative to extent); 0: none.
+        final_share: sh_dc, sh_rest, opacity, scale and rotation fall exponentially to this share of
+            themselves at the end of the run; 1: they stay constant.
+        beta1, beta2, eps: Adam's constants for B = 1.
+        sparse: ordinary sparse Adam: rows outside a step's active set keep their moments and do not move.
+            False: the steps that they miss are applied later, as in dense Adam.
+    """
+
+    position: float = 1.6e-4
+    position_final: float = 1.6e-6
+    sh_dc: float = 2.5e-3
+    sh_rest: float = 1.25e-4
+    opacity: float = 2.5e-2
+    scale: float = 5e-3
+    rotation: float = 1e-3
+    position_noise: float = 0.0
+    final_share: float = 1.0
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-15
+    sparse: bool = False
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """(1 - ssim) L1 + ssim (1 - SSIM) + scale L_scale + opacity L_opacity + size L_size per view.
+
+    Attributes:
+        ssim: weight of the SSIM term.
+        opacity: weight of the mean opacity of the visible Gaussians (3DGS-MCMC takes the mean of all
+            Gaussians; here the term does not act on Gaussians that a step does not see).
+        opacity_total: weight of the same mean beside the sum of the losses of all training views. A run
+            minimises the mean of these losses, so a new run sets `opacity` to this weight divided by the
+            number of training views, from `LEAST_OPACITY` to `MOST_OPACITY`. The run's own configuration has
+            the result in `opacity`, and 0 here. 0: `opacity` is the weight.
+        scale: weight of the mean smallest axis of the visible Gaussians.
+        scale_reference: that axis is measured in units of extent x scale_reference.
+        size: weight of the mean of all three axes of the visible Gaussians, in units of the extent; the other
+            regulariser of 3DGS-MCMC.
+    """
+
+    ssim: float = 0.2
+    opacity: float = 0.0
+    opacity_total: float = 0.0
+    scale: float = 10.0
+    scale_reference: float = 10.0
+    size: float = 0.0
+
+
+@dataclass(frozen=True)
+class PopulationConfig:
+    """Density control: which Gaussians are cloned, split and pruned, and the two importance passes.
+
+    Some fields have no effect on some runs. With "relocation": `grad_threshold`, `absolute_gradients`,
+    `absolute_threshold`, `clone_scale`, `min_observations` and `phi`. With "density": `growth`. Without
+    `importance`: `score`, `pass1_keep`, `pass2_mass`, `pass2_keep` and `phi`. Without `gate`: `gate_rate` and
+    `gate_rule`. With the gate "random": `gate_rule`.
+
+    Attributes:
+        strategy: what a density event does: "density" (clone and split by gradients, prune) or "relocation"
+            (3DGS-MCMC: Gaussians that would be pruned are replaced by copies of others, drawn by opacity, and
+            the population grows by `growth`).
+        relocate: with "density" too, replace Gaussians that would be pruned by copies of others.
+        growth: share of the population that "relocation" adds at each event.
+        grad_threshold: mean norm of the 2D-mean gradient (half-image units) above which a Gaussian is
+            densified.
+        absolute_gradients: use the sum over pixels of the absolute gradients instead (AbsGS), in which
+            opposite gradients of a Gaussian's two halves do not cancel.
+        absolute_threshold: replaces `grad_threshold` with `absolute_gradients`.
+        clone_scale: Gaussians up to this largest axis (relative to extent) are cloned, larger ones split; 0:
+            all are split.
+        min_opacity: Gaussians of lower opacity are pruned.
+        reset_opacity: cap of the opacities at each `schedule.reset_every`.
+        opacity_decay: share of its opacity that every Gaussian loses at each density event.
+        prune_screen_radius: pixels; Gaussians with a larger radius are pruned after
+            `schedule.size_prune_after`.
+        prune_world_scale: relative to extent; Gaussians with a larger axis are pruned after the same time.
+        max_gaussians: limit of the population's growth; the candidates with the largest gradients are
+            densified first. A population that begins above it stays. 0: no limit.
+        importance: at `schedule.t1` and `schedule.t2` score all Gaussians by their contributions to the
+            training views, and prune those of low score.
+        score: the score of the passes, summed over the views: "density" (BlitzGS: contribution per pixel),
+            "weight" (contribution), "root" (contribution over the square root of the number of pixels) or
+            "energy" (sum of the squared contributions to pixels).
+        pass1_keep: share of the Gaussians that the first pass keeps, drawn in proportion to their scores; 1:
+            it keeps all and only computes phi and the cull matrix.
+        pass2_mass: the second pass keeps the fewest Gaussians that hold this share of the total score,
+            without those below `min_opacity`. 1: it keeps all whose score is not zero.
+        pass2_keep: largest share of the Gaussians that the second pass keeps, those of the highest scores,
+            without those below `min_opacity`; 1: no such limit. If `pass2_mass` and `pass2_keep` are both 1,
+            the pass keeps all Gaussians and only computes phi and the cull matrix.
+        phi: from the first pass on, density control multiplies the gradients that it sums with phi: among the
+            views that see a Gaussian, the share of those in which it counts.
+        gate: model file of a spawn gate (`blitzgs gate fit`), or "default" for the one that comes with
+            BlitzGS, for configs/compact.yaml with schedule.t1=8999, pass1_keep=0.85 and score=weight; or
+            "random" to withhold as many at random, which a gate has to surpass; null: none.
+        gate_rate: share of the candidates, clones and splits apart, that the gate withholds at each density
+            event from `schedule.gate_from` on.
+        gate_rule: "rank" (BlitzGS): the gate withholds the candidates of lowest rank; "sample": those that it
+            lets pass are drawn in proportion to their odds to survive.
+        lineage: log every birth and death as Parquet files in the run's folder `lineage` (needs pyarrow).
+        pixels_per_gaussian: limits the population to the pixels of all training photographs divided by this.
+            0: no limit.
+        gaussians_per_point: limits the population to the points of the reconstruction times this; there are
+            more points where photographs show more detail. 0: no limit.
+        min_observations: a Gaussian is judged by the mean of at least this many gradients, one for each view
+            of a step that sees it. With fewer, its gradients are kept for the next density event.
+    """
+
+    strategy: str = "density"
+    relocate: bool = False
+    growth: float = 0.05
+    grad_threshold: float = 2e-4
+    absolute_gradients: bool = False
+    absolute_threshold: float = 8e-4
+    clone_scale: float = 0.01
+    min_opacity: float = 0.005
+    reset_opacity: float = 0.01
+    opacity_decay: float = 0.0
+    prune_screen_radius: float = 20.0
+    prune_world_scale: float = 0.1
+    max_gaussians: int = 0
+    importance: bool = False
+    score: str = "density"
+    pass1_keep: float = 0.7
+    pass2_mass: float = 0.99
+    pass2_keep: float = 1.0
+    phi: bool = True
+    gate: str | None = None
+    gate_rate: float = 0.6
+    gate_rule: str = "rank"
+    lineage: bool = False
+    pixels_per_gaussian: float = 24.0
+    gaussians_per_point: float = 0.0
+    min_observations: int = 1
+
+
+@dataclass(frozen=True)
+class ViewConfig:
+    """Which Gaussians a view leaves out before projection.
+
+    Attributes:
+        lod: from `schedule.densify_until` on, views leave out Gaussians whose octree level is too fine for
+            their distance. The trained model is evaluated and rendered in the same way.
+        first_levels: finest level that views may keep at the start of the run, as a share of the number of
+            levels.
+        level_ratio: the finer levels are added one by one until `schedule.levels_until`; each wait is shorter
+            than the one before by this factor.
+        most_kept: views that would keep at least this share of all Gaussians are rendered with all of them.
+        smooth: opacities fade out over half a level around the distance at which `lod` would cut them off.
+            All views then have the gate, and `most_kept` is ignored. Needs `lod`.
+        cull: from the first importance pass on, a training view leaves out the Gaussians that did not count
+            in it at the last pass. This ends halfway between the last pass and the end of the run. Needs
+            `population.importance`.
+    """
+
+    lod: bool = False
+    first_levels: float = 0.5
+    level_ratio: float = 1.5
+    most_kept: float = 0.8
+    smooth: bool = False
+    cull: bool = False
+
+
+@dataclass(frozen=True)
+class MemoryConfig:
+    """Where the Gaussians are stored during training; no field changes the result beyond rounding.
+
+    Attributes:
+        resident_gb: gigabytes of each rank's device for Gaussians. All Gaussians are stored in host memory,
+            and those that the next views may see are copied to the device. 0: all are stored on the device.
+    """
+
+    resident_gb: float = 0.0
+
+
+@dataclass(frozen=True)
+class RanksConfig:
+    """How several processes share a run; only `half_exchange` changes the result beyond rounding.
+
+    Attributes:
+        timeout_seconds: the job ends if a rank does not arrive at a collective within this time.
+        transport: how splats are sent: "peer" (written to the other GPUs' memory), "collective" (by NCCL or
+            Gloo) or "auto" ("peer" if it works, else "collective").
+        share_gpus: if a host has fewer GPUs than ranks, let several ranks use one GPU, in turns; slow, for
+            development.
+        half_exchange: send splats and their gradients in half precision, by collectives; for slow links.
+        max_imbalance: Gaussians are redistributed when the largest shard exceeds the smallest by this factor.
+    """
+
+    timeout_seconds: float = 120.0
+    transport: str = "auto"
+    share_gpus: bool = False
+    half_exchange: bool = False
+    max_imbalance: float = 1.1
+
+
+@dataclass(frozen=True)
+class LogConfig:
+    """What a run logs and saves.
+
+    Attributes:
+        every: images between two log records.
+        tensorboard: also write TensorBoard events, if the package is installed.
+        pictures: number of side-by-side pictures that an evaluation writes.
+        checkpoint_seconds: seconds between two checkpoints; a crash loses at most this much training. 0: no
+            checkpoints by wall time.
+        keep_checkpoints: number of checkpoints that are kept on disk.
+        lpips_weights: path of a TorchScript module of LPIPS for the evaluation, or null.
+    """
+
+    every: int = 100
+    tensorboard: bool = True
+    pictures: int = 8
+    checkpoint_seconds: float = 600.0
+    keep_checkpoints: int = 3
+    lpips_weights: str | None = None
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that decides what a run computes.
+
+    Attributes:
+        seed: seed of the batch order and of every random draw.
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    lod: LodConfig = field(default_factory=LodConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    population: PopulationConfig = field(default_factory=PopulationConfig)
+    view: ViewConfig = field(default_factory=ViewConfig)
+    memory: MemoryConfig = field(default_factory=MemoryConfig)
+    ranks: RanksConfig = field(default_factory=RanksConfig)
+    log: LogConfig = field(default_factory=LogConfig)
+    seed: int = 0

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reads configurations from YAML files and `--section.field=value` overrides, and checks them."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import hashlib
+import json
+import math
+import types
+import typing
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from blitzgs.config.fields import Config
+from blitzgs.config.ranges import problems
+from blitzgs.util.output import write_file
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names the field, the value and the remedy."""
+
+
+def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -> Config:
+    """Build a configuration from the defaults, then a YAML file, then overrides.
+
+    Args:
+        path: YAML file with sections as in `Config`, or None. A file may name another one under `base`
+            (relative to itself); it then changes the values of that file.
+        overrides: "section.field=value" with a YAML value; leading dashes are allowed.
+
+    Raises:
+        ConfigError: unknown field, ill-typed or impossible value, unreadable file.
+    """
+    values: dict[str, Any] = {}
+    if path is not None:
+        values = _read(Path(path), set())
+        try:
+            _build(Config, values, "")
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from error
+    for text in overrides:
+        name, equals, value = text.lstrip("-").partition("=")
+        if not equals:
+            raise ConfigError(f"'{text}' is not an override: write --section.field=value")
+        try:
+            parsed = yaml.load(value, _Loader)
+        except _UNREADABLE as error:
+            raise ConfigError(f"{name}: cannot read the value '{value}': {error}") from error
+        _merge(values, _nest(name.split("."), parsed), name)
+    config: Config = _build(Config, values, "")
+    for problem in problems(config):
+        raise ConfigError(problem)
+    return config
+
+
+def from_dict(values: dict[str, Any]) -> Config:
+    """Rebuild a configuration from `to_dict`'s nested dictionary; raises ConfigError like `load_config`."""
+    config: Config = _build(Config, values, "")
+    return config
+
+
+def to_dict(config: Config) -> dict[str, Any]:
+    """Return the configuration as nested dictionaries of JSON-able values."""
+    result: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
+    return result
+
+
+def save_config(config: Config, path: Path) -> None:
+    """Write the resolved configuration as YAML; `load_config` reads it back to the same object."""
+    write_file(path, yaml.safe_dump(to_dict(config), sort_keys=False))
+
+
+def config_hash(config: Config) -> str:
+    """Return the first 16 hex digits of the SHA-256 of the resolved configuration."""
+    return hashlib.sha256(json.dumps(to_dict(config), sort_keys=True).encode()).hexdigest()[:16]
+
+
+class _Loader(yaml.SafeLoader):
+    """A YAML loader that refuses duplicate keys, of which PyYAML silently keeps the last.
+
+    A number whose usual form is another one, and a date, stay text: 100_0001 may be the name of a folder.
+    """
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Build a mapping as the parent class does; a duplicate key is an error."""
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                text = f"the key '{key.value}' is given twice"
+                raise yaml.MarkedYAMLError(problem=text, problem_mark=key.start_mark)
+            seen.add(str(key.value))
+        return super().construct_mapping(node, deep)
+
+    def construct_number(self, node: yaml.ScalarNode) -> int | float | str:
+        """Return the number if Python writes it as the file does, else its text, which `_convert` reads."""
+        is_int = node.tag == "tag:yaml.org,2002:int"
+        value: int | float = self.construct_yaml_int(node) if is_int else self.construct_yaml_float(node)
+        not_finite = isinstance(value, float) and not math.isfinite(value)
+        return value if not_finite or str(value) == node.value else node.value
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_number)
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_number)
+_Loader.add_constructor("tag:yaml.org,2002:timestamp", lambda _, node: node.value)
+
+# Errors that PyYAML raises for text that is not YAML or has a value that Python cannot represent.
+_UNREADABLE = (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError)
+
+
+def _read(path: Path, seen: set[Path]) -> dict[str, Any]:
+    path = path.resolve()
+    if path in seen:
+        raise ConfigError(f"{path}: 'base' leads back to the same file")
+    try:
+        values = yaml.load(path.read_text(encoding="utf-8-sig"), _Loader) or {}
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot read the configuration: {error.strerror}") from error
+    except _UNREADABLE as error:
+        raise ConfigError(f"{path}: not valid YAML: {error}") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: must hold sections, got {type(values).__name__}")
+    base = values.pop("base", None)
+    if base is None:
+        return values
+    if not isinstance(base, str):
+        raise ConfigError(f"{path}: base must be a file name, got {base!r}")
+    merged = _read(path.parent / base, seen | {path})
+    _merge(merged, values, str(path))
+    return merged
+
+
+_MOST_DEPTH = 20
+
+
+def _nest(names: list[str], value: Any) -> dict[str, Any]:
+    return {names[0]: value if len(names) == 1 else _nest(names[1:], value)}
+
+
+def _merge(target: dict[str, Any], changes: dict[str, Any], where: str, depth: int = 0) -> None:
+    # An anchor can make a section contain itself.
+    if depth > _MOST_DEPTH:
+        raise ConfigError(f"{where}: sections are nested more than {_MOST_DEPTH} deep")
+    for name, value in changes.items():
+        if isinstance(value, dict):
+            section = target.setdefault(name, {})
+            if not isinstance(section, dict):
+                raise ConfigError(f"{where}: '{name}' is a value, not a section")
+            _merge(section, value, where, depth + 1)
+        else:
+            target[name] = value
+
+
+def _build(kind: type, values: Any, where: str) -> Any:
+    hints = typing.get_type_hints(kind)
+    if not isinstance(values, dict):
+        raise ConfigError(
+            f"{where or 'configuration'}: must be a section with {', '.join(hints)}; got {values!r}"
+        )
+    arguments = {}
+    for name, value in values.items():
+        path = f"{where}.{name}" if where else str(name)
+        if name not in hints:
+            raise ConfigError(f"{path}: unknown field; {_hint(str(name), list(hints))}")
+        arguments[name] = _convert(hints[name], value, path)
+    return kind(**arguments)
+
+
+def _hint(name: str, known: list[str]) -> str:
+    """Return what may have been meant by an unknown name: a similar one, else a field of another section."""
+    if close := difflib.get_close_matches(name, known, n=1):
+        return f"did you mean '{close[0]}'?"
+    sections = typing.get_type_hints(Config)
+    fields = [
+        f"{section}.{name}"
+        for section, kind in sections.items()
+        if dataclasses.is_dataclass(kind) and name in typing.get_type_hints(kind)
+    ]
+    return f"did you mean '{fields[0]}'?" if fields else f"known: {', '.join(known)}"
+
+
+def _convert(hint: Any, value: Any, path: str) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return _build(typing.cast(type, hint), value, path)
+    origin, options = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        if value is None or (isinstance(value, bool) and bool in options):
+            return value
+        return _convert(next(option for option in options if option is not type(None)), value, path)
+    if origin is tuple:
+        if options[-1] is Ellipsis and isinstance(value, (list, tuple)):
+            options = options[:1] * len(value)
+        if not isinstance(value, (list, tuple)) or len(value) != len(options):
+            raise ConfigError(f"{path}: must be a list of {len(options)} values, got {value!r}")
+        return tuple(
+            _convert(o, v, f"{path}[{i}]") for i, (o, v) in enumerate(zip(options, value, strict=True))
+        )
+    if hint in (int, float) and isinstance(value, str):
+        # YAML 1.1 reads 1e-4 as a string. An integer keeps all its digits, which a float may not hold.
+        text = value
+        for kind in (float, int):
+            with contextlib.suppress(ValueError):
+                value = kind(text)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        try:
+            return float(value)
+        except OverflowError:
+            raise ConfigError(f"{path}: {value} is too large") from None
+    if hint is str and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return str(value)
+    if hint is int and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
+        raise ConfigError(f"{path}: must be {_kind(hint)}, got {value!r} ({type(value).__name__})")
+    return value
+
+
+def _kind(hint: type) -> str:
+    return {int: "an integer", float: "a number", bool: "true or false", str: "text"}.get(hint, hint.__name__)

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The allowed values of every configuration field; they are checked when a configuration is read.
+
+A test checks that every field has an entry. The limits exclude values that cannot work (an infinite rate, an
+opacity of 2) or that would exhaust memory or never end; they are far from any sensible value.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, get_args
+
+from blitzgs.config.fields import MOST_STRETCH, Config, ScheduleConfig, ScoreRule, Transport
+
+
+@dataclass(frozen=True)
+class Range:
+    """The numbers from `low` to `high`; an end that is open is excluded."""
+
+    low: float
+    high: float
+    low_open: bool = False
+    high_open: bool = False
+
+    def __contains__(self, value: float) -> bool:
+        above = value > self.low if self.low_open else value >= self.low
+        return above and (value < self.high if self.high_open else value <= self.high)
+
+    def __str__(self) -> str:
+        brackets = "(" if self.low_open else "[", ")" if self.high_open else "]"
+        return f"in {brackets[0]}{self.low:,.12g}, {self.high:,.12g}{brackets[1]}"
+
+
+# Images of a whole run: its table of learning rates takes 48 bytes a step.
+MOST_IMAGES = 10_000_000
+SCALE = Range(1e-4, 1e4)
+_TIME = Range(0, 1e9)
+_EVERY = Range(1, 1e9)
+_EVERY_OR_NEVER = Range(0, 1e9)
+_SHARE = Range(0, 1, low_open=True)
+_RATE = Range(0, 10)
+_BETA = Range(0, 1, high_open=True)
+_LENGTH = Range(0, 1e6)
+
+RANGES: Mapping[str, Range] = {
+    "data.downscale": Range(1, 1000),
+    "data.cache_bytes": Range(0, 2**50),
+    "data.threads": Range(0, 1024),
+    "data.prefetch": Range(0, 1000),
+    "model.sh_degree": Range(0, 3),
+    "model.background": Range(0, 1),
+    "model.near": Range(1e-9, 1e6),
+    "model.far": Range(1e-9, 1e12),
+    "model.eps2d": Range(0, 100),
+    "model.initial_opacity": Range(1e-4, 0.9999),
+    "model.scale_floor": Range(0, 100),
+    "lod.fork": Range(1.01, 100),
+    "lod.visible_threshold": Range(0, 1, high_open=True),
+    "lod.base_resolution": Range(1e-6, 1),
+    "schedule.iterations": Range(1, 1e9),
+    "schedule.scale": SCALE,
+    "schedule.images_per_view": Range(0, 1e6),
+    "schedule.minutes": Range(0, 1e6),
+    "schedule.pace": Range(1e-4, 1e9),
+    "schedule.adaptive_limit": Range(0, 1, high_open=True),
+    "schedule.placed": _TIME,
+    "schedule.batch_size": Range(1, 32),
+    "schedule.densify_from": _TIME,
+    "schedule.densify_until": _TIME,
+    "schedule.densify_every": _EVERY,
+    "schedule.size_prune_after": _TIME,
+    "schedule.reset_every": _EVERY_OR_NEVER,
+    "schedule.gate_from": _TIME,
+    "schedule.t1": _EVERY_OR_NEVER,
+    "schedule.t2": _EVERY_OR_NEVER,
+    "schedule.levels_until": _TIME,
+    "schedule.sh_every": _EVERY,
+    "schedule.position_decay": _EVERY,
+    "schedule.checkpoint_every": _EVERY_OR_NEVER,
+    "schedule.evaluate_every": _EVERY_OR_NEVER,
+    "optimiser.position": Range(0, 1),
+    "optimiser.position_final": Range(1e-20, 1),
+    "optimiser.sh_dc": _RATE,
+    "optimiser.sh_rest": _RATE,
+    "optimiser.opacity": _RATE,
+    "optimiser.scale": _RATE,
+    "optimiser.rotation": _RATE,
+    "optimiser.position_noise": Range(0, 1e12),
+    "optimiser.final_share": Range(1e-6, 1),
+    "optimiser.beta1": _BETA,
+    "optimiser.beta2": _BETA,
+    "optimiser.eps": Range(1e-30, 1),
+    "loss.ssim": Range(0, 1),
+    "loss.opacity": Range(0, 1e6),
+    "loss.opacity_total": Range(0, 1e6),
+    "loss.scale": Range(0, 1e6),
+    "loss.scale_reference": Range(1e-6, 1e6),
+    "loss.size": Range(0, 1e6),
+    "population.growth": Range(0, 10),
+    "population.grad_threshold": Range(0, 1e30),
+    "population.absolute_threshold": Range(0, 1e6),
+    "population.clone_scale": _LENGTH,
+    "population.min_opacity": Range(0, 1, high_open=True),
+    "population.reset_opacity": Range(0, 1, low_open=True, high_open=True),
+    "population.opacity_decay": Range(0, 1, high_open=True),
+    "population.prune_screen_radius": _LENGTH,
+    "population.prune_world_scale": _LENGTH,
+    "population.max_gaussians": Range(0, 1e11),
+    "population.pixels_per_gaussian": Range(0, 1e9),
+    "population.gaussians_per_point": Range(0, 1e6),
+    "population.min_observations": Range(1, 1e6),
+    "population.gate_rate": Range(0, 1),
+    "population.pass1_keep": _SHARE,
+    "population.pass2_mass": _SHARE,
+    "population.pass2_keep": _SHARE,
+    "view.first_levels": Range(0, 1),
+    "view.level_ratio": Range(1.001, 100),
+    "view.most_kept": Range(0, 1),
+    "memory.resident_gb": Range(0, 1e6),
+    "ranks.timeout_seconds": Range(1, 1e6),
+    "ranks.max_imbalance": Range(1, 1e6),
+    "log.every": _EVERY,
+    "log.pictures": Range(0, 1e6),
+    "log.checkpoint_seconds": Range(0, 1e9),
+    "log.keep_checkpoints": Range(1, 1e6),
+    "seed": Range(0, 2**63 - 1),
+}
+
+CHOICES: Mapping[str, tuple[str, ...]] = {
+    "data.undistort": ("crop", "mask"),
+    "data.exif": ("auto", "apply", "ignore"),
+    "ranks.transport": get_args(Transport),
+    "population.strategy": ("density", "relocation"),
+    "population.score": get_args(ScoreRule),
+    "population.gate_rule": ("rank", "sample"),
+}
+
+
+def problems(config: Config) -> Iterator[str]:
+    """Name each field whose value makes no sense, with the value and what is allowed."""
+    for name, value in flat_fields(config):
+        if name in RANGES and not all(number in RANGES[name] for number in _numbers(value)):
+            yield f"{name}: must be {RANGES[name]}, got {value}"
+        if name in CHOICES and value not in CHOICES[name]:
+            yield f"{name}: must be one of {', '.join(CHOICES[name])}, got {value}"
+    model, schedule, population = config.model, config.schedule, config.population
+    if not model.near < model.far:
+        yield f"model.near: must be below model.far ({model.far}), got {model.near}"
+    if 0 < config.optimiser.position < 1e-20:
+        # The rate falls by a power of the ratio of position_final to it, which must stay a number.
+        yield f"optimiser.position: must be 0 or at least 1e-20, got {config.optimiser.position}"
+    beta1, beta2 = config.optimiser.beta1, config.optimiser.beta2
+    if beta1 * beta1 >= beta2:
+        # Otherwise the steps of a row without gradients do not fade, and cannot be applied later.
+        yield (
+            f"optimiser.beta1: must be below the square root of optimiser.beta2 ({beta2}), or Adam's steps "
+            f"grow without gradients; got {beta1}"
+        )
+    yield from _problems_of_length(schedule)
+    yield from _problems_of_places(schedule)
+    if schedule.reset_every > 0 and not population.min_opacity < population.reset_opacity:
+        yield (
+            f"population.reset_opacity: must be above population.min_opacity ({population.min_opacity}), or "
+            f"all Gaussians are pruned; got {population.reset_opacity}"
+        )
+    if config.loss.opacity > 0 and config.loss.opacity_total > 0:
+        yield (
+            f"loss.opacity: loss.opacity_total ({config.loss.opacity_total:g}) sets it by the number of "
+            f"views; for {config.loss.opacity:g}, add --loss.opacity_total=0"
+        )
+    if population.strategy == "relocation" and population.gate is not None:
+        yield "population.gate: withholds candidates of population.strategy=density; relocation has none"
+    if config.view.smooth and not config.view.lod:
+        yield "view.smooth: needs view.lod=true, whose cuts it smooths"
+    if config.view.cull and not population.importance:
+        yield "view.cull: needs population.importance=true, whose passes make the mask"
+
+
+def _numbers(value: Any) -> list[Any]:
+    """Return the values of nested tuples."""
+    return [number for part in value for number in _numbers(part)] if isinstance(value, tuple) else [value]
+
+
+def _problems_of_length(schedule: ScheduleConfig) -> Iterator[str]:
+    """Name the problems with the length of a run."""
+    images = [image for image, _ in schedule.pace]
+    if any(image >= after for image, after in itertools.pairwise([0, *images])):
+        yield f"schedule.pace: its images must be above 0 and increase, got {images}"
+    factors = [factor for _, factor in schedule.pace]
+    if wrong := [factor for factor in factors if factor not in SCALE]:
+        yield f"schedule.pace: its factors must be {SCALE}, got {wrong[0]}"
+    stretch = MOST_STRETCH if schedule.images_per_view > 0 else 1.0
+    total = schedule.iterations * schedule.scale * stretch * max([1.0, *factors])
+    if not math.isnan(total) and total > MOST_IMAGES:
+        yield (
+            f"schedule.iterations: times schedule.scale must be at most {MOST_IMAGES:,} images, got "
+            f"{total:,.0f}"
+        )
+    if schedule.minutes > 0 and schedule.scale != 1.0:
+        yield (
+            f"schedule.scale: must be 1 with schedule.minutes (--minutes), which chooses the scale; got "
+            f"{schedule.scale}: add --schedule.scale=1 or leave out the minutes"
+        )
+
+
+def _problems_of_places(schedule: ScheduleConfig) -> Iterator[str]:
+    """Name the problems with the times of T1, the end of densification and T2."""
+    placed = [time for time in schedule.placed if time > 0]
+    if len(schedule.placed) > 3 or placed != sorted(placed):
+        yield f"schedule.placed: must be up to 3 times, none before the last, got {list(schedule.placed)}"
+    times = [time for time in (schedule.t1, schedule.densify_until, schedule.t2) if time > 0]
+    if schedule.adaptive and times != sorted(times):
+        yield (
+            "schedule.adaptive: needs t1 <= densify_until <= t2, of which t1 and t2 may be 0; got "
+            f"{schedule.t1}, {schedule.densify_until} and {schedule.t2}"
+        )
+
+
+def flat_fields(section: Any, where: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield all fields of a configuration as (dotted name, value)."""
+    for entry in fields(section):
+        value = getattr(section, entry.name)
+        if is_dataclass(value):
+            yield from flat_fields(value, f"{where}{entry.name}.")
+        else:
+            yield where + entry.name, value

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The schedule of a run: the events of each step, and the learning rates of all steps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from blitzgs.config.fields import MOST_STRETCH, OptimiserConfig, ScheduleConfig
+from blitzgs.config.pace import Pace
+
+EventKind = Literal[
+    "densify", "reset_opacities", "pass_1", "pass_2", "clear_cull", "place", "evaluate", "checkpoint"
+]
+# What `schedule.placed` holds, in this order.
+PLACED = ("t1", "densify_until", "t2")
+# No time is placed later than this share of the run, unless the fixed schedule has it later.
+_LAST_PLACE = 0.95
+# The events of this number of images are searched at once.
+_SEARCHED = 1024
+# The columns of the learning-rate table.
+RATES = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
+
+
+@dataclass(frozen=True, order=True)
+class Event:
+    """Something that happens at the end of the step that contains `time` (in images)."""
+
+    time: int
+    order: int
+    kind: EventKind
+
+
+def latest_times(config: ScheduleConfig) -> list[int]:
+    """Return the latest places of T1, the end of densification and T2, in times of the configuration."""
+    most = 1 + config.adaptive_limit if config.adaptive else 1.0
+    last = int(_LAST_PLACE * config.iterations)
+    times = (config.t1, config.densify_until, config.t2)
+    return [min(int(most * time), max(time, last)) for time in times]
+
+
+def _with_places(config: ScheduleConfig) -> ScheduleConfig:
+    """Return a configuration in which T1, the end of densification and T2 have their placed values.
+
+    A time that is not placed yet has its latest possible value.
+    """
+    if not (config.adaptive or config.placed):
+        return config
+    t1, until, t2 = (*config.placed, *latest_times(config)[len(config.placed) :])
+    return replace(config, t1=t1, densify_until=until, t2=t2)
+
+
+def stretched(config: ScheduleConfig, views: int) -> ScheduleConfig:
+    """Return a schedule for a number of views: `scale` times what gives each view `images_per_view` images.
+
+    The factor is between 1 and `MOST_STRETCH`. The result has `images_per_view` 0, so that a second call
+    changes nothing.
+
+    Args:
+        config: the schedule as configured.
+        views: number of training views.
+    """
+    factor = min(max(config.images_per_view * views / config.iterations, 1.0), MOST_STRETCH)
+    if config.minutes > 0:
+        factor = 1.0  # The minutes decide how long the run is.
+    return replace(config, scale=config.scale * factor, images_per_view=0.0)
+
+
+class Schedule:
+    """Tells which events happen at which step. Time t counts images; step number t / B + 1 covers [t, t + B).
+
+    `pace` maps every time of the configuration to an image of the run (without changes of pace: multiplied by
+    `scale`), rounded down. The schedule therefore has the same shape at any length.
+
+    Attributes:
+        pace: maps times of the configuration to images of the run.
+        batch_size: views per step, B.
+        steps: optimiser steps of the whole run.
+        iterations: images of the whole run, steps x B.
+    """
+
+    def __init__(self, config: ScheduleConfig) -> None:
+        self._config = _with_places(config)
+        self.pace = Pace(config.scale, config.pace)
+        self.batch_size = config.batch_size
+        self.steps = max(1, math.ceil(self._scaled(config.iterations) / self.batch_size))
+        self.iterations = self.steps * self.batch_size
+        self._found: tuple[int, int, list[Event]] = (0, 0, [])  # the events of [first, last) images
+
+    def _scaled(self, time: float) -> int:
+        # The small term keeps 0.1 * 30 from being rounded down to 2.
+        return math.floor(self.pace.image(time) + 1e-6)
+
+    def events(self, begin: int, end: int) -> list[Event]:
+        """Return the events with begin <= time < end, in the order in which they happen."""
+        # Training asks after every step, and most steps have no event.
+        first, last, found = self._found
+        if begin < first or end > last:
+            first, last = begin, max(end, begin + _SEARCHED)
+            found = self._search(first, last)
+            self._found = first, last, found
+        return [event for event in found if begin <= event.time < end]
+
+    def _search(self, begin: int, end: int) -> list[Event]:
+        """See `events`."""
+        config = self._config
+        series: list[tuple[EventKind, float, float, float]] = [
+            ("densify", config.densify_from, config.densify_until, config.densify_every),
+            # A reset happens after the density event of the same image.
+            ("reset_opacities", config.reset_every, config.densify_until, config.reset_every),
+            ("pass_1", config.t1, config.t1 + 1, min(config.t1, 1)),
+            ("pass_2", config.t2, config.t2 + 1, min(config.t2, 1)),
+            self._clear_cull(),
+            ("place", config.densify_from, config.iterations, self._placing_interval()),
+            ("evaluate", config.evaluate_every, math.inf, config.evaluate_every),
+            ("checkpoint", config.checkpoint_every, math.inf, config.checkpoint_every),
+        ]
+        found = [
+            Event(time, order, kind)
+            for order, (kind, first, until, every) in enumerate(series)
+            if every > 0
+            for time in self._series(first, until, every, begin, end)
+        ]
+        return sorted(found)
+
+    def _placing_interval(self) -> int:
+        """Return the interval at which a run checks whether to place its next time; 0: never."""
+        config = self._config
+        is_open = config.adaptive and len(config.placed) < len(PLACED)
+        return config.densify_every if is_open else 0
+
+    def _clear_cull(self) -> tuple[EventKind, float, float, float]:
+        """Return when the cull mask is dropped: halfway between the last importance pass and the end."""
+        config = self._config
+        # A pass that is set to a time after the end does not happen.
+        last = max(time for time in (0, config.t1, config.t2) if time < config.iterations)
+        time = math.floor((last + config.iterations) / 2)
+        return "clear_cull", time, time + 1, min(last, 1)
+
+    def _series(self, first: float, until: float, every: float, begin: int, end: int) -> list[int]:
+        """Return the images in [begin, end) of the times first + k every < until."""
+        k = max(0, math.floor((self.pace.time(begin) - first) / every) - 1)
+        times: list[int] = []
+        while (unscaled := first + k * every) < until and (time := self._scaled(unscaled)) < end:
+            # A compressed schedule may map two events of one kind to the same image; they become one event.
+            if time >= begin and (not times or times[-1] != time):
+                times.append(time)
+            k += 1
+        return times
+
+    def sh_degree(self, begin: int, limit: int) -> int:
+        """Return the SH degree of the step at [begin, begin + B): one more each `sh_every`, up to `limit`."""
+        time = self.pace.time(begin + self.batch_size)
+        return min(limit, max(1, math.ceil(time / self._config.sh_every - 1e-9)) - 1)
+
+    def gathers_statistics(self, begin: int) -> bool:
+        """Tell whether a later density event uses the statistics of the step at [begin, begin + B)."""
+        return self.pace.time(begin) < self._config.densify_until
+
+    def has_lod_gate(self, begin: int) -> bool:
+        """Tell whether the step at [begin, begin + B) may leave out Gaussians by their octree levels.
+
+        It may not while statistics for density control are gathered, because a Gaussian that is left out
+        would gather no gradients.
+        """
+        return not self.gathers_statistics(begin)
+
+    def finest_level(self, begin: int, count: int, first_levels: float, ratio: float) -> int:
+        """Return L_max(t), the finest octree level that the step at [begin, begin + B) may keep.
+
+        It is floor(K x `first_levels`) at the start and K - 1 from `levels_until` on. Each wait for the next
+        level is shorter than the one before by `ratio` (Octree-GS, Ren et al. 2024).
+
+        Args:
+            begin: t.
+            count: number of levels K.
+            first_levels: L_max(0), relative to K.
+            ratio: ratio of consecutive waits.
+        """
+        first = min(count - 1, math.floor(count * first_levels))
+        config, waits = self._config, count - 1 - first
+        until = config.levels_until or config.densify_until
+        unlocked = (1 - ratio**-k for k in range(1, waits + 1))
+        whole = 1 - ratio**-waits
+        return first + sum(begin + 1e-6 >= self.pace.image(until * share / whole) for share in unlocked)
+
+    def has_spawn_gate(self, time: int) -> bool:
+        """Tell whether the spawn gate judges the candidates of a density event at `time`."""
+        return time >= self._scaled(self._config.gate_from)
+
+    def prunes_by_size(self, time: int) -> bool:
+        """Tell whether a density event at `time` also prunes by screen and world size."""
+        return time > self._scaled(self._config.size_prune_after)
+
+    def learning_rates(self, config: OptimiserConfig, extent: float) -> Tensor:
+        """Tabulate the learning rates of the whole run.
+
+        The position rate falls exponentially from `position` to `position_final` over `position_decay`
+        images, both times `extent`; with `position` 0 it stays 0. Every rate is multiplied by sqrt(B).
+
+        Args:
+            config: the rates for B = 1.
+            extent: the scene's extent in its own unit.
+
+        Returns:
+            float32 [S + 1, 6]: row s holds the rates of step s = 1..S for `RATES`; row 0 is zero.
+        """
+        begin = torch.arange(self.steps, dtype=torch.float64) * self.batch_size
+        times = self.pace.times(begin)
+        progress = (times / self._config.position_decay).clamp(max=1.0)
+        fall = config.position_final / config.position if config.position > 0 else 0.0
+        position = config.position * fall**progress * extent
+        constants = (config.rotation, config.scale, config.opacity, config.sh_dc, config.sh_rest)
+        table = torch.zeros(self.steps + 1, len(RATES), dtype=torch.float64)
+        table[1:, 0] = position
+        share = config.final_share ** (times / self._config.iterations)
+        table[1:, 1:] = torch.tensor(constants, dtype=torch.float64) * share[:, None]
+        return (table * math.sqrt(self.batch_size)).float()

@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Renders views of a table and computes the gradients of splats, without autograd.
+
+`forward` projects the active Gaussians, lists them by tile and composites them; the result is a `Frame`.
+`backward_splats` computes the gradients of the projected splats from the gradients of the images. No tensor
+here is as long as the table: the cost follows the Gaussians that the views see. Between projection and tile
+intersection, a transport (`blitzgs.frame.transport`) sends the splats to the ranks that composite them,
+and later returns their gradients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from blitzgs._library import below_autograd
+from blitzgs.frame.tiles import TileAssignment
+from blitzgs.frame.transport import (
+    LocalTransport,
+    Mark,
+    Traffic,
+    Transport,
+    WayBack,
+    open_transport,
+    unmarked,
+)
+from blitzgs.ops.blocks import ActiveRows
+from blitzgs.ops.capacity import Attempt
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions, Splats
+from blitzgs.ops.rasterize import RasterizeSaved
+from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients, absolute_column
+from blitzgs.table.table import GaussianTable
+
+
+@dataclass(frozen=True)
+class Views:
+    """B pinhole views of one image size, rendered together.
+
+    Attributes:
+        viewmats: world to camera, float32 [B, 4, 4].
+        Ks: intrinsics in pixels, float32 [B, 3, 3].
+        width: pixels.
+        height: pixels.
+    """
+
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+
+    def __len__(self) -> int:
+        return self.viewmats.shape[0]
+
+    def as_arguments(self) -> tuple[Tensor, Tensor, int, int]:
+        """Return viewmats, Ks, width and height, for functions that take these as separate arguments."""
+        return self.viewmats, self.Ks, self.width, self.height
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How Gaussians become an image; lengths in the unit of the table.
+
+    Attributes:
+        sh_degree: spherical-harmonics degree that is evaluated.
+        near_plane: Gaussians with z <= near_plane are not seen.
+        far_plane: Gaussians with z > far_plane are not seen.
+        eps2d: screen-space blur, pixels squared.
+        antialiased: compensate that blur in the opacities.
+        background: RGB behind everything.
+        tile_size: pixels.
+        deterministic: gradients repeat bit for bit on CUDA too (they always do on the CPU).
+        fade: opacities fade by octree level and distance, `blitzgs.view.gate.LodGate.fade`; empty: they do
+            not.
+    """
+
+    sh_degree: int
+    near_plane: float
+    far_plane: float
+    eps2d: float = 0.3
+    antialiased: bool = False
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tile_size: int = 16
+    deterministic: bool = False
+    fade: tuple[float, ...] = ()
+
+    @property
+    def limits(self) -> tuple[float, float, float]:
+        """Near plane, far plane and eps2d, which decide whether a view may see a Gaussian."""
+        return self.near_plane, self.far_plane, self.eps2d
+
+    def projection(self, views: Views) -> ProjectionOptions:
+        """Return the options for projecting into these views."""
+        return ProjectionOptions(
+            width=views.width,
+            height=views.height,
+            tile_size=self.tile_size,
+            sh_degree=self.sh_degree,
+            near_plane=self.near_plane,
+            far_plane=self.far_plane,
+            eps2d=self.eps2d,
+            antialiased=self.antialiased,
+            fade=self.fade,
+        )
+
+
+class Frame(NamedTuple):
+    """The images that `forward` rendered, and the data that `backward_splats` needs.
+
+    Attributes:
+        views: the views.
+        options: the options.
+        projected: the P splats of the Gaussians that this rank owns.
+        splats: the splats that this rank composited: its own, or those that it received.
+        assignment: the tiles of each rank; None: one rank composites all.
+        way_back: returns the gradients of splats to their owners; None: one rank owns all.
+        traffic: numbers of splats sent between the ranks; None: none were sent.
+        visible: int64 [B], Gaussians visible in each view, over all ranks; valid until the next exchange.
+        active: rows that were considered, and the views of each; None: all.
+        renders: [B, H, W, 3]; undefined in pixels that only other ranks composite.
+        tile_work: int32 [B * T], list entries each composited tile went through.
+        saved: the tensors that the backward pass of compositing reads.
+        gradients: memory in which the gradients of the splats are summed.
+    """
+
+    views: Views
+    options: RenderOptions
+    projected: ProjectedSplats
+    splats: Splats
+    assignment: TileAssignment | None
+    way_back: WayBack | None
+    traffic: Traffic | None
+    visible: Tensor
+    active: ActiveRows | None
+    renders: Tensor
+    tile_work: Tensor
+    saved: RasterizeSaved
+    gradients: GradientBuffer
+
+
+def forward(
+    table: GaussianTable,
+    views: Views,
+    options: RenderOptions,
+    active: ActiveRows | None = None,
+    assignment: TileAssignment | None = None,
+    transport: Transport | None = None,
+    mark: Mark = unmarked,
+    backward_follows: bool = False,
+) -> Frame:
+    """Render views of a table whose active rows have no pending optimiser steps.
+
+    Args:
+        table: the Gaussians.
+        views: at most 32 views.
+        options: how to render.
+        active: rows to consider, and the views of each; None: all rows in all views.
+        assignment: the tiles of each rank; every rank of the job calls this with its table. None: render all
+            tiles from this table alone.
+        transport: sends the splats to the ranks that composite them. A transport that is used for several
+            frames estimates the sizes of a frame from the frames before, so that the device need not wait for
+            the host; the result does not depend on it. None: a new one.
+        mark: called at the end of each stage: "project", "exchange", "sort", "raster".
+        backward_follows: prepare for a backward pass, which is then faster; the backward pass also works
+            without.
+
+    Returns:
+        The frame; its images do not depend on the order of the table's rows, on inactive rows, or on how many
+        ranks shared the work.
+    """
+    if transport is None:
+        transport = LocalTransport() if assignment is None else open_transport(assignment.ranks)
+    for attempt in transport.capacity.attempts():
+        frame = forward_once(
+            table, views, options, active, assignment, transport, attempt, mark, backward_follows
+        )
+    assert frame is not None  # or there would be another attempt
+    return frame
+
+
+def forward_once(
+    table: GaussianTable,
+    views: Views,
+    options: RenderOptions,
+    active: ActiveRows | None,
+    assignment: TileAssignment | None,
+    transport: Transport,
+    attempt: Attempt,
+    mark: Mark = unmarked,
+    backward_follows: bool = False,
+) -> Frame | None:
+    """Make one attempt of `forward`: queue all work, then wait for the sizes.
+
+    Arguments as for `forward`; `attempt` has the sizes of the memory to allocate.
+
+    Returns:
+        The frame; None if the estimated sizes of the active rows or of `attempt` were too small.
+    """
+    inputs, grid = inputs_of(table, views, options, active), tile_grid(views, options, assignment)
+    backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
+    # Skip autograd: for an op with a registered gradient formula, its Python takes 20 us of the host's time.
+    with below_autograd():
+        exchange = transport.project_and_send(inputs, assignment, attempt, mark)
+        splats, n_splats, n_isects = exchange.arrived
+        geometry = (splats.means2d, splats.conics, splats.opacities)
+        isect_splats, tile_offsets = torch.ops.blitzgs.intersect(
+            *geometry, splats.depths, splats.camera_ids, splats.ids, grid, n_isects, n_splats, True
+        )
+        mark("sort")
+        arguments = (*geometry, splats.colors, backgrounds, isect_splats, tile_offsets, grid)
+        gradient_table = exchange.gradient_table
+        if gradient_table is not None and backward_follows:
+            composited = torch.ops.blitzgs.rasterize_fwd_packed_(*arguments, gradient_table, n_splats)
+            zeros = gradient_table
+        else:
+            *composited, zeros = torch.ops.blitzgs.rasterize_fwd(
+                *arguments, False, backward_follows, n_splats
+            )
+            if gradient_table is not None:
+                zeros = None  # the gradients must be in this table, which the backward pass then zeroes
+        mark("raster")
+        result = exchange.finish()
+    if result is None:
+        return None
+    renders, transmittances, last_ids, tile_work, packed_splats, tile_order = composited
+    splats = result.splats
+    return Frame(
+        views=views,
+        options=options,
+        projected=result.projected,
+        splats=splats,
+        assignment=assignment,
+        way_back=result.way_back,
+        traffic=result.traffic,
+        visible=result.visible,
+        active=active,
+        renders=renders,
+        tile_work=tile_work,
+        saved=RasterizeSaved(
+            [splats.means2d, splats.conics, splats.opacities, splats.colors],
+            backgrounds,
+            [isect_splats, tile_offsets],
+            [transmittances, last_ids, packed_splats, tile_order],
+        ),
+        gradients=GradientBuffer(zeros, None if result.way_back is None else result.way_back.cleared_table),
+    )
+
+
+def inputs_of(
+    table: GaussianTable,
+    views: Views,
+    options: RenderOptions,
+    active: ActiveRows | None = None,
+    colored: bool = True,
+) -> ProjectionInputs:
+    """Return the inputs of the projection of a table; `colored`: with SH, from which colours are computed."""
+    cameras = (views.viewmats, views.Ks)
+    gaussians = table.parameters if colored else table.parameters[:4]
+    level = table["level"] if options.fade else None
+    return ProjectionInputs(gaussians, cameras, options.projection(views), active or (), table["id"], level)
+
+
+def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> list[int]:
+    """Return the grid of tiles, and the range of them that this rank composites, as the ops take both."""
+    tiles = (0, -1) if assignment is None else assignment.composited_tiles
+    return [len(views), views.width, views.height, options.tile_size, *tiles]
+
+
+@lru_cache(maxsize=16)
+def _backgrounds(colour: tuple[float, float, float], count: int, device: torch.device) -> Tensor | None:
+    """Return a colour for each of `count` views, [B, 3]; None: black. Cached: the host waits for uploads."""
+    return torch.tensor(colour, device=device).repeat(count, 1) if any(colour) else None
+
+
+def backward_splats(
+    frame: Frame, v_renders: Tensor, mark: Mark = unmarked, absolute: bool = False
+) -> SplatGradients:
+    """Compute the gradients of this rank's projected splats from the gradients of the images.
+
+    Args:
+        frame: from `forward`.
+        v_renders: gradient of the loss by the images, [B, H, W, 3]; only this rank's tiles are read.
+        mark: called at the end of each stage: "raster back", "exchange back".
+        absolute: also sum the absolute values of the pixels' gradients of means2d.
+
+    Raises:
+        RuntimeError: the ranks share memory, and a later frame has overwritten this frame's splats.
+    """
+    views, options, way_back = frame.views, frame.options, frame.way_back
+    tiles = (0, -1) if frame.assignment is None else frame.assignment.own_tiles
+    grid = [len(views), views.width, views.height, options.tile_size, *tiles]
+    if way_back is not None:
+        way_back.check_still_valid()
+    if v_renders.is_cuda:
+        packed = frame.gradients.take(frame.splats.means2d)
+        torch.ops.blitzgs.rasterize_bwd_packed_(
+            *frame.saved, v_renders, grid, options.deterministic, packed, absolute
+        )
+        gradients = SplatGradients([packed], None, absolute_column(packed) if absolute else None)
+    else:
+        *parts, v_abs = torch.ops.blitzgs.rasterize_bwd(
+            *frame.saved, v_renders, None, grid, absolute, options.deterministic
+        )
+        gradients = SplatGradients(parts, None, v_abs if absolute else None)
+    mark("raster back")
+    if way_back is not None:
+        gradients = way_back.return_gradients(gradients)
+    mark("exchange back")
+    return gradients

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The survey of views: what each Gaussian contributes to each view, on any number of ranks."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from blitzgs._library import below_autograd
+from blitzgs.frame.frame import RenderOptions, Views, inputs_of, tile_grid
+from blitzgs.frame.tiles import TileAssignment
+from blitzgs.frame.transport import LocalTransport, Transport, open_transport
+from blitzgs.ops.blocks import ActiveRows
+from blitzgs.ops.projection_types import ProjectedSplats
+from blitzgs.table.table import GaussianTable
+
+
+class Survey(NamedTuple):
+    """The contributions of this rank's P splats to their views.
+
+    Attributes:
+        splats: the projected Gaussians.
+        weights: int64 [P], sum of alpha T over the pixels in units of 2^-32.
+        pixels: int32 [P], the number of pixels at which a splat is composited.
+        squares: int64 [P], sum of (alpha T)^2 over these pixels in the same units, if asked for.
+    """
+
+    splats: ProjectedSplats
+    weights: Tensor
+    pixels: Tensor
+    squares: Tensor | None = None
+
+
+def survey(
+    table: GaussianTable,
+    views: Views,
+    options: RenderOptions,
+    assignment: TileAssignment | None = None,
+    transport: Transport | None = None,
+    active: ActiveRows | None = None,
+    squares: bool = False,
+) -> Survey:
+    """Measure what each Gaussian contributes to views of a table without pending optimiser steps.
+
+    Args:
+        table: the Gaussians.
+        views: at most 32 views.
+        options: how to render; no colour is computed.
+        assignment: the tiles of each rank; every rank of the job calls this with its table. None: this rank
+            composites all tiles.
+        transport: as for `forward`, but not in half precision, which would change the contributions.
+        active: as for `forward`.
+        squares: whether to sum the squares as well.
+
+    Returns:
+        The splats of this rank's Gaussians with the sums over the tiles of all ranks; the bits do not depend
+        on the number of ranks.
+    """
+    if transport is None:
+        transport = LocalTransport() if assignment is None else open_transport(assignment.ranks)
+    inputs = inputs_of(table, views, options, active, colored=False)
+    grid = tile_grid(views, options, assignment)
+
+    with below_autograd():
+        for attempt in transport.capacity.attempts():
+            exchange = transport.project_and_send(inputs, assignment, attempt)
+            splats, n_splats, n_isects = exchange.arrived
+            geometry = (splats.means2d, splats.conics, splats.opacities)
+            lists = torch.ops.blitzgs.intersect(
+                *geometry, splats.depths, splats.camera_ids, splats.ids, grid, n_isects, n_splats, True
+            )
+            sums = torch.ops.blitzgs.contributions(*geometry, *lists, grid, n_splats, squares)
+            result = exchange.finish()
+    assert result is not None  # or there would be another attempt
+    columns = [column[: len(result.splats.depths)] for column in (sums if squares else sums[:2])]
+    if result.way_back is not None:
+        returned = result.way_back.return_sums(torch.stack([column.long() for column in columns], 1))
+        weights, pixels, *rest = (column.contiguous() for column in returned.unbind(1))
+        columns = [weights, pixels.int(), *rest]
+    return Survey(result.projected, *columns)

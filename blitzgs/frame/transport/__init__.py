@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sends projected splats to the ranks that composite them, and returns their gradients."""
+
+from __future__ import annotations
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.frame.transport.collective import CollectiveTransport
+from blitzgs.frame.transport.local import LocalTransport
+from blitzgs.frame.transport.peer import PeerTransport
+from blitzgs.frame.transport.protocol import (
+    Arrived,
+    Exchange,
+    ExchangeResult,
+    Mark,
+    Traffic,
+    Transport,
+    WayBack,
+    unmarked,
+)
+
+__all__ = [
+    "Arrived",
+    "CollectiveTransport",
+    "Exchange",
+    "ExchangeResult",
+    "LocalTransport",
+    "Mark",
+    "PeerTransport",
+    "Traffic",
+    "Transport",
+    "WayBack",
+    "open_transport",
+    "unmarked",
+]
+
+
+def open_transport(ranks: Ranks, half: bool = False) -> Transport:
+    """Return the fastest transport of a job.
+
+    Args:
+        ranks: the job; the transport is valid until it ends.
+        half: send splats in half precision, which only the collective transport can; see
+            `collective.HalfCodec`.
+    """
+    if ranks.world_size == 1:
+        return LocalTransport()
+    if ranks.memory is None or half:
+        return CollectiveTransport(ranks, half)
+    return PeerTransport(ranks)

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writes splats into the memory of the GPUs that composite them, and lets their owners read gradients there.
+
+Each rank has a buffer (`SharedMemory.buffers`) that all ranks have mapped. The buffer has two parts: the
+columns of the splats that arrive at this rank, and the table in which compositing's backward pass adds up
+their gradients. Every buffer has room for the same number of splats, which is also the capacity of every
+rank's projection. Each rank can therefore compute from the counts, also on the device, whether the splats of
+all ranks fit.
+
+In stream order, a step on every rank consists of
+
+- projection;
+- barrier A, which brings the counts of all ranks;
+- writing splats into the buffers of other ranks;
+- barrier B;
+- sorting, and compositing, which zeroes the rank's table;
+- the gradient of compositing, which is added up in this table;
+- barrier C;
+- reading the tables of all ranks.
+
+Work that a rank queues after a barrier begins when all work that any rank queued before it has ended. Hence
+
+- splats are complete when they are read, because they are written before B and read after it; gradients are
+  complete, because they are added up before C and read after it;
+- no splat is overwritten while a rank reads it: a step writes its splats after its A, and every rank queues
+  its reading of the previous step's splats before this A;
+- no table is zeroed while a rank reads it: a step zeroes its table after its B, and every rank queues its
+  reading of the previous step's tables before this B. A second backward pass of one frame has an additional
+  barrier before the table is zeroed again.
+
+The host queues writing and compositing before it knows the counts. If the splats do not fit into the buffer
+of some rank, every rank finds this from the same counts, writes no splats and composites nothing. All ranks
+then enlarge their buffers and start the frame again. They do the same if one rank has more tile entries than
+the common capacity. If a rank dies, the others wait in a barrier. Their hosts wait in `Watchdog.waiting`, so
+the watchdog names the dead rank. A barrier on the device that exceeds the timeout aborts the kernels of its
+process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.frame.tiles import TileAssignment
+from blitzgs.frame.transport.protocol import Arrived, ExchangeResult, Mark, Traffic, unmarked
+from blitzgs.frame.transport.way_back import PeerWayBack
+from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
+from blitzgs.ops.host import current_stream
+from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Splats, splats_of
+from blitzgs.ops.scatter import runs_of
+from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
+
+# The columns of `Splats` in the order in which ranks write them (kSentColumns of csrc/exchange/transport.h):
+# dtype, words and shape of an element.
+_COLUMNS = (
+    (torch.float32, 2, (2,)),
+    (torch.float32, 3, (3,)),
+    (torch.float32, 1, ()),
+    (torch.float32, 3, (3,)),
+    (torch.float32, 1, ()),
+    (torch.int32, 1, ()),
+    (torch.int64, 2, ()),
+)
+_SPLAT_WORDS = sum(words for _, words, _ in _COLUMNS)
+WORDS_PER_SPLAT = _SPLAT_WORDS + SPLAT_GRADIENT
+# Buffers hold a multiple of this many splats, so that every column begins at a full memory transaction.
+_ALIGNMENT = 32
+
+
+def room_for(splats: int, words: int) -> int:
+    """Return the words that each buffer needs for a number of splats; `words` is its present length.
+
+    All ranks stop and map their memory anew when the buffers grow. A buffer that is too small therefore grows
+    by at least a quarter: in a growing model, each record of the number of splats is a little higher than the
+    one before.
+    """
+    needed = -(-splats // _ALIGNMENT) * _ALIGNMENT * WORDS_PER_SPLAT
+    return words if needed <= words else max(needed, words * 5 // 4)
+
+
+class PeerBuffers:
+    """The parts of the buffers of all ranks.
+
+    Attributes:
+        buffers: int32 [words] of each rank, mapped here.
+        length: capacity of each buffer, in splats.
+        splats: columns in this rank's buffer, [length].
+        tables: table of splat gradients of each rank, float32 [length, 12].
+    """
+
+    def __init__(self, buffers: Sequence[Tensor], rank: int) -> None:
+        """Divide buffers of equal length."""
+        self.buffers = list(buffers)
+        self.length = len(buffers[0]) // WORDS_PER_SPLAT // _ALIGNMENT * _ALIGNMENT
+        columns, begin = [], 0
+        for dtype, words, shape in _COLUMNS:
+            end = begin + self.length * words
+            columns.append(buffers[rank][begin:end].view(dtype).view(self.length, *shape))
+            begin = end
+        self.splats = Splats(*columns)
+        end = begin + self.length * SPLAT_GRADIENT
+        self.tables = [
+            buffer[begin:end].view(torch.float32).view(self.length, SPLAT_GRADIENT) for buffer in buffers
+        ]
+
+
+class PeerTransport:
+    """The transport for ranks of one host whose GPUs can access each other's memory."""
+
+    def __init__(self, ranks: Ranks, capacity: CapacityEstimate | None = None) -> None:
+        """Use the shared memory of `ranks`; the estimate must be the same on all ranks."""
+        if ranks.memory is None:
+            raise ValueError(f"the ranks share no memory; their transport is {ranks.transport}")
+        self.capacity = capacity or CapacityEstimate()
+        self._ranks, self._memory = ranks, ranks.memory
+        self._buffers: PeerBuffers | None = None
+        # One event serves all exchanges. The host waits for it before it starts the next exchange; if an
+        # exchange was given up, a later record of the event comes after its counts, too.
+        self._counted = torch.cuda.Event()
+
+    def project_and_send(
+        self,
+        inputs: ProjectionInputs,
+        assignment: TileAssignment | None,
+        attempt: Attempt,
+        mark: Mark = unmarked,
+    ) -> PeerExchange:
+        """See `Transport.project_and_send`."""
+        if assignment is None:
+            raise ValueError("several ranks need an assignment of tiles")
+        if attempt.sizes is not None:
+            present = self._memory.buffers[0].shape[0]
+            words = room_for(attempt.sizes.splats, present)
+            if words > present:
+                with self._ranks.watchdog.waiting("reserve"):
+                    self._memory.reserve(words)
+        if self._buffers is None or self._buffers.buffers[0] is not self._memory.buffers[0]:
+            self._buffers = PeerBuffers(self._memory.buffers, self._ranks.rank)
+        return PeerExchange(self._ranks, self._buffers, self._counted, inputs, assignment, attempt, mark)
+
+
+class PeerExchange:
+    """See `Exchange`."""
+
+    def __init__(
+        self,
+        ranks: Ranks,
+        buffers: PeerBuffers,
+        counted: torch.cuda.Event,
+        inputs: ProjectionInputs,
+        assignment: TileAssignment,
+        attempt: Attempt,
+        mark: Mark,
+    ) -> None:
+        """Queue the projection and the writing of the splats; record `counted` behind the counts."""
+        assert ranks.memory is not None  # see `PeerTransport`
+        self._memory = memory = ranks.memory
+        self._ranks, self._buffers, self._counted, self._attempt = ranks, buffers, counted, attempt
+        self._n_views = inputs.n_views
+        self._traffic: Traffic | None = None
+        capacity = Sizes(buffers.length, buffers.length, 0)
+        projected = inputs.run(capacity, assignment.composited_by_rank)
+        self._own = projected.splats
+        self._shared = memory.share(projected.totals)  # barrier A
+        counted.record(current_stream(ranks.device))
+        self._places, plan = torch.ops.blitzgs.send_splats_(
+            list(projected.for_compositing), projected.splats.rank_masks, self._shared.everyone, ranks.rank,
+            buffers.buffers, buffers.length,
+        )  # fmt: skip
+        memory.barrier()  # B
+        memory.generation += 1
+        self._generation = memory.generation
+        mark("project")
+        n_isects = self._read().n_isects if attempt.sizes is None else attempt.sizes.isects
+        self.arrived = Arrived(buffers.splats, plan[:1], n_isects)
+        self.gradient_table: Tensor | None = buffers.tables[ranks.rank]
+        mark("exchange")
+
+    def finish(self) -> ExchangeResult | None:
+        """See `Exchange.finish`."""
+        traffic, sizes = self._read(), self._attempt.sizes
+        fits = traffic.most <= self._buffers.length
+        if sizes is not None:
+            fits = fits and traffic.most_isects <= sizes.isects and traffic.most_blocks <= sizes.blocks
+        self._attempt.end(traffic.needed, fits)
+        if not fits:
+            return None
+        visible = self._shared.sums[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
+        composited = self._buffers.splats.first(sum(traffic.received))
+        way_back = PeerWayBack(
+            self._ranks, self._memory, self._generation, self._buffers.tables, traffic,
+            self._places[: runs_of(traffic.own.splats)],
+        )  # fmt: skip
+        return ExchangeResult(splats_of(self._own, traffic.own), composited, visible, traffic, way_back)
+
+    def _read(self) -> Traffic:
+        """Wait for the counts of all ranks."""
+        if self._traffic is None:
+            with self._ranks.watchdog.waiting("share_counts"):
+                self._counted.synchronize()
+            self._traffic = Traffic.of(self._shared.host.tolist(), self._n_views, self._ranks.rank)
+        return self._traffic

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The interface of transports, which send splats to the ranks that composite them, and gradients back.
+
+Every rank projects the Gaussians that it owns. Each splat (a Gaussian in a view) is then sent to the ranks
+that composite tiles which it touches, and its gradient is returned (BlitzGS, section 3.1). The calls of one
+frame, on every rank::
+
+    exchange = transport.project_and_send(inputs, assignment, attempt, mark)
+    exchange.arrived, exchange.gradient_table                # for compositing
+    result = exchange.finish()                               # None: the capacity was too small
+    result.way_back.check_still_valid()                      # before the backward pass of compositing
+    gradients = result.way_back.return_gradients(gradients)  # gradients of this rank's own splats
+
+The last two may be repeated. `local`, `collective` and `peer` each have one transport; `way_back` returns the
+gradients for the last two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from torch import Tensor
+
+from blitzgs.frame.tiles import TileAssignment
+from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
+from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, Splats
+from blitzgs.ops.splat_gradients import SplatGradients
+
+# Called at the end of each stage of a step with the stage's name, for benchmarks.
+Mark = Callable[[str], None]
+
+
+def unmarked(stage: str) -> None:
+    """Do nothing at the end of a stage."""
+
+
+class Traffic(NamedTuple):
+    """The numbers of splats that the ranks send each other.
+
+    Attributes:
+        own: numbers of this rank's visible Gaussians, splats, tiles that they touch, and blocks.
+        splats: splats[s][d] is the number of splats that rank s sends to rank d.
+        sent: number of splats sent to each rank.
+        received: number of splats received from each rank.
+        starts: for each rank, the position of this rank's first splat among all that the rank receives.
+        most: largest number of splats that any rank has, sends or receives.
+        n_isects: upper bound of the tile entries of the splats received.
+        most_isects: largest `n_isects` of any rank.
+        most_blocks: largest number of blocks of which a view may see a part, of any rank.
+    """
+
+    own: Sizes
+    splats: list[list[int]]
+    sent: list[int]
+    received: list[int]
+    starts: list[int]
+    most: int
+    n_isects: int
+    most_isects: int
+    most_blocks: int
+
+    @classmethod
+    def of(cls, totals: list[list[int]], n_views: int, rank: int) -> Traffic:
+        """Read the numbers from every rank's `ProjectionOutputs.totals`."""
+        first = VIEW_TOTALS + n_views
+        columns = list(zip(*totals, strict=True))  # columns[i][s] is number i of rank s
+        _, owned, _, blocks = columns[:VIEW_TOTALS]  # as in `Sizes`
+        received = columns[first::2]  # by each rank, from each rank
+        isects = [sum(column) for column in columns[first + 1 :: 2]]
+        splats = [numbers[first::2] for numbers in totals]
+        return cls(
+            own=Sizes(*totals[rank][:VIEW_TOTALS]),
+            splats=splats,
+            sent=splats[rank],
+            received=list(received[rank]),
+            starts=[sum(column[:rank]) for column in received],
+            most=max(*owned, *map(sum, splats), *map(sum, received)),
+            n_isects=isects[rank],
+            most_isects=max(isects),
+            most_blocks=max(blocks),
+        )
+
+    @property
+    def needed(self) -> Sizes:
+        """The sizes that every rank must allocate, for transports that need equal sizes on all ranks."""
+        return Sizes(self.most, self.most, self.most_isects, self.most_blocks)
+
+
+class Arrived(NamedTuple):
+    """The splats that this rank composites.
+
+    Attributes:
+        splats: the splats; the columns are longer than their number if the host does not know it yet.
+        n_splats: int64 [1], number of valid splats, on the device; None: all are valid.
+        n_isects: upper bound of the tile entries, or capacity for them; -1: they must be counted.
+    """
+
+    splats: Splats
+    n_splats: Tensor | None
+    n_isects: int
+
+
+class ExchangeResult(NamedTuple):
+    """The splats after an exchange, cut to their numbers, which the host knows by now.
+
+    Attributes:
+        projected: this rank's own splats, only valid ones.
+        splats: the splats that this rank composites, only valid ones.
+        visible: int64 [B], splats of each view over all ranks; valid until the next exchange.
+        traffic: numbers of splats sent between the ranks; None: there is one rank.
+        way_back: returns the gradients; None: there is one rank, which has them already.
+    """
+
+    projected: ProjectedSplats
+    splats: Splats
+    visible: Tensor
+    traffic: Traffic | None
+    way_back: WayBack | None
+
+
+class Exchange(Protocol):
+    """The exchange of one frame's splats: queued work, whose sizes the host may not know until `finish`.
+
+    Attributes:
+        arrived: the splats that this rank composites.
+        gradient_table: memory, [R, 12], in which the gradients of these splats must be added up, because
+            other ranks read them there; compositing must zero it. None: any memory can be used.
+    """
+
+    arrived: Arrived
+    gradient_table: Tensor | None
+
+    def finish(self) -> ExchangeResult | None:
+        """Wait for the numbers and end the attempt.
+
+        Returns:
+            The result; None if the capacity was too small and the frame must be started again.
+        """
+
+
+class WayBack(Protocol):
+    """Returns the gradients, and sums, of one frame's splats to the owners of their Gaussians."""
+
+    def check_still_valid(self) -> None:
+        """Check that gradients of this frame can still be returned.
+
+        Raises:
+            RuntimeError: a later frame has overwritten this frame's splats.
+        """
+
+    def cleared_table(self) -> Tensor | None:
+        """Zero `gradient_table` for another backward pass, when no rank reads it any more. Collective."""
+
+    def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
+        """Return the gradients of this rank's own splats. Collective.
+
+        Args:
+            gradients: gradients of the splats that arrived, in `gradient_table` if there is one.
+        """
+
+    def return_sums(self, sums: Tensor) -> Tensor:
+        """Return integer sums over the tiles of each rank to the splats' owners, and add them up. Collective.
+
+        Args:
+            sums: int64 [R, C], sums of the splats that arrived here.
+
+        Returns:
+            int64 [P, C], sums of this rank's own splats; zero for splats that touch no tile. Integers add up
+            exactly, so the result does not depend on the number of ranks.
+        """
+
+
+class Transport(Protocol):
+    """Sends the splats of many frames, one after the other.
+
+    Attributes:
+        capacity: estimate of the sizes of a frame; the same on all ranks if the transport needs equal sizes.
+    """
+
+    capacity: CapacityEstimate
+
+    def project_and_send(
+        self,
+        inputs: ProjectionInputs,
+        assignment: TileAssignment | None,
+        attempt: Attempt,
+        mark: Mark = unmarked,
+    ) -> Exchange:
+        """Project this rank's Gaussians and send the splats to the ranks that composite them. Collective.
+
+        Args:
+            inputs: inputs of the projection, with the Gaussians' ids.
+            assignment: the tiles of each rank; None: this rank composites all tiles.
+            attempt: the sizes to allocate; without sizes the host first waits for the numbers.
+            mark: called at the end of the stages "project" and "exchange".
+        """

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The optimiser of a table: dense Adam that updates only visible rows, with batch scaling."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+
+from blitzgs.config.fields import OptimiserConfig
+from blitzgs.config.schedule import Schedule
+from blitzgs.frame.frame import Frame
+from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_
+from blitzgs.ops.project_step import project_bwd_step_
+from blitzgs.ops.projection_types import WeightedViews
+from blitzgs.ops.splat_gradients import SplatGradients
+from blitzgs.table.table import GaussianTable
+
+
+class TableAdam:
+    """Adam over the rows of a table, batch-scaled as Grendel does: lr sqrt(B), beta^B, eps / sqrt(B).
+
+    The batch scaling is that of Grendel-GS (Zhao et al. 2024). A step does not touch rows that it does not
+    update; the columns `last_step` and `moment_step` note how far each row is current. `catch_up` must be
+    called before the parameters of such rows are read. Use this class for a `GaussianTable` and a `Schedule`
+    that is known in advance, as the trainer does, and `blitzgs.optim.LazyAdam` in a loop of your own.
+
+    Attributes:
+        lr_table: float32 [S + 1, 6], the learning rates of every step; see `Schedule.learning_rates`.
+        pending_table: table that bounds the movement by pending steps (`AdamSchedule.table`); None with
+            `optimiser.sparse`, which has no pending steps.
+    """
+
+    def __init__(self, config: OptimiserConfig, schedule: Schedule, extent: float, device: object) -> None:
+        """Tabulate the run's learning rates on `device`; `extent` is in the unit of the means."""
+        batch = schedule.batch_size
+        self._config, self._extent, self._device = config, extent, device
+        self._betas = (config.beta1**batch, config.beta2**batch)
+        self._eps = config.eps / math.sqrt(batch)
+        self._sparse = config.sparse
+        self.follow(schedule)
+
+    def follow(self, schedule: Schedule) -> None:
+        """Tabulate the learning rates of a changed schedule.
+
+        Pending steps are steps already taken, so the new schedule must have the same rates for those.
+        """
+        rates = schedule.learning_rates(self._config, self._extent)
+        self._position_rates = rates[:, 0].tolist()
+        self.lr_table: Tensor = rates.to(self._device)  # type: ignore[call-overload]
+        self._schedule = AdamSchedule(self.lr_table, *self._betas, self._eps, self._sparse)
+        self.pending_table = None if self._sparse else self._schedule.table
+
+    def position_rate(self, step: int) -> float:
+        """Return the learning rate of the means in step `step` (from 1), in their unit."""
+        rate: float = self._position_rates[step]
+        return rate
+
+    def catch_up(
+        self, table: GaussianTable, ids: Tensor | None, step: int, count: Tensor | None = None
+    ) -> None:
+        """Apply the pending steps up to `step` to the rows `ids` (int32 [A]; None: all).
+
+        ``count``, int32 [1]: only the first `count` of `ids` are rows.
+        """
+        if self._sparse:
+            return
+        lazy_adam_catch_up_(_state_of(table), self._schedule, step, ids, count)
+
+    def step(
+        self,
+        table: GaussianTable,
+        frame: Frame,
+        gradients: SplatGradients,
+        scale_reg: Tensor | None,
+        opacity_reg: Tensor | None,
+        size_reg: Tensor | None,
+        step: int,
+        means2d_sums: Tensor | None = None,
+        absolute_sums: bool = False,
+    ) -> None:
+        """Take step number `step` (from 1) for the Gaussians that a frame shows.
+
+        Args:
+            table: the table that was rendered, unchanged since.
+            frame: of `pipeline.forward`.
+            gradients: gradients of the frame's splats, from `pipeline.backward_splats`.
+            scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no
+                such term.
+            opacity_reg: weight per view, [B], of the opacity of each Gaussian visible in it; None: no such
+                term.
+            size_reg: weight per view, [B], of the mean axis of each Gaussian visible in it; None: no such
+                term.
+            step: number of the step; the visible rows must be current up to `step` - 1.
+            means2d_sums: [P, 2], receives the gradient of the splats' means2d if its parts are at several
+                ranks.
+            absolute_sums: `means2d_sums` receives the sum over pixels of absolute gradients instead.
+        """
+        project_bwd_step_(
+            _state_of(table),
+            self._schedule,
+            step,
+            WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg, size_reg),
+            frame.projected,
+            frame.options.projection(frame.views),
+            gradients,
+            table["level"] if frame.options.fade else None,
+            means2d_sums,
+            absolute_sums,
+        )
+
+
+def _state_of(table: GaussianTable) -> AdamState:
+    return AdamState(
+        table.parameters, table.exp_avgs, table.exp_avg_sqs, table["last_step"], table["moment_step"]
+    )

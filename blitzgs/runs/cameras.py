@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stores the cameras of a run in its folder, so that rendering does not need the capture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.capture.cameras import MOST_SIDE
+from blitzgs.capture.capture import Capture
+from blitzgs.util.output import write_file
+from blitzgs.view.views import CameraLike
+
+CAMERAS = "cameras.json"
+_VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class RunCamera:
+    """A pinhole camera with the fields of `blitzgs.capture.cameras.Camera` that rendering reads.
+
+    Attributes:
+        name: name of the image.
+        width: image width in pixels.
+        height: image height in pixels.
+        K: intrinsics in pixels, float64 [3, 3]; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+        world_to_camera: rigid pose, float64 [4, 4], in the re-centred world (capture position - the run's
+            offset).
+    """
+
+    name: str
+    width: int
+    height: int
+    K: npt.NDArray[np.float64]
+    world_to_camera: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RunCameras:
+    """All cameras of a run.
+
+    Attributes:
+        cameras: all cameras in the order of the capture.
+        train: indices of the training cameras.
+        test: indices of the held-out cameras.
+        inputs: paths of the photographs and masks during training.
+    """
+
+    cameras: Sequence[CameraLike]
+    train: list[int]
+    test: list[int]
+    inputs: list[Path]
+
+
+def checked_camera(
+    name: str, width: int, height: int, K: npt.ArrayLike, world_to_camera: npt.ArrayLike
+) -> RunCamera:
+    """Return a camera with these values, in arrays of its own.
+
+    Raises:
+        ValueError: a value is impossible; the message names it.
+    """
+    intrinsics, pose = np.array(K, dtype=np.float64), np.array(world_to_camera, dtype=np.float64)
+    for argument, matrix, shape in (("K", intrinsics, (3, 3)), ("world_to_camera", pose, (4, 4))):
+        if matrix.shape != shape or not np.isfinite(matrix).all():
+            raise ValueError(f"{argument} must be a finite matrix {shape}, got {matrix.tolist()}")
+    if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
+        raise ValueError(f"K must have positive focal lengths, got {intrinsics.tolist()}")
+    rotation = pose[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise ValueError(f"world_to_camera[:3, :3] must be a rotation, got {rotation.tolist()}")
+    for argument, size in (("width", width), ("height", height)):
+        if not 1 <= size <= MOST_SIDE or size != int(size):
+            raise ValueError(f"{argument} must be an integer from 1 to {MOST_SIDE:,}, got {size}")
+    return RunCamera(name, int(width), int(height), intrinsics, pose)
+
+
+def save_cameras(folder: Path, capture: Capture) -> None:
+    """Write the cameras of a capture into the folder of a run."""
+    views = [
+        {
+            "name": camera.name,
+            "width": camera.width,
+            "height": camera.height,
+            "K": np.asarray(camera.K).tolist(),
+            "world_to_camera": np.asarray(camera.world_to_camera).tolist(),
+        }
+        for camera in capture.cameras
+    ]
+    content = {
+        "version": _VERSION,
+        "train": list(capture.train),
+        "test": list(capture.test),
+        "inputs": [str(path.absolute()) for path in input_files(capture)],
+        "cameras": views,
+    }
+    write_file(folder / CAMERAS, json.dumps(content))
+
+
+def load_cameras(folder: Path) -> RunCameras:
+    """Read the cameras of a run.
+
+    Raises:
+        FileNotFoundError: the run is older than this file.
+        ValueError: the file is damaged.
+    """
+    path = folder / CAMERAS
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["version"] != _VERSION:
+            raise ValueError(f"version {content['version']}, this program reads {_VERSION}")
+        cameras = [
+            checked_camera(
+                str(view["name"]), view["width"], view["height"], view["K"], view["world_to_camera"]
+            )
+            for view in content["cameras"]
+        ]
+        train, test = _indices(content["train"], len(cameras)), _indices(content["test"], len(cameras))
+        return RunCameras(cameras, train, test, [Path(text) for text in content["inputs"]])
+    except FileNotFoundError:
+        raise
+    except (
+        OSError,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+    ) as error:
+        raise ValueError(f"{path} is damaged ({error}): give the capture with --data DIR instead") from error
+
+
+def input_files(capture: Capture) -> list[Path]:
+    """Return the paths of a capture's photographs and masks, which no command may overwrite."""
+    images = [camera.image_path for camera in capture.cameras]
+    return images + [camera.mask_path for camera in capture.cameras if camera.mask_path is not None]
+
+
+def _indices(values: Sequence[int], count: int) -> list[int]:
+    indices = [int(value) for value in values]
+    if any(not 0 <= index < count for index in indices):
+        raise ValueError("a view of the split does not exist")
+    return indices

@@ -1,0 +1,394 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checkpoints that survive crashes and load at any world size.
+
+A checkpoint is a folder: one safetensors file per rank with the columns of its shard, and `manifest.json`
+with the training state, the size and SHA-256 of each file, and the SHA-256 of its own content. It is written
+to a temporary folder, synced to disk, and renamed, so a folder with the final name is complete. Loading
+compares the files with the digests. The folder must be on a file system that every rank sees.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import re
+import shutil
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import safe_open
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.sharding import global_positions
+from blitzgs.runs.shard_file import file_digest, header_of, write_shard
+from blitzgs.util.output import sync_to_disk
+
+FORMAT = 2
+MANIFEST = "manifest.json"
+SHARED = "shared.safetensors"
+_NAME = re.compile(r"checkpoint_(\d{6})")
+_UNFINISHED = ".unfinished_"
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint could not be written or read; the message names the checkpoint and the reason."""
+
+
+@dataclass
+class Shard:
+    """One file of a checkpoint: name, rows of the table in it, size and SHA-256."""
+
+    file: str
+    rows: int
+    bytes: int
+    sha256: str
+
+
+def save(
+    directory: str | os.PathLike[str],
+    columns: Mapping[str, Tensor],
+    state: Mapping[str, Any],
+    ranks: Ranks,
+    keep: int = 3,
+    shared: Mapping[str, Tensor] | None = None,
+    reached: Callable[[str], None] = lambda point: None,
+) -> Path:
+    """Write a checkpoint; return on every rank when it is on disk.
+
+    Args:
+        directory: folder of checkpoints, made if missing.
+        columns: name -> [N_rank, ...], this rank's shard; the same names, dtypes and widths on every rank.
+        state: the rest of what a resumed run needs, as JSON values; rank 0's is stored.
+        ranks: the job.
+        keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
+        shared: tensors that are the same on all ranks; rank 0's are stored, in a separate file.
+        reached: called at each point at which the save may be interrupted, with the point's name; the tests
+            of crashes stop the process there.
+
+    Returns:
+        The folder of the new checkpoint, `directory/checkpoint_NNNNNN`.
+
+    Raises:
+        CheckpointError: on every rank, if any rank could not write; earlier checkpoints are unchanged.
+        ValueError: the columns differ in length, or `keep` < 1.
+    """
+    if keep < 1:
+        raise ValueError(f"checkpoint: keep must be at least 1, got {keep}")
+    rows = _common_length(columns)
+    directory = Path(directory)
+    name, problem = "", None
+    if ranks.rank == 0:
+        try:
+            name = _next_name(directory)
+            _delete_unfinished(directory)
+        except OSError as error:
+            problem = f"no checkpoint was saved, because rank 0 could not read {directory}: {error}."
+    name, problem = ranks.broadcast_object((name, problem))
+    if problem:
+        raise CheckpointError(problem)
+    unfinished = directory / (_UNFINISHED + name)
+    mine, common = None, None
+    try:
+        reached("begin")
+        unfinished.mkdir(parents=True, exist_ok=True)
+        _check_space(unfinished, columns)
+        reached("folder made")
+        file = f"shard_{ranks.rank:04d}_of_{ranks.world_size:04d}.safetensors"
+        with ranks.watchdog.working("writing a checkpoint"):
+            size, digest = write_shard(unfinished / file, columns, reached)
+        mine = Shard(file, rows, size, digest)
+        if shared and ranks.rank == 0:
+            common = Shard(SHARED, 0, *write_shard(unfinished / SHARED, shared, lambda point: None))
+    except OSError as error:
+        problem = f"rank {ranks.rank} could not write: {_explain(error)}"
+    results = ranks.all_gather_object((mine, problem))
+    problems = [text for _, text in results if text]
+    if not problems and ranks.rank == 0:
+        try:
+            with ranks.watchdog.working("finishing a checkpoint"):
+                shards = [shard for shard, _ in results if shard]
+                _finish(directory, name, shards, common, state, ranks.world_size, reached)
+        except OSError as error:
+            problems.append(f"rank 0 could not write: {_explain(error)}")
+    problems = ranks.broadcast_object(problems)
+    if problems:
+        if ranks.rank == 0:
+            shutil.rmtree(unfinished, ignore_errors=True)
+        raise CheckpointError(
+            f"checkpoint {directory / name} was not saved: {'; '.join(problems)}. "
+            "Earlier checkpoints are untouched."
+        )
+    if ranks.rank == 0:
+        try:
+            _delete_old(directory, keep, reached)
+        except OSError as error:
+            # The new checkpoint is complete; the next save tries to delete the old ones again.
+            warnings.warn(f"an older checkpoint could not be deleted: {error}", stacklevel=2)
+    return directory / name
+
+
+@dataclass
+class Loaded:
+    """A checkpoint in memory.
+
+    Attributes:
+        columns: columns of this rank's shard.
+        state: the state that was saved with them.
+        shared: tensors that are the same on all ranks; empty if none were stored.
+        name: name of the checkpoint.
+        refused: for each newer checkpoint, why it was not used.
+    """
+
+    columns: dict[str, Tensor]
+    state: dict[str, Any]
+    shared: dict[str, Tensor]
+    name: str
+    refused: list[str]
+
+
+def load_latest(
+    directory: str | os.PathLike[str],
+    ranks: Ranks,
+    device: torch.device | str,
+    problem: Callable[[dict[str, Tensor]], str | None] = lambda columns: None,
+) -> Loaded | None:
+    """Load this rank's share of the newest sound checkpoint.
+
+    A damaged checkpoint is refused, and the one before it is tried. A warning names the refused checkpoints,
+    the reasons, and the checkpoint that is used.
+
+    Args:
+        directory: folder given to `save`.
+        ranks: the job, of any world size.
+        device: where the columns go.
+        problem: returns what is wrong with a shard's columns, or None.
+
+    Returns:
+        The checkpoint; None if the folder has none.
+
+    Raises:
+        CheckpointError: checkpoints exist, but none is sound.
+    """
+    found = ranks.broadcast_object(_names(Path(directory)) if ranks.rank == 0 else [])
+    refused = []
+    for name in reversed(found):
+        try:
+            columns, state, shared = load(Path(directory) / name, ranks, device)
+            wrong = [text for text in ranks.all_gather_object(problem(columns)) if text]
+            if wrong:
+                raise CheckpointError(f"checkpoint {Path(directory) / name} is refused: {'; '.join(wrong)}")
+        except CheckpointError as error:
+            refused.append(str(error))
+            continue
+        if refused and ranks.rank == 0:
+            warnings.warn(f"{'; '.join(refused)}; using {name}", stacklevel=2)
+        return Loaded(columns, state, shared, name, refused)
+    if refused:
+        raise CheckpointError(f"no sound checkpoint in {directory}: {'; '.join(refused)}")
+    return None
+
+
+def load(
+    path: str | os.PathLike[str], ranks: Ranks, device: torch.device | str
+) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Tensor]]:
+    """Load this rank's share of one checkpoint.
+
+    With the world size that it was saved with, each rank gets its own shard unchanged. With another one the
+    rows are redistributed: rank m gets the positions = m (mod M) of the global order
+    (`sharding.global_positions`), and opens only the files that hold some of these rows.
+
+    Args:
+        path: folder returned by `save`.
+        ranks: the job, of any world size.
+        device: where the columns go.
+
+    Returns:
+        The columns of this rank's shard, name -> [N_rank, ...]; the state; and the tensors that are the same
+        on all ranks, on the CPU.
+
+    Raises:
+        CheckpointError: on every rank, when a file is missing, torn or altered.
+    """
+    path = Path(path)
+    manifest, problem = None, None
+    try:
+        manifest = _read_manifest(path)
+        # Each rank checks some of the files, so that every file is read for its digest once.
+        with ranks.watchdog.working("reading a checkpoint"):
+            files = [*manifest.shards, *([manifest.shared] if manifest.shared else [])]
+            for shard in files[ranks.rank :: ranks.world_size]:
+                _verify(path, shard)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        problem = str(error) or type(error).__name__
+    problems = [text for text in ranks.all_gather_object(problem) if text]
+    if problems or manifest is None:
+        raise CheckpointError(f"checkpoint {path} is damaged: {'; '.join(sorted(set(problems)))}")
+    shared = {}
+    if manifest.shared is not None:
+        with _opened(path / manifest.shared.file) as file:
+            shared = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    return read_share(path, manifest.shards, ranks, torch.device(device)), manifest.state, shared
+
+
+@dataclass
+class _Manifest:
+    shards: list[Shard]
+    shared: Shard | None
+    state: dict[str, Any]
+
+
+def read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.device) -> dict[str, Tensor]:
+    """Read this rank's share of the columns in a folder's shards, as `load` does, without verifying files."""
+    sizes = [shard.rows for shard in shards]
+    if len(shards) == ranks.world_size:
+        with _opened(path / shards[ranks.rank].file) as file:
+            return {name: file.get_tensor(name).to(device) for name in file.keys()}  # noqa: SIM118
+    positions = [global_positions(sizes, index) for index in range(len(shards))]
+    count = len(range(ranks.rank, sum(sizes), ranks.world_size))
+    columns = {
+        name: torch.empty((count, *spec.shape[1:]), dtype=spec.dtype, device=device)
+        for name, spec in header_of(path / shards[0].file).items()
+    }
+    for shard, order in zip(shards, positions, strict=True):
+        chosen = (order % ranks.world_size == ranks.rank).nonzero().squeeze(1)
+        if len(chosen) == 0:
+            continue
+        target = (order[chosen] // ranks.world_size).to(device)
+        with _opened(path / shard.file) as file:
+            for name, column in columns.items():
+                column[target] = file.get_tensor(name)[chosen].to(device)
+    return columns
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a safetensors file, also if its path is not valid UTF-8."""
+    with open(path, "rb") as file:
+        is_text = os.fsencode(path).decode(errors="replace") == str(path)
+        # The package accepts only UTF-8 paths.
+        with safe_open(path if is_text else f"/proc/self/fd/{file.fileno()}", "pt") as shard:
+            yield shard
+
+
+def _read_manifest(path: Path) -> _Manifest:
+    try:
+        content = json.loads((path / MANIFEST).read_text())
+    except FileNotFoundError:
+        raise ValueError(f"{MANIFEST} is missing") from None
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{MANIFEST} is not valid JSON ({error})") from error
+    if content["format"] not in (1, FORMAT):
+        raise ValueError(f"{MANIFEST} has format {content['format']}, this version reads 1 and {FORMAT}")
+    # Format 1 had no digest of the manifest.
+    if content["format"] != 1 and content.pop("sha256") != _digest(content):
+        raise ValueError(f"{MANIFEST} does not match its own SHA-256")
+    shared = content.get("shared")
+    shards = [Shard(**shard) for shard in content["shards"]]
+    if not shards:
+        raise ValueError(f"{MANIFEST} names no files")
+    return _Manifest(shards, None if shared is None else Shard(**shared), content["state"])
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _verify(path: Path, shard: Shard) -> None:
+    file = path / shard.file
+    if not file.exists():
+        raise ValueError(f"{shard.file} is missing")
+    if file.stat().st_size != shard.bytes:
+        raise ValueError(f"{shard.file} has {file.stat().st_size} bytes, the manifest says {shard.bytes}")
+    if file_digest(file) != shard.sha256:
+        raise ValueError(f"{shard.file} does not match its SHA-256")
+
+
+def _finish(
+    directory: Path,
+    name: str,
+    shards: list[Shard],
+    shared: Shard | None,
+    state: Mapping[str, Any],
+    world_size: int,
+    reached: Callable[[str], None],
+) -> None:
+    """Write the manifest beside the shards and give the folder its final name, each step synced."""
+    unfinished = directory / (_UNFINISHED + name)
+    missing = [shard.file for shard in shards if not (unfinished / shard.file).exists()]
+    if missing:
+        raise OSError(f"{', '.join(missing)} not in {unfinished}: every rank must see the same file system")
+    content = {
+        "format": FORMAT,
+        "world_size": world_size,
+        "shards": [asdict(shard) for shard in shards],
+        "shared": None if shared is None else asdict(shared),
+        "state": dict(state),
+    }
+    content = json.loads(json.dumps(content))  # tuples become lists: what is read back has the same digest
+    with open(unfinished / MANIFEST, "w") as file:
+        json.dump(content | {"sha256": _digest(content)}, file, indent=1)
+        reached("manifest written")
+        file.flush()
+        os.fsync(file.fileno())
+    sync_to_disk(unfinished)
+    reached("manifest synced")
+    unfinished.rename(directory / name)
+    reached("renamed")
+    sync_to_disk(directory)
+    reached("finished")
+
+
+def _delete_old(directory: Path, keep: int, reached: Callable[[str], None]) -> None:
+    """Delete all but the newest `keep`."""
+    for name in _names(directory)[:-keep]:
+        # Rename first: an interrupted deletion must not leave half a checkpoint under a final name.
+        (directory / name).rename(directory / (_UNFINISHED + name))
+        reached("old one renamed")
+    _delete_unfinished(directory)
+
+
+def _delete_unfinished(directory: Path) -> None:
+    """Delete the files that interrupted saves and deletions have left."""
+    for leftover in directory.glob(_UNFINISHED + "*"):
+        shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _names(directory: Path) -> list[str]:
+    if not directory.is_dir():
+        return []
+    return sorted(entry.name for entry in directory.iterdir() if _NAME.fullmatch(entry.name))
+
+
+def _next_name(directory: Path) -> str:
+    names = _names(directory)
+    return f"checkpoint_{int(names[-1].rsplit('_', 1)[1]) + 1 if names else 0:06d}"
+
+
+def _common_length(columns: Mapping[str, Tensor]) -> int:
+    lengths = {name: len(column) for name, column in columns.items()}
+    if len(set(lengths.values())) != 1:
+        raise ValueError(f"checkpoint: the columns must be given and of one length, got {lengths}")
+    return next(iter(lengths.values()))
+
+
+def _check_space(folder: Path, columns: Mapping[str, Tensor]) -> None:
+    needed = sum(column.numel() * column.element_size() for column in columns.values())
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise OSError(
+            errno.ENOSPC, f"{needed / 1e9:.2f} GB are needed and {free / 1e9:.2f} GB are free", str(folder)
+        )
+
+
+def _explain(error: OSError) -> str:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return f"the disk is full ({error}); free some space or lower the number of checkpoints kept"
+    return str(error)

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measures renders against their photographs: PSNR, SSIM and, given weights, LPIPS; writes pictures."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from blitzgs.capture.images import Images, PhotographError
+from blitzgs.capture.pictures import comparison, encode_image
+from blitzgs.distributed.group import Ranks
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import RenderOptions
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.pixels import collect_images
+from blitzgs.frame.tiles import TileAssignment
+from blitzgs.ops.photometric import ssim
+from blitzgs.util.output import OutputFolder
+from blitzgs.util.progress import Report
+from blitzgs.view.gate import SceneGate
+from blitzgs.view.views import CameraLike, ViewSet
+from blitzgs.view.visible import Scene, VisibleFinder
+
+Lpips = Callable[[Tensor, Tensor], Tensor]
+Stops = Callable[[], bool]
+METRICS = ("psnr", "ssim", "psnr_corrected", "lpips")
+
+
+class EvaluationStoppedError(Exception):
+    """An evaluation was given up because the run has to stop."""
+
+
+def image_metrics(render: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, float]:
+    """Return PSNR in dB, SSIM, and the PSNR after `correct_colours` ("psnr_corrected") of one view.
+
+    Args:
+        render: float [H, W, 3]; clamped to [0, 1] and not quantised.
+        target: uint8 [H, W, 3].
+        mask: uint8 [H, W]; pixels with 0 are left out of all metrics; None: no mask.
+    """
+    render = render.clamp(0.0, 1.0)
+    counted = torch.ones_like(target[..., 0]) if mask is None else mask
+    pixels, wanted = render[counted != 0].double(), target[counted != 0].double() / 255.0
+    similarity = ssim(render[None], target[None], None if mask is None else mask[None])
+    return {
+        "psnr": _psnr(pixels, wanted),
+        "ssim": similarity.item(),
+        "psnr_corrected": _psnr(correct_colours(pixels, wanted), wanted),
+    }
+
+
+def correct_colours(pixels: Tensor, wanted: Tensor) -> Tensor:
+    """Apply the affine colour map (a 3 x 4 matrix) that brings `pixels` closest to `wanted`.
+
+    The map is fitted by least squares over the pixels of one view. It removes differences of exposure and
+    white balance, which are properties of the photograph and not of the scene.
+
+    Args:
+        pixels: float64 [P, 3].
+        wanted: float64 [P, 3].
+
+    Returns:
+        float64 [P, 3], clamped to [0, 1].
+    """
+    known = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
+    # The pseudo-inverse also handles a view of a single colour, for which many maps are equally good.
+    inverse = torch.linalg.pinv(known.T @ known, hermitian=True)
+    return (known @ (inverse @ (known.T @ wanted))).clamp(0.0, 1.0)
+
+
+def _psnr(pixels: Tensor, wanted: Tensor) -> float:
+    """Return the PSNR in dB of colours [P, 3]; 120 if they are equal or P is 0."""
+    mse = ((pixels - wanted) ** 2).sum().item() / max(1, pixels.numel())
+    return -10.0 * math.log10(max(mse, 1e-12))
+
+
+def load_lpips(path: str | None) -> Lpips | None:
+    """Load a perceptual metric: a TorchScript module (render, target) -> distance, [1, 3, H, W] in [-1, 1].
+
+    Raises:
+        ValueError: the file is missing or not a TorchScript module.
+    """
+    if path is None:
+        return None
+    try:
+        metric: Lpips = torch.jit.load(path, map_location="cpu")
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(
+            f"{path} is not a readable TorchScript module of LPIPS (--lpips, log.lpips_weights): {error}"
+        ) from error
+    return metric
+
+
+def render_view(
+    finder: VisibleFinder,
+    views: ViewSet,
+    index: int,
+    options: RenderOptions,
+    owners: TileOwners,
+    destination: int = 0,
+) -> Tensor | None:
+    """Render camera `index` with the Gaussians of all ranks; every rank calls this.
+
+    Args:
+        finder: finds this rank's Gaussians in the view.
+        views: all cameras.
+        index: the camera to render.
+        options: how to render.
+        owners: divides the tiles among the ranks.
+        destination: rank that gets the image.
+
+    Returns:
+        float32 [H, W, 3] on rank `destination`, the same bits at any number of ranks; None elsewhere.
+    """
+    picked, ranks = views.pick([index]), owners.ranks
+    table, active, _ = finder.find(*picked.as_arguments(), options.limits)
+    if ranks.world_size == 1:
+        return pipeline.forward(table, picked, options, active).renders[0]
+    ranges = owners.divide([index], picked.width, picked.height, options.tile_size)
+    frame = pipeline.forward(table, picked, options, active, TileAssignment(ranks, ranges))
+    owners.record([index], frame.tile_work, ranges)
+    collect_images(frame.renders, ranges, ranks, destination)
+    return frame.renders[0] if ranks.rank == destination else None
+
+
+def _compare(render: Tensor, target: Tensor, mask: Tensor | None, lpips: Lpips | None) -> dict[str, float]:
+    """Return all metrics of one view; arguments as for `image_metrics`."""
+    metrics = image_metrics(render, target, None if mask is None else mask.to(target.device))
+    if lpips is not None:
+        pair = [
+            image.permute(2, 0, 1)[None].cpu() * 2 - 1 for image in (render.clamp(0, 1), target.float() / 255)
+        ]
+        metrics["lpips"] = float(lpips(pair[0], pair[1]))
+    return metrics
+
+
+def evaluate(
+    scene: Scene,
+    views: ViewSet,
+    cameras: Sequence[CameraLike],
+    images: Images,
+    indices: Sequence[int],
+    options: RenderOptions,
+    folder: Path | None,
+    owners: TileOwners,
+    *,
+    pictures: int = 0,
+    lpips: Lpips | None = None,
+    report: Report | None = None,
+    inputs: Iterable[Path] = (),
+    optional_files: bool = False,
+    lod: SceneGate | None = None,
+    stops: Stops | None = None,
+) -> dict[str, Any]:
+    """Render views and compare them with their photographs; the ranks take turns at comparing.
+
+    Args:
+        scene: this rank's Gaussians, without pending optimiser steps.
+        views: all cameras, on the device.
+        cameras: the same cameras, for their names.
+        images: the photographs.
+        indices: cameras to evaluate.
+        options: how to render.
+        folder: folder for `metrics.json` and the pictures; None: nothing is written.
+        owners: divides the tiles among the ranks; every rank calls this function.
+        pictures: number of evenly spaced views for which render | photograph | error are written side by
+            side.
+        lpips: from `load_lpips`.
+        report: called with (views rendered, number of views) after each view.
+        inputs: files that must not be overwritten.
+        optional_files: if a file cannot be written, warn instead of raising an error; used during training.
+        lod: leaves out Gaussians whose octree level is too fine for their distance; None: no gate.
+        stops: asked after each round in which every rank compares one view; if it returns True, the
+            evaluation ends. It must return the same on every rank. None: never stop.
+
+    Returns:
+        {"psnr": mean, "ssim": mean, "psnr_corrected": mean, ("lpips": mean,) "views": {name: {...}}}, the
+        same on every rank. Views whose pixels are all masked are left out; the means are absent if no view
+        remains.
+
+    Raises:
+        OSError: a file cannot be written, and `optional_files` is not set.
+        PhotographError: a photograph cannot be read; raised on every rank after the other views are measured.
+        EvaluationStoppedError: `stops` returned True.
+    """
+    ranks = owners.ranks
+    files = None if folder is None else _Files(folder, inputs, optional_files)
+    chosen = files.plan(indices, cameras, pictures) if files is not None else {}
+    per_view: dict[str, dict[str, float]] = {}
+    lost: str | None = None
+    own = list(indices[ranks.rank :: ranks.world_size])
+    finder = VisibleFinder(scene, lod)
+    for position, index in enumerate(indices):
+        turn, destination = divmod(position, ranks.world_size)
+        if destination == 0:
+            if stops is not None and position > 0 and stops():
+                raise EvaluationStoppedError
+            images.prefetch(own[turn : turn + 4])
+        render = render_view(finder, views, index, options, owners, destination)
+        if report is not None:
+            report(position + 1, len(indices))
+        if render is None:
+            continue
+        with ranks.watchdog.working(f"comparing view {cameras[index].name}"):
+            try:
+                target, mask = images.get(index).to(render.device), images.mask(index)
+            except (OSError, ValueError) as error:
+                lost = lost or str(error)  # the other ranks continue and learn of this at the end
+                continue
+            if mask is not None and not bool(mask.any()):
+                continue  # nothing to compare
+            per_view[cameras[index].name] = _compare(render, target, mask, lpips)
+            if files is not None and index in chosen:
+                picture = comparison(render, target, mask)
+                files.write(chosen[index], encode_image(picture, ".jpg"))
+    result = _over_all_ranks(per_view, lost, [cameras[index].name for index in indices], ranks)
+    if files is not None and ranks.rank == 0:
+        files.write(files.output.root / "metrics.json", json.dumps(result, indent=1).encode())
+    return result
+
+
+def _over_all_ranks(
+    per_view: dict[str, dict[str, float]], lost: str | None, names: list[str], ranks: Ranks
+) -> dict[str, Any]:
+    """Collect the metrics of all ranks, and return what `evaluate` returns. Collective.
+
+    Args:
+        per_view: the metrics of the views that this rank compared.
+        lost: why this rank could not read a photograph; None: it has read all.
+        names: names of all views, in the order of the result.
+        ranks: the job.
+
+    Raises:
+        PhotographError: a rank could not read a photograph.
+    """
+    parts = ranks.all_gather_object((per_view, lost))
+    if reasons := [reason for _, reason in parts if reason is not None]:
+        raise PhotographError("; ".join(reasons))
+    found = {name: view for part, _ in parts for name, view in part.items()}
+    masked = [name for name in names if name not in found]
+    if masked and ranks.rank == 0:
+        shown = ", ".join(masked[:5]) + (", ..." if len(masked) > 5 else "")
+        text = f"{len(masked)} of {len(names)} views cannot be measured, as they are masked: {shown}"
+        warnings.warn(text, stacklevel=3)
+    views = {name: found[name] for name in names if name in found}
+    result: dict[str, Any] = {}
+    for metric in METRICS:
+        values = [view[metric] for view in views.values() if metric in view]
+        if values:
+            result[metric] = sum(values) / len(values)
+    result["views"] = views
+    return result
+
+
+class _Files:
+    """The files that an evaluation writes into its folder."""
+
+    def __init__(self, folder: Path, inputs: Iterable[Path], optional: bool) -> None:
+        self.output = OutputFolder(folder, inputs)
+        self._optional = optional
+
+    def plan(self, indices: Sequence[int], cameras: Sequence[CameraLike], pictures: int) -> dict[int, Path]:
+        """Choose evenly spaced views; return their cameras and the paths of their pictures."""
+        count = min(pictures, len(indices))
+        chosen = [indices[k * len(indices) // count] for k in range(count)]
+        try:
+            paths = self.output.paths([cameras[index].name for index in chosen], ".jpg", flat=True)
+        except OSError as error:
+            self._failed(error)
+            return {}
+        return dict(zip(chosen, paths, strict=True))
+
+    def write(self, path: Path, content: bytes) -> None:
+        try:
+            self.output.write(path, content)
+        except OSError as error:
+            self._failed(error)
+
+    def _failed(self, error: OSError) -> None:
+        if not self._optional:
+            raise error
+        warnings.warn(f"the evaluation could not write a file and goes on without it: {error}", stacklevel=2)

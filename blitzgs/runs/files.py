@@ -1,0 +1,347 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folder of a run: the names of its files, and functions that save and open its checkpoints."""
+
+from __future__ import annotations
+
+import dataclasses
+import platform
+import resource
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import blitzgs
+from blitzgs.config.fields import Config
+from blitzgs.config.files import ConfigError, from_dict, load_config, to_dict
+from blitzgs.config.schedule import Schedule
+from blitzgs.distributed.group import Ranks
+from blitzgs.optim.table_adam import TableAdam
+from blitzgs.runs import checkpoint
+from blitzgs.runs.checkpoint import CheckpointError
+from blitzgs.runs.guard import bad_column, check_before_saving
+from blitzgs.table.host_table import HostTable
+from blitzgs.table.pool import Residence
+from blitzgs.table.table import GaussianTable
+from blitzgs.view.views import Space
+from blitzgs.view.visible import Scene
+
+CONFIG = "config.yaml"
+CHECKPOINTS = "checkpoints"
+SUMMARY = "summary.json"
+EVALUATION = "evaluation"
+LINEAGE = "lineage"
+# Sections and fields that a resumed run may change, because they do not change the result beyond rounding.
+# The exception is `data.allow_missing`: a run whose photograph is lost could not be resumed without it.
+FREE_FIELDS = (
+    "log",
+    "memory",
+    "ranks",
+    "data.path",
+    "data.allow_missing",
+    "data.cache_bytes",
+    "data.threads",
+    "data.prefetch",
+    "schedule.checkpoint_every",
+    "schedule.evaluate_every",
+)
+# Half precision changes the result by 1e-3.
+BOUND_FIELDS = ("ranks.half_exchange",)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The progress of a run; saved with every checkpoint.
+
+    Attributes:
+        step: number of optimiser steps taken.
+        sh_degree: spherical-harmonics degree of the last step.
+        level_count: number of octree levels K.
+        peak_gaussians: largest number of Gaussians so far.
+        seconds: seconds of training so far, without evaluations.
+        milestones: number of Gaussians at named points of the run, such as "before_pass_1".
+        ledger: ledger of the lineage (`blitzgs.spawn.lineage.Ledger`), if births and deaths are logged.
+        reference_distance: d_0 of the levels (`blitzgs.view.levels.Levels`), in the unit of the means.
+        finest_level: finest level that the LOD gate keeps; None: there is no gate at this point of the run.
+        gated_views: for each training view, in order, "1" if it has the LOD gate and "0" if the gate would
+            keep almost all Gaussians; empty without a gate.
+        least_kept: the smallest share of the Gaussians that a training view keeps with the LOD gate; 0
+            without a gate, and in old checkpoints.
+        train_views: digest of the names of the training views, in their order; empty in old checkpoints.
+        signals: result of `blitzgs.training.adaptive.Signals.saved`, with `schedule.adaptive`.
+        gate: digest of the spawn gate's files; empty without a gate, and in old checkpoints.
+        events_left: (time, order, kind) of the events of the last step that a signal kept from running.
+    """
+
+    step: int
+    sh_degree: int
+    level_count: int
+    peak_gaussians: int
+    seconds: float
+    milestones: dict[str, int] = dataclasses.field(default_factory=dict)
+    ledger: dict[str, int] = dataclasses.field(default_factory=dict)
+    reference_distance: float = 0.0
+    finest_level: int | None = None
+    gated_views: str = ""
+    least_kept: float = 0.0
+    train_views: str = ""
+    signals: dict[str, Any] = dataclasses.field(default_factory=dict)
+    gate: str = ""
+    events_left: list[tuple[Any, ...]] = dataclasses.field(default_factory=list)
+
+
+@dataclass
+class TrainedModel:
+    """A model read from a run's checkpoint, without pending optimiser steps, ready to render.
+
+    Attributes:
+        config: configuration of the run.
+        progress: progress of the run at the checkpoint.
+        space: maps between the trained world and the capture's world.
+        table: this rank's Gaussians.
+        pool_bytes: bytes of a device that the Gaussians may take, if the run trained with a pool; else 0.
+    """
+
+    config: Config
+    progress: Progress
+    space: Space
+    table: GaussianTable
+    pool_bytes: int = 0
+
+    def scene(self, device: torch.device) -> Scene:
+        """Return the scene that views are rendered from on a device.
+
+        With a pool, the first call moves the table into memory that the pool can reach.
+
+        Raises:
+            ResidenceError: the pool has room for fewer than two blocks.
+        """
+        if self.pool_bytes == 0:
+            return self.table
+        self.table = HostTable(self.table.release(), pinned=device.type == "cuda")
+        return Residence(self.table, device, self.pool_bytes, None)
+
+
+def save(
+    folder: Path,
+    table: GaussianTable,
+    progress: Progress,
+    space: Space,
+    config: Config,
+    ranks: Ranks,
+    run_id: str = "",
+    shared: Mapping[str, torch.Tensor] | None = None,
+) -> Path:
+    """Write a checkpoint of a run; pending optimiser steps stay pending, so that saving changes nothing.
+
+    Returns:
+        The checkpoint's folder.
+
+    Raises:
+        NonFiniteError: a value is not finite; nothing is written, and earlier checkpoints are kept.
+        CheckpointError: a rank could not write; earlier checkpoints are kept.
+    """
+    check_before_saving(table, progress.step, ranks)
+    state = {
+        "progress": dataclasses.asdict(progress),
+        "space": dataclasses.asdict(space),
+        "config": to_dict(config),
+        "run": run_id,
+    }
+    keep = config.log.keep_checkpoints
+    columns = {name: table[name] for name in table}
+    return checkpoint.save(folder / CHECKPOINTS, columns, state, ranks, keep, shared)
+
+
+@dataclass
+class Restored:
+    """The content of a run's checkpoint.
+
+    Attributes:
+        table: this rank's Gaussians.
+        progress: progress of the run at the checkpoint.
+        space: maps between the trained world and the capture's world.
+        config: configuration of the run.
+        run_id: identifies the run in its log.
+        source: name of the checkpoint and why it was chosen, as text.
+        shared: tensors that are the same on all ranks: `TileOwners.columns`.
+    """
+
+    table: GaussianTable
+    progress: Progress
+    space: Space
+    config: Config
+    run_id: str
+    source: str
+    shared: dict[str, torch.Tensor]
+
+
+def restore(folder: Path, ranks: Ranks, device: torch.device | None = None) -> Restored | None:
+    """Read the newest undamaged checkpoint of a run; return None if the run has no checkpoint.
+
+    Args:
+        folder: folder of the run.
+        ranks: the job.
+        device: device of the Gaussians; None: the ranks' device.
+
+    Raises:
+        CheckpointError: there are checkpoints, but all are damaged, or the newest is of another version.
+    """
+    loaded = checkpoint.load_latest(folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns)
+    if loaded is None:
+        return None
+    state = loaded.state
+    why = "the newest sound one" if loaded.refused else "the newest"
+    skipped = f"; {len(loaded.refused)} newer refused" if loaded.refused else ""
+    try:
+        progress = Progress(**state["progress"])
+        space = Space(**(state["space"] | {"offset": tuple(state["space"]["offset"])}))
+        config = from_dict(state["config"])
+    except (LookupError, TypeError, ConfigError) as error:
+        raise CheckpointError(
+            f"checkpoint {folder / CHECKPOINTS / loaded.name} belongs to another version of BlitzGS: {error}"
+        ) from error
+    return Restored(
+        GaussianTable(loaded.columns),
+        progress,
+        space,
+        config,
+        state.get("run", ""),
+        f"{loaded.name} ({why}{skipped})",
+        loaded.shared,
+    )
+
+
+def _problem_of_columns(columns: dict[str, torch.Tensor]) -> str | None:
+    return bad_column(GaussianTable(columns))
+
+
+def check_is_run(folder: Path) -> None:
+    """Check that a folder looks like a run.
+
+    Raises:
+        FileNotFoundError: it has neither a configuration nor checkpoints.
+    """
+    if not (folder / CONFIG).exists() and not (folder / CHECKPOINTS).exists():
+        raise FileNotFoundError(f"{folder} is not a run: it has no {CONFIG} and no {CHECKPOINTS}")
+
+
+def open_model(
+    folder: Path, ranks: Ranks, data: Path | None = None, resident_gb: float | None = None
+) -> TrainedModel:
+    """Open the newest model of a run for rendering, with the configuration that was saved with it.
+
+    Args:
+        folder: folder of the run.
+        ranks: the job.
+        data: present folder of the capture; None: unchanged.
+        resident_gb: gigabytes of each device for Gaussians; 0: no limit; None: as the run.
+
+    Raises:
+        FileNotFoundError: the folder is not a run, or holds no checkpoint.
+    """
+    check_is_run(folder)
+    pool_bytes = int((_resident_gb(folder / CONFIG) if resident_gb is None else resident_gb) * 1e9)
+    home = torch.device("cpu") if pool_bytes > 0 else ranks.device
+    restored = restore(folder, ranks, home)
+    if restored is None:
+        raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
+    config, progress, table = restored.config, restored.progress, restored.table
+    if ranks.rank == 0:
+        _compare_with_file(config, folder / CONFIG)
+    if data is not None:
+        config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
+    optimiser = TableAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
+    optimiser.catch_up(table, None, progress.step)
+    return TrainedModel(config, progress, restored.space, table, pool_bytes)
+
+
+def _resident_gb(path: Path) -> float:
+    """Return how many gigabytes of a device the configuration gives to the Gaussians; 0: no limit."""
+    try:
+        return load_config(path).memory.resident_gb
+    except ConfigError:
+        return 0.0
+
+
+def _compare_with_file(config: Config, path: Path) -> None:
+    """Warn if a run's configuration file differs from the configuration in its checkpoint."""
+    try:
+        # The file has the pace of the run's beginning or, after its end, the final one.
+        fields = _changed_fields(config, with_pace_of(load_config(path), config))
+        what = f"differs in {', '.join(fields)}" if fields else ""
+    except ConfigError as error:
+        what = f"cannot be read ({error})"
+    if what:
+        warnings.warn(f"{path} {what}: the configuration in the checkpoint is used", stacklevel=3)
+
+
+def check_resumable(saved: Config, wanted: Config) -> None:
+    """Check that a configuration gives the same result as the one that a checkpoint was trained with.
+
+    Raises:
+        ConfigError: a field differs; the message names the first one.
+    """
+    for name, old, new in _differences(to_dict(saved), to_dict(wanted), ""):
+        # The number of minutes may change: the rest of the run is then fitted into the rest of the new time.
+        is_budget = name == "schedule.minutes" and old > 0 and new > 0
+        if not (_is_free(name) or is_budget):
+            raise ConfigError(
+                f"{name}: the checkpoint was trained with {old!r}, now {new!r}; "
+                "leave out --config and the fields to resume with the run's own configuration, or start "
+                "another run"
+            )
+
+
+def with_pace_of(config: Config, saved: Config | None) -> Config:
+    """Return `config` with the pace and the placed times of the checkpoint's configuration, `saved`.
+
+    With `schedule.minutes`, the pace comes from `saved`, because the run has measured it; `saved` is None at
+    the start of a run, which has not measured any yet. Without `schedule.minutes`, the pace of `config` is
+    kept. The same rule applies to the times that `schedule.adaptive` places.
+    """
+    schedule = config.schedule
+    if schedule.minutes > 0:
+        schedule = dataclasses.replace(schedule, pace=() if saved is None else saved.schedule.pace)
+    if schedule.adaptive:
+        schedule = dataclasses.replace(schedule, placed=() if saved is None else saved.schedule.placed)
+    return dataclasses.replace(config, schedule=schedule)
+
+
+def _is_free(name: str) -> bool:
+    return name not in BOUND_FIELDS and any(
+        name == free or name.startswith(free + ".") for free in FREE_FIELDS
+    )
+
+
+def _changed_fields(saved: Config, found: Config) -> list[str]:
+    return [name for name, *_ in _differences(to_dict(saved), to_dict(found), "") if not _is_free(name)]
+
+
+def _differences(old: dict[str, Any], new: dict[str, Any], where: str) -> list[tuple[str, Any, Any]]:
+    found = []
+    for name in old | new:
+        path, a, b = where + name, old.get(name), new.get(name)
+        if isinstance(a, dict) and isinstance(b, dict):
+            found += _differences(a, b, path + ".")
+        elif a != b:
+            found.append((path, a, b))
+    return found
+
+
+def peak_memory_bytes(device: torch.device) -> int:
+    """Return this process's peak memory in bytes: allocated on a GPU, or resident on the CPU."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def versions(device: torch.device) -> dict[str, str]:
+    """Return the versions of the software and the name of the device."""
+    found = {"blitzgs": blitzgs.__version__, "torch": torch.__version__, "python": platform.python_version()}
+    if device.type == "cuda":
+        found |= {"device": torch.cuda.get_device_name(device), "cuda": str(torch.version.cuda)}
+    return found | {"machine": platform.platform()}

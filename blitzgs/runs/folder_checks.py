@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks a run's folder before training: all ranks can write to it, it has space, no other run uses it."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import secrets
+import shutil
+import socket
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.table.table import GaussianTable
+
+LOCK = ".lock"
+# A rank that torchrun restarts may begin before the process that it replaces has ended.
+LOCK_SECONDS = 5.0
+_PROBE_BYTES = 4096
+
+
+class FolderError(RuntimeError):
+    """The folder of a run cannot be used; the message names the ranks and the reason."""
+
+
+@contextlib.contextmanager
+def locked(folder: Path, ranks: Ranks) -> Iterator[None]:
+    """Lock a folder against other runs while the context lasts; every rank calls this.
+
+    The operating system releases the lock when the process ends, also after a crash.
+
+    Raises:
+        FolderError: on every rank, when another process is training in the folder.
+    """
+    descriptor, problem = None, None
+    if ranks.rank == 0:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor, problem = _lock(folder / LOCK)
+    problem = ranks.broadcast_object(problem)
+    try:
+        if problem is not None:
+            raise FolderError(problem)
+        yield
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _lock(path: Path) -> tuple[int | None, str | None]:
+    """Return the descriptor that holds the lock, or why there is none."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    deadline = time.monotonic() + LOCK_SECONDS
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            break
+        except BlockingIOError:
+            if time.monotonic() > deadline:
+                holder = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
+                os.close(descriptor)
+                return None, (
+                    f"{path.parent} is in use by another run ({holder or 'of unknown name'}): wait for it, "
+                    "stop it, or choose another --out"
+                )
+            time.sleep(0.1)
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
+                raise
+            os.close(descriptor)
+            warnings.warn(
+                f"{path.parent} is on a file system without locks ({error.strerror}): nothing keeps a second "
+                "run out of it",
+                stacklevel=2,
+            )
+            return None, None
+    os.ftruncate(descriptor, 0)
+    os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+    return descriptor, None
+
+
+def check_writable(folder: Path, ranks: Ranks) -> None:
+    """Check that every rank can write to the folder and that all of them see the same one.
+
+    Raises:
+        FolderError: on every rank, naming those that cannot.
+    """
+    token = ranks.broadcast_object(f".probe_{secrets.token_hex(6)}")
+    problem = None
+    own = folder / f"{token}_{ranks.rank}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with open(own, "xb", buffering=0) as file:
+            written = file.write(bytes(_PROBE_BYTES))
+            os.fsync(file.fileno())
+        if written != _PROBE_BYTES:
+            problem = f"rank {ranks.rank} ({socket.gethostname()}): the disk is full"
+    except OSError as error:
+        reason = (
+            "a file is where a folder is needed" if isinstance(error, FileExistsError) else error.strerror
+        )
+        problem = f"rank {ranks.rank} ({socket.gethostname()}): {reason or error}"
+    try:
+        problems = [text for text in ranks.all_gather_object(problem) if text]
+        seen = (folder / f"{token}_0").exists()
+        unseen = [rank for rank, there in enumerate(ranks.all_gather_object(seen)) if not there]
+    finally:
+        with contextlib.suppress(OSError):
+            own.unlink(missing_ok=True)
+    if problems:
+        raise FolderError(f"{folder} cannot be written: {'; '.join(problems)}")
+    if unseen:
+        raise FolderError(
+            f"{folder}: ranks {', '.join(map(str, unseen))} do not see what rank 0 writes there: --out must "
+            "be on a file system that all hosts share"
+        )
+
+
+def check_unclaimed(checkpoints: Path, files: Sequence[str], ranks: Ranks) -> None:
+    """Check that a run will not replace files of another program: every run has a folder of checkpoints.
+
+    Args:
+        checkpoints: that folder; it may be missing.
+        files: names of the files and folders beside it that a run writes.
+        ranks: the job.
+
+    Raises:
+        FileExistsError: on every rank; it is missing, and one of the files exists.
+    """
+    found = None
+    if ranks.rank == 0 and not os.path.lexists(checkpoints):
+        found = next((name for name in files if os.path.lexists(checkpoints.parent / name)), None)
+    if (found := ranks.broadcast_object(found)) is not None:
+        raise FileExistsError(
+            f"{checkpoints.parent} has {found}, which a run would replace, and no checkpoints: choose "
+            "another --out"
+        )
+
+
+def check_room(folder: Path, table: GaussianTable, ranks: Ranks, most_gaussians: int) -> None:
+    """Check that a checkpoint fits on the disk, and warn if one of the largest population will not fit.
+
+    Args:
+        folder: folder of the run.
+        table: this rank's Gaussians.
+        ranks: the job.
+        most_gaussians: limit of the population; 0: none is known.
+
+    Raises:
+        FolderError: on every rank, if not even a checkpoint of the present population fits.
+    """
+    row = sum(table.row_bytes.values())
+    parts = ranks.all_gather_object((len(table), row))
+    rows, row = sum(count for count, _ in parts), max(size for _, size in parts)
+    free = ranks.broadcast_object(shutil.disk_usage(folder).free if ranks.rank == 0 else 0)
+    if free < rows * row:
+        raise FolderError(
+            f"{folder}: a checkpoint takes {_gigabytes(rows * row)} and {_gigabytes(free)} are free: free "
+            "some space or choose another --out"
+        )
+    # A new checkpoint is complete before an old one is deleted.
+    most = max(rows, most_gaussians)
+    wanted = 2 * most * row
+    if free < wanted and ranks.rank == 0:
+        warnings.warn(
+            f"{folder}: {_gigabytes(free)} are free; two checkpoints of {most:,} Gaussians take "
+            f"{_gigabytes(wanted)}",
+            stacklevel=2,
+        )
+
+
+def _gigabytes(size: float) -> str:
+    return f"{size / 1e9:.2f} GB"

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Makes the LOD gate of a run, or of its model, from its configuration and progress."""
+
+from __future__ import annotations
+
+import math
+
+from blitzgs.config.fields import Config
+from blitzgs.distributed.group import Ranks
+from blitzgs.runs.files import Progress
+from blitzgs.table.table import GaussianTable
+from blitzgs.view.gate import LodGate, SceneGate
+
+# Gaussians move after the training views were chosen, and held-out views see a little more or less.
+_SLACK = 0.9
+
+
+def lod_gate(config: Config, progress: Progress) -> LodGate | None:
+    """Return the LOD gate at a point of a run; None if it is not open, or no training view has it.
+
+    If every training view is rendered with all Gaussians (`view.most_kept`), the coarse levels have never
+    been trained to stand alone. A view from farther away would then show holes where it leaves out the fine
+    ones. Smooth levels fade in every training view.
+    """
+    if progress.finest_level is None:
+        return None
+    if progress.gated_views and "1" not in progress.gated_views:
+        return None
+    return LodGate(
+        progress.reference_distance,
+        config.lod.fork,
+        progress.level_count,
+        progress.finest_level,
+        config.view.smooth,
+    )
+
+
+def scene_gate(config: Config, progress: Progress, table: GaussianTable, ranks: Ranks) -> SceneGate | None:
+    """Return the LOD gate of a model for any camera; None if it is not open. Collective.
+
+    Args:
+        config: configuration of the run.
+        progress: progress of the run.
+        table: this rank's Gaussians, without pending optimiser steps.
+        ranks: the job.
+    """
+    gate = lod_gate(config, progress)
+    if gate is None:
+        return None
+    # With smooth levels every view has the gate: a change from a view with it to one without would be a
+    # visible jump.
+    if gate.smooth:
+        return SceneGate(gate, math.inf, table, ranks)
+    return SceneGate(gate, config.view.most_kept, table, ranks, _SLACK * progress.least_kept)

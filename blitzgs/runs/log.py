@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The log of a run: a progress bar (or plain lines), a JSONL file and TensorBoard events.
+
+A failure to log never ends a run. If the disk is full or the terminal is closed, one warning is printed, and
+records are kept in memory to be written later.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from blitzgs.util.output import write_file
+from blitzgs.util.progress import Report
+
+LOG = "log.jsonl"
+BOARD = "tensorboard"
+# Largest number of records that are kept while the disk is full; then the oldest are dropped.
+_MOST_WAITING = 10_000
+
+# Least seconds between two moves of a terminal's bar and, without one, between two lines about long work.
+_BAR_SECONDS = 0.5
+_LINE_SECONDS = 30.0
+
+# Events after the last image, which a run that is resumed there logs again.
+_AT_THE_END = ("population", "image_memory", "evaluation")
+
+_SHOWN: dict[str, Callable[[float], str]] = {
+    "loss": lambda value: f"loss {value:.4f}",
+    "psnr": lambda value: f"{value:.2f} dB",
+    "gaussians": lambda value: f"{_count(value)} Gaussians",
+    "images_per_second": lambda value: f"{value:.1f} images/s",
+}
+
+
+def _count(value: float) -> str:
+    return f"{value / 1e6:.2f}M" if value >= 1e6 else f"{value / 1e3:.1f}k"
+
+
+class RunLog:
+    """Writes the records of a run; without a folder (on ranks other than 0) it does nothing.
+
+    Attributes:
+        total: images of the whole run, from which the remaining time is estimated.
+    """
+
+    def __init__(
+        self, folder: Path | None, total: int, done: int, tensorboard: bool, run_id: str = ""
+    ) -> None:
+        """Open the log, and drop the records that a resumed run will write again.
+
+        Args:
+            folder: folder of the run, to whose `log.jsonl` records are appended. None: log nothing.
+            total: images of the whole run.
+            done: images that a resumed run has seen before.
+            tensorboard: also write events to `folder/tensorboard`, if the package is installed.
+            run_id: identifies the run in every record.
+        """
+        self._failures = _Failures()
+        self._file: _JsonLines | None = None
+        self._board: _Board | None = None
+        self._progress: Progress | None = None
+        self._task = TaskID(0)
+        self._moved = 0.0
+        self._run_id = run_id
+        self._first, self._started = done, time.monotonic()
+        self.total = total
+        self.console = Console(quiet=folder is None, highlight=False)
+        if folder is None:
+            return
+        with self._failures.tolerated("log file"):
+            folder.mkdir(parents=True, exist_ok=True)
+            _drop_repeated(folder / LOG, run_id, done, total)
+        self._file = _JsonLines(folder / LOG, self._failures)
+        if tensorboard:
+            self._board = _Board(folder / BOARD, done, self._failures)
+        if self.console.is_terminal:
+            self._progress = Progress(
+                TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
+                BarColumn(bar_width=8),
+                TextColumn("{task.description}  ETA"),
+                TimeRemainingColumn(compact=True),
+                console=self.console,
+            )
+            self._task = self._progress.add_task("", total=total, completed=done)
+            self._progress.start()
+
+    def advance(self, t: int) -> None:
+        """Move the terminal's bar to time `t` (images): every half second at most, and at the end."""
+        if self._progress is None:
+            return
+        now = time.monotonic()
+        if now >= self._moved + _BAR_SECONDS or t >= self.total:
+            self._moved = now
+            self._progress.update(self._task, completed=t, total=self.total)
+
+    @contextlib.contextmanager
+    def work(self, what: str) -> Iterator[Report]:
+        """Show how far other work is while the context lasts: a bar on a terminal, else a line now and then.
+
+        Args:
+            what: what is counted, for example "views measured".
+
+        Yields:
+            A function to call with (number done, number of all).
+        """
+        if self._progress is not None:
+            bar = self._progress
+            task = bar.add_task(what, total=0)
+            try:
+                yield lambda done, total: bar.update(task, completed=done, total=total)
+            finally:
+                bar.remove_task(task)
+            return
+        printed = time.monotonic()
+
+        def report(done: int, total: int) -> None:
+            nonlocal printed
+            if self._file is not None and time.monotonic() >= printed + _LINE_SECONDS:
+                printed = time.monotonic()
+                self._print(f"        {done:,} of {total:,} {what}")
+
+        yield report
+
+    def scalars(self, t: int, values: Mapping[str, float]) -> None:
+        """Record numbers at time `t` (images)."""
+        self._write(t, values)
+        if self._board is not None:
+            self._board.add(t, values)
+        text = "  ".join(_SHOWN[name](value) for name, value in values.items() if name in _SHOWN)
+        if self._progress is not None:
+            self._progress.update(self._task, completed=t, total=self.total, description=text)
+        elif self._file is not None:
+            rate = (time.monotonic() - self._started) / max(1, t - self._first)
+            left = timedelta(seconds=round(rate * (self.total - t)))
+            self._print(f"{t:>7,}/{self.total:,} images  {text}  ETA {left}")
+
+    def event(self, t: int, kind: str, values: Mapping[str, Any], text: str | None = None) -> None:
+        """Record something that happened at time `t`; print `text` if given."""
+        self._write(t, {"event": kind, **values})
+        if self._board is not None:
+            numbers = {name: value for name, value in values.items() if isinstance(value, (int, float))}
+            self._board.add(t, {f"{kind}/{name}": value for name, value in numbers.items()})
+        if text is not None:
+            self._print(f"{t:>7,} {text}")
+
+    def close(self) -> None:
+        """Write remaining records and end the progress display."""
+        if self._progress is not None:
+            with self._failures.tolerated("terminal"):
+                self._progress.stop()
+        if self._board is not None:
+            self._board.close()
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _write(self, t: int, values: Mapping[str, Any]) -> None:
+        if self._file is not None:
+            self._file.add({"t": t} | ({"run": self._run_id} if self._run_id else {}) | dict(values))
+
+    def _print(self, text: str) -> None:
+        with self._failures.tolerated("terminal"):
+            self.console.print(text, soft_wrap=True, markup=False, emoji=False)
+
+
+class _JsonLines:
+    """A file with one JSON record per line; records that cannot be written are kept in memory."""
+
+    def __init__(self, path: Path, failures: _Failures) -> None:
+        self._path, self._failures = path, failures
+        self._waiting: deque[bytes] = deque(maxlen=_MOST_WAITING)
+
+    def add(self, record: Mapping[str, Any]) -> None:
+        self._waiting.append(json.dumps(record).encode() + b"\n")
+        with self._failures.tolerated("log file"):
+            self._flush()
+
+    def close(self) -> None:
+        with self._failures.tolerated("log file"):
+            self._flush()
+
+    def _flush(self) -> None:
+        if not self._waiting:
+            return
+        # Open the file each time, because its disk may have been detached and attached again.
+        with open(self._path, "ab", buffering=0) as file:
+            while self._waiting:
+                line = self._waiting[0]
+                written = file.write(line)
+                if written < len(line):
+                    # Write the rest when there is space again; readers skip lines that stay incomplete.
+                    self._waiting[0] = line[written:]
+                    raise OSError("the disk is full")
+                self._waiting.popleft()
+
+
+class _Board:
+    """Writes TensorBoard events while that is possible."""
+
+    def __init__(self, folder: Path, done: int, failures: _Failures) -> None:
+        self._folder, self._done, self._failures = folder, done, failures
+        self._writer: Any = None
+        self._open()
+
+    def add(self, t: int, values: Mapping[str, float]) -> None:
+        with self._failures.tolerated("TensorBoard"):
+            if self._writer is None:
+                self._open()
+            try:
+                for name, value in values.items():
+                    if self._writer is not None:
+                        self._writer.add_scalar(name, value, t)
+            except Exception:
+                # The writer's thread has ended with an error; the next record makes a new writer.
+                self._writer = None
+                raise
+
+    def close(self) -> None:
+        with self._failures.tolerated("TensorBoard"):
+            if self._writer is not None:
+                self._writer.close()
+
+    def _open(self) -> None:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            return
+        with self._failures.tolerated("TensorBoard"):
+            # Drop the steps after `done` that an interrupted run has logged: they will be logged again.
+            self._writer = SummaryWriter(str(self._folder), purge_step=self._done + 1 if self._done else None)
+
+
+class _Failures:
+    """Turns the errors of a log into warnings, one for each kind of log."""
+
+    def __init__(self) -> None:
+        self._warned: set[str] = set()
+
+    @contextlib.contextmanager
+    def tolerated(self, kind: str) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, ValueError, RuntimeError) as error:
+            if kind not in self._warned:
+                self._warned.add(kind)
+                with contextlib.suppress(OSError):
+                    warnings.warn(
+                        f"{kind}: {error}; training goes on, records may be missing there", stacklevel=4
+                    )
+
+
+def _drop_repeated(path: Path, run_id: str, done: int, total: int) -> None:
+    """Drop the records of run `run_id` after `done` images: the resumed run will write them again."""
+    if not run_id or not path.exists():
+        return
+    kept = []
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    for line in lines:
+        try:
+            record = json.loads(line)
+            repeated = record.get("run") == run_id and (
+                record["t"] > done or (record["t"] == total and record.get("event") in _AT_THE_END)
+            )
+        except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+            repeated = True  # an incomplete line, from a crash
+        if not repeated:
+            kept.append(line + "\n")
+    if len(kept) < len(lines):
+        write_file(path, "".join(kept))

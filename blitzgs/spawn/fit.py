@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fits spawn gates on lineage, and evaluates them: do a candidate's children survive to the final model?"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blitzgs.spawn.candidates import FEATURES
+from blitzgs.spawn.gate import GateInfo, check_no_other, write_info
+from blitzgs.spawn.lineage import ABOUT
+from blitzgs.spawn.lineage_parts import read_lineage
+from blitzgs.util.output import write_file
+
+# Largest number of births that a fit takes from a scene, drawn evenly.
+MOST_ROWS = 4_000_000
+XGBOOST_PARAMETERS = {
+    "objective": "binary:logistic",
+    "tree_method": "hist",
+    "max_depth": 5,
+    "eta": 0.05,
+    "colsample_bytree": 0.5,
+    "subsample": 0.8,
+    "base_score": 0.5,
+}
+ROUNDS = 150
+# Smallest share of the rows for a leaf. Leaves with fewer rows fit peculiarities of a scene, which lowers the
+# AUC on other scenes.
+LEAF_SHARE = 1 / 500
+# With a single scene: share of its births, by parent, that are held out to evaluate the fit on the others.
+HELD_OUT = 0.25
+
+
+@dataclass(frozen=True)
+class Spawns:
+    """The spawns of one run, K of them, without its initial Gaussians.
+
+    Attributes:
+        name: name of the run.
+        scene: fingerprint of its capture.
+        schedule: fields of its configuration that decide how long Gaussians live.
+        features: float32 [K, F], see `candidates.FEATURES`; NaN where the log is older than a feature.
+        survived: bool [K].
+        parents: int64 [K].
+        positions: float32 [K, 3], where they were born.
+        initial_survival: share of the run's initial Gaussians that reached its final model.
+    """
+
+    name: str
+    scene: str
+    schedule: dict[str, Any]
+    features: NDArray[np.float32]
+    survived: NDArray[np.bool_]
+    parents: NDArray[np.int64]
+    positions: NDArray[np.float32]
+    initial_survival: float = math.nan
+
+    @property
+    def times(self) -> NDArray[np.float32]:
+        """When they were born, images."""
+        times: NDArray[np.float32] = self.features[:, FEATURES.index("time")]
+        return times
+
+    def only(self, rows: NDArray[np.bool_]) -> Spawns:
+        """Return some of the spawns."""
+        return dataclasses.replace(
+            self,
+            features=self.features[rows],
+            survived=self.survived[rows],
+            parents=self.parents[rows],
+            positions=self.positions[rows],
+        )
+
+
+def read_spawns(folder: Path, gaussians: int | None = None) -> Spawns:
+    """Read the spawns of a finished run from its lineage.
+
+    Args:
+        folder: folder of the lineage.
+        gaussians: number of Gaussians of the finished model, which the lineage must have; None: unknown.
+
+    Raises:
+        FileNotFoundError: there is no lineage.
+        ValueError: a file is damaged or lost, there are no spawns, or all or none of them survived.
+        ImportError: pyarrow is not installed.
+    """
+    tables = read_lineage(folder)
+    about = read_about((folder / ABOUT).read_bytes(), folder / ABOUT)
+    births, deaths = tables["births"], tables["deaths"]
+    spawned = births["parent"] >= 0
+    alive = ~np.isin(births["id"], deaths["id"])
+    if not np.isin(deaths["id"], births["id"]).all() or gaussians not in (None, int(alive.sum())):
+        raise ValueError(f"{folder} is not complete: a file of its births or deaths is lost")
+    survived = alive[spawned]
+    check_outcomes(survived, folder)
+    return Spawns(
+        name=about["name"],
+        scene=about["scene"],
+        schedule=about["schedule"],
+        features=feature_columns({name: births[name][spawned] for name in births}, len(survived)),
+        survived=survived,
+        parents=births["parent"][spawned],
+        positions=np.stack([births[axis][spawned] for axis in "xyz"], 1),
+        initial_survival=float(alive[~spawned].mean()),
+    )
+
+
+def read_about(text: bytes | str, file: Path) -> dict[str, Any]:
+    """Read the description of a run that is stored with its spawns.
+
+    Raises:
+        ValueError: it is damaged; names the file.
+    """
+    try:
+        about = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{file}: the description of the run is damaged: {error}") from error
+    kinds = {"name": str, "scene": str, "schedule": dict}
+    if not isinstance(about, dict) or not all(isinstance(about.get(k), kind) for k, kind in kinds.items()):
+        raise ValueError(f"{file}: the description of the run is damaged: it has no {', '.join(kinds)}")
+    return about
+
+
+def check_outcomes(survived: NDArray[np.bool_], source: object) -> None:
+    """Check that some spawns survived and some did not.
+
+    Raises:
+        ValueError: this is not so; names `source`.
+    """
+    if not 0 < survived.sum() < len(survived):
+        raise ValueError(
+            f"{source}: {int(survived.sum()):,} of {len(survived):,} spawns survived; a gate needs a "
+            "finished run in which some did and some did not"
+        )
+
+
+def with_distinct_names(runs: Sequence[Spawns]) -> list[Spawns]:
+    """Number runs that have the same name (of their capture's folder): `capture`, `capture_2`."""
+    found: list[Spawns] = []
+    names: set[str] = set()
+    for run in runs:
+        name, number = run.name, 1
+        while name in names:
+            number += 1
+            name = f"{run.name}_{number}"
+        names.add(name)
+        found.append(dataclasses.replace(run, name=name))
+    return found
+
+
+def feature_columns(columns: Mapping[str, NDArray[Any]], count: int) -> NDArray[np.float32]:
+    """Return the features of K spawns, float32 [K, F], from columns by name; NaN where there is none."""
+    unknown = np.full(count, np.nan, np.float32)
+    return np.stack([columns.get(name, unknown).astype(np.float32) for name in FEATURES], 1)
+
+
+def auc(scores: NDArray[Any], positive: NDArray[np.bool_]) -> float:
+    """Return the area under the ROC curve, from the sum of ranks (Mann and Whitney 1947).
+
+    It is the probability that a positive scores higher than a negative; ties count half.
+
+    Args:
+        scores: [K].
+        positive: bool [K], some true and some false.
+    """
+    _, inverse, counts = np.unique(scores, return_inverse=True, return_counts=True)
+    ends = counts.cumsum()
+    ranks = (ends - (counts - 1) / 2)[inverse]
+    n_positive = int(positive.sum())
+    n_negative = len(positive) - n_positive
+    return float((ranks[positive].sum() - n_positive * (n_positive + 1) / 2) / (n_positive * n_negative))
+
+
+def best_feature(spawns: Spawns) -> tuple[str, float]:
+    """Return the single feature that separates best by itself, in either direction, and its AUC."""
+    found = [(name, auc(spawns.features[:, k], spawns.survived)) for k, name in enumerate(FEATURES)]
+    return max(((name, max(value, 1 - value)) for name, value in found), key=lambda pair: pair[1])
+
+
+def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0, seed: int = 0) -> dict[str, Any]:
+    """Fit a gate on all runs, and measure how well such a gate predicts on scenes that it was not fitted on.
+
+    With several scenes, each scene is left out once: a gate is fitted on the runs of the other scenes and
+    evaluated on the spawns of this one. With a single scene, a quarter of the parents is held out instead.
+
+    Args:
+        runs: at least one run.
+        path: path of the model, `NAME.json` or `NAME.ubj`; its metadata are written beside it.
+        gate_from: time in images from which on a gate is going to judge spawns; see `judge`.
+        seed: seed of the draws of rows.
+
+    Returns:
+        The figures that go into the metadata: `judge` for each run held out.
+
+    Raises:
+        ValueError: the runs are of different schedules, or a run has too few spawns.
+        FileExistsError: one of the two files exists and belongs to no gate.
+        ImportError: xgboost is not installed.
+    """
+    xgboost = _xgboost()
+    check_no_other(path)
+    runs = with_distinct_names(runs)
+    _check_same_schedule(runs)
+    scenes = sorted({run.scene for run in runs})
+    figures = []
+    for run in runs:
+        if len(scenes) > 1:
+            others = [other for other in runs if other.scene != run.scene]
+            judged = np.ones(len(run.survived), bool)
+            booster = _train(xgboost, others, [np.ones(len(o.survived), bool) for o in others], seed)
+        else:
+            judged = _hash_uniform(run.parents) < HELD_OUT
+            for part in (judged, ~judged):
+                check_outcomes(run.survived[part], f"{run.name}, of which a part is held out")
+            booster = _train(xgboost, runs, [_hash_uniform(o.parents) >= HELD_OUT for o in runs], seed)
+        held_out = run.only(judged)
+        figures.append(judge(held_out, _predict(xgboost, booster, held_out.features), gate_from))
+    protocol = "leave one scene out" if len(scenes) > 1 else "a quarter of the parents held out"
+    result = {"protocol": protocol, "held_out": figures}
+    booster = _train(xgboost, runs, [np.ones(len(run.survived), bool) for run in runs], seed)
+    write_file(path, bytes(booster.save_raw(path.suffix[1:])))
+    write_info(path, GateInfo(FEATURES, runs[0].schedule, {run.name: run.scene for run in runs}, auc=result))
+    return result
+
+
+def judge(run: Spawns, scores: NDArray[Any], gate_from: float = 0.0) -> dict[str, Any]:
+    """Return how scores separate the spawns of a run that survived from the others.
+
+    Args:
+        run: the spawns, some of which survived and some did not.
+        scores: [K], the gate's.
+        gate_from: time in images from which on a gate judges spawns.
+
+    Returns:
+        The AUC of the scores, that of the best single feature and its name, the number of spawns, and the
+        share that survived. `judged` has the same of the spawns from `gate_from` on, if this leaves some out
+        and if some of these survived and some did not.
+    """
+    name, single = best_feature(run)
+    found = {
+        "run": run.name,
+        "auc": auc(scores, run.survived),
+        "best_feature": name,
+        "best_feature_auc": single,
+        "spawns": len(run.survived),
+        "survived": float(run.survived.mean()),
+    }
+    late = run.times >= gate_from
+    if not late.all() and 0 < run.survived[late].sum() < late.sum():
+        found["judged"] = judge(run.only(late), scores[late])
+    return found
+
+
+def _check_same_schedule(runs: Sequence[Spawns]) -> None:
+    """Check that all runs have the schedule of the first; the message names the fields that differ."""
+    first = runs[0]
+    for run in runs[1:]:
+        fields = sorted(first.schedule.keys() | run.schedule.keys())
+        pairs = [(name, first.schedule.get(name), run.schedule.get(name)) for name in fields]
+        differing = [f"{name} ({mine!r} and {other!r})" for name, mine, other in pairs if mine != other]
+        if differing:
+            raise ValueError(
+                f"{first.name} and {run.name} were trained with different schedules, and need a gate each: "
+                + ", ".join(differing)
+            )
+
+
+def _train(xgboost: ModuleType, runs: Sequence[Spawns], rows: Sequence[NDArray[np.bool_]], seed: int) -> Any:
+    """Return a booster that is trained on the chosen rows of each run."""
+    generator = np.random.default_rng(seed)
+    features, labels = [], []
+    for run, mine in zip(runs, rows, strict=True):
+        chosen = mine.nonzero()[0]
+        if len(chosen) > MOST_ROWS:
+            chosen = np.sort(generator.choice(chosen, MOST_ROWS, replace=False))
+        features.append(run.features[chosen])
+        labels.append(run.survived[chosen])
+    data = xgboost.DMatrix(np.concatenate(features), np.concatenate(labels), feature_names=list(FEATURES))
+    # A row's weight in a leaf is p (1 - p), at most 1/4.
+    least = {"min_child_weight": LEAF_SHARE * data.num_row() / 4}
+    return xgboost.train(XGBOOST_PARAMETERS | least | {"seed": seed}, data, ROUNDS)
+
+
+def _predict(xgboost: ModuleType, booster: Any, features: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the log odds of survival, [K], that a booster predicts."""
+    data = xgboost.DMatrix(features, feature_names=list(FEATURES))
+    scores: NDArray[np.float32] = booster.predict(data, output_margin=True)
+    return scores
+
+
+def _hash_uniform(ids: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Map the ids of parents [K] to numbers in [0, 1); the children of a parent have the same number."""
+    mixed = (ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(11)
+    return mixed / 2.0**53
+
+
+def _xgboost() -> ModuleType:
+    try:
+        import xgboost
+    except ImportError as error:
+        raise ImportError("fitting a gate needs xgboost: pip install xgboost") from error
+    module: ModuleType = xgboost
+    return module

@@ -1,0 +1,372 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The spawn gate: withholds the candidates that a predictor ranks lowest (BlitzGS, section 3.2).
+
+A gate is a gradient-boosted tree model in XGBoost's JSON, `NAME.json`, and beside it `NAME.meta.json` with
+what it was fitted on (`GateInfo`). Scores are only compared with each other: by their order, or by the ratios
+of the odds. So one predictor suits scenes with very different numbers of candidates. BlitzGS evaluates the
+trees itself, in integers, so the scores are the same on every device and at every world size, and training
+does not need XGBoost.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+import math
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.selection import decimal_share, smallest
+from blitzgs.ops.counter_random import uniform
+from blitzgs.ops.tree_sums import tree_sums
+from blitzgs.spawn.candidates import FEATURES, Candidates
+from blitzgs.util.output import check_replaceable, write_file
+
+FORMAT = 1
+# Name of the gate that is included in BlitzGS, for configs/compact.yaml.
+DEFAULT = "default"
+# Takes the place of a gate's name: vetoes at random, which a gate has to surpass.
+RANDOM = "random"
+_SHIPPED = Path(__file__).with_name("gates") / "compact.json"
+# Leaf values are rounded to integers in units of 2^-32.
+_LEAF_BITS = 32
+# XGBoost may crash when it reads a damaged file, so a process of its own reads the file, and writes the model
+# as JSON. It gets the search path of this one as its argument. A wrong length in the file must not fill the
+# host's memory either.
+_TO_JSON = """
+import json, resource, sys
+sys.path[:] = json.loads(sys.argv[1])
+result, sys.stdout = sys.stdout.buffer, sys.stderr  # XGBoost prints its messages
+import xgboost
+data = sys.stdin.buffer.read()
+most, hard = (4 << 30) + 100 * len(data), resource.getrlimit(resource.RLIMIT_DATA)[1]
+resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
+try:
+    result.write(xgboost.Booster(model_file=bytearray(data)).save_raw("json"))
+except xgboost.core.XGBoostError as error:
+    sys.exit(str(error).partition("\\n")[0])  # the lines after the first are the stack of the library
+"""
+_READING_SECONDS = 120
+# The draws of a veto are those of the event `time` + 2^40. An importance pass of the same time draws among
+# the same Gaussians by their ids and `time` itself, and would prune those that the veto has just withheld.
+_VETO_EVENTS = 1 << 40
+
+
+class GateError(ValueError):
+    """A gate's files are missing, damaged or of another kind; the message names the file and the reason."""
+
+
+@dataclass(frozen=True)
+class GateInfo:
+    """What a gate was fitted on.
+
+    Attributes:
+        features: names of the model's inputs, in order.
+        schedule: fields of the configurations of the runs that it was fitted on.
+        scenes: {"name": fingerprint} of the captures.
+        auc: measured figures, see `blitzgs.spawn.fit`.
+    """
+
+    features: tuple[str, ...]
+    schedule: dict[str, Any]
+    scenes: dict[str, str]
+    auc: dict[str, Any] = field(default_factory=dict)
+
+
+def gate_file(name: str) -> Path:
+    """Return the model file of a gate: a path, or the shipped one for "default"."""
+    return _SHIPPED if name == DEFAULT else Path(name)
+
+
+def info_path(path: Path) -> Path:
+    """Return the path of the metadata of a model file."""
+    return path.with_suffix(".meta.json")
+
+
+def write_info(path: Path, info: GateInfo) -> None:
+    """Write the metadata beside a model file."""
+    write_file(info_path(path), json.dumps({"format": FORMAT} | dataclasses.asdict(info), indent=1) + "\n")
+
+
+def check_no_other(path: Path) -> None:
+    """Check that a new gate would replace only the files of a gate, which its metadata show.
+
+    Raises:
+        FileExistsError: there is a model file without metadata, another file at the path of the metadata, or
+            a gate in the other format, to which the metadata belong.
+        OSError: one of the two is no regular file.
+    """
+    metadata = info_path(path)
+    for file in (path, metadata):
+        check_replaceable(file)
+    foreign = None
+    try:
+        content = json.loads(metadata.read_text())
+        if not (isinstance(content, dict) and {"format", "features"} <= content.keys()):
+            foreign = metadata
+    except FileNotFoundError:
+        if path.exists():
+            foreign = path
+    except (ValueError, RecursionError):
+        foreign = metadata
+    for other in (path.with_suffix(suffix) for suffix in (".json", ".ubj") if suffix != path.suffix):
+        if other.exists():
+            raise FileExistsError(
+                f"{other} exists, whose metadata {metadata.name} the new gate would replace: choose another "
+                "--out"
+            )
+    if foreign is not None:
+        raise FileExistsError(f"{foreign} exists and does not belong to a gate: choose another --out")
+
+
+def read_info(path: Path) -> GateInfo:
+    """Read the metadata of a model file.
+
+    Raises:
+        GateError: they are missing, damaged, of another format, or of other features.
+    """
+    if not path.name:
+        raise GateError(f"{path}: no such gate; `blitzgs gate fit` makes one")
+    beside = info_path(path)
+    try:
+        content = json.loads(beside.read_text())
+        found = content.pop("format")
+        info = GateInfo(**(content | {"features": tuple(content["features"])})) if found == FORMAT else None
+        if info and not all(isinstance(part, dict) for part in (info.schedule, info.scenes, info.auc)):
+            raise TypeError("schedule, scenes and auc must be objects")
+    except FileNotFoundError:
+        if not path.exists():
+            raise GateError(f"{path}: no such gate; `blitzgs gate fit` makes one") from None
+        raise GateError(f"{beside} is missing: a gate is a model and its metadata, keep both") from None
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise GateError(f"{beside} is not the metadata of a gate: {error!r}") from error
+    if info is None:
+        raise GateError(f"{beside}: format {found}, this version reads {FORMAT}")
+    if info.features != FEATURES:
+        raise GateError(
+            f"{beside}: the gate was fitted on the features {list(info.features)}, this version computes "
+            f"{list(FEATURES)}; fit it anew"
+        )
+    return info
+
+
+class SpawnGate:
+    """A predictor of survival.
+
+    Attributes:
+        info: what it was fitted on.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read a model and its metadata.
+
+        Args:
+            path: a model in XGBoost's JSON, or in UBJSON where xgboost is installed.
+
+        Raises:
+            GateError: a file is missing, damaged or of another kind.
+        """
+        self.info = read_info(path)
+        try:
+            self._trees = _Trees.of(_read_model(path))
+        except GateError:
+            raise
+        except OSError as error:
+            raise GateError(f"{path} cannot be read: {error.strerror or error}") from error
+        except (ValueError, LookupError, TypeError, OverflowError, RuntimeError) as error:
+            raise GateError(f"{path} is not a binary classifier in XGBoost's JSON: {error!r}") from error
+
+    def scores(self, features: Tensor) -> Tensor:
+        """Score candidates by their chance to survive.
+
+        Args:
+            features: float32 [M, F], see `FEATURES`; NaN: unknown.
+
+        Returns:
+            int64 [M], the sum of the trees' leaves in units of 2^-32: log odds up to a constant.
+        """
+        self._trees = self._trees.to(features.device)
+        trees = self._trees
+        return tree_sums(features, trees.roots, trees.nodes, trees.leaves, trees.depth)
+
+
+class RankVeto:
+    """Vetoes the share of clones, and of splits, with the lowest scores over all ranks."""
+
+    def __init__(self, gate: SpawnGate, rate: float) -> None:
+        """Veto by a gate's scores; `rate` is the vetoed share, in [0, 1]."""
+        self._gate, self._rate = gate, rate
+
+    def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
+        """Tell which candidates are vetoed, bool [M]; ties go to the smaller id. Collective."""
+        return veto_lowest(self._gate.scores(candidates.features).float(), candidates, self._rate, ranks)
+
+
+class SampledVeto:
+    """Vetoes a share of clones, and of splits, at random, the likelier the lower a gate's scores.
+
+    The kept candidates are drawn without replacement, in proportion to the odds that the gate gives them. A
+    candidate of low rank, which `RankVeto` would withhold at event after event, is thus kept now and then.
+    """
+
+    def __init__(self, gate: SpawnGate, rate: float, seed: int) -> None:
+        """Veto by a gate's scores; `rate` is the vetoed share, in [0, 1]."""
+        self._gate, self._rate, self._seed = gate, rate, seed
+
+    def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
+        """Tell which candidates are vetoed, bool [M], the same ones at every world size. Collective."""
+        log_odds = self._gate.scores(candidates.features).double() * 2.0**-_LEAF_BITS
+        # The order of exponential races, whose keys are -log(u) / odds, by the logarithms of the keys: the
+        # odds themselves may exceed the range of numbers.
+        races = (-veto_draws(candidates, self._seed).log()).log() - log_odds
+        return veto_lowest((-races).float(), candidates, self._rate, ranks)
+
+
+class RandomVeto:
+    """Vetoes a share of clones, and of splits, at random, the same ones at every world size."""
+
+    def __init__(self, rate: float, seed: int) -> None:
+        """Veto a share `rate` of the candidates."""
+        self._rate, self._seed = rate, seed
+
+    def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
+        """Tell which candidates are vetoed, bool [M]. Collective."""
+        return veto_lowest(veto_draws(candidates, self._seed).float(), candidates, self._rate, ranks)
+
+
+def veto_draws(candidates: Candidates, seed: int) -> Tensor:
+    """Draw a number for each candidate, float64 [M] uniform in (0, 1), from (seed, time, parent) alone."""
+    return uniform(seed, candidates.time + _VETO_EVENTS, candidates.parents)
+
+
+def veto_lowest(scores: Tensor, candidates: Candidates, rate: float, ranks: Ranks) -> Tensor:
+    """Mark the ceil(rate n) lowest of all ranks' n clones, and likewise of their splits.
+
+    Args:
+        scores: float32 [M].
+        candidates: candidates of this rank.
+        rate: vetoed share in [0, 1]; its decimal value counts.
+        ranks: the job; every rank calls this.
+
+    Returns:
+        bool [M], the same candidates at every world size; ties go to the smaller parent id.
+    """
+    vetoed = torch.zeros_like(candidates.is_split)
+    for group in (~candidates.is_split, candidates.is_split):
+        rows = group.nonzero().squeeze(1)
+        count = int(ranks.all_reduce(torch.tensor(len(rows), device=rows.device)))
+        k = math.ceil(decimal_share(rate) * count)
+        vetoed[rows] = smallest(scores[rows], candidates.parents[rows], k, ranks)
+    return vetoed
+
+
+def _read_model(path: Path) -> dict[str, Any]:
+    """Read a model as XGBoost's JSON."""
+    if path.suffix == ".json":
+        content: dict[str, Any] = json.loads(path.read_text())
+        return content
+    if importlib.util.find_spec("xgboost") is None:
+        raise GateError(
+            f"{path}: only .json is read without xgboost (pip install xgboost); save the model as .json"
+        )
+    command = [sys.executable, "-c", _TO_JSON, json.dumps(sys.path)]
+    try:
+        read = subprocess.run(
+            command, input=path.read_bytes(), capture_output=True, timeout=_READING_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise GateError(f"{path} is damaged: XGBoost did not read it within {_READING_SECONDS} s") from error
+    if read.returncode < 0:
+        raise GateError(
+            f"{path} is damaged: XGBoost crashed when it read it ({signal.strsignal(-read.returncode)})"
+        )
+    if read.returncode > 0:
+        lines = read.stderr.decode(errors="replace").strip().splitlines()
+        raise ValueError(lines[-1] if lines else f"XGBoost ended with status {read.returncode}")
+    content = json.loads(read.stdout)
+    return content
+
+
+@dataclass(frozen=True)
+class _Trees:
+    """All nodes of all trees, one after the other, as `tree_sums` takes them.
+
+    Attributes:
+        roots: int32 [T].
+        nodes: int32 [n, 4].
+        leaves: int64 [n], in units of 2^-32.
+        depth: of the deepest tree.
+    """
+
+    roots: Tensor
+    nodes: Tensor
+    leaves: Tensor
+    depth: int
+
+    @classmethod
+    def of(cls, model: dict[str, Any]) -> _Trees:
+        """Read the trees of a model."""
+        learner = model["learner"]
+        objective, count = learner["objective"]["name"], int(learner["learner_model_param"]["num_feature"])
+        if objective != "binary:logistic" or count != len(FEATURES):
+            raise ValueError(f"objective {objective} with {count} features")
+        roots: list[int] = []
+        thresholds: list[float] = []
+        splits: list[tuple[int, int, int]] = []
+        leaves: list[int] = []
+        depth = 0
+        for tree in learner["gradient_booster"]["model"]["trees"]:
+            first = len(leaves)
+            roots.append(first)
+            depth = max(depth, _depth(tree["left_children"], tree["right_children"]))
+            for node, left in enumerate(tree["left_children"]):
+                value = tree["split_conditions"][node]
+                if left < 0:
+                    splits.append((0, -1, -1))
+                else:
+                    feature, unknown = tree["split_indices"][node], bool(tree["default_left"][node])
+                    if not (isinstance(feature, int) and 0 <= feature < count):
+                        raise ValueError(f"a split of feature {feature}")
+                    if node in tree.get("categories_nodes", ()) or math.isnan(value):
+                        raise ValueError(f"a split of feature {feature} without a threshold")
+                    splits.append((2 * feature + unknown, first + left, first + tree["right_children"][node]))
+                thresholds.append(0.0 if left < 0 else value)
+                leaves.append(round(value * 2**_LEAF_BITS) if left < 0 else 0)
+        if not roots:
+            raise ValueError("no trees")
+        # The sum of the leaves that a row reaches is an integer of 64 bits.
+        if sum(max(map(abs, leaves[first:end])) for first, end in pairwise([*roots, len(leaves)])) >= 2**63:
+            raise ValueError("the leaves of its trees may add up to 2^31 or more")
+        bits = torch.tensor(thresholds, dtype=torch.float32).view(torch.int32)
+        nodes = torch.cat((bits[:, None], torch.tensor(splits, dtype=torch.int32).view(-1, 3)), 1)
+        return cls(torch.tensor(roots, dtype=torch.int32), nodes, torch.tensor(leaves), depth)
+
+    def to(self, device: torch.device) -> _Trees:
+        """Return the trees on a device."""
+        if self.roots.device == device:
+            return self
+        return _Trees(self.roots.to(device), self.nodes.to(device), self.leaves.to(device), self.depth)
+
+
+def _depth(left: list[int], right: list[int]) -> int:
+    """Return how many comparisons the longest path through a tree has.
+
+    Raises:
+        ValueError: a child of a node is outside the tree, or the nodes do not form a tree.
+    """
+    depth, level, met = 0, [0], 1
+    while level := [child for node in level for child in (left[node], right[node]) if left[node] >= 0]:
+        depth, met = depth + 1, met + len(level)
+        if met > len(left) or min(level) < 0 or max(level) >= len(left):
+            raise ValueError("the nodes of a tree do not form one")
+    return depth

@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lineage: every birth and death of a Gaussian, logged as Parquet and reconciled with the live population.
+
+Each rank writes parts of two tables into one folder (`blitzgs.spawn.lineage_parts`), which hold what
+happened up to the optimiser step in their names:
+
+- births: id, parent (-1: of the initial model), x, y, z, and the spawn features of `candidates.FEATURES`
+  (NaN for the initial model but for `time`, 0);
+- deaths: id, time (in images), cause (`Cause`).
+
+A Gaussian without a death is alive. At each checkpoint, births - deaths must equal the live population, in
+number and in the sum of the hashes of all ids, or the run fails. A run that is resumed from a checkpoint
+deletes the parts written after it.
+
+An event only queues work on the device that makes its rows. Other threads copy the rows and write them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.ops.counter_random import hash_keys
+from blitzgs.spawn.candidates import FEATURES
+from blitzgs.spawn.lineage_parts import PART_NAME, TABLES, PartWriter
+from blitzgs.util.output import PARTIAL, write_file
+
+# File that describes the run: the capture's name and fingerprint, and the schedule.
+ABOUT = "about.json"
+# Number of rows, some 60 bytes each, that are kept on the device before they become parts. The remaining rows
+# are written at a checkpoint, which waits for them.
+_MOST_PENDING = 1 << 17
+
+
+class Cause(enum.IntEnum):
+    """Why a Gaussian died."""
+
+    OPACITY = 1  # too transparent at a density event
+    SIZE = 2  # too large there, on screen or in the world
+    SPLIT = 3  # replaced by its children
+    PASS_1 = 4  # not drawn by the first importance pass
+    PASS_2 = 5  # outside the mass that the second pass keeps
+    LATE_OPACITY = 6  # within it, but too transparent
+    RELOCATED = 7  # dead at a density event, where a copy of a live one took its place
+
+
+class LineageError(RuntimeError):
+    """Births and deaths do not add up to the live population."""
+
+
+@dataclass(frozen=True)
+class Births:
+    """Gaussians born on this rank, M of them.
+
+    Attributes:
+        ids: int64 [M].
+        parents: int64 [M].
+        means: float32 [M, 3].
+        features: float32 [M, F], features of the candidates.
+    """
+
+    ids: Tensor
+    parents: Tensor
+    means: Tensor
+    features: Tensor
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """Totals of births and deaths so far, over all ranks; part of a checkpoint.
+
+    Attributes:
+        births: number of births.
+        deaths: number of deaths.
+        id_sum: sum of the hashed ids of births less that of deaths, modulo 2^64, as a signed integer.
+        parts: number of parts that each rank has written, the largest of all ranks; 0 in old checkpoints.
+    """
+
+    births: int = 0
+    deaths: int = 0
+    id_sum: int = 0
+    parts: int = 0
+
+
+class Lineage:
+    """Logs births and deaths of one rank."""
+
+    def __init__(
+        self, folder: Path, ranks: Ranks, step: int, ledger: Ledger, about: dict[str, Any] | None = None
+    ) -> None:
+        """Begin a log, or continue one from a checkpoint. Collective.
+
+        Args:
+            folder: folder of the parts of all ranks, made if missing.
+            ranks: the job.
+            step: optimiser step of the checkpoint; parts that were written later are deleted.
+            ledger: ledger of the checkpoint. One without births begins a log: all parts are deleted.
+            about: description of the run, for the file `ABOUT`.
+
+        Raises:
+            ImportError: pyarrow is not installed.
+        """
+        self._writer = PartWriter(folder, ranks.device)
+        self._folder, self._ranks, self.ledger = folder, ranks, ledger
+        if ranks.rank == 0:
+            folder.mkdir(parents=True, exist_ok=True)
+            for path in list(folder.iterdir()):
+                name = PART_NAME.fullmatch(path.name)
+                if PARTIAL.fullmatch(path.name) or (name and _is_later(name, step, ledger)):
+                    path.unlink()
+            self.describe(about or {})
+        ranks.barrier()
+        # Changes since the ledger.
+        self._births = self._deaths = 0
+        self._id_sum = torch.zeros((), dtype=torch.int64, device=ranks.device)
+        self._pending: dict[str, list[tuple[Tensor, ...]]] = {table: [] for table in TABLES}
+        # The events that a stop kept from happening write parts of the checkpoint's step, beside those of the
+        # events before the stop.
+        self._rows, self._parts = 0, ledger.parts
+
+    def describe(self, about: dict[str, Any]) -> None:
+        """Write the description of the run to the file `ABOUT`; one rank calls this."""
+        write_file(self._folder / ABOUT, json.dumps(about, indent=1) + "\n")
+
+    def born(self, births: Births, step: int) -> None:
+        """Log births at the end of an optimiser step."""
+        floats = torch.cat((births.means.t(), births.features.t()))
+        self._log("births", (torch.stack((births.ids, births.parents)), floats), step)
+
+    def died(self, ids: Tensor, causes: Tensor, time: int, step: int) -> None:
+        """Log deaths.
+
+        Args:
+            ids: int64 [M]; kept, so it must not change any more.
+            causes: [M], values of `Cause`; the same holds.
+            time: time of the event, in images.
+            step: optimiser step.
+        """
+        times = torch.full_like(ids, time, dtype=torch.int32)
+        self._log("deaths", (ids[None], times[None], causes.to(torch.uint8)[None]), step)
+
+    def flush_and_check(self, ids: Tensor, step: int) -> Ledger:
+        """Write all pending rows and check that births - deaths is the population. Collective.
+
+        Call this before a checkpoint is written.
+
+        Args:
+            ids: int64 [N], ids of this rank's live Gaussians.
+            step: optimiser step.
+
+        Returns:
+            The present ledger.
+
+        Raises:
+            LineageError: on every rank, when births - deaths is not the live population.
+            OSError: on every rank, when one could not write a part; a later call tries that part again.
+        """
+        self.flush(step)
+        found = self._ranks.all_gather_object((self._writer.finish(), self._parts))
+        problems = [text for part, _ in found for text in part]
+        if problems:
+            raise OSError(f"the lineage could not be written: {problems[0]}")
+        self._parts = max(parts for _, parts in found)
+        device = self._id_sum.device
+        counts = torch.tensor([self._births, self._deaths, len(ids)], device=device)
+        hashes = torch.stack((self._id_sum, hash_keys(ids).sum().to(device)))
+        births, deaths, live, change, id_sum = self._ranks.all_reduce(torch.cat((counts, hashes))).tolist()
+        self._births = self._deaths = 0
+        self._id_sum.zero_()
+        ledger = Ledger(
+            self.ledger.births + births,
+            self.ledger.deaths + deaths,
+            _wrapped(self.ledger.id_sum + change),
+            self._parts,
+        )
+        if ledger.births - ledger.deaths != live or ledger.id_sum != id_sum:
+            raise LineageError(
+                f"lineage: {ledger.births:,} births less {ledger.deaths:,} deaths is not the live population "
+                f"of {live:,} Gaussians{_same_number(ledger, live)}; the log in {self._folder} is "
+                "not to be trusted. Please report this; population.lineage=false trains without it."
+            )
+        self.ledger = ledger
+        return ledger
+
+    def close(self) -> None:
+        """Stop writing; rows since the last `flush_and_check` are lost, as is the training since then."""
+        self._writer.close()
+
+    def flush(self, step: int) -> None:
+        """Let other threads write the pending rows."""
+        for table, blocks in self._pending.items():
+            if not blocks:
+                continue
+            groups = [torch.cat(parts, 1) for parts in zip(*blocks, strict=True)]
+            blocks.clear()
+            self._count(groups[0][0], births=table == "births")
+            name = f"{table}_{step:08d}_{self._ranks.rank:04d}_{self._parts:04d}.parquet"
+            self._parts += 1
+            self._writer.add(name, table, groups)
+        self._rows = 0
+
+    def _log(self, table: str, groups: tuple[Tensor, ...], step: int) -> None:
+        self._pending[table].append(groups)
+        self._rows += groups[0].shape[1]
+        if self._rows > _MOST_PENDING:
+            self.flush(step)
+
+    def _count(self, ids: Tensor, births: bool) -> None:
+        """Add the births or deaths of a part to the sums. Not at each event: it takes many small kernels."""
+        hashes = hash_keys(ids).sum()
+        if births:
+            self._births += len(ids)
+            self._id_sum += hashes
+        else:
+            self._deaths += len(ids)
+            self._id_sum -= hashes
+
+
+def initial_births(ids: Tensor, parents: Tensor, means: Tensor) -> Births:
+    """Return the births of a model's first Gaussians, whose features are NaN."""
+    features = torch.full((len(ids), len(FEATURES)), torch.nan, device=ids.device)
+    features[:, FEATURES.index("time")] = 0
+    return Births(ids, parents, means, features)
+
+
+def ledger_of(state: dict[str, int] | None) -> Ledger:
+    """Read a ledger back from a checkpoint."""
+    return Ledger(**(state or {}))
+
+
+def ledger_state(ledger: Ledger) -> dict[str, int]:
+    """Return a ledger for a checkpoint."""
+    return dataclasses.asdict(ledger)
+
+
+def _is_later(name: re.Match[str], step: int, ledger: Ledger) -> bool:
+    """Tell whether a part was written after the checkpoint of `step` that has this ledger."""
+    its_step, number = int(name[2]), int(name[4])
+    if ledger.births == 0 or its_step > step:
+        return True
+    return its_step == step and 0 < ledger.parts <= number
+
+
+def _wrapped(value: int) -> int:
+    """Return an integer modulo 2^64, as a signed integer."""
+    return (value + (1 << 63)) % (1 << 64) - (1 << 63)
+
+
+def _same_number(ledger: Ledger, live: int) -> str:
+    return " (their numbers agree, their ids do not)" if ledger.births - ledger.deaths == live else ""

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples of spawns: reduces a run's lineage to one small file from which a gate can be fitted elsewhere."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from blitzgs.ops.counter_random import uniform
+from blitzgs.spawn.candidates import FEATURES
+from blitzgs.spawn.fit import Spawns, check_outcomes, feature_columns, read_about
+from blitzgs.spawn.lineage_parts import check_columns, import_pyarrow, read_numbers
+from blitzgs.util.output import check_replaceable, new_file
+
+SUFFIX = ".parquet"
+# Number of rows of a sample; a row takes some 40 bytes.
+MOST_ROWS = 250_000
+_ABOUT = b"blitzgs.spawns"
+# Seed of the draw of parents; no other draw uses it.
+_SEED = 0x5A3B1E
+_AXES = ("x", "y", "z")
+
+
+def write_sample(run: Spawns, path: Path, most: int = MOST_ROWS) -> float:
+    """Write the spawns of some parents, drawn by the hash of their ids, so that siblings stay together.
+
+    Args:
+        run: the spawns of a run.
+        path: path of the file, `NAME.parquet`.
+        most: expected number of rows; if there are fewer spawns, all are written.
+
+    Returns:
+        The share of the parents that was drawn.
+
+    Raises:
+        FileExistsError: the file exists and is not a sample.
+        ImportError: pyarrow is not installed.
+    """
+    arrow, parquet = import_pyarrow()
+    check_no_other(path)
+    rate = min(1.0, most / len(run.survived))
+    some = run.only((uniform(_SEED, torch.from_numpy(run.parents)) < rate).numpy())
+    columns: dict[str, Any] = {"parent": some.parents, "survived": some.survived}
+    columns |= dict(zip(_AXES, some.positions.T, strict=True))
+    columns |= dict(zip(FEATURES, some.features.T, strict=True))
+    about = {
+        "name": run.name,
+        "scene": run.scene,
+        "schedule": run.schedule,
+        "initial_survival": run.initial_survival,
+        "spawns": len(run.survived),
+        "rate": rate,
+    }
+    table = arrow.table({name: np.ascontiguousarray(column) for name, column in columns.items()})
+    table = table.replace_schema_metadata({_ABOUT: json.dumps(about)})
+    # pyarrow takes no path that is not UTF-8, so it gets the open file.
+    with new_file(path) as partial, partial.open("wb") as file:
+        parquet.write_table(table, file, compression="zstd", use_dictionary=False)
+    return rate
+
+
+def check_no_other(path: Path) -> None:
+    """Check that a new sample replaces no file of another kind, such as a part of a lineage.
+
+    Raises:
+        FileExistsError: the file exists and is not a sample.
+        OSError: it is no regular file.
+    """
+    check_replaceable(path)
+    if not path.exists():
+        return
+    arrow, parquet = import_pyarrow()
+    try:
+        with path.open("rb") as file:
+            known = _ABOUT in (parquet.read_schema(file).metadata or {})
+    except (OSError, arrow.ArrowException):
+        known = False
+    if not known:
+        raise FileExistsError(f"{path} exists and is not a sample of spawns: choose another --out")
+
+
+def read_sample(path: Path) -> Spawns:
+    """Read a sample back.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is not a sample, or is damaged; names the file.
+        ImportError: pyarrow is not installed.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: there is no such sample of spawns")
+    table = read_numbers(path)
+    content = (table.schema.metadata or {}).get(_ABOUT)
+    if content is None:
+        raise ValueError(f"{path} is not a sample of spawns: write one with blitzgs gate sample")
+    check_columns(table, ("parent", "survived", *_AXES), path)
+    columns = {name: table[name].to_numpy() for name in table.column_names}
+    about = read_about(content, path)
+    survived = columns["survived"].astype(bool)
+    check_outcomes(survived, path)
+    return Spawns(
+        name=about["name"],
+        scene=about["scene"],
+        schedule=about["schedule"],
+        features=feature_columns(columns, len(table)),
+        survived=survived,
+        parents=columns["parent"],
+        positions=np.stack([columns[axis] for axis in _AXES], 1),
+        initial_survival=about.get("initial_survival", math.nan),
+    )

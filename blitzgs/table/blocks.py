@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The active set: the rows of a table that a batch of views may see, found from the bounds of blocks."""
+
+from __future__ import annotations
+
+from operator import itemgetter
+
+import torch
+from torch import Tensor
+
+from blitzgs.ops.blocks import (
+    BLOCK_ROWS,
+    ActiveRows,
+    GateRules,
+    PendingSteps,
+    cull_blocks,
+    morton_keys,
+    update_block_bounds_,
+)
+from blitzgs.table.table import GaussianTable
+
+# The columns of `PendingSteps`.
+_PENDING_OF = itemgetter(
+    "exp_avg.means", "exp_avg_sq.means", "exp_avg.scales", "exp_avg_sq.scales", "last_step", "moment_step"
+)
+
+# `morton_order` takes the span of a cloud between the quantiles `_SHARE` and 1 - `_SHARE` of up to `_SAMPLE`
+# rows, and its grid reaches `_REACH` spans beyond them. So the span has at least 2^21 / 65 cells a side.
+_SAMPLE, _SHARE, _REACH = 1 << 16, 0.05, 32.0
+
+
+@torch.no_grad()
+def morton_order(means: Tensor) -> Tensor:
+    """Return the permutation (int64 [N]) that puts neighbours in space next to each other.
+
+    Rows with the same Morton key keep their order; rows that are not finite come last. Rows far outside the
+    cloud count as if they lay at its border, so that they do not coarsen the grid of all others. The result
+    is the same on all devices.
+
+    Args:
+        means: [N, 3], float32; other dtypes are rounded to it.
+
+    Raises:
+        TypeError: `means` is not a tensor.
+        ValueError: it has a wrong shape.
+    """
+    if not isinstance(means, Tensor):
+        raise TypeError(f"means must be a torch.Tensor, got {type(means).__name__}")
+    if means.dim() != 2 or means.shape[1] != 3:
+        raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
+    return torch.sort(morton_keys(_without_far(means.float())), stable=True).indices
+
+
+def _without_far(points: Tensor) -> Tensor:
+    """Return points [N, 3] whose finite coordinates lie at most `_REACH` spans outside the quantiles.
+
+    The span is the largest distance of the quantiles on an axis. If it is 0 or unknown, no point moves.
+    """
+    if len(points) == 0:
+        return points
+    sample = points[:: -(-len(points) // _SAMPLE)]
+    sample = sample.where(sample.isfinite(), torch.nan)
+    # Quantiles that are values of the sample are the same on all devices.
+    low, high = (sample.nanquantile(q, dim=0, interpolation="nearest") for q in (_SHARE, 1 - _SHARE))
+    reach = _REACH * (high - low).amax()
+    known = reach > 0
+    low, high = (low - reach).where(known, -torch.inf), (high + reach).where(known, torch.inf)
+    return points.where(~points.isfinite(), points.clamp(low, high))
+
+
+class BlockIndex:
+    """Bounds of blocks of 256 consecutive rows of one table, updated as an optimiser moves rows.
+
+    Build a new index whenever rows were added, removed or reordered. Sort the table by `morton_order` first:
+    the active set is right in any order, but in a random order blocks are large and no block is skipped.
+
+    Attributes:
+        bounds: the bounds of each block, float32 [blocks, 8]; see `update_block_bounds_` for their layout.
+        level_ranges: the coarsest and the finest level of each block, uint8 [blocks, 2].
+    """
+
+    def __init__(self, table: GaussianTable, pending_table: Tensor | None = None) -> None:
+        """Compute the bounds of every block of the table.
+
+        Args:
+            table: the rows.
+            pending_table: `AdamSchedule.table` of the lazy optimiser, if rows may have pending steps; None:
+                they have none.
+        """
+        self._pending_table = pending_table
+        count = -(-len(table) // BLOCK_ROWS)
+        self.bounds = torch.empty(count, 8, dtype=torch.float32, device=table.device)
+        self.level_ranges = _level_ranges(table["level"], count)
+        self.update(table, None)
+
+    @classmethod
+    def of_bounds(cls, bounds: Tensor, level_ranges: Tensor, pending_table: Tensor | None) -> BlockIndex:
+        """Make an index from `bounds` and `level_ranges` that are known already."""
+        index = cls.__new__(cls)
+        index.bounds, index.level_ranges, index._pending_table = bounds, level_ranges, pending_table
+        return index
+
+    def active(
+        self,
+        table: GaussianTable,
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+        near_plane: float,
+        far_plane: float,
+        eps2d: float = 0.3,
+        rules: GateRules | None = None,
+        capacity_blocks: int | None = None,
+    ) -> ActiveRows:
+        """Return the rows that the views may see, and for each row the views that may see it.
+
+        Whether a row is in the result depends on that row alone, not on the order of the rows or on their
+        division among ranks. Arguments as in `blitzgs.ops.blocks.cull_blocks`.
+        """
+        pending = self._pending(table)
+        return cull_blocks(
+            self.bounds, table["means"], table["scales"], viewmats, Ks, width, height, near_plane, far_plane,
+            eps2d, pending, self.level_ranges, rules, capacity_blocks,
+        )  # fmt: skip
+
+    def update(self, table: GaussianTable, ids: Tensor | None) -> None:
+        """Recompute the bounds after an optimiser step of the rows `ids` (int32 [U]; None: of any rows).
+
+        No update is needed after `catch_up`, because the bounds contain all movement by pending steps.
+        """
+        update_block_bounds_(self.bounds, ids, table["means"], table["scales"], self._pending(table))
+
+    def _pending(self, table: GaussianTable) -> PendingSteps | None:
+        if self._pending_table is None:
+            return None
+        return PendingSteps._make((*_PENDING_OF(table.columns), self._pending_table))
+
+
+def _level_ranges(level: Tensor, blocks: int) -> Tensor:
+    """Return the coarsest and the finest level of each block, uint8 [blocks, 2]."""
+    rest = level[-1:].expand(blocks * BLOCK_ROWS - len(level)) if blocks else level
+    of_block = torch.cat((level, rest)).view(-1, BLOCK_ROWS)
+    return torch.stack((of_block.amin(dim=1), of_block.amax(dim=1)), dim=1)

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A table of Gaussians in host memory, whose columns a GPU can read and write."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import mmap
+import weakref
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from blitzgs.table.table import GaussianTable
+
+# Memory is allocated for this many times the present rows, so that a growing table is rarely moved.
+_GROWTH = 1.25
+MEMORY_INFO = Path("/proc/meminfo")
+
+
+class HostMemoryError(RuntimeError):
+    """The host has too little memory for the table; the message names the sizes and a remedy."""
+
+
+class HostTable(GaussianTable):
+    """Columns in host memory that is reused while rows are added and removed; pinned if a GPU reads it.
+
+    Pinning memory takes longer than filling it, so a changed column is copied into the memory of the old one.
+    """
+
+    def __init__(self, columns: dict[str, Tensor], pinned: bool) -> None:
+        """Move the given columns, one by one, into memory that the table owns.
+
+        Args:
+            columns: as for `GaussianTable`, on the CPU; the dictionary is emptied.
+            pinned: whether a GPU will read and write the columns.
+
+        Raises:
+            HostMemoryError: the columns do not fit into the host's memory.
+        """
+        super().__init__(columns)
+        self._pinned = pinned
+        self._memory: dict[str, Tensor] = {}
+        for name in list(columns):
+            del columns[name]
+            self._store_raw(name, self.columns[name])
+
+    def __delitem__(self, name: str) -> None:
+        """Drop a column and free its memory."""
+        super().__delitem__(name)
+        del self._memory[name]
+
+    def _store_raw(self, name: str, tensor: Tensor) -> None:
+        memory = self._memory.get(name)
+        if not (
+            memory is not None
+            and memory.dtype == tensor.dtype
+            and memory.shape[1:] == tensor.shape[1:]
+            and len(memory) >= len(tensor)
+        ):
+            # Free the old memory first, so that the host never holds both.
+            self._memory.pop(name, None)
+            self.columns[name] = tensor
+            del memory
+            memory = self._memory[name] = _allocate(tensor, self._pinned)
+        self.columns[name] = memory[: len(tensor)].copy_(tensor)
+
+
+def available_bytes() -> int | None:
+    """Return how many bytes the host can allocate without swapping; None if the system does not tell."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        for line in MEMORY_INFO.read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    return None
+
+
+def _allocate(like: Tensor, pinned: bool) -> Tensor:
+    """Allocate memory for `_GROWTH` times the rows of a tensor, on separate pages."""
+    rows = max(1, int(_GROWTH * len(like)))
+    size = rows * like.element_size() * math.prod(like.shape[1:])
+    available = available_bytes()
+    if available is not None and size > available:
+        raise HostMemoryError(
+            f"a column of {len(like):,} Gaussians needs {size / 1e9:.2f} GB in the memory of the host, which "
+            f"has {available / 1e9:.2f} GB left: use more memory or hosts, or cap population.max_gaussians"
+        )
+    pages = mmap.mmap(-1, max(1, size), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    for advice in ("MADV_HUGEPAGE", "MADV_DONTFORK"):  # fewer pages to pin; a fork must not copy them
+        with contextlib.suppress(AttributeError, OSError):
+            pages.madvise(getattr(mmap, advice))
+    view = memoryview(pages)
+    memory = torch.frombuffer(view, dtype=torch.uint8, count=max(1, size))[:size]
+    if pinned and size:
+        address = memory.data_ptr()
+        error = int(torch.cuda.cudart().cudaHostRegister(address, size, 0))
+        if error:
+            raise HostMemoryError(
+                f"{size / 1e9:.2f} GB of the host's memory cannot be pinned (CUDA error {error}): use a host "
+                "with more memory, or cap population.max_gaussians"
+            )
+        weakref.finalize(view, _unpin, address, pages)
+    return memory.view(like.dtype).view(rows, *like.shape[1:])
+
+
+def _unpin(address: int, _pages: mmap.mmap) -> None:
+    """Unpin memory after its last tensor is deleted. Holding `_pages` keeps them mapped until then."""
+    torch.cuda.cudart().cudaHostUnregister(address)

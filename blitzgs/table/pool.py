@@ -1,0 +1,375 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training beyond the memory of a GPU: keeps the blocks that views need in a pool on the device.
+
+The whole table is in host memory. A `Residence` has a pool on the device: a smaller table with the same
+columns, whose slots hold blocks of 256 rows of the host's table for a while. No result depends on a row's
+position, so the ops work on the pool as they would on the table.
+
+The order of the training views is known. Before a step begins, the bounds of all blocks, which stay on the
+device, are tested against the views of that step and of the next ones (`seen_blocks`). While the step runs, a
+second stream loads the blocks that the next step sees into the slots of the blocks that are needed last. The
+bounds of a block change only when a step moves its rows, and the blocks of the present step keep their slots
+until it has ended. The result of the test is therefore still right after the step. If the blocks of both
+steps do not fit together, the next step loads its remaining blocks when it begins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from blitzgs.ops.blocks import BLOCK_ROWS
+from blitzgs.ops.host import to_device
+from blitzgs.ops.residence import swap_blocks_
+from blitzgs.table.block_visibility import BlockVisibility, Cameras, culled_blocks
+from blitzgs.table.blocks import BlockIndex
+from blitzgs.table.host_table import HostTable
+from blitzgs.table.table import CULL, EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
+
+# Columns that steps change and that are therefore written back to the host.
+_WRITTEN = (
+    *PARAMETERS, *EXP_AVGS, *EXP_AVG_SQS, "last_step", "moment_step", "grad_sum", "grad_count", "max_radii",
+)  # fmt: skip
+_SETTING = "memory.resident_gb (eval, render: --resident-gb)"
+_FREE = -1
+
+
+class ResidenceError(RuntimeError):
+    """The blocks that views see do not fit into the pool; the message names the sizes and a remedy."""
+
+
+class Moved(NamedTuple):
+    """Counts of what moved between host and device.
+
+    Attributes:
+        steps: training steps.
+        needed: blocks that the views of these steps see.
+        loaded: blocks that were copied to the device because views see them.
+        bytes_in: bytes copied to the device, for any reason.
+        bytes_out: bytes written back to the host.
+    """
+
+    steps: int = 0
+    needed: int = 0
+    loaded: int = 0
+    bytes_in: int = 0
+    bytes_out: int = 0
+
+    def since(self, earlier: Moved) -> Moved:
+        """Return the difference from an earlier count."""
+        return Moved(*(now - then for now, then in zip(self, earlier, strict=True)))
+
+    def values(self) -> dict[str, float]:
+        """Return, for the log, the share of needed blocks that were on the device, and megabytes per step."""
+        return {
+            "resident_hits": max(0.0, 1.0 - self.loaded / max(1, self.needed)),
+            "moved_mb_per_step": (self.bytes_in + self.bytes_out) / 1e6 / max(1, self.steps),
+        }
+
+
+class Residence:
+    """A pool on the device for blocks of a table in host memory.
+
+    Between `load_for_step` and `write_back` the table on the host is out of date; `write_back` copies all
+    changes to it and empties the pool.
+
+    Attributes:
+        table: the table on the host.
+        pool: the table on the device; rows outside the blocks of `load_for_step`'s index are undefined.
+        moved: counts since the beginning.
+    """
+
+    def __init__(
+        self, table: HostTable, device: torch.device, budget_bytes: int, pending_table: Tensor | None
+    ) -> None:
+        """Allocate the pool.
+
+        Args:
+            table: the table on the host; pinned if `device` is a GPU.
+            device: device of the pool.
+            budget_bytes: bytes of the device that the pool may take.
+            pending_table: as for `BlockIndex`, on the device.
+
+        Raises:
+            ResidenceError: the budget is less than two blocks.
+        """
+        self.table, self._device, self._budget = table, device, budget_bytes
+        self.moved = Moved()
+        # High priority: its kernels need few multiprocessors, and the next step waits for them.
+        self._stream = torch.cuda.Stream(device, priority=-1) if device.type == "cuda" else None
+        self._storage: dict[str, Tensor] = {}
+        self.pool = self._pool_of({name: column[:0] for name, column in table.columns.items()}, 0)
+        self._is_open = self._rest_changed = False
+        self.reindex(pending_table)
+
+    # --- The pool -----------------------------------------------------------------------------------------
+
+    def reindex(self, pending_table: Tensor | None) -> None:
+        """Rebuild the index after rows were added, removed or reordered, or the schedule changed."""
+        self.write_back()
+        self._pending_table = pending_table
+        self._blocks, self._rest = divmod(len(self.table), BLOCK_ROWS)
+        self._make_pool()
+        index = BlockIndex(self.table, None if pending_table is None else pending_table.cpu())
+        # The last entry is used for slots without a block: a box that no view sees.
+        nothing = torch.full((1, 8), torch.finfo(torch.float32).max)
+        nothing[:, 3:6] *= -1
+        nothing[:, 6:] = 0
+        levels = torch.zeros(1, 2, dtype=torch.uint8)
+        self._bounds = torch.cat((index.bounds, nothing)).to(self._device)
+        self._level_ranges = torch.cat((index.level_ranges, levels)).to(self._device)
+        cull = self.table.cull
+        self._culled = None if cull is None else culled_blocks(cull[: self._blocks]).to(self._device)
+
+    def _make_pool(self) -> None:
+        """Allocate as many slots as the budget allows; a last, partial block has its own slot."""
+        table = self.table
+        names = [*_WRITTEN, *(name for name in table if name not in _WRITTEN)]
+        sizes = {name: BLOCK_ROWS * table.row_bytes[name] for name in names}
+        self._bytes_in = sum(sizes.values())
+        self._bytes_out = sum(sizes[name] for name in _WRITTEN)
+        has_rest = self._rest > 0
+        slots = min(self._blocks, self._budget // self._bytes_in - has_rest)
+        if slots < min(1, self._blocks):
+            raise ResidenceError(
+                f"{_SETTING}: {self._budget / 1e9:g} GB are less than two blocks of 256 Gaussians, "
+                f"which take {2 * self._bytes_in / 1e9:.4f} GB"
+            )
+        rows = slots * BLOCK_ROWS + self._rest
+        allocated_rows = (slots + has_rest) * BLOCK_ROWS
+        if any(not _fits(self._storage.get(name), table.columns[name], allocated_rows) for name in names):
+            # Free the old pool before allocating the new one.
+            self.pool.columns.clear()
+            self._storage.clear()
+            self._storage = {
+                name: torch.zeros((allocated_rows, *row.shape), dtype=row.dtype, device=self._device)
+                for name, row in ((name, table.row_of(name)) for name in names)
+            }
+        self.pool = self._pool_of({name: self._storage[name] for name in names}, rows)
+        self._block_in = np.full(slots, _FREE, dtype=np.int64)
+        self._slot_of = np.full(self._blocks, _FREE, dtype=np.int64)
+        self._is_changed = np.zeros(slots, dtype=bool)
+        self._last_use = np.zeros(slots, dtype=np.int64)
+        self._clock = 0
+        self._ready_for: int | None = None
+
+    @staticmethod
+    def _pool_of(columns: Mapping[str, Tensor], rows: int) -> GaussianTable:
+        """Return a table of the first `rows` rows of columns in their stored form."""
+        pool = GaussianTable({name: column[:rows] for name, column in columns.items() if name != CULL})
+        if CULL in columns:
+            pool.columns[CULL] = columns[CULL][: -(-rows // BLOCK_ROWS) * BLOCK_ROWS]
+        return pool
+
+    def _open(self) -> None:
+        """Begin to use the pool: load the last, partial block, which stays."""
+        if not self._is_open and self._rest:
+            for name, column in self.pool.columns.items():
+                # The mask of the last block has the length of a full block.
+                count = BLOCK_ROWS if name == CULL else self._rest
+                column[-count:].copy_(self.table.columns[name][-count:])
+        self._is_open = True
+
+    def write_back(self) -> None:
+        """Write all changes back to the table on the host, and empty the pool."""
+        if not self._is_open:
+            return
+        slots = (self._block_in >= 0).nonzero()[0]
+        self._move(slots, np.full(len(slots), _FREE), self._mark())
+        for name in _WRITTEN if self._rest_changed else ():
+            self.table[name][-self._rest :].copy_(self.pool[name][-self._rest :])
+        if self._stream is not None:
+            self._stream.synchronize()
+        self._is_open, self._rest_changed, self._ready_for = False, False, None
+
+    def catch_up(self, function: Callable[[GaussianTable], None]) -> None:
+        """Load every block of the table into the pool, one part after the other, and change its rows there.
+
+        Args:
+            function: changes the pool in place, and must tolerate that some rows are passed to it twice.
+        """
+        self.write_back()
+        self._open()
+        slots = len(self._block_in)
+        for begin in range(0, max(1, self._blocks), max(1, slots)):
+            coming = np.arange(begin, min(begin + slots, self._blocks))
+            self._move(np.arange(len(coming)), coming, self._mark())
+            self._wait()
+            function(self.pool)
+            self._is_changed[:] = True
+            self._rest_changed = self._rest > 0
+        self.write_back()
+
+    # --- Blocks for views ---------------------------------------------------------------------------------
+
+    def load_for_step(self, step: int, cameras: Cameras, batch_size: int) -> BlockIndex:
+        """Load the blocks that the views of a step see into the pool.
+
+        Args:
+            step: number of the step.
+            cameras: views of this step and of the following steps, in order, at most 32.
+            batch_size: views per step.
+
+        Returns:
+            The index of the pool's blocks. The step updates its bounds; pass it to `store_bounds` afterwards.
+
+        Raises:
+            ResidenceError: the blocks do not fit into the pool.
+        """
+        self._open()
+        self._begun = self._mark()
+        self._visibility = BlockVisibility(self._bounds[: self._blocks], cameras, batch_size, self._culled)
+        if self._ready_for != step:
+            # `prefetch` has not loaded all of them.
+            self._load(self._visibility.blocks_of_batch(0), self._begun, required=True)
+        self._ready_for = None
+        self._wait()
+        return self._index()
+
+    def prefetch(self, step: int) -> None:
+        """Load the blocks of the next step, number `step`, while the step of `load_for_step` runs.
+
+        Call this after the host has waited for the running step's number of splats. Its active set is then
+        complete. Before that, the device may still read the cull masks of blocks that the step leaves out as
+        a whole, and this method may reuse their slots.
+        """
+        now = self._visibility.blocks_of_batch(0)
+        slots = self._slot_of[now.nonzero()[0]]
+        if (slots < 0).any():
+            raise RuntimeError("blocks of this step have left the pool; this is a bug, please report it")
+        self._clock += 1
+        self._last_use[slots] = self._clock
+        self._is_changed[slots] = True
+        self._rest_changed = self._rest > 0
+        self._count(steps=1, needed=len(slots))
+        # If a batch has more than half of the 32 views that are tested together, only the present batch is
+        # known.
+        if self._visibility.batches > 1:
+            following = self._visibility.blocks_of_batch(1)
+            if self._load(following, self._begun, kept=now):
+                self._ready_for = step
+
+    def store_bounds(self, index: BlockIndex) -> None:
+        """Store the bounds of the index that `load_for_step` returned, after a step has moved rows."""
+        self._bounds[self._table_blocks] = index.bounds
+
+    def load_for_views(self, cameras: Cameras) -> BlockIndex:
+        """Load the blocks that views see, to render without a training step; else as `load_for_step`."""
+        self._open()
+        self._ready_for = None
+        self._visibility = BlockVisibility(self._bounds[: self._blocks], cameras, len(cameras.viewmats))
+        wanted = self._visibility.blocks_of_batch(0)
+        self._count(needed=int(wanted.sum()))
+        self._load(wanted, self._mark(), required=True)
+        self._wait()
+        return self._index()
+
+    def rows_of(self, rows: Tensor) -> Tensor:
+        """Map rows of the pool to rows of the table, both int32."""
+        blocks = self._table_blocks[rows.long() // BLOCK_ROWS].int()
+        return blocks * BLOCK_ROWS + rows % BLOCK_ROWS
+
+    def _index(self) -> BlockIndex:
+        blocks = np.where(self._block_in < 0, len(self._bounds) - 1, self._block_in)
+        table_blocks = torch.from_numpy(np.append(blocks, self._blocks) if self._rest else blocks)
+        self._table_blocks = to_device(table_blocks, self._device)
+        return BlockIndex.of_bounds(
+            self._bounds[self._table_blocks], self._level_ranges[self._table_blocks], self._pending_table
+        )
+
+    def _load(
+        self,
+        wanted: npt.NDArray[np.bool_],
+        after: torch.cuda.Event | None,
+        kept: npt.NDArray[np.bool_] | None = None,
+        required: bool = False,
+    ) -> bool:
+        """Start to load as many blocks as fit; return whether that is all of the wanted blocks."""
+        missing = (wanted & (self._slot_of < 0)).nonzero()[0]
+        free = (self._block_in < 0).nonzero()[0]
+        if len(missing) > len(free):
+            held = wanted if kept is None else wanted | kept
+            taken = (self._block_in >= 0).nonzero()[0]
+            idle = taken[~held[self._block_in[taken]]]
+            free = np.append(free, self._first_to_go(idle, len(missing) - len(free)))
+        if required and len(missing) > len(free):
+            self._refuse(int(wanted.sum()))
+        count = min(len(missing), len(free))
+        self._move(free[:count], missing[:count], after)
+        self._count(loaded=count)
+        return count == len(missing)
+
+    def _refuse(self, needed: int) -> None:
+        slots = len(self._block_in)
+        raise ResidenceError(
+            f"views that are rendered together see {needed:,} blocks of 256 Gaussians, "
+            f"{needed * self._bytes_in / 1e9:.3f} GB, and the pool has room for {slots:,}, "
+            f"{slots * self._bytes_in / 1e9:.3f} GB: raise {_SETTING}, or train with a lower "
+            "schedule.batch_size"
+        )
+
+    def _first_to_go(self, slots: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:
+        """Choose the slots whose blocks are needed last; among equals, those that were used longest ago."""
+        if len(slots) <= count:
+            return slots
+        rank = self._visibility.next_use(self._block_in[slots]) * (self._clock + 1) - self._last_use[slots]
+        return slots[np.argpartition(-rank, count)[:count]]
+
+    # --- Moves --------------------------------------------------------------------------------------------
+
+    def _move(
+        self,
+        slots: npt.NDArray[np.int64],
+        coming: npt.NDArray[np.int64],
+        after: torch.cuda.Event | None,
+    ) -> None:
+        """Queue a swap behind an event: write the slots' blocks back and load `coming`; -1: load none."""
+        if len(slots) == 0:
+            return
+        old, is_changed = self._block_in[slots], self._is_changed[slots]
+        leaving = np.where(is_changed, old, _FREE)
+        lists = torch.from_numpy(np.stack((slots, leaving, coming)).astype(np.int32))
+        columns = list(self.pool.columns.values()), [self.table.columns[name] for name in self.pool]
+        if self._stream is None:
+            swap_blocks_(*columns, len(_WRITTEN), *lists)
+        else:
+            assert after is not None
+            self._stream.wait_event(after)
+            with torch.cuda.stream(self._stream):
+                lists = to_device(lists, self._device)
+                swap_blocks_(*columns, len(_WRITTEN), *lists)
+        self._slot_of[old[old >= 0]] = _FREE
+        self._block_in[slots], self._is_changed[slots] = coming, False
+        self._slot_of[coming[coming >= 0]] = slots[coming >= 0]
+        self._count(
+            bytes_in=int((coming >= 0).sum()) * self._bytes_in,
+            bytes_out=int((leaving >= 0).sum()) * self._bytes_out,
+        )
+
+    def _count(self, **more: int) -> None:
+        counts = {name: getattr(self.moved, name) + count for name, count in more.items()}
+        self.moved = self.moved._replace(**counts)
+
+    def _mark(self) -> torch.cuda.Event | None:
+        """Record an event after all work queued so far; None on the CPU."""
+        return None if self._stream is None else torch.cuda.current_stream(self._device).record_event()
+
+    def _wait(self) -> None:
+        """Make the current stream wait for the swaps."""
+        if self._stream is not None:
+            torch.cuda.current_stream(self._device).wait_stream(self._stream)
+
+
+def _fits(storage: Tensor | None, column: Tensor, rows: int) -> bool:
+    """Tell whether memory of the pool can hold some rows of a column."""
+    return (
+        storage is not None
+        and len(storage) >= rows
+        and storage.shape[1:] == column.shape[1:]
+        and storage.dtype == column.dtype
+    )

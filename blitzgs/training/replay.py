@@ -1,0 +1,320 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measures a gate's worth by continuing one checkpoint with different vetoes (BlitzGS, oracle analysis).
+
+All arms continue the same checkpoint, from before the gate's onset:
+
+- reference: no veto. Its lineage labels each spawn event, (parent, time, clone or split): non-surviving if
+  and only if none of its children is in the final model.
+- oracle: vetoes exactly the candidates labelled non-surviving; oracle_rate: of these, at most the gate's
+  share.
+- gate: vetoes by the learned ranking; gate_sampled: draws those that pass by their odds; random: vetoes as
+  many at random.
+
+If training repeats bit for bit (on the CPU, or with model.deterministic), the oracle's first event has the
+same candidates as the reference's. Later events may differ, because each veto changes the rest of the run. An
+oracle never vetoes a candidate that the reference did not have; `matched` is the share of candidates that it
+did have. These include the candidates that the limit of the population held back in the reference, which have
+no label, because they never became Gaussians.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from blitzgs.capture.capture import Capture
+from blitzgs.capture.images import Images
+from blitzgs.config.fields import Config
+from blitzgs.config.schedule import Schedule
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.selection import decimal_share, smallest
+from blitzgs.ops.counter_random import hash_keys
+from blitzgs.runs import files as run_files
+from blitzgs.runs.checkpoint import MANIFEST
+from blitzgs.runs.folder_checks import locked
+from blitzgs.spawn.candidates import Candidates, Veto
+from blitzgs.spawn.gate import RandomVeto, RankVeto, SampledVeto, SpawnGate, veto_draws
+from blitzgs.spawn.lineage_parts import read_lineage
+from blitzgs.training.trainer import Trainer
+
+REFERENCE = "reference"
+ARMS = (REFERENCE, "oracle", "oracle_rate", "gate", "gate_sampled", "random")
+FIGURES, TABLE = "replay.json", "replay.md"
+# An empty file in the folder of the reference until this arm is trained: a replay that ended before that
+# begins again.
+BEGUN = "replay_begun"
+
+
+class CandidateRecord:
+    """Vetoes nothing, and records the candidates of a run before the limit of the population applies."""
+
+    def __init__(self) -> None:
+        self._keys: list[Tensor] = []
+
+    def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
+        """Record candidates, and return that none is vetoed, bool [M]."""
+        self._keys.append(event_keys(candidates.parents, candidates.time, candidates.is_split).cpu())
+        return torch.zeros_like(candidates.is_split)
+
+    def of_all_ranks(self, ranks: Ranks) -> Tensor:
+        """Return the `event_keys` of all candidates, int64 [K] on the CPU. Collective."""
+        return torch.cat(ranks.all_gather_object(torch.cat([torch.empty(0, dtype=torch.int64), *self._keys])))
+
+
+class OracleVeto:
+    """Vetoes candidates whose children did not survive in a reference run.
+
+    Attributes:
+        seen: number of candidates so far, on this rank.
+        matched: number of those that the reference run had too.
+    """
+
+    def __init__(self, known: Tensor, dead: Tensor, rate: float | None, seed: int) -> None:
+        """Store the reference run's candidates and events.
+
+        Args:
+            known: int64 [K], `event_keys` of its candidates.
+            dead: int64 [D], `event_keys` of its non-surviving spawn events.
+            rate: veto at most this share of the clones and of the splits; None: no limit.
+            seed: seed of the draw among non-surviving candidates if there are more.
+        """
+        self._known, self._dead, self._rate, self._seed = known, dead, rate, seed
+        self.seen = self.matched = 0
+
+    def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
+        """Tell which candidates are vetoed, bool [M]. Collective."""
+        keys = event_keys(candidates.parents, candidates.time, candidates.is_split)
+        self.seen += len(keys)
+        self.matched += int(torch.isin(keys, self._known.to(keys.device)).sum())
+        dead = torch.isin(keys, self._dead.to(keys.device))
+        if self._rate is None:
+            return dead
+        vetoed = torch.zeros_like(dead)
+        for group in (~candidates.is_split, candidates.is_split):
+            counts = torch.stack((group.sum(), (group & dead).sum()))
+            total, dying = ranks.all_reduce(counts).tolist()
+            most = math.ceil(decimal_share(self._rate) * total)
+            rows = (group & dead).nonzero().squeeze(1)
+            draws = veto_draws(candidates, self._seed)[rows].float()
+            vetoed[rows] = smallest(draws, candidates.parents[rows], min(most, dying), ranks)
+        return vetoed
+
+
+def event_keys(parents: Tensor, times: Tensor | int, is_split: Tensor) -> Tensor:
+    """Return a hash, int64, of the spawn events (parent, time, clone or split)."""
+    return hash_keys(parents, times, is_split.long())
+
+
+def label_events(lineage: Path) -> tuple[Tensor, Tensor]:
+    """Return the keys of all spawn events of a run, and of those whose children all died."""
+    tables = read_lineage(lineage)
+    births, deaths = tables["births"], tables["deaths"]
+    spawned = births["parent"] >= 0
+    parents, times, splits = (
+        torch.from_numpy(births[name][spawned]) for name in ("parent", "time", "is_split")
+    )
+    keys = event_keys(parents, times.long(), splits.bool()).numpy()
+    survived = ~np.isin(births["id"][spawned], deaths["id"])
+    known = np.unique(keys)
+    alive = np.unique(keys[survived])
+    return torch.from_numpy(known), torch.from_numpy(np.setdiff1d(known, alive))
+
+
+def branch_point(folder: Path, config: Config) -> Path:
+    """Return the last checkpoint of a run before the gate's onset.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: the run or its densification ends before the gate's onset, or a checkpoint is damaged.
+    """
+    schedule, found = Schedule(config.schedule), []
+    if not schedule.has_spawn_gate(schedule.iterations - 1):
+        raise ValueError(
+            f"{folder} ends before the gate's onset (schedule.gate_from {config.schedule.gate_from}, "
+            f"{schedule.iterations} images): replay a run that goes on after it"
+        )
+    events = schedule.events(0, schedule.iterations)
+    last = max((event.time for event in events if event.kind == "densify"), default=0)
+    if not schedule.has_spawn_gate(last):
+        raise ValueError(
+            f"{folder} has no density event from the gate's onset on (schedule.gate_from "
+            f"{config.schedule.gate_from}, the last event {last}): all arms would be the same run. Replay a "
+            "run with an earlier schedule.gate_from"
+        )
+    for manifest in (folder / run_files.CHECKPOINTS).glob(f"checkpoint_*/{MANIFEST}"):
+        try:
+            step = int(json.loads(manifest.read_text())["state"]["progress"]["step"])
+        except (ValueError, LookupError, TypeError, RecursionError) as error:
+            raise ValueError(f"{manifest} is damaged: {error!r}") from error
+        # Events before the end of a step belong to it.
+        if not schedule.has_spawn_gate(step * schedule.batch_size - 1):
+            found.append((step, manifest.parent))
+    if not found:
+        raise FileNotFoundError(
+            f"{folder} has no checkpoint from before the gate's onset (schedule.gate_from "
+            f"{config.schedule.gate_from}): train it with --population.lineage=true "
+            f"--schedule.checkpoint_every={max(config.schedule.gate_from // 2, 1)} --log.keep_checkpoints=100"
+        )
+    return max(found)[1]
+
+
+def replay(
+    config: Config,
+    capture: Capture,
+    images: Images,
+    source: Path,
+    out: Path,
+    gate: SpawnGate,
+    rate: float,
+    ranks: Ranks,
+) -> Iterator[dict[str, Any]]:
+    """Train every arm to the end, one after the other. Collective.
+
+    Args:
+        config: of the run that is branched, with `population.lineage`.
+        capture: of the run.
+        images: of the capture.
+        source: folder of the run.
+        out: gets a folder for each arm.
+        gate: the learned ranking.
+        rate: share that is vetoed.
+        ranks: the job.
+
+    Yields:
+        For each arm, when it is trained: its name, psnr, ssim, peak and final Gaussians, the seconds of
+        training since the branch, the reference's share of non-surviving events (`dead`) and of candidates
+        that the limit of the population held back (`held_back`), and of an oracle the share of the candidates
+        that it knew (`matched`).
+
+    Raises:
+        ValueError: the run logged no lineage, has no candidates from the gate's onset on, was trained by the
+            clock, ends before the onset, or all pixels of the views that are measured are masked.
+        FileNotFoundError: it has no checkpoint from before the onset.
+        FileExistsError: `out` holds a replay already, or another folder with the name of an arm. A replay
+            that ended before its first arm was trained is begun again.
+        FolderError: another process is training in the folder of an arm.
+    """
+    _check_comparable(config, capture, images, source)
+    _check_unclaimed(out, ranks)
+    point = branch_point(source, config)
+
+    def train(name: str, veto: Veto | None) -> dict[str, Any]:
+        folder = out / name
+        # No other process may train in the folder, least of all a replay that would begin again there.
+        with locked(folder, ranks):
+            if ranks.rank == 0:
+                _branch(point, folder)
+            ranks.barrier()
+            trainer = Trainer(config, capture, images, folder, ranks, resume=True)
+            trainer.state.veto, began = veto, trainer.state.progress.seconds
+            if ranks.rank == 0:
+                print(f"arm {name}:", flush=True)
+            summary = trainer.train()
+        if summary is None:
+            raise InterruptedError(f"arm {name} was stopped by a signal")
+        return {
+            "arm": name,
+            "psnr": summary["psnr"],
+            "ssim": summary["ssim"],
+            "peak": summary["peak_gaussians"],
+            "final": summary["gaussians"],
+            "seconds": summary["seconds"] - began,
+        }
+
+    record = CandidateRecord()
+    reference = train(REFERENCE, record)
+    known = record.of_all_ranks(ranks)
+    spawned, dead = label_events(out / REFERENCE / run_files.LINEAGE)
+    held_back = int(torch.isin(known, spawned, invert=True).sum()) / max(1, len(known))
+    if held_back > 0.5 and ranks.rank == 0:
+        warnings.warn(
+            f"the limit of the population held back {held_back:.0%} of the reference's candidates, so all "
+            "arms may end alike: replay a run with a higher limit (population.max_gaussians, "
+            "pixels_per_gaussian, gaussians_per_point)",
+            stacklevel=2,
+        )
+    if ranks.rank == 0:
+        (out / REFERENCE / BEGUN).unlink()
+    yield reference | {"dead": len(dead) / max(1, len(spawned)), "held_back": held_back}
+    for name, cap in (("oracle", None), ("oracle_rate", rate)):
+        oracle = OracleVeto(known, dead, cap, config.seed)
+        result = train(name, oracle)
+        counts = torch.tensor([oracle.matched, oracle.seen], device=ranks.device)
+        matched, seen = ranks.all_reduce(counts).tolist()
+        yield result | {"matched": matched / max(1, seen)}
+    yield train("gate", RankVeto(gate, rate))
+    yield train("gate_sampled", SampledVeto(gate, rate, config.seed))
+    yield train("random", RandomVeto(rate, config.seed))
+
+
+def _check_unclaimed(out: Path, ranks: Ranks) -> None:
+    """Check that a replay will not replace anything in its folder, except a reference that was not trained.
+
+    Raises:
+        FileExistsError: on every rank; a replay has trained an arm there, or the folder has another file or
+            folder with the name of one that the replay writes.
+    """
+    found = None
+    # Rank 0 checks for all, because another rank might check after rank 0 has begun to write.
+    if ranks.rank == 0:
+        begun = (out / REFERENCE / BEGUN).is_file()
+        names = [FIGURES, TABLE, *ARMS[begun:]]
+        found = next((name for name in names if os.path.lexists(out / name)), None)
+    found = ranks.broadcast_object(found)
+    if found in (FIGURES, TABLE):
+        raise FileExistsError(f"{out} already holds a replay: choose another --out, or delete it")
+    if found is not None:
+        raise FileExistsError(f"{out} has {found}, which a replay would replace: choose another --out")
+
+
+def _branch(point: Path, folder: Path) -> None:
+    """Make a run in `folder` that continues from the checkpoint `point`.
+
+    Of a reference that was begun before, the checkpoints are deleted. Its other files are dealt with as those
+    of any run that is resumed from an early checkpoint.
+    """
+    checkpoints = folder / run_files.CHECKPOINTS
+    if folder.name == REFERENCE:
+        if (folder / BEGUN).exists() and checkpoints.exists():
+            shutil.rmtree(checkpoints)
+        (folder / BEGUN).touch()
+    shutil.copytree(point, checkpoints / point.name)
+
+
+def _check_comparable(config: Config, capture: Capture, images: Images, source: Path) -> None:
+    """Check that arms can be branched from a run and that their results can be compared.
+
+    Raises:
+        ValueError: the run logged no lineage, has no candidates, was trained by the clock, or all pixels of
+            the views that are measured are masked.
+    """
+    if not config.population.lineage:
+        raise ValueError(
+            f"{source} was trained without --population.lineage=true: there is nothing to branch"
+        )
+    if config.population.strategy == "relocation":
+        raise ValueError(
+            f"{source} was trained with population.strategy=relocation, which has no candidates: replay a "
+            "run with population.strategy=density"
+        )
+    if config.schedule.minutes > 0:
+        raise ValueError(
+            f"{source} was trained with schedule.minutes ({config.schedule.minutes:g}): its arms would "
+            "differ in length, and could not be compared. Train it with schedule.scale instead"
+        )
+    masks = (images.mask(index) for index in capture.test or capture.train)
+    if not any(mask is None or bool(mask.any()) for mask in masks):
+        raise ValueError(
+            f"{source}: its arms could not be compared, because the views that are measured are masked as a "
+            "whole. Train it with another data.split or other masks"
+        )

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Takes the photographs of a city, except those that an interrupted generation has finished."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from blitzgs.util.output import write_file
+from blitzgs_synth.arrays import Bytes
+from blitzgs_synth.flight import View
+from blitzgs_synth.options import CityOptions
+from blitzgs_synth.processes import each
+from blitzgs_synth.render import City
+from blitzgs_synth.tracks import Corners, find_corners
+
+IMAGES, CORNERS = "images", "corners"
+_JPEG_QUALITY = 95
+_FIELDS = ("pixels", "positions", "directions", "colors")
+
+# Called with the images finished so far and their number.
+Progress = Callable[[int, int], None]
+
+
+def take_photographs(
+    folder: Path, city: City, views: list[View], processes: int, progress: Progress | None
+) -> list[Corners]:
+    """Write the photographs of all views and return the corners found in each.
+
+    A photograph that exists, is whole and has its corners beside it is not taken again. It is read once and
+    compared with the checksum that is kept with the corners.
+
+    Args:
+        folder: folder for `images/` and for `corners/`, from which an interrupted call continues.
+        city: the city to photograph.
+        views: the cameras.
+        processes: number of processes that share the views.
+        progress: called after each view.
+    """
+    for name in (IMAGES, CORNERS):
+        (folder / name).mkdir(exist_ok=True)
+    options = city.plan.options
+
+    def photograph(index: int) -> Corners:
+        view = views[index]
+        path = folder / IMAGES / view.name
+        record = folder / CORNERS / f"{index:05d}.npz"
+        corners = _finished(path, record)
+        if corners is None:
+            image = _exposed(city.render(view), index, options)
+            corners = find_corners(city, view, image, options.points_per_view, options.seed)
+            encoded = _encode_jpeg(path, image)
+            # Checksums find files that a power failure tore, so the files are not synced to disk.
+            write_file(path, encoded, sync=False)
+            write_file(record, _pack(corners, encoded), sync=False)
+        return corners
+
+    found = []
+    for corners in each(photograph, len(views), processes):
+        found.append(corners)
+        if progress:
+            progress(len(found), len(views))
+    return found
+
+
+def _exposed(image: Bytes, index: int, options: CityOptions) -> Bytes:
+    """Return a photograph, RGB [H, W, 3], with the gain and the grain of the camera."""
+    if options.grain == 0 and options.exposure == 0:
+        return image
+    rng = np.random.default_rng([options.seed, 6, index])
+    # Channels differ by less than photographs do.
+    gains = np.exp(options.exposure * (rng.standard_normal() + 0.25 * rng.standard_normal(3)))
+    values = image * gains.astype(np.float32)
+    values += np.float32(options.grain) * rng.standard_normal(image.shape, np.float32)
+    exposed: Bytes = np.clip(values + 0.5, 0, 255).astype(np.uint8)
+    return exposed
+
+
+def _finished(image: Path, record: Path) -> Corners | None:
+    """Return the corners of a photograph that is whole, else None."""
+    try:
+        content = image.read_bytes()
+        with np.load(record, allow_pickle=False) as arrays:
+            if int(arrays["checksum"]) != zlib.crc32(content):
+                return None
+            return Corners(*(arrays[name] for name in _FIELDS))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+        return None
+
+
+def _pack(corners: Corners, encoded: bytes) -> bytes:
+    buffer = io.BytesIO()
+    arrays = {name: getattr(corners, name) for name in _FIELDS}
+    np.savez(buffer, checksum=np.uint32(zlib.crc32(encoded)), **arrays)
+    return buffer.getvalue()
+
+
+def _encode_jpeg(path: Path, image: Bytes) -> bytes:
+    done, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    if not done:
+        raise OSError(f"{path}: the image could not be encoded as JPEG")
+    return encoded.tobytes()

@@ -1,0 +1,130 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <utility>
+#include <vector>
+
+#include "active/blocks.h"
+#include "common/parallel.h"
+
+namespace blitzgs::cpu {
+
+namespace {
+
+void bound_block(const BlockRows& rows, std::int64_t block, float* bounds) {
+  SweptBox box = empty_box();
+  bool all_finite = true;
+  const std::int64_t end = std::min(rows.n, (block + 1) * kBlockRows);
+  for (std::int64_t row = block * kBlockRows; row < end; ++row) {
+    const SweptBox swept = sweep_row(rows, row);
+    extend(box, swept);
+    all_finite &= !is_empty(swept);
+  }
+  store_bounds(box, all_finite, bounds + block * kBlockBounds);
+}
+
+// The frusta of the views and the table of the gate.
+struct CullViews {
+  Frustum planes[kMaxViews];
+  GateTable table;
+
+  explicit CullViews(const CullInputs& in) : table(in.gate.rules.table) {
+    for (int view = 0; view < in.views; ++view) {
+      planes[view] = make_frustum(in.camera, view);
+      camera_centre(in.camera.viewmats + 16 * view, table.centres[view]);
+    }
+  }
+};
+
+// Returns the blocks that some view may see, in order.
+template <bool kGated>
+std::vector<ActiveBlock> list_blocks(const CullInputs& in, const CullViews& views) {
+  constexpr std::int64_t kPart = 1024;
+  const std::int64_t blocks = blocks_of(in.rows.n);
+  std::vector<std::vector<ActiveBlock>> parts((blocks + kPart - 1) / kPart);
+  parallel_for(0, static_cast<std::int64_t>(parts.size()), 1, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t part = begin; part < end; ++part) {
+      for (std::int64_t block = part * kPart; block < std::min(blocks, (part + 1) * kPart); ++block) {
+        const BlockViews seen =
+            views_of_block<kGated>(views.planes, in.views, in.bounds, block, in.gate, views.table);
+        if (seen.any) parts[part].push_back({static_cast<std::int32_t>(block), seen});
+      }
+    }
+  });
+  std::vector<ActiveBlock> active;
+  for (const std::vector<ActiveBlock>& part : parts) active.insert(active.end(), part.begin(), part.end());
+  return active;
+}
+
+std::vector<ActiveBlock> active_blocks(const CullInputs& in, const CullViews& views) {
+  return leaves_out_any(in.gate.rules) ? list_blocks<true>(in, views) : list_blocks<false>(in, views);
+}
+
+// Finds the views of the rows of mixed blocks, and the number of active rows of each block.
+template <bool kGated>
+void fill_plan(const CullInputs& in, const CullViews& views, const CullPlan& plan) {
+  parallel_for(0, plan.capacity_blocks, 16, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t place = begin; place < end; ++place) {
+      const auto& [block, seen] = plan.blocks[place];
+      const int count = rows_in_block(in.rows.n, block);
+      plan.active[place] = count;
+      if (!is_mixed(seen)) continue;
+      plan.active[place] = 0;
+      for (int local = 0; local < count; ++local) {
+        std::uint32_t& mask = plan.masks[place * kBlockRows + local];
+        mask = views_of_row<kGated>(in.rows, views.planes, in.views, in.bounds, seen,
+                                    std::int64_t{block} * kBlockRows + local, in.gate, views.table);
+        plan.active[place] += mask != 0;
+      }
+    }
+  });
+}
+
+}  // namespace
+
+void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
+                         Workspace& workspace, CudaStream) {
+  std::int64_t count = blocks_of(rows.n);
+  std::int32_t* list = nullptr;
+  if (ids) {
+    list = workspace.allocate<std::int32_t>(n_ids);
+    std::transform(ids, ids + n_ids, list, [](std::int32_t row) { return row / kBlockRows; });
+    if (!std::is_sorted(list, list + n_ids)) std::sort(list, list + n_ids);
+    count = std::unique(list, list + n_ids) - list;
+  }
+  parallel_for(0, count, 16, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) bound_block(rows, list ? list[i] : i, bounds);
+  });
+}
+
+std::int64_t count_active_blocks(const CullInputs& in, Workspace&, CudaStream) {
+  return static_cast<std::int64_t>(active_blocks(in, CullViews(in)).size());
+}
+
+void cull_blocks(const CullInputs& in, const ActiveList& list, Workspace& workspace, CudaStream) {
+  const CullViews views(in);
+  const std::vector<ActiveBlock> blocks = active_blocks(in, views);
+  const auto n_blocks = static_cast<std::int64_t>(blocks.size());
+  *list.n_blocks = static_cast<std::int32_t>(n_blocks);
+  *list.count = 0;
+  if (n_blocks > list.capacity_blocks) return;
+  const CullPlan plan(n_blocks, workspace);
+  std::copy(blocks.begin(), blocks.end(), plan.blocks);
+  (leaves_out_any(in.gate.rules) ? fill_plan<true> : fill_plan<false>)(in, views, plan);
+  for (std::int64_t place = 0; place < n_blocks; ++place) {
+    *list.count += std::exchange(plan.active[place], *list.count);
+  }
+  parallel_for(0, n_blocks, 64, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t place = begin; place < end; ++place) {
+      const auto& [block, seen] = plan.blocks[place];
+      std::int64_t at = plan.active[place];
+      for (int local = 0; local < rows_in_block(in.rows.n, block); ++local) {
+        const std::uint32_t mask = is_mixed(seen) ? plan.masks[place * kBlockRows + local] : seen.all;
+        if (!mask) continue;
+        list.ids[at] = block * kBlockRows + local;
+        list.views[at++] = static_cast<std::int32_t>(mask);
+      }
+    }
+  });
+}
+
+}  // namespace blitzgs::cpu

@@ -1,0 +1,123 @@
+// SPDX-License-Identifier: Apache-2.0
+// The view level (BlitzGS, section 3.3; levels as in Octree-GS, Ren et al. 2024): drops pairs of a row and a
+// view from the active set before the projection.
+//
+// LOD gate (Eq. 1 and 2): view v keeps row i iff level_i <= L_v(|mean_i - centre_v|). Eq. 1 rounds
+// log_f(d_0 / d) to the nearest integer, so level l is kept up to the distance reach_l = d_0 f^(1/2 - l);
+// level 0 at any distance, and a level beyond L_max(t) nowhere (reach < 0). Comparing squared distances
+// decides the same sets without a logarithm.
+//
+// Cull mask: view v drops row i iff the row's bit in column columns[v] of the cull matrix is set. The matrix
+// is stored by sector (cull_mask.h).
+//
+// The op clears the bits of dropped pairs in `views`, in place. The decision for a row depends on this row
+// alone, in float32 and from caught-up means, so the sets depend neither on the order of the rows nor on how
+// they are divided among ranks. One thread handles a row: deterministic. The cost is O(listed rows).
+//
+// ids int32 [capacity] and views int32 [capacity], of which the first count [1] are valid; means [N, 3];
+// level uint8 [N]; viewmats [B, 4, 4], rigid; cull int32 [ceil(N / 256), columns, 8].
+#pragma once
+#include <cstdint>
+
+#include "active/cull_mask.h"
+#include "common/kernel.h"
+
+namespace blitzgs {
+
+// The values that the rows of a launch are compared with, by view or by level.
+struct GateTable {
+  float centres[kMaxViews][3];
+  float reach2[kMaxLevels];         // squared; negative: the level is kept nowhere
+  std::int32_t columns[kMaxViews];  // columns of the cull matrix; negative: the view has no mask
+};
+
+// The rules by which rows of a table are dropped from B views.
+struct GateRules {
+  const std::uint8_t* level;  // [N]
+  const std::int32_t* cull;   // [blocks_of(N), cull_columns, kSectorWords]; may be null
+  std::int64_t n_rows, cull_columns;
+  int n_views, n_levels;
+  std::uint32_t lod_views;   // bits of the views that have an LOD gate
+  std::uint32_t cull_views;  // bits of the views that have a mask
+  GateTable table;           // without the centres, which the kernels compute
+};
+
+BLITZGS_HD bool leaves_out_any(const GateRules& rules) { return (rules.lod_views | rules.cull_views) != 0; }
+
+struct ViewGateArgs {
+  const std::int32_t* ids;
+  std::int32_t* views;
+  std::int64_t capacity;
+  const std::int32_t* count;  // CUDA: the number of valid ids, in device memory; null: all
+  const float* means;
+  const float* viewmats;
+  GateRules rules;
+};
+
+// The camera centre -R^T t of a rigid pose.
+BLITZGS_HD void camera_centre(const float* viewmat, float* centre) {
+  for (int axis = 0; axis < 3; ++axis) {
+    double sum = 0;
+    for (int i = 0; i < 3; ++i) {
+      sum -= static_cast<double>(viewmat[4 * i + axis]) * static_cast<double>(viewmat[4 * i + 3]);
+    }
+    centre[axis] = static_cast<float>(sum);
+  }
+}
+
+BLITZGS_HD float squared_distance(const float* a, const float* b) {
+  float sum = 0;
+  for (int axis = 0; axis < 3; ++axis) sum += (a[axis] - b[axis]) * (a[axis] - b[axis]);
+  return sum;
+}
+
+BLITZGS_HD bool has_bit(std::uint32_t bits, int index) { return (bits >> index & 1u) != 0; }
+
+BLITZGS_HD float reach2_of(const GateRules& rules, const GateTable& table, std::int64_t row) {
+  const int level = rules.level[row], last = rules.n_levels - 1;
+  return table.reach2[level < last ? level : last];
+}
+
+// The views of `seen` whose masks drop a row.
+BLITZGS_HD std::uint32_t views_that_cull(const GateRules& rules, const GateTable& table, std::int64_t row,
+                                         std::uint32_t seen) {
+  std::uint32_t culled = 0;
+  if (!(seen & rules.cull_views)) return culled;
+  for (int view = 0; view < rules.n_views; ++view) {
+    if (!has_bit(seen & rules.cull_views, view)) continue;
+    if (sector_bit(rules.cull, rules.cull_columns, table.columns[view], row)) culled |= 1u << view;
+  }
+  return culled;
+}
+
+// Applies the gate to entry i of the list.
+BLITZGS_HD void gate_entry(const ViewGateArgs& args, const GateTable& table, std::int64_t i) {
+  const GateRules& rules = args.rules;
+  const std::int64_t row = args.ids[i];
+  const auto seen = static_cast<std::uint32_t>(args.views[i]);
+  std::uint32_t kept = seen & ~views_that_cull(rules, table, row, seen);
+  if (kept & rules.lod_views) {
+    const float reach2 = reach2_of(rules, table, row);
+    for (int view = 0; view < rules.n_views; ++view) {
+      if (!has_bit(kept & rules.lod_views, view)) continue;
+      if (squared_distance(args.means + 3 * row, table.centres[view]) > reach2) kept &= ~(1u << view);
+    }
+  }
+  if (kept != seen) args.views[i] = static_cast<std::int32_t>(kept);
+}
+
+namespace BLITZGS_BACKEND {
+void gate_views(const ViewGateArgs&, Workspace&, CudaStream);
+}  // namespace BLITZGS_BACKEND
+
+// Fills `table` with the table of the rules and the camera centres. All threads of a block call this, each
+// for one level and one view.
+BLITZGS_HD void fill_gate_table(const GateRules& rules, const float* viewmats, int thread, GateTable& table) {
+  if (thread < kMaxLevels) table.reach2[thread] = rules.table.reach2[thread];
+  if (thread < rules.n_views) {
+    table.columns[thread] = rules.table.columns[thread];
+    camera_centre(viewmats + 16 * thread, table.centres[thread]);
+  }
+}
+
+}  // namespace blitzgs

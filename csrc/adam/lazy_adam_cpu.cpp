@@ -1,0 +1,96 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <type_traits>
+
+#include "adam/lazy_adam.h"
+#include "adam/lazy_adam_lanes.h"
+#include "common/cpu_features.h"
+#include "common/parallel.h"
+
+namespace blitzgs::cpu {
+
+namespace {
+
+template <class T>
+AdamRowUpdate<T> row_update() {
+  if constexpr (std::is_same_v<T, float>) {
+    if (use_avx2()) return avx2_adam_row_update();
+  }
+  return update_row<PlainLanes<T>, T>;
+}
+
+// The rows of a list are scattered in memory, so a row's state is prefetched while the rows before it are
+// updated.
+constexpr std::int64_t kPrefetchDistance = 3;
+
+template <class T>
+void prefetch_row(const AdamArgs<T>& args, std::int64_t row) {
+  constexpr std::int64_t kLine = 64 / sizeof(T);
+  asm volatile("");  // without this, gcc drops calls of a function that only prefetches
+  for (const AdamColumn<T>& column : args.columns) {
+    for (T* start : {column.param, column.exp_avg, column.exp_avg_sq}) {
+      for (std::int64_t j = 0; j < column.width; j += kLine)
+        __builtin_prefetch(start + row * column.width + j, 1);
+    }
+  }
+}
+
+// Among rows with pending steps few different values of last_step occur, so each thread computes the rules
+// once for many rows.
+template <class T>
+class PendingStepsCache {
+ public:
+  const PendingSteps<T>& get(const AdamArgs<T>& args, std::int32_t from, std::int32_t to) {
+    if (args.final_rules && to - from >= args.explicit_steps) return args.final_rules[from];
+    PendingSteps<T>& steps = cached_[from % kSlots];
+    if (!used_[from % kSlots] || steps.from != from) {
+      steps = pending_steps(args, from, to);
+      used_[from % kSlots] = true;
+    }
+    return steps;
+  }
+
+ private:
+  static constexpr int kSlots = 64;
+  PendingSteps<T> cached_[kSlots];
+  bool used_[kSlots] = {};
+};
+
+}  // namespace
+
+template <class T>
+void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream) {
+  const bool with_gradient = args.with_gradient();
+  const AdamStep<T> step = adam_step_scalars(args);
+  const AdamRowUpdate<T> update = row_update<T>();
+  const std::int32_t target = args.target();
+  parallel_for(0, args.n, 512, [&](std::int64_t begin, std::int64_t end) {
+    PendingStepsCache<T> pending;
+    for (std::int64_t i = begin; i < end; ++i) {
+      const std::int64_t row = args.ids ? args.ids[i] : i;
+      if (args.ids) prefetch_row(args, args.ids[std::min(i + kPrefetchDistance, end - 1)]);
+      const AdamRow<T> state = adam_row(args, row);
+      if (!with_gradient && state.from >= target) continue;
+      const PendingSteps<T>* steps = state.moves ? &pending.get(args, state.from, target) : nullptr;
+      if (with_gradient || steps) update({args, step, state, steps, adam_explicit_drift<T>, row, i});
+      args.last_step[row] = args.step;
+      if (with_gradient) args.moment_step[row] = args.step;
+    }
+  });
+}
+
+template <class T>
+void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream) {
+  parallel_for(0, n, 1024, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t from = begin; from < end; ++from) {
+      rules[from] = final_pending_steps(args, static_cast<std::int32_t>(from));
+    }
+  });
+}
+
+template void final_rules<float>(const AdamArgs<float>&, std::int64_t, PendingSteps<float>*, CudaStream);
+template void final_rules<double>(const AdamArgs<double>&, std::int64_t, PendingSteps<double>*, CudaStream);
+template void lazy_adam<float>(const AdamArgs<float>&, Workspace&, CudaStream);
+template void lazy_adam<double>(const AdamArgs<double>&, Workspace&, CudaStream);
+
+}  // namespace blitzgs::cpu

@@ -1,0 +1,57 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "adam/lazy_adam_op.h"
+
+namespace blitzgs {
+namespace {
+
+void lazy_adam_step(const std::vector<Tensor>& state, const std::vector<Tensor>& tables,
+                    const std::vector<std::int64_t>& steps, const std::vector<double>& decays,
+                    const std::vector<Tensor>& grads, const Tensor& ids) {
+  AdamTensors("lazy_adam_step_", state, tables, steps, decays).step_rows(grads, ids);
+}
+
+void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<Tensor>& tables,
+                        const std::vector<std::int64_t>& steps, const std::vector<double>& decays,
+                        const std::optional<Tensor>& ids, const std::optional<Tensor>& count) {
+  constexpr const char* kOp = "lazy_adam_catch_up_";
+  AdamTensors state(kOp, state_in, tables, steps, decays);
+  const std::optional<Tensor> list = checked(kOp, "ids", ids, ScalarType::Int, {-1});
+  const std::int64_t n = max_listed(kOp, count, list ? list->size(0) : state.rows());
+  DeviceScope scope(state.like());
+  dispatch_floating(state.like(), [&](auto zero) {
+    auto args = state.arguments<decltype(zero)>(data_or_null<std::int32_t>(list), n);
+    args.count = data_or_null<std::int32_t>(count);
+    if (n > 0) backend::lazy_adam(args, scope.workspace, scope.stream);
+  });
+}
+
+Tensor lazy_adam_final_rules(const Tensor& table, const Tensor& like, std::int64_t explicit_steps,
+                             double eps) {
+  constexpr const char* kOp = "lazy_adam_final_rules";
+  const Tensor contiguous = checked(kOp, "table", table, ScalarType::Double, {-1, kAdamTable});
+  check_floating(kOp, "like", like);
+  STD_TORCH_CHECK(explicit_steps >= 1, "blitzgs::", kOp, ": explicit_steps must be 1 or more, got ",
+                  explicit_steps);
+  const std::int64_t n = final_rules_of(table.size(0), explicit_steps);
+  std::optional<Tensor> rules;
+  DeviceScope scope(contiguous);
+  dispatch_floating(like, [&](auto zero) {
+    using T = decltype(zero);
+    AdamArgs<T> args{};
+    args.table = data<double>(contiguous);
+    args.explicit_steps = static_cast<std::int32_t>(explicit_steps);
+    args.eps = eps;
+    rules = make_empty(contiguous, {n, static_cast<std::int64_t>(sizeof(PendingSteps<T>))}, ScalarType::Byte);
+    backend::final_rules(args, n, static_cast<PendingSteps<T>*>(rules->mutable_data_ptr()), scope.stream);
+  });
+  return *rules;
+}
+
+}  // namespace
+}  // namespace blitzgs
+
+BLITZGS_REGISTER(m) {
+  m.impl("lazy_adam_step_", TORCH_BOX(&blitzgs::lazy_adam_step));
+  m.impl("lazy_adam_final_rules", TORCH_BOX(&blitzgs::lazy_adam_final_rules));
+  m.impl("lazy_adam_catch_up_", TORCH_BOX(&blitzgs::lazy_adam_catch_up));
+}

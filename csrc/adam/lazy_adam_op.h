@@ -1,0 +1,155 @@
+// SPDX-License-Identifier: Apache-2.0
+// The checked tensors of the optimiser's state and schedule, for all ops that move parameters.
+#pragma once
+#include <optional>
+#include <utility>
+#include <vector>
+
+#include "adam/lazy_adam.h"
+#include "common/op.h"
+
+namespace blitzgs {
+
+inline constexpr const char* kAdamNames[kAdamColumns] = {"means", "quats", "scales", "opacities", "sh"};
+
+// The number of tensors in a state: parameters, first and second moments of each column; last_step,
+// moment_step.
+inline constexpr std::size_t kAdamState = 3 * kAdamColumns + 2;
+
+// The optimiser's state of a table of Gaussians and its schedule. state: (params, exp_avgs, exp_avg_sqs,
+// last_step, moment_step), of which each of the first three is (means, quats, scales, opacities, sh); tables:
+// (table of lazy_adam.h, lr_table[, final_rules]); steps: (step, explicit_steps, sparse); decays: (beta1,
+// beta2, eps). blitzgs/ops/lazy_adam.py builds these groups.
+struct AdamTensors {
+  const char* op;
+  std::vector<Tensor> params, exp_avgs, exp_avg_sqs;
+  Tensor last_step, moment_step, table, lr_table;
+  std::optional<Tensor> final_rules;
+  std::int64_t step = 0, explicit_steps = 0;
+  double beta1 = 0, beta2 = 0, eps = 0;
+  bool sparse = false;
+
+  AdamTensors(const char* op_name, const std::vector<Tensor>& state, const std::vector<Tensor>& tables,
+              const std::vector<std::int64_t>& steps, const std::vector<double>& decays)
+      : op(op_name) {
+    STD_TORCH_CHECK(state.size() == kAdamState && (tables.size() == 2 || tables.size() == 3) &&
+                        steps.size() == 3 && decays.size() == 3,
+                    "blitzgs::", op, ": expected state (params, exp_avgs and exp_avg_sqs of means, quats, ",
+                    "scales, opacities and sh, last_step, moment_step), tables (table, ",
+                    "lr_table[, final_rules]), steps (step, explicit_steps, sparse) and decays (beta1, ",
+                    "beta2, eps); got ", state.size(), ", ", tables.size(), ", ", steps.size(), " and ",
+                    decays.size(), " entries");
+    auto next = state.begin();
+    for (std::vector<Tensor>* columns : {&params, &exp_avgs, &exp_avg_sqs}) {
+      columns->assign(next, next + kAdamColumns);
+      next += kAdamColumns;
+    }
+    last_step = *next++;
+    moment_step = *next;
+    table = tables[0];
+    lr_table = tables[1];
+    if (tables.size() == 3) final_rules = tables[2];
+    step = steps[0];
+    explicit_steps = steps[1];
+    sparse = steps[2] != 0;
+    beta1 = decays[0];
+    beta2 = decays[1];
+    eps = decays[2];
+    check();
+  }
+
+  const Tensor& like() const { return params[0]; }
+  std::int64_t rows() const { return like().size(0); }
+
+  // The kernel's arguments for the n rows `ids`, or for all rows if ids is null. Gradients are null; the
+  // caller sets them.
+  template <class T>
+  AdamArgs<T> arguments(const std::int32_t* ids, std::int64_t n) {
+    AdamArgs<T> args{};
+    for (int c = 0; c < kAdamColumns; ++c) {
+      args.columns[c] = {mutable_data<T>(params[c]), mutable_data<T>(exp_avgs[c]),
+                         mutable_data<T>(exp_avg_sqs[c]), nullptr, width(c)};
+    }
+    args.ids = ids;
+    args.n = n;
+    args.last_step = mutable_data<std::int32_t>(last_step);
+    args.moment_step = mutable_data<std::int32_t>(moment_step);
+    args.table = data<double>(table);
+    args.lr_table = data<float>(lr_table);
+    if (final_rules) {
+      check_in_place(op, "final_rules", *final_rules, ScalarType::Byte,
+                     {final_rules_of(table.size(0), explicit_steps),
+                      static_cast<std::int64_t>(sizeof(PendingSteps<T>))});
+      args.final_rules = static_cast<const PendingSteps<T>*>(final_rules->const_data_ptr());
+    }
+    args.step = static_cast<std::int32_t>(step);
+    args.explicit_steps = static_cast<std::int32_t>(explicit_steps);
+    args.beta1 = beta1;
+    args.beta2 = beta2;
+    args.eps = eps;
+    args.sparse = sparse;
+    return args;
+  }
+
+  // Takes the step for the rows `ids`, int32 [A], from a gradient [A, ...] for each column; those of empty
+  // columns are not read. current: the parameters of the rows stand at step - 1.
+  void step_rows(const std::vector<Tensor>& grads, const Tensor& ids, bool current = false) {
+    STD_TORCH_CHECK(grads.size() == kAdamColumns, "blitzgs::", op,
+                    ": grads must hold means, quats, scales, opacities, sh; got ", grads.size(), " tensors");
+    STD_TORCH_CHECK(step >= 1, "blitzgs::", op, ": steps count from 1, got ", step);
+    const Tensor list = checked(op, "ids", ids, ScalarType::Int, {-1});
+    const std::int64_t n = list.size(0);
+    std::vector<Tensor> held;
+    for (int c = 0; c < kAdamColumns; ++c) {
+      const Tensor& grad = held.emplace_back(as_contiguous(grads[c]));
+      if (width(c) == 0) continue;
+      check_dtype(op, "grads", grad, like().scalar_type());
+      STD_TORCH_CHECK(grad.dim() >= 1 && grad.size(0) == n && grad.numel() == n * width(c), "blitzgs::", op,
+                      ": the gradient of ", kAdamNames[c], " must have ", n, " rows of ", width(c),
+                      " values, got ", shape_of(grad));
+    }
+    DeviceScope scope(like());
+    dispatch_floating(like(), [&](auto zero) {
+      using T = decltype(zero);
+      AdamArgs<T> args = arguments<T>(data<std::int32_t>(list), n);
+      for (int c = 0; c < kAdamColumns; ++c) args.columns[c].grad = data<T>(held[c]);
+      args.current = current;
+      if (n > 0) backend::lazy_adam(args, scope.workspace, scope.stream);
+    });
+  }
+
+  std::int64_t width(int column) const { return rows() ? params[column].numel() / rows() : 0; }
+
+ private:
+  void check() const {
+    check_floating(op, "means", like());
+    for (int c = 0; c < kAdamColumns; ++c) {
+      for (const Tensor* tensor : {&params[c], &exp_avgs[c], &exp_avg_sqs[c]}) check_column(*tensor, c);
+    }
+    // A single parameter, of any width, is stepped as SH: the other columns are then empty.
+    const bool alone = params[0].numel() == 0;
+    for (const auto& [c, values] : {std::pair{0, 3}, std::pair{1, 4}, std::pair{2, 3}, std::pair{3, 1}}) {
+      STD_TORCH_CHECK(params[c].numel() == (alone ? 0 : values * rows()), "blitzgs::", op, ": ",
+                      kAdamNames[c], " must have ", alone ? 0 : values, " values in each of ", rows(),
+                      " rows, got ", shape_of(params[c]));
+    }
+    check_in_place(op, "last_step", last_step, ScalarType::Int, {rows()});
+    check_in_place(op, "moment_step", moment_step, ScalarType::Int, {rows()});
+    check_in_place(op, "table", table, ScalarType::Double, {-1, kAdamTable});
+    check_in_place(op, "lr_table", lr_table, ScalarType::Float, {table.size(0), kAdamGroups});
+    STD_TORCH_CHECK(step >= 0 && step < table.size(0), "blitzgs::", op, ": step ", step,
+                    " is outside the learning-rate table, which ends at step ", table.size(0) - 1);
+  }
+
+  void check_column(const Tensor& tensor, int column) const {
+    const char* name = kAdamNames[column];
+    check_dtype(op, name, tensor, like().scalar_type());
+    check_contiguous(op, name, tensor);
+    STD_TORCH_CHECK(tensor.dim() >= 1 && tensor.size(0) == rows(), "blitzgs::", op, ": ", name, " must have ",
+                    rows(), " rows, got ", shape_of(tensor));
+    STD_TORCH_CHECK(tensor.numel() == params[column].numel(), "blitzgs::", op, ": the moments of ", name,
+                    " must have its shape ", shape_of(params[column]));
+  }
+};
+
+}  // namespace blitzgs

@@ -1,0 +1,104 @@
+// SPDX-License-Identifier: Apache-2.0
+// The exchange of splats between ranks (BlitzGS, section 3.1; Grendel-GS, Zhao et al. 2024): packing and
+// unpacking. Bit m of masks[p] sends splat p to rank m; the splats for one rank are a group. All data are
+// 32-bit words: a column with w words per splat is int32 [P, w].
+//
+//   scatter: columns, masks -> one group per rank, in which each column is contiguous; and places [runs, M]:
+//            the positions in each group of the splats of each run of kPlaceSplats splats. The splats of a
+//            block of kScatterBlock splats keep their order in a group, but blocks may come in any order. The
+//            places are all that the sender needs to find its splats' gradients again.
+//   gather:  the groups that arrived, one after the other -> columns.
+//   sum:     values [S, F], groups in the layout of `scatter` one after the other -> columns [P, w], the sum
+//            over the groups of each splat in the order of ranks, starting from zero: deterministic.
+//
+// The cost is O(words moved). Splats beyond the given size of a group are dropped, whatever the masks say.
+#pragma once
+#include <cstdint>
+
+#include "common/kernel.h"
+#include "exchange/places.h"
+
+namespace blitzgs {
+
+constexpr int kScatterBlock = 256;
+constexpr int kMaxSplatColumns = 8;
+
+inline std::int64_t scatter_blocks(std::int64_t splats) {
+  return (splats + kScatterBlock - 1) / kScatterBlock;
+}
+
+// bits != 0.
+BLITZGS_HD int lowest_bit(std::uint64_t bits) {
+#ifdef __CUDA_ARCH__
+  return __ffsll(static_cast<long long>(bits)) - 1;
+#else
+  return __builtin_ctzll(bits);
+#endif
+}
+
+// The columns of some splats. begin: the offset of each column in a splat, in words; the last entry is the
+// number of words in a splat.
+template <class Word>
+struct SplatColumns {
+  Word* data[kMaxSplatColumns];
+  int begin[kMaxSplatColumns + 1];
+  int count;
+};
+
+// The number of splats in each of M groups, and the number of splats in the groups before it.
+struct SplatGroups {
+  std::int64_t size[kMaxRanks], start[kMaxRanks];
+  int count;
+};
+
+// The address of each column of each rank's group.
+struct ScatterTargets {
+  std::int32_t* words[kMaxRanks][kMaxSplatColumns];
+};
+
+// The splats to scatter.
+struct ScatterSplats {
+  SplatColumns<const std::int32_t> columns;
+  const std::int64_t* masks;
+  std::int64_t count;
+};
+
+// Values of splats, `width` per splat, that came back from each rank that a splat went to.
+template <class T>
+struct SplatValues {
+  const T* values;
+  int width;
+  std::int64_t count;
+  const SplatPlace* places;
+  SplatGroups groups;
+
+  // Calls f(pointer to the splat's values from a rank) for each rank that the splat went to, in order.
+  template <class F>
+  BLITZGS_HD void for_each(std::uint64_t splat, const F& f) const {
+    const SplatPlace* run = places + splat / kPlaceSplats * groups.count;
+    const auto in_run = static_cast<std::uint32_t>(splat % kPlaceSplats);
+    std::uint64_t ranks = 0;
+#ifdef __CUDA_ARCH__
+#pragma unroll 4  // four loads at a time; the compiler would choose 16
+#endif
+    for (int m = 0; m < groups.count; ++m) ranks |= std::uint64_t{run[m].has(in_run)} << m;
+    // Most splats went to a single rank. With this loop the threads of a warp load their first values
+    // together.
+    for (; ranks != 0; ranks &= ranks - 1) {
+      const int m = lowest_bit(ranks);
+      const std::int64_t at = run[m].of(in_run);
+      if (at < groups.size[m]) f(values + (groups.start[m] + at) * width);
+    }
+  }
+};
+
+namespace BLITZGS_BACKEND {
+void scatter(const ScatterSplats&, const SplatGroups&, const ScatterTargets&, SplatPlace* places, Workspace&,
+             CudaStream);
+void gather(const std::int32_t* packed, const SplatGroups&, const SplatColumns<std::int32_t>&, Workspace&,
+            CudaStream);
+template <class T>
+void sum(const SplatValues<T>&, const SplatColumns<T>&, Workspace&, CudaStream);
+}  // namespace BLITZGS_BACKEND
+
+}  // namespace blitzgs

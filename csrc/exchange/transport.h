@@ -1,0 +1,62 @@
+// SPDX-License-Identifier: Apache-2.0
+// The exchange of splats between ranks that can access each other's memory (CUDA only). All ranks have
+// buffers of the same shape; buffers[m] is the memory of rank m, mapped into this process.
+//
+// send_splats_ writes each splat to the buffers of the ranks in its rank mask. In each buffer the splats of
+// this rank follow those of the ranks before it, and column c begins at word
+// capacity * kSentColumns.begin[c]. If any rank has, sends or receives more than `capacity` splats, no rank
+// writes any. All ranks decide this alike, because they have the same totals.
+//
+// The gradients need no op for their way back: in the projection's backward pass the owner of the splats
+// reads them from the tables of the ranks that composited the splats (RankSplatGradients, project/project.h).
+//
+// device_barrier_ is a barrier in stream order: all work that any rank queued before its barrier is done, and
+// its writes are visible, before work that any rank queues after its barrier runs. Each rank also sends its
+// `values` to all others. control[m], int64: [M], the number of the last barrier that each rank reached; from
+// word `first` on [M, n], the values of each rank, then [n], their sums. host [M, n], in pinned memory,
+// receives the values for the host. A rank that waits for longer than timeout_seconds aborts its kernels, so
+// that its process gets an error.
+#pragma once
+#include "common/kernel.h"
+#include "exchange/scatter.h"
+#include "project/project.h"
+
+namespace blitzgs {
+
+// The control words of all ranks, mapped into this process; `rank` is this rank.
+struct ControlWords {
+  std::int64_t* of[kMaxPeers];
+  int count, rank;
+};
+
+// The columns of a splat that other ranks need, with their offsets in words: means2d, conics, opacities,
+// colors, depths, camera_ids and the Gaussian's persistent id.
+inline constexpr SplatColumns<const std::int32_t> kSentColumns{{}, {0, 2, 5, 6, 9, 10, 11, 13}, 7};
+
+// The numbers of splats that this rank sends and receives, in device memory.
+struct SendPlan {
+  std::int64_t received;  // splats that this rank receives; first, so that ops can read it as a number
+  std::int64_t splats;    // splats of this rank
+  SplatGroups groups;     // the splats for each rank, and the position of the first of them in its buffer
+  std::int64_t filled[kMaxRanks];  // the number of positions for each rank that warps have taken
+};
+
+// everyone: project_totals of each rank, in device memory. targets: the addresses of the columns in each
+// rank's buffer. plan and places are outputs.
+struct SendArguments {
+  ScatterSplats splats;  // the columns of kSentColumns; count is the capacity
+  SendPlan* plan;
+  SplatPlace* places;
+  const std::int64_t* everyone;
+  int n_views, n_ranks, rank;
+  ScatterTargets targets;
+};
+
+namespace cuda {
+// host: null, or pinned memory.
+void device_barrier(const ControlWords&, std::int64_t number, const std::int64_t* values, int n_values,
+                    std::int64_t first, double timeout_seconds, std::int64_t* host, Workspace&, CudaStream);
+void send_splats(const SendArguments&, CudaStream);
+}  // namespace cuda
+
+}  // namespace blitzgs

@@ -1,0 +1,68 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <type_traits>
+
+#include "common/cpu_features.h"
+#include "common/parallel.h"
+#include "loss/photometric_strip.h"
+
+namespace blitzgs::cpu {
+
+// photometric_avx2.cpp
+void photometric_strips_avx2(const PhotometricArgs<float>& args, const std::int64_t* strips,
+                             std::int64_t begin, std::int64_t end, double* sums);
+
+namespace {
+
+template <class T>
+void run_strips(const PhotometricArgs<T>& args, const std::int64_t* strips, std::int64_t begin,
+                std::int64_t end, double* sums) {
+  if constexpr (std::is_same_v<T, float>) {
+    if (use_avx2()) return photometric_strips_avx2(args, strips, begin, end, sums);
+  }
+  run_photometric_strips(args, strips, begin, end, sums);
+}
+
+}  // namespace
+
+template <class T>
+std::int64_t photometric_parts(const PhotometricArgs<T>& args) {
+  return (args.height + kStripRows - 1) / kStripRows;
+}
+
+template <class T>
+void photometric(const PhotometricArgs<T>& args, Workspace& workspace, CudaStream) {
+  const std::int64_t per_view = photometric_parts(args);
+  const std::int64_t total = args.views * per_view;
+  const std::int64_t view_tiles = std::int64_t{args.tiles_x} * args.tiles_y;
+  std::int64_t* strips = workspace.allocate<std::int64_t>(total);
+  double* sums = args.parts ? args.parts : workspace.allocate<double>(2 * total);
+  std::fill_n(sums, 2 * total, 0.0);
+  std::int64_t count = 0;
+  for (std::int64_t strip = 0; strip < total; ++strip) {
+    const std::int64_t first = strip / per_view * view_tiles;
+    const int begin = static_cast<int>(strip % per_view) * kStripRows;
+    const int end = std::min(args.height, begin + kStripRows);
+    const bool owned =
+        first + begin / args.tile_size * std::int64_t{args.tiles_x} < args.tile_end &&
+        first + ((end - 1) / args.tile_size + 1) * std::int64_t{args.tiles_x} > args.tile_begin;
+    if (owned) {
+      strips[count++] = strip;
+    } else if (args.v_renders && args.clear_rest) {
+      const std::int64_t row = 3 * std::int64_t{args.width};
+      T* rows = args.v_renders + (strip / per_view * args.height + begin) * row;
+      std::fill_n(rows, (end - begin) * row, T(0));
+    }
+  }
+  parallel_for(0, count, 1,
+               [&](std::int64_t begin, std::int64_t end) { run_strips(args, strips, begin, end, sums); });
+  if (!args.means.visible) return;
+  for (std::int64_t view = 0; view < args.views; ++view) write_mean_terms(args.means, args.views, view);
+}
+
+template std::int64_t photometric_parts<float>(const PhotometricArgs<float>&);
+template std::int64_t photometric_parts<double>(const PhotometricArgs<double>&);
+template void photometric<float>(const PhotometricArgs<float>&, Workspace&, CudaStream);
+template void photometric<double>(const PhotometricArgs<double>&, Workspace&, CudaStream);
+
+}  // namespace blitzgs::cpu

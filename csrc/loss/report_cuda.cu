@@ -1,0 +1,47 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "common/cuda.cuh"
+#include "loss/report.h"
+
+namespace blitzgs::cuda {
+
+namespace {
+
+constexpr int kReportThreads = 256;
+
+// Writes the report (report.h). Each of the first B blocks sums the parts of a view; in the others a thread
+// copies the cost of a tile.
+__global__ void __launch_bounds__(kReportThreads)
+    report_kernel(const __grid_constant__ Report<float> report) {
+  const std::int64_t view = blockIdx.x;
+  if (view >= report.views) {
+    const std::int64_t tile = report.tile_begin + (view - report.views) * kReportThreads + threadIdx.x;
+    if (tile >= report.tile_end) return;
+    const auto work = static_cast<float>(report.tile_work[tile]);
+    for (int m = 0; m < report.n_targets; ++m) report.targets[m].tiles[tile] = work;
+    return;
+  }
+  const double* parts = report.parts + 2 * view * report.n_parts;
+  double l1 = 0, ssim = 0;
+  for (std::int64_t i = threadIdx.x; i < report.n_parts; i += kReportThreads) {
+    l1 += parts[2 * i], ssim += parts[2 * i + 1];
+  }
+  l1 = block_sum<kReportThreads>(l1), ssim = block_sum<kReportThreads>(ssim);
+  if (threadIdx.x > 0) return;
+  for (int m = 0; m < report.n_targets; ++m) {
+    report.targets[m].l1[view] = static_cast<float>(l1);
+    report.targets[m].ssim[view] = static_cast<float>(ssim);
+  }
+}
+
+}  // namespace
+
+template <>
+void report<float>(const Report<float>& report, Workspace&, CudaStream stream) {
+  const auto blocks =
+      static_cast<unsigned>(report.views) + blocks_for(report.tile_end - report.tile_begin, kReportThreads);
+  if (blocks == 0) return;
+  report_kernel<<<blocks, kReportThreads, 0, stream>>>(report);
+  check_launch("report");
+}
+
+}  // namespace blitzgs::cuda

@@ -1,0 +1,43 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "common/cuda.cuh"
+#include "render/gather_rows.h"
+
+namespace blitzgs::cuda {
+
+namespace {
+
+constexpr int kThreads = 256;
+
+// The rows of one column (gather_rows.h), blockIdx.y. A block copies kThreads rows, a thread one word at a
+// time, so that neighbouring threads read neighbouring words.
+__global__ void __launch_bounds__(kThreads) gather_rows_kernel(const __grid_constant__ GatherRows gather) {
+  __shared__ std::int64_t rows[kThreads];
+  const GatheredColumn& column = gather.columns[blockIdx.y];
+  const std::int64_t first = blockIdx.x * std::int64_t{kThreads};
+  const std::int64_t left = valid_splat_count(gather.n, gather.known) - first;
+  if (left <= 0) return;
+  const auto n = static_cast<std::uint32_t>(left < kThreads ? left : kThreads);
+  if (threadIdx.x < n) {
+    const std::int64_t i = first + threadIdx.x;
+    rows[threadIdx.x] = gather.ids ? gather.ids[i] : i;
+  }
+  __syncthreads();
+  const std::uint32_t width = column.width;
+  std::uint32_t* to = column.to + first * column.stride;
+#pragma unroll 4
+  for (std::uint32_t i = threadIdx.x; i < n * width; i += kThreads) {
+    const std::uint32_t place = i / width, k = i - place * width;
+    to[place * column.stride + k] = column.from[rows[place] * column.from_stride + k];
+  }
+}
+
+}  // namespace
+
+void gather_rows(const GatherRows& gather, Workspace&, CudaStream stream) {
+  if (gather.n == 0 || gather.n_columns == 0) return;
+  const dim3 blocks(blocks_for(gather.n, kThreads), static_cast<unsigned>(gather.n_columns));
+  gather_rows_kernel<<<blocks, kThreads, 0, stream>>>(gather);
+  check_launch("gather_rows");
+}
+
+}  // namespace blitzgs::cuda

@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs.rasterization` under autograd, checkpointing and torch.compile."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+import torch.utils.checkpoint
+
+from blitzgs.call.arguments import _warn_of_intrinsics
+from blitzgs.ops.photometric import photometric_loss
+from blitzgs.reference.gaussians import covariance_factors
+from tests.call.test_raw_rasterization import raw, raw_parameters
+from tests.helpers import DEVICES, PARAMETERS, random_scene, rasterize_scene, relative_error
+
+
+def render_raw(scene):
+    return raw(raw_parameters(scene), scene)
+
+
+def second_derivative_of_a_gradient(scene):
+    image, _, _ = rasterize_scene(scene)
+    (gradient,) = torch.autograd.grad(image.square().sum(), scene.means, create_graph=True)
+    gradient.sum().backward()
+
+
+def second_derivative_of_a_linear_loss(scene):
+    image, alphas, _ = rasterize_scene(scene)
+    (gradient,) = torch.autograd.grad(image.sum() + alphas.sum(), scene.colors, create_graph=True)
+    torch.autograd.grad(gradient.sum(), scene.means)
+
+
+def second_derivative_through_arranged_splats(scene):
+    image, _, meta = rasterize_scene(scene, packed=False)
+    (gradient,) = torch.autograd.grad(image.square().sum(), meta["means2d"], create_graph=True)
+    gradient.sum().backward()
+
+
+def hessian(scene):
+    def loss(means):
+        return rasterize_scene(replace(scene, means=means))[0].sum()
+
+    torch.autograd.functional.hessian(loss, scene.means.detach())
+
+
+def second_derivative_of_the_loss_function(scene):
+    image = torch.rand(1, 20, 20, 3, device=scene.means.device, requires_grad=True)
+    loss = photometric_loss(image, torch.zeros_like(image))
+    (gradient,) = torch.autograd.grad(loss.sum(), image, create_graph=True)
+    gradient.sum().backward()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(
+    "differentiate_twice",
+    [
+        second_derivative_of_a_gradient,
+        second_derivative_of_a_linear_loss,
+        second_derivative_through_arranged_splats,
+        hessian,
+        second_derivative_of_the_loss_function,
+    ],
+)
+def test_a_second_derivative_is_refused(device, differentiate_twice):
+    scene = random_scene(n=6, width=8, height=8, device=device).leaves()
+    for _ in range(2):  # on CUDA the second call is queued
+        with pytest.raises(RuntimeError, match="has first derivatives only"):
+            differentiate_twice(scene)
+
+
+@pytest.mark.parametrize("transform", [torch.func.grad, torch.func.jacrev, torch.func.jacfwd, torch.vmap])
+def test_transforms_of_torch_func_are_refused(transform):
+    scene = random_scene(n=6, width=8, height=8)
+
+    def loss(means):
+        return rasterize_scene(replace(scene, means=means))[0].sum()
+
+    means = scene.means[None] if transform is torch.vmap else scene.means
+    with pytest.raises(RuntimeError, match=r"blitzgs does not support the transforms of torch\.func"):
+        transform(loss)(means)
+
+
+def test_a_gradient_with_a_graph_may_be_used_as_a_value():
+    scene = random_scene(n=20).leaves()
+    expected, created = (
+        torch.autograd.grad(rasterize_scene(scene)[0].square().sum(), scene.means, create_graph=graph)[0]
+        for graph in (False, True)
+    )
+    assert torch.equal(created, expected)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(
+    "options", [{}, {"packed": False}, *({"render_mode": mode} for mode in ("RGB+ED", "ED", "D"))], ids=str
+)
+def test_images_may_be_changed_in_place(device, options):
+    """As gsplat's trainer does with the pixels outside of a mask."""
+    scene = random_scene(n=40, device=device)
+    mask = torch.rand(2, 32, 40, generator=torch.Generator().manual_seed(0)).to(device) > 0.3
+    gradients = []
+    for in_place in (True, False):
+        leaves = scene.leaves()
+        renders, alphas, _ = rasterize_scene(leaves, **options)
+        if in_place:
+            renders[~mask] = 0
+            alphas.mul_(mask[..., None])
+        else:
+            renders, alphas = renders * mask[..., None], alphas * mask[..., None]
+        (renders.square().sum() + alphas.square().sum()).backward()
+        gradients.append([getattr(leaves, name).grad for name in PARAMETERS])
+    for name, actual, expected in zip(PARAMETERS, *gradients, strict=True):
+        assert (actual is None) == (expected is None)
+        assert actual is None or relative_error(actual, expected) < 1e-5, name
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("options", [{}, {"packed": False}, {"render_mode": "ED"}], ids=str)
+@pytest.mark.parametrize("with_sh", [True, False])
+def test_sparse_gradients_are_the_dense_ones(device, options, with_sh):
+    scene = random_scene(n=80, width=20, height=16, device=device)
+    scene.means[::2] *= 8.0  # some are seen by no view
+    if not with_sh:
+        scene.sh_degree, scene.colors = None, scene.colors[:, 0]
+    dense, sparse = scene.leaves(), scene.leaves()
+    for leaves, flag in ((dense, False), (sparse, True)):
+        rasterize_scene(leaves, sparse_grad=flag, **options)[0].square().sum().backward()
+    sparse_names = ["means", "quats", "scales"]
+    if with_sh and "render_mode" not in options:
+        sparse_names += ["opacities", "colors"]
+    for name in PARAMETERS:
+        expected, actual = getattr(dense, name).grad, getattr(sparse, name).grad
+        assert (actual is None) == (expected is None)
+        if actual is None:
+            continue
+        assert actual.is_sparse == (name in sparse_names), name
+        if actual.is_sparse:
+            assert actual.coalesce().values().shape[0] < 80
+            actual = actual.to_dense()
+        assert relative_error(actual, expected) < 1e-6, name
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_sparse_gradients_pass_what_was_made_of_opacities_and_colours(device):
+    """A sparse gradient can go neither through a sigmoid nor through a concatenation."""
+    scene = random_scene(n=30, device=device)
+    names = ("means", "quats", "scales")
+    results = []
+    for sparse in (False, True):
+        leaves = scene.leaves()
+        logits = scene.opacities.logit().requires_grad_()
+        dc, rest = (part.detach().clone().requires_grad_() for part in scene.colors.split([1, 15], dim=1))
+        called = replace(leaves, opacities=logits.sigmoid(), colors=torch.cat([dc, rest], 1))
+        rasterize_scene(called, sparse_grad=sparse)[0].square().sum().backward()
+        inputs = [*(getattr(leaves, name) for name in names), logits, dc, rest]
+        assert [x.grad.is_sparse for x in inputs] == [sparse] * 3 + [False] * 3
+        results.append([x.grad.to_dense() for x in inputs])
+    for actual, expected in zip(*results, strict=True):
+        assert relative_error(actual, expected) < 1e-5
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", [*PARAMETERS, "Ks"])
+def test_an_argument_may_have_the_negative_bit(device, name):
+    """Torch negates such a tensor, as the imaginary part of a conjugate, only when it is read."""
+    results = []
+    for with_bit in (False, True):
+        leaves = random_scene(n=30, device=device).leaves()
+        called = leaves
+        if with_bit:
+            called = replace(leaves, **{name: torch._neg_view(-getattr(leaves, name))})
+        rasterize_scene(called)[0].square().sum().backward()
+        results.append([getattr(leaves, parameter).grad for parameter in PARAMETERS])
+    for parameter, expected, actual in zip(PARAMETERS, *results, strict=True):
+        assert relative_error(actual, expected) < 1e-5, parameter
+
+
+@pytest.mark.parametrize("render", [rasterize_scene, render_raw], ids=["rasterization", "raw_rasterization"])
+def test_intrinsics_that_require_a_gradient_are_named_once(render, recwarn):
+    _warn_of_intrinsics.cache_clear()
+    scene = random_scene(n=20)
+    for tensor in (scene.means, scene.Ks):
+        tensor.requires_grad_()
+    with torch.no_grad():
+        render(scene)
+    assert not recwarn.list
+    with pytest.warns(RuntimeWarning, match="Ks requires a gradient and gets none, as in gsplat") as found:
+        render(scene)[0].sum().backward()
+    assert found[0].filename.endswith(("helpers.py", "test_raw_rasterization.py")) and scene.Ks.grad is None
+    render(scene)
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_autocast_changes_nothing(device):
+    scene = random_scene(n=40, device=device)
+    results = []
+    for enabled in (False, True):
+        leaves = scene.leaves()
+        backgrounds = torch.full((2, 3), 0.5, device=device, requires_grad=True)
+        with torch.autocast(device, dtype=torch.bfloat16, enabled=enabled):
+            renders, _, _ = rasterize_scene(leaves, backgrounds=backgrounds)
+            renders.square().sum().backward()
+        results.append([renders.detach(), backgrounds.grad, *(getattr(leaves, n).grad for n in PARAMETERS)])
+    for expected, actual in zip(*results, strict=True):
+        assert relative_error(actual, expected) < 1e-5
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("options", [{}, {"packed": False}, {"render_mode": "RGB+ED"}], ids=str)
+def test_checkpointing_recomputes_the_call(device, options):
+    scene = random_scene(n=60, device=device)
+    results = []
+    for call in (lambda f, *a: f(*a), partial(torch.utils.checkpoint.checkpoint, use_reentrant=False)):
+        for _ in range(3):  # on CUDA the capacity is estimated from earlier calls
+            leaves = scene.leaves()
+            inputs = [getattr(leaves, name) for name in PARAMETERS]
+
+            def image(*values):
+                changed = replace(scene, **dict(zip(PARAMETERS, values, strict=True)))
+                return rasterize_scene(changed, **options)[0]
+
+            call(image, *inputs).square().sum().backward()
+        results.append([x.grad for x in inputs])
+    for name, actual, expected in zip(PARAMETERS, *results, strict=True):
+        assert relative_error(actual, expected) < 1e-5, name
+
+
+COMPILED = [{}, {"packed": False}, {"render_mode": "RGB+ED"}, {"rasterize_mode": "antialiased"}]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("options", COMPILED, ids=str)
+def test_one_graph_is_compiled_of_a_call(device, options):
+    torch._dynamo.reset()
+    scene = random_scene(n=40, device=device)
+
+    def call(scene):
+        renders, alphas, meta = rasterize_scene(scene, **options)
+        return renders, alphas, meta["means2d"], meta["radii"], meta["flatten_ids"]
+
+    def gradients(leaves, renders, alphas):
+        loss = renders.square().sum() + alphas.sum()
+        return torch.autograd.grad(loss, [getattr(leaves, name) for name in PARAMETERS])
+
+    leaves = scene.leaves()
+    eager = call(leaves)
+    compiled = torch.compile(call, fullgraph=True, backend="aot_eager")(leaves)
+    for actual, expected in zip(compiled, eager, strict=True):
+        assert torch.equal(actual, expected)
+    renders = compiled[0]
+    renders[:, :4] = 0  # may be changed in place here too
+    eager[0][:, :4] = 0
+    pairs = zip(gradients(leaves, *compiled[:2]), gradients(leaves, *eager[:2]), strict=True)
+    for name, (actual, expected) in zip(PARAMETERS, pairs, strict=True):
+        assert relative_error(actual, expected) < 1e-5, name
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_a_graph_takes_other_numbers_of_gaussians(packed):
+    torch._dynamo.reset()
+    image_of = torch.compile(
+        lambda scene: rasterize_scene(scene, packed=packed)[0], fullgraph=True, backend="aot_eager"
+    )
+    for n in (20, 33, 45):
+        leaves = random_scene(n=n).leaves()
+        image, expected = image_of(leaves), rasterize_scene(leaves, packed=packed)[0]
+        assert torch.equal(image, expected)
+        inputs = [getattr(leaves, name) for name in PARAMETERS]
+        found = torch.autograd.grad(image.square().sum(), inputs)
+        for actual, wanted in zip(found, torch.autograd.grad(expected.square().sum(), inputs), strict=True):
+            assert relative_error(actual, wanted) < 1e-5
+
+
+def test_a_graph_of_many_views_and_one_of_covariances():
+    torch._dynamo.reset()
+    views = random_scene(n=20, cameras=34, width=8, height=8).leaves()
+    shapes = random_scene(n=20, cameras=1).leaves()
+    factors = covariance_factors(shapes.quats.detach(), shapes.scales.detach())
+    for scene, options in ((views, {}), (shapes, {"covars": factors @ factors.mT})):
+        call = partial(rasterize_scene, **options)
+        image = torch.compile(lambda s, call=call: call(s)[0], fullgraph=True, backend="aot_eager")(scene)
+        expected = call(scene)[0]
+        assert torch.equal(image, expected)
+        found, wanted = (torch.autograd.grad(x.square().sum(), scene.means)[0] for x in (image, expected))
+        assert relative_error(found, wanted) < 1e-5
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_second_derivative_of_a_compiled_call_is_refused(device):
+    torch._dynamo.reset()
+    leaves = random_scene(n=20, device=device).leaves()
+    image = torch.compile(lambda s: rasterize_scene(s)[0], fullgraph=True, backend="aot_eager")(leaves)
+    with pytest.raises(RuntimeError, match="create_graph=False|double backward"):
+        (gradient,) = torch.autograd.grad(image.sum(), leaves.means, create_graph=True)
+        gradient.sum().backward()
+
+
+@pytest.mark.parametrize("options", [{"absgrad": True}, {"sparse_grad": True}], ids=str)
+def test_options_without_compile_support_are_named(options):
+    torch._dynamo.reset()
+    leaves = random_scene(n=20).leaves()
+    with pytest.raises(Exception, match="not supported under torch.compile"):
+        torch.compile(lambda s: rasterize_scene(s, **options)[0], fullgraph=True, backend="aot_eager")(leaves)

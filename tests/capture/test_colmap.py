@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pycolmap
+import pytest
+
+from blitzgs.capture import colmap
+from blitzgs.formats.native import native_io
+from tests.capture.helpers import reconstruction, shared_data
+
+NAMES = ["a.jpg", "sub/b c.png", "ü.jpg"]
+
+
+def assert_same(model: colmap.ColmapModel, rec: pycolmap.Reconstruction) -> None:
+    assert len(model.cameras) == len(rec.cameras)
+    for camera in model.cameras:
+        other = rec.cameras[camera.id]
+        assert (camera.model, camera.width, camera.height) == (other.model_name, other.width, other.height)
+        np.testing.assert_array_equal(camera.params, other.params)
+    images, points = model.images, model.points
+    assert sorted(images.names) == sorted(image.name for image in rec.images.values())
+    poses = colmap.world_to_camera(images)
+    for i, image_id in enumerate(images.ids.tolist()):
+        other = rec.images[image_id]
+        assert (images.names[i], images.camera_ids[i]) == (other.name, other.camera_id)
+        np.testing.assert_allclose(poses[i, :3], other.cam_from_world().matrix(), atol=1e-12)
+        rows = slice(*images.point2d_offsets[i : i + 2].tolist())
+        np.testing.assert_array_equal(images.points2d[rows], [p.xy for p in other.points2D])
+        ids = [p.point3D_id if p.has_point3D() else -1 for p in other.points2D]
+        np.testing.assert_array_equal(images.point3d_ids[rows], ids)
+    assert len(points.ids) == len(rec.points3D)
+    for i, point_id in enumerate(points.ids.tolist()):
+        other = rec.points3D[point_id]
+        np.testing.assert_array_equal(points.positions[i], other.xyz)
+        np.testing.assert_array_equal(points.colors[i], other.color)
+        assert points.errors[i] == other.error
+        assert points.track_lengths[i] == other.track.length()
+        rows = slice(*points.track_offsets[i : i + 2].tolist())
+        track = [(e.image_id, e.point2D_idx) for e in other.track.elements]
+        found = list(
+            zip(points.track_image_ids[rows].tolist(), points.track_point2d_ids[rows].tolist(), strict=True)
+        )
+        assert found == track
+
+
+def test_every_camera_model_of_colmap_is_known_with_its_parameters():
+    ours = {name: (id_, params) for id_, name, params in native_io().camera_models()}
+    for name, model_id in pycolmap.CameraModelId.__members__.items():
+        if name == "INVALID":
+            continue
+        camera = pycolmap.Camera.create_from_model_id(1, model_id, 500.0, 640, 480)
+        assert ours[name] == (int(model_id), camera.params_info.replace(" ", ""))
+    assert len(ours) == len(pycolmap.CameraModelId.__members__) - 1
+
+
+@pytest.mark.parametrize("model", [m for m in pycolmap.CameraModelId.__members__ if m != "INVALID"])
+@pytest.mark.parametrize("text", [False, True])
+def test_reads_what_colmap_writes_and_colmap_reads_what_we_write(tmp_path, model, text):
+    names = (
+        [name.replace(" ", "_") for name in NAMES] if text else NAMES
+    )  # COLMAP's text reader ends at a blank
+    rec = reconstruction(names, 640, 480, model=model)
+    (rec.write_text if text else rec.write_binary)(str(tmp_path))
+    ours = colmap.read_model(tmp_path, points2d=True, tracks=True)
+    assert_same(ours, rec)
+
+    again = tmp_path / "again"
+    colmap.write_model(again, ours, text=text)
+    back = pycolmap.Reconstruction()
+    (back.read_text if text else back.read_binary)(str(again))
+    assert_same(ours, back)
+    assert_same(colmap.read_model(again, points2d=True, tracks=True), rec)
+
+
+def test_observations_and_tracks_are_left_out_unless_asked_for(tmp_path):
+    reconstruction(NAMES, 64, 48).write_binary(str(tmp_path))
+    model = colmap.read_model(tmp_path)
+    assert model.images.points2d.shape == (0, 2) and not model.images.point2d_offsets.any()
+    assert len(model.points.track_image_ids) == 0
+    assert (
+        model.points.track_lengths.tolist()
+        == colmap.read_model(tmp_path, tracks=True).points.track_lengths.tolist()
+    )
+    assert model.points.track_lengths.sum() > 0
+
+
+def test_an_empty_model_round_trips(tmp_path):
+    for text in (False, True):
+        colmap.write_model(tmp_path / str(text), colmap.ColmapModel(), text=text)
+        model = colmap.read_model(tmp_path / str(text), points2d=True, tracks=True)
+        assert model.cameras == [] and len(model.images.ids) == 0 and model.points.positions.shape == (0, 3)
+
+
+def test_text_tolerates_blank_lines_carriage_returns_and_a_missing_last_line(tmp_path):
+    (tmp_path / "cameras.txt").write_bytes(b"# comment\r\n\r\n1 PINHOLE 4 3 +1.5 2 2 1.5\r\n")
+    (tmp_path / "images.txt").write_bytes(
+        b"7 1 0 0 0 0 1e-400 1e-3 1 name with blanks.jpg\n1 2 +3\n8 1 0 0 0 0 0 0 1 b.jpg"
+    )
+    (tmp_path / "points3D.txt").write_bytes(b"")
+    model = colmap.read_model(tmp_path, points2d=True)
+    assert model.cameras[0].params.tolist() == [1.5, 2, 2, 1.5]
+    assert model.images.names == ["name with blanks.jpg", "b.jpg"]
+    assert model.images.translations[0].tolist() == [0, 0, 1e-3]
+    assert colmap.read_model(tmp_path).images.names == model.images.names
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("cameras.bin", b"\xff" * 8, "cameras.bin: at byte 8: it claims 18446744073709551615 cameras"),
+        ("cameras.bin", b"\x01" + b"\0" * 7, "but 0 bytes are left"),
+        ("cameras.txt", b"1 PINHOLE 4 3 1 2 x 4", "line 1: 'x' is not a valid camera parameter"),
+        ("cameras.txt", b"\n1 NOVEL 4 3 1", "line 2: camera 1 has the unknown model NOVEL"),
+        ("cameras.txt", b"1 PINHOLE 4 3 1 2 3", r"needs 4 parameters \(fx,fy,cx,cy\), got 3"),
+        ("images.txt", b"1 1 0 0 0 0 0 0 1", "image 1 has no name"),
+        ("images.txt", b"1 1 0 0 0 0 0 0 1 a\n1 2", "line 2: the line ends before observation point id"),
+        ("points3D.txt", b"1 0 0 0 256 0 0 0", "line 1: '256' is not a valid colour"),
+    ],
+)
+def test_damage_is_named_with_file_place_and_reason(tmp_path, file, content, message):
+    colmap.write_model(tmp_path, colmap.ColmapModel(), text=file.endswith(".txt"))
+    (tmp_path / file).write_bytes(content)
+    with pytest.raises(ValueError, match=message):
+        colmap.read_model(tmp_path, points2d=True, tracks=True)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    reconstruction(NAMES, 64, 48).write_binary(str(tmp_path))
+    (tmp_path / "images.bin").unlink()
+    with pytest.raises(FileNotFoundError, match="images.bin is missing"):
+        colmap.read_model(tmp_path)
+
+
+def test_the_complete_model_is_read_where_files_of_another_kind_are_left(tmp_path):
+    rec = reconstruction(NAMES[:1], 64, 48)
+    rec.write_text(str(tmp_path))
+    (tmp_path / "cameras.bin").write_bytes(b"stale")
+    assert colmap.read_model(tmp_path).images.names == NAMES[:1]
+    rec.write_binary(str(tmp_path))
+    (tmp_path / "cameras.txt").write_bytes(b"stale")
+    assert colmap.read_model(tmp_path).images.names == NAMES[:1]
+    (tmp_path / "images.bin").unlink()
+    (tmp_path / "points3D.txt").unlink()
+    with pytest.raises(FileNotFoundError, match="images.bin is missing"):
+        colmap.read_model(tmp_path)
+
+
+def test_columns_that_disagree_are_not_written(tmp_path):
+    reconstruction(NAMES, 64, 48).write_binary(str(tmp_path))
+    model = colmap.read_model(tmp_path)
+    model.images.quats = model.images.quats[:-1]
+    with pytest.raises(ValueError, match=r"quats \[N, 4\]"):
+        colmap.write_model(tmp_path / "out", model)
+    assert not (tmp_path / "out" / "images.bin").exists()
+
+
+@pytest.mark.parametrize("name", [" a.jpg", "a.jpg ", "\ta.jpg", "a.jpg\r", "\va.jpg", "a.jpg\f", " "])
+def test_names_that_text_would_change_are_written_only_as_binary(tmp_path, name):
+    reconstruction(NAMES, 64, 48).write_binary(str(tmp_path))
+    model = colmap.read_model(tmp_path, tracks=True)
+    model.images.names[0] = name
+    with pytest.raises(ValueError, match=f"the name '{name}' begins or ends with a blank"):
+        colmap.write_model(tmp_path / "text", model, text=True)
+    assert not (tmp_path / "text" / "images.txt").exists()
+    colmap.write_model(tmp_path / "binary", model)
+    assert colmap.read_model(tmp_path / "binary").images.names == model.images.names
+
+
+@pytest.mark.skipif(shared_data() is None, reason="the real captures are not here")
+@pytest.mark.parametrize("name", ["sheffield", "caliterra"])
+def test_a_real_model_is_written_back_byte_for_byte(tmp_path, name):
+    folder = colmap.find_model(shared_data() / name)
+    colmap.write_model(tmp_path, colmap.read_model(folder, points2d=True, tracks=True))
+    for file in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (tmp_path / file).read_bytes() == (folder / file).read_bytes()

@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Captures are found in each layout on disk, and a folder without one says what is missing."""
+
+import json
+import math
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from blitzgs.capture.capture import MissingImagesError, load_capture
+from blitzgs.capture.images import ImageStore
+from blitzgs.capture.transforms import read_transforms
+from tests.capture.helpers import edit_model, smooth_image, write_capture, write_image
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:overflow encountered"),
+    pytest.mark.filterwarnings("ignore:all training cameras are in one place"),
+    pytest.mark.filterwarnings("ignore:.* see none of the points"),
+]
+NAMES = [f"v{i:02d}.png" for i in range(9)]
+
+
+def test_nothing_to_load_is_said_clearly(tmp_path):
+    with pytest.raises(FileNotFoundError, match="holds no capture: expected a COLMAP model"):
+        load_capture(tmp_path)
+    with pytest.raises(FileNotFoundError, match="is not a folder"):
+        load_capture(tmp_path / "nowhere")
+    (tmp_path / "photographs").mkdir()
+    (tmp_path / "photographs" / "DJI_0001.JPG").touch()
+    with pytest.raises(FileNotFoundError, match="has images but not their cameras: run COLMAP"):
+        load_capture(tmp_path)
+    (tmp_path / "sparse" / "1").mkdir(parents=True)
+    (tmp_path / "sparse" / "1" / "cameras.bin").touch()
+    with pytest.raises(FileNotFoundError, match="there is a COLMAP model in .*sparse/1: .* to .*sparse/0"):
+        load_capture(tmp_path)
+    shutil.rmtree(tmp_path / "sparse")
+    (tmp_path / "transforms.json").write_text('{"frames": []}')
+    with pytest.raises(ValueError, match=f"{tmp_path}: its COLMAP model or transforms.json lists no images"):
+        load_capture(tmp_path)
+    pose = np.eye(4).tolist()
+    frame = {"file_path": "gone.png", "camera_angle_x": 1.0, "transform_matrix": pose}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    with pytest.raises(ValueError, match=r"transforms.json: frame 0: the image .*gone.png does not exist"):
+        load_capture(tmp_path)
+    (tmp_path / "transforms.json").unlink()
+    write_capture(tmp_path, NAMES[:2])
+    with pytest.raises(ValueError, match="downscale must be at least 1, got 0.5"):
+        load_capture(tmp_path, downscale=0.5)
+    with pytest.raises(ValueError, match="undistort must be one of crop, mask, got 'none'"):
+        load_capture(tmp_path, undistort="none")
+    with pytest.raises(FileNotFoundError, match="2 of 2 images .* with --data.images=FOLDER") as caught:
+        load_capture(tmp_path, images="elsewhere", allow_missing=True)
+    assert not isinstance(caught.value, MissingImagesError)  # leaving out all views is no remedy
+    edit_model(tmp_path, lambda m: m.images.camera_ids.fill(7))
+    with pytest.raises(ValueError, match=f"the cameras of 2 images .first: {NAMES[0]}. are not there"):
+        load_capture(tmp_path)
+    points = next((tmp_path / "sparse" / "0").glob("points3D.*"))
+    points.unlink()
+    with pytest.raises(FileNotFoundError, match=f"{points.name} is missing: .* not a complete COLMAP"):
+        load_capture(tmp_path)
+
+
+def test_mega_nerf_layout_with_mappings_and_with_two_models(tmp_path):
+    one = write_capture(tmp_path / "one", NAMES)
+    lines = []
+    for i, name in enumerate(NAMES):
+        part = "val" if i in (2, 5) else "train"
+        target = one / part / "rgbs" / f"{i:06d}.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        (one / "images" / name).rename(target)
+        lines.append(f"{name},{i:06d}.pt\n")
+    (one / "mappings.txt").write_text("".join(lines))
+    assert load_capture(one).test == [2, 5]
+    assert load_capture(one, split=4).test == [0, 4, 8]
+
+    two = tmp_path / "two"
+    write_capture(two / "train", NAMES[:6])
+    write_capture(two / "val", NAMES[6:8])
+    for part in ("train", "val"):
+        (two / part / "images").rename(two / part / "rgbs")
+    capture = load_capture(two, split="val")
+    assert [capture.cameras[i].name for i in capture.test] == [f"val/{name}" for name in NAMES[6:8]]
+    assert len(capture.train) == 6 and len(capture.points) == 20
+
+
+def test_blender_transforms(tmp_path):
+    frames = []
+    for i in range(3):
+        alpha = np.zeros((20, 30, 4), dtype=np.uint8)
+        alpha[5:10, 5:10] = (10, 20, 30, 255)
+        (tmp_path / "train").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "train" / f"r_{i}.png"), alpha)
+        matrix = np.eye(4)
+        matrix[:3, 3] = [i, 0, 4]
+        frames.append({"file_path": f"./train/r_{i}", "transform_matrix": matrix.tolist()})
+    content = {"camera_angle_x": 0.8, "frames": frames[:2]}
+    (tmp_path / "transforms_train.json").write_text(json.dumps(content))
+    (tmp_path / "transforms_test.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames[2:]}))
+    with pytest.warns(UserWarning, match="no points"):
+        capture = load_capture(tmp_path)
+    assert (capture.train, capture.test, capture.has_alpha) == ([0, 1], [2], True)
+    camera = capture.cameras[0]
+    assert camera.K[0, 0] == pytest.approx(15 / np.tan(0.4)) and camera.K[0, 2] == 15
+    # The camera at z = 4 looks down its own -z, so the origin is 4 in front of it, and world up is image up.
+    origin = camera.world_to_camera @ np.append(-capture.offset, 1)
+    np.testing.assert_allclose(origin[:3], [0, 0, 4], atol=1e-12)
+    above = camera.world_to_camera @ np.append(np.array([0, 1, 0]) - capture.offset, 1)
+    assert above[1] < 0
+    image = ImageStore(capture, background=(1.0, 0.5, 0.0)).get(0)
+    assert image[0, 0].tolist() == [255, 128, 0] and image[6, 6].tolist() == [30, 20, 10]
+    assert len(capture.points) == 100_000
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"w": math.inf, "h": 48}, "frame 0: cannot convert float infinity to integer"),
+        ({"w": 0, "h": 0}, "frame 0: the image's size must be at least 1 x 1, got 0 x 0"),
+        ({"fl_x": 10**400}, "frame 0: int too large to convert to float"),
+        ({"fl_x": None}, "frame 0: float.* argument must be a string or a real number"),
+        ({"file_path": ""}, "frame 0: file_path must name an image, got ''"),
+        ({"file_path": None}, "frame 0: file_path must name an image, got None"),
+        ({"transform_matrix": np.diag([-1.0, 1, 1, 1]).tolist()}, "frame 0: .* mirrors the scene"),
+        ({"test_filenames": "a.png"}, "test_filenames must be a list"),
+        ({"val_filenames": ["a.png", 3]}, "val_filenames must be a list"),
+        ({"val_filenames": ["./a.png", "b.png"]}, r"name 1 images that are no frames \(first: b.png\)"),
+        ({"ply_file_path": None}, "ply_file_path must be text, got None"),
+        ({"mask_path": 3}, "frame 0: mask_path must name an image or be null, got 3"),
+        ({"mask_path": ""}, "frame 0: mask_path must name an image or be null, got ''"),
+        ({"k4": 0.01}, "frame 0: k4 is 0.01, without k5 and k6: .* undistort the images"),
+        ({"is_fisheye": True, "p1": 0.1}, "frame 0: p1 = 0.1: a fisheye lens has only k1 to k4"),
+        ({"is_fisheye": True, "camera_model": "OPENCV"}, "frame 0: is_fisheye is true but camera_model is"),
+        ({"is_fisheye": "yes"}, "frame 0: is_fisheye must be true or false, got 'yes'"),
+        ({"k1": 1e300}, "the camera of .*a.png: the lens does not see along its own axis"),
+    ],
+)
+def test_transforms_that_make_no_sense_are_named(tmp_path, fields, message):
+    write_image(tmp_path / "a.png", smooth_image(48, 64))
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 60.0}
+    content = {"frames": [frame | fields]} | fields
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=message) as caught:
+        load_capture(tmp_path)
+    assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("fields", "model", "distortion"),
+    [
+        ({"k1": 0.1, "k4": 0.0}, "FULL_OPENCV", (0.1, 0, 0, 0, 0, 0, 0, 0)),
+        ({"k4": 0.01, "k5": 0.0}, "FULL_OPENCV", (0, 0, 0, 0, 0, 0.01, 0, 0)),
+        ({"is_fisheye": False, "k1": 0.1}, "FULL_OPENCV", (0.1, 0, 0, 0, 0, 0, 0, 0)),
+        ({"is_fisheye": True, "k1": 0.1, "k4": 0.01, "p1": 0}, "OPENCV_FISHEYE", (0.1, 0, 0, 0.01)),
+        ({"camera_model": "OPENCV_FISHEYE", "k4": 0.01}, "OPENCV_FISHEYE", (0, 0, 0, 0.01)),
+    ],
+)
+def test_the_coefficients_of_transforms_are_those_of_their_lens(tmp_path, fields, model, distortion):
+    write_image(tmp_path / "a.png", smooth_image(48, 64))
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 60.0}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]} | fields))
+    lens = read_transforms(tmp_path).frames[0].lens
+    assert (lens.model, lens.distortion) == (model, distortion)
+
+
+@pytest.mark.parametrize("again", ["a.png", "./a.png", "a"])
+def test_an_image_of_two_frames_is_refused(tmp_path, again):
+    frames = [
+        {"file_path": name, "transform_matrix": np.eye(4).tolist(), "fl_x": 60.0}
+        for name in ("a.png", "b.png", again)
+    ]
+    for name in ("a.png", "b.png"):
+        write_image(tmp_path / name, smooth_image(48, 64))
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    with pytest.raises(ValueError, match=r"transforms.json: images of more than one frame: a[^b]*; keep one"):
+        load_capture(tmp_path)
+
+
+def test_missing_images_of_transforms_are_named_by_their_paths(tmp_path):
+    """The folder `images` and the flag data.images have no meaning for them."""
+    frames = [
+        {"file_path": f"photos/{name}.png", "w": 64, "h": 48, "fl_x": 50.0, "transform_matrix": pose.tolist()}
+        for name, pose in (("a", np.eye(4)), ("b", np.diag([-1.0, -1.0, 1.0, 1.0])))
+    ]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    with pytest.raises(FileNotFoundError, match="correct file_path in its transforms.json") as caught:
+        load_capture(tmp_path)
+    assert f"2 of 2 images are not in {tmp_path}: photos/a.png, photos/b.png;" in str(caught.value)
+    write_image(tmp_path / "photos" / "a.png", smooth_image(48, 64))
+    with pytest.raises(MissingImagesError, match=f"1 of 2 images are not in {tmp_path}: photos/b.png;"):
+        load_capture(tmp_path, split=0)
+
+
+@pytest.mark.parametrize("text", ['{"frames": ' + "[" * 100_000, "[]"])
+def test_transforms_that_are_damaged_are_named(tmp_path, text):
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(ValueError, match=f"{tmp_path}/transforms.json: not a transforms file"):
+        load_capture(tmp_path)
+
+
+def test_an_angle_of_zero_is_named(tmp_path):
+    write_image(tmp_path / "a.png", smooth_image(48, 64))
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "camera_angle_x": 0}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    with pytest.raises(ValueError, match="frame 0: float division by zero"):
+        load_capture(tmp_path)
+
+
+def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
+    frames = []
+    (tmp_path / "own").mkdir()
+    for i in range(4):
+        write_image(tmp_path / "images" / f"f{i}.png", smooth_image(48, 64, i))
+        cv2.imwrite(str(tmp_path / "own" / f"f{i}.png"), np.zeros((48, 64), dtype=np.uint8))
+        matrix = np.eye(4)
+        matrix[0, 3] = i
+        frame = {"file_path": f"images/f{i}.png", "transform_matrix": matrix.tolist()}
+        frames.append(frame | ([{}, {"mask_path": f"own/f{i}.png"}, {"mask_path": None}, {}][i]))
+    (tmp_path / "p.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+        "1 2 3 9 8 7\n4 5 6 1 2 3\n"
+    )
+    content = {
+        **{"fl_x": 60.0, "fl_y": 61.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "camera_model": "OPENCV"},
+        **{"k1": -0.1, "k2": 0.01, "p1": 0.001, "p2": 0.0, "frames": frames, "ply_file_path": "p.ply"},
+        **{"train_filenames": [f"images/f{i}.png" for i in (0, 1, 3)], "test_filenames": ["./images/f2.png"]},
+    }
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps(content))
+    assert all(camera.mask_path is None for camera in load_capture(tmp_path, masks=False).cameras)
+    capture = load_capture(tmp_path)
+    assert capture.test == [2] and not capture.has_alpha
+    np.testing.assert_allclose(capture.points + capture.offset, [[1, 2, 3], [4, 5, 6]])
+    assert capture.colors.tolist() == [[9, 8, 7], [1, 2, 3]] and capture.track_lengths is None
+    lens = capture.cameras[0].rectification.lens
+    assert lens.model == "FULL_OPENCV" and lens.distortion[:4] == (-0.1, 0.01, 0.001, 0.0)
+    store = ImageStore(capture)
+    assert store.mask(0) is None and not store.mask(1).any()
+
+    content["frames"] = [{"file_path": "images/f0.png"}]
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="frame 0: the field 'transform_matrix' is missing"):
+        load_capture(tmp_path)
+    path.write_text('{"frames": 3}')
+    with pytest.raises(ValueError, match="not a transforms file with a list of frames"):
+        load_capture(tmp_path)

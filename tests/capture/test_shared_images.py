@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ranks of a host share decoded images: each is decoded once, and all of them see the same pixels."""
+
+import dataclasses
+import os
+import socket
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from blitzgs.capture.capture import load_capture
+from blitzgs.capture.images import ImageStore, decoded_shapes
+from blitzgs.capture.shared_images import SharedImages, size_of
+from blitzgs.training import inputs
+from tests.capture.helpers import write_capture
+from tests.distributed.rank_harness import run_ranks
+from tests.training.tiny import tiny_config
+
+pytestmark = pytest.mark.filterwarnings("ignore:all training cameras are in one place")
+NAMES = [f"v{i:02d}.jpg" for i in range(12)]
+SHAPES = {"a": (2, 3, 3), "b": (5, 7, 3), "c": (4, 4)}
+
+
+def noise(shape, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+def test_what_one_puts_there_the_other_finds():
+    one, offer = SharedImages.create(SHAPES)
+    other = SharedImages.join(offer, SHAPES)
+    for seed, (key, shape) in enumerate(SHAPES.items()):
+        assert one.get(key) is None and other.get(key) is None
+        one.put(key, noise(shape, seed))
+    for seed, (key, shape) in enumerate(SHAPES.items()):
+        np.testing.assert_array_equal(other.get(key), noise(shape, seed))
+    assert other.bytes == one.size == 18 + 105 + 16
+    del one
+    np.testing.assert_array_equal(other.get("b"), noise(SHAPES["b"], 1))
+
+
+def test_other_memory_is_refused():
+    _one, offer = SharedImages.create(SHAPES)
+    with pytest.raises(OSError, match="memory of another process"):
+        SharedImages.join(offer._replace(token=bytes(16)), SHAPES)
+    with pytest.raises(OSError, match="not the memory of the same images"):
+        SharedImages.join(offer, SHAPES | {"d": (9, 9)})
+    with pytest.raises(OSError, match=r"fd/12345"):
+        SharedImages.join(offer._replace(path="/proc/self/fd/12345"), SHAPES)
+
+
+def test_the_memory_ends_with_its_users():
+    one, offer = SharedImages.create(SHAPES)
+    assert os.path.exists(offer.path)
+    del one
+    assert not os.path.exists(offer.path)
+
+
+def test_stores_with_shared_memory_return_the_same_images_and_decode_each_once(tmp_path):
+    capture = load_capture(write_capture(tmp_path, NAMES))
+    shared, offer = SharedImages.create(decoded_shapes(capture))
+    stores = [
+        ImageStore(capture, shared=shared),
+        ImageStore(capture, shared=SharedImages.join(offer, decoded_shapes(capture))),
+    ]
+    alone = ImageStore(capture)
+    for index in range(12):
+        stores[index % 2].prefetch(range(index, 12))
+        for store in stores:
+            assert torch.equal(store.get(index), alone.get(index))
+            assert store.mask(index) is None
+    stores[0].prefetch(range(12))
+    for store in stores:
+        store.close()
+        memory = store.memory()
+        assert memory.decoded_bytes == 12 * 3 * 64 * 48 < memory.decoded_budget
+        assert store.decoded.bytes == store.compressed.bytes == 0
+    # Both may decode an image at the same time, but not one that the other has decoded.
+    assert 12 <= sum(store.memory().decoded for store in stores) <= 24
+    assert ImageStore(capture, shared=shared).get(3).sum() == alone.get(3).sum()
+
+
+def test_masks_are_shared_too(tmp_path):
+    capture = load_capture(write_capture(tmp_path, NAMES[:2]))
+    mask = tmp_path / "mask.png"
+    cv2.imwrite(str(mask), 255 * (noise((48, 64)) > 99).astype(np.uint8))
+    cameras = [dataclasses.replace(camera, mask_path=mask) for camera in capture.cameras]
+    capture = dataclasses.replace(capture, cameras=cameras)
+    shapes = decoded_shapes(capture)
+    assert shapes["mask", 1] == (48, 64) and size_of(shapes) > 2 * 4 * 48 * 64
+    shared, _ = SharedImages.create(shapes)
+    first, second = ImageStore(capture, shared=shared), ImageStore(capture, shared=shared)
+    assert torch.equal(first.mask(1), ImageStore(capture).mask(1))
+    assert torch.equal(second.mask(1), first.mask(1)) and second.memory().decoded == 0
+
+
+def _decode_all(ranks, folder, cache_bytes):
+    config = tiny_config(f"data.path={folder}", f"data.cache_bytes={cache_bytes}")
+    _, images = inputs.open_capture(config, ranks)
+    sums = []
+    for index in range(12):
+        if index % ranks.world_size == ranks.rank:
+            images.get(index)
+    ranks.barrier()
+    for index in range(12):
+        sums.append(int(images.get(index).sum()))
+    images.close()
+    return images.memory().decoded, sums, images.compressed.budget
+
+
+@pytest.mark.parametrize("shares", [True, False])
+def test_ranks_decode_each_image_once_if_all_fit(tmp_path, shares):
+    folder = write_capture(tmp_path, NAMES)
+    needed = size_of(decoded_shapes(load_capture(folder)))
+    cache = 2 * needed if shares else 2 * needed - 2
+    results = run_ranks(_decode_all, 3, folder, cache)
+    # A rank's own budget is too small for all, so some are decoded again.
+    assert all(decoded == 4 if shares else decoded >= 12 for decoded, _, _ in results)
+    assert all(sums == results[0][1] for _, sums, _ in results)
+    left = cache - needed if shares else cache
+    assert {budget for _, _, budget in results} == {left // 3}
+
+
+def _refuse(*_args):
+    raise OSError("no such memory")
+
+
+def _decode_without(ranks, folder, refused, cache_bytes):
+    if ranks.rank == refused:
+        SharedImages.create = SharedImages.join = _refuse
+    return _decode_all(ranks, folder, cache_bytes)
+
+
+@pytest.mark.parametrize("refused", [0, 1])
+def test_a_rank_without_access_decodes_for_itself(tmp_path, refused):
+    folder = write_capture(tmp_path, NAMES)
+    needed, cache = size_of(decoded_shapes(load_capture(folder))), 10_000_000
+    results = run_ranks(_decode_without, 2, folder, refused, cache)
+    assert [decoded for decoded, _, _ in results] == [12, 12]
+    assert results[0][1] == results[1][1]
+    # The memory that one rank has made is taken from the budget of both.
+    left = cache if refused == 0 else cache - needed
+    assert [budget for _, _, budget in results] == [left // 2] * 2
+
+
+def _decode_on_unequal_hosts(ranks, folder):
+    # Ranks 0 and 1 are on a host that has too little memory to share, ranks 2 to 4 on another one.
+    first = ranks.rank < 2
+    socket.gethostname = lambda: "first" if first else "second"
+    ranks.local_world_size = 2 if first else 3
+    return _decode_all(ranks, folder, 200_000 if first else 10_000_000)[0]
+
+
+def test_hosts_may_have_different_numbers_of_ranks(tmp_path):
+    decoded = run_ranks(_decode_on_unequal_hosts, 5, write_capture(tmp_path, NAMES))
+    assert min(decoded[:2]) >= 12
+    # Any rank of the second host may decode those 6 images that the ranks of the first one decode first.
+    assert sum(decoded[2:]) >= 12 and max(decoded[2:]) <= 2 + 6

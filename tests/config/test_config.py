@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from blitzgs.config.fields import Config
+from blitzgs.config.files import ConfigError, config_hash, from_dict, load_config, save_config, to_dict
+from blitzgs.config.ranges import CHOICES, RANGES, flat_fields, problems
+from blitzgs.config.schedule import Schedule
+
+FOLDER = Path(__file__).parents[2] / "configs"
+CONFIGS, AERIAL = sorted(FOLDER.glob("*.yaml")), FOLDER / "aerial.yaml"
+
+
+def test_file_then_overrides(tmp_path):
+    (tmp_path / "base.yaml").write_text("schedule: {iterations: 7500, batch_size: 2}\nseed: 5\n")
+    (tmp_path / "child.yaml").write_text("base: base.yaml\nschedule: {batch_size: 4}\nloss: {scale: 1e-3}\n")
+    config = load_config(
+        tmp_path / "child.yaml",
+        ["--data.downscale=2", "--model.background=[1, 1, 1]", "--data.masks=null", "--log.every=1e3"],
+    )
+    assert (config.schedule.iterations, config.schedule.batch_size, config.seed) == (7500, 4, 5)
+    assert config.log.every == 1000 and isinstance(config.log.every, int)
+    assert config.loss.scale == 1e-3
+    assert config.data.downscale == 2
+    assert config.model.background == (1.0, 1.0, 1.0)
+
+
+def test_saved_configuration_reads_back_to_the_same(tmp_path):
+    config = load_config(None, ["--schedule.scale=0.3", "--data.masks=masks"])
+    save_config(config, tmp_path / "config.yaml")
+    again = load_config(tmp_path / "config.yaml")
+    assert again == config == from_dict(to_dict(config))
+    assert config_hash(again) == config_hash(config) != config_hash(Config())
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("--schedule.iteratons=3", "schedule.iteratons: unknown field; did you mean 'iterations'"),
+        ("--shedule.iterations=3", "shedule: unknown field; did you mean 'schedule'"),
+        ("--max_gaussians=3", "max_gaussians: unknown field; did you mean 'population.max_gaussians'"),
+        (
+            "--schedule.max_gaussians=3",
+            "max_gaussians: unknown field; did you mean 'population.max_gaussians'",
+        ),
+        ("--nonsense=3", "nonsense: unknown field; known: data, model"),
+        ("--schedule.iterations=many", r"schedule.iterations: must be an integer, got 'many' \(str\)"),
+        ("--schedule.iterations=25e-1", "schedule.iterations: must be an integer, got 2.5"),
+        ("--schedule.iterations=3.5", "schedule.iterations: must be an integer, got 3.5"),
+        ("--schedule.batch_size=true", "schedule.batch_size: must be an integer, got True"),
+        ("--schedule.batch_size=33", r"schedule.batch_size: must be in \[1, 32\], got 33"),
+        ("--loss.ssim=high", "loss.ssim: must be a number, got 'high'"),
+        ("--loss.ssim=1.5", r"loss.ssim: must be in \[0, 1\], got 1.5"),
+        ("--optimiser.opacity=-0.01", r"optimiser.opacity: must be in \[0, 10\], got -0.01"),
+        ("--optimiser.sh_dc=.inf", r"optimiser.sh_dc: must be in \[0, 10\], got inf"),
+        ("--optimiser.beta2=1.0", r"optimiser.beta2: must be in \[0, 1\), got 1.0"),
+        ("--model.background=[0, 0]", "model.background: must be a list of 3 values"),
+        ("--loss=3", "loss: must be a section with ssim"),
+        ("--log.tensorboard=1", "log.tensorboard: must be true or false, got 1"),
+        ("--seed", "not an override: write --section.field=value"),
+        ("--seed=[", "seed: cannot read the value"),
+        ("--schedule.scale=" + "9" * 400, "schedule.scale: 9+ is too large"),
+        ("--log=&all {every: *all}", "log: sections are nested more than 20 deep"),
+    ],
+)
+def test_errors_name_the_field(override, message):
+    with pytest.raises(ConfigError, match=message):
+        load_config(None, [override])
+
+
+def test_an_error_of_a_file_names_the_file(tmp_path):
+    file = tmp_path / "mine.yaml"
+    for text, message in (
+        ("loss:\n  sim: 1", "loss.sim: unknown field"),
+        ("loss: 5", "loss: must be a section"),
+    ):
+        file.write_text(text)
+        with pytest.raises(ConfigError, match=f"^{file}: {message}"):
+            load_config(file)
+
+
+def test_unreadable_files(tmp_path):
+    with pytest.raises(ConfigError, match="cannot read the configuration"):
+        load_config(tmp_path / "missing.yaml")
+    (tmp_path / "broken.yaml").write_text("a: [")
+    with pytest.raises(ConfigError, match="not valid YAML"):
+        load_config(tmp_path / "broken.yaml")
+    (tmp_path / "loop.yaml").write_text("base: loop.yaml")
+    with pytest.raises(ConfigError, match="leads back"):
+        load_config(tmp_path / "loop.yaml")
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_shipped_configurations_load(path):
+    assert load_config(path).schedule.iterations > 0
+
+
+NUMBERS = [(name, value) for name, value in flat_fields(Config()) if isinstance(value, (int, float, tuple))]
+NUMBERS = [(name, value) for name, value in NUMBERS if not isinstance(value, bool)]
+
+
+def test_relocation_has_no_candidates_for_a_gate():
+    assert load_config(None, ["population.strategy=relocation"]).population.growth == 0.05
+    with pytest.raises(ConfigError, match=r"population.gate: .* relocation has none"):
+        load_config(None, ["population.strategy=relocation", "population.gate=gate.json"])
+
+
+def test_two_weights_of_the_opacity_term_are_refused():
+    with pytest.raises(ConfigError, match=r"loss.opacity: .* for 0.03, add --loss.opacity_total=0"):
+        load_config(AERIAL, ["loss.opacity=0.03"])
+    config = load_config(AERIAL, ["loss.opacity=0.03", "loss.opacity_total=0"])
+    assert config.loss.opacity == 0.03
+
+
+def test_opacities_are_capped_above_the_limit_of_pruning_only_where_they_are_reset():
+    flags = ["population.min_opacity=0.02", "population.reset_opacity=0.01"]
+    assert load_config(None, flags).population.min_opacity == 0.02
+    with pytest.raises(ConfigError, match="population.reset_opacity: must be above population.min_opacity"):
+        load_config(None, [*flags, "schedule.reset_every=3000"])
+
+
+def test_every_number_has_a_range_and_every_default_lies_in_it():
+    assert sorted(name for name, _ in NUMBERS) == sorted(RANGES)
+    assert list(problems(Config())) == []
+    fields = {name for name, _ in flat_fields(Config())}
+    assert set(CHOICES) <= fields
+
+
+@pytest.mark.parametrize(("name", "default"), NUMBERS, ids=lambda value: str(value))
+@pytest.mark.parametrize("value", [".nan", ".inf", "-.inf", "-1", "1e40", "-1e-9", str(10**30), "2e15"])
+def test_senseless_numbers_are_refused_by_name(name, default, value):
+    number = float(value.replace(".nan", "nan").replace(".inf", "inf"))
+    if not isinstance(default, tuple) and number in RANGES[name]:
+        assert name.startswith(("population.grad", "seed")) and number >= 0
+        return
+    text = f"[{value}, 0, 0]" if isinstance(default, tuple) else value
+    with pytest.raises(ConfigError, match=rf"{name}.*: must be .*got"):
+        load_config(None, [f"--{name}={text}"])
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("schedule.scale=1e-9", r"schedule.scale: must be in \[0.0001, 10,000\], got 1e-09"),
+        ("schedule.iterations=999999999", "times schedule.scale must be at most 10,000,000 images"),
+        ("lod.fork=1e30", r"lod.fork: must be in \[1.01, 100\], got 1e\+30"),
+        ("lod.base_resolution=0", "lod.base_resolution: must be in"),
+        ("lod.visible_threshold=1", r"lod.visible_threshold: must be in \[0, 1\), got 1.0"),
+        ("population.min_opacity=2", r"population.min_opacity: must be in \[0, 1\), got 2.0"),
+        ("loss.size=-0.01", r"loss.size: must be in \[0, 1,000,000\], got -0.01"),
+        ("loss.size=.inf", r"loss.size: must be in"),
+        ("model.near=2e6", "model.near: must be in"),
+        ("model.far=0.001", "model.near: must be below model.far"),
+        ("optimiser.beta1=0.9999", "optimiser.beta1: must be below the square root of optimiser.beta2"),
+        ("data.exif=maybe", "data.exif: must be one of auto, apply, ignore, got maybe"),
+        ("ranks.timeout_seconds=-1", r"ranks.timeout_seconds: must be in \[1, 1,000,000\], got -1.0"),
+    ],
+)
+def test_values_out_of_range_are_refused(override, message):
+    with pytest.raises(ConfigError, match=message):
+        load_config(None, [f"--{override}"])
+
+
+def test_a_position_rate_of_zero_keeps_the_means_in_place():
+    config = load_config(None, ["--optimiser.position=0"])
+    rates = Schedule(config.schedule).learning_rates(config.optimiser, 3.0)
+    assert rates.isfinite().all() and not rates[:, 0].any() and rates[1:, 1:].all()
+
+
+@pytest.mark.parametrize("name", ["100_0001", "0042", "2024-01-05", "1.50", "12:30"])
+def test_a_name_that_looks_like_a_number_or_a_date_is_kept(tmp_path, name):
+    assert load_config(None, [f"--data.images={name}"]).data.images == name
+    file = tmp_path / "c.yaml"
+    file.write_text(f"data:\n  images: {name}\n")
+    assert load_config(file).data.images == name
+
+
+def test_a_number_may_have_zeros_in_front_and_underscores():
+    numbers = ["--seed=9_223_372_036_854_775_807", "--log.every=010", "--model.near=1.5e-01"]
+    config = load_config(None, numbers)
+    assert (config.seed, config.log.every, config.model.near) == (2**63 - 1, 10, 0.15)
+
+
+def test_masks_may_be_switched_off():
+    assert load_config(None, ["--data.masks=false"]).data.masks is False
+    assert load_config(None, ["--data.masks=true"]).data.masks is True
+    assert load_config(None, ["--data.masks=folder"]).data.masks == "folder"
+
+
+def test_a_section_that_is_there_twice_is_refused_and_a_bom_is_not_read(tmp_path):
+    file = tmp_path / "config.yaml"
+    file.write_text("seed: 1\nloss:\n  ssim: 0.5\nloss:\n  scale: 1\n")
+    with pytest.raises(ConfigError, match="config.yaml: not valid YAML: the key 'loss' is given twice"):
+        load_config(file)
+    file.write_bytes(b"\xef\xbb\xbfseed: 7\n")
+    assert load_config(file).seed == 7
+
+
+VALUES = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5)),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=4), st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    ),
+    max_leaves=4,
+)
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.sampled_from([name for name, _ in flat_fields(Config())] + ["loss", "seed.x", "", "data."]), VALUES)
+def test_any_value_is_taken_or_refused_by_name(name, value):
+    try:
+        config = load_config(None, [f"{name}={json.dumps(value)}"])
+    except ConfigError as error:
+        assert str(error)
+        return
+    assert list(problems(config)) == []
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.binary(max_size=60))
+@example(b"loss: &a {ssim: *a}")
+@example(b"? {a: 1}\n: 2")
+@example(b"<<: {seed: 3}")
+@example(b"base: [1]")
+def test_any_file_is_taken_or_refused(content):
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "config.yaml"
+        file.write_bytes(content)
+        try:
+            load_config(file)
+        except ConfigError as error:
+            assert "config.yaml" in str(error) or ":" in str(error)
+
+
+def test_the_papers_configuration_has_the_papers_values():
+    config = load_config(Path(__file__).parents[2] / "configs" / "paper.yaml", [])
+    schedule, rates, population, loss = config.schedule, config.optimiser, config.population, config.loss
+    assert config.data.downscale == 4
+    assert (schedule.iterations, schedule.batch_size, schedule.scale) == (90_000, 4, 1)
+    assert (schedule.densify_from, schedule.densify_until, schedule.densify_every) == (2_000, 32_000, 1_000)
+    assert (schedule.t1, schedule.t2, schedule.gate_from) == (16_000, 34_000, 24_000)
+    assert (schedule.size_prune_after, schedule.sh_every, schedule.position_decay) == (3_000, 1_000, 50_000)
+    assert schedule.reset_every == 0 and population.opacity_decay == 0
+    assert (rates.position, rates.position_final) == (1.6e-4, 1.6e-6)
+    assert (rates.sh_dc, rates.sh_rest) == (7.5e-3, pytest.approx(7.5e-3 / 20))
+    assert (rates.opacity, rates.scale, rates.rotation) == (2e-2, 7e-3, 1e-3)
+    assert (rates.beta1, rates.beta2, rates.eps, rates.final_share) == (0.9, 0.999, 1e-15, 1)
+    assert rates.position_noise == 0 and not rates.sparse
+    assert (population.grad_threshold, population.min_opacity, population.clone_scale) == (1e-4, 0.005, 0.01)
+    assert (population.prune_screen_radius, population.prune_world_scale) == (20, 0.1)
+    assert population.importance and population.phi
+    assert (population.pass1_keep, population.pass2_mass, population.pass2_keep) == (0.7, 0.99, 1)
+    assert population.gate_rate == 0.6
+    assert (population.max_gaussians, population.pixels_per_gaussian, population.min_observations) == (
+        0,
+        0,
+        1,
+    )
+    assert (loss.ssim, loss.scale) == (0.2, 10)
+    assert not config.model.antialiased and config.model.sh_degree == 3

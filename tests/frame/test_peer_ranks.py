@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several ranks that write to each other's memory, without a GPU: ranks are threads, CUDA ops are replaced.
+
+The tests check that all ranks reach the same number of barriers, also if the capacity of some of them is too
+small, and that splats and gradients are in the places that the transport names.
+"""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.shared_memory import Shared
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.survey import survey
+from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
+from blitzgs.frame.transport import PeerTransport, peer
+from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, room_for
+from blitzgs.frame.transport.way_back import PeerWayBack
+from blitzgs.ops.capacity import CapacityEstimate, Sizes
+from blitzgs.ops.projection_types import VIEW_TOTALS
+from blitzgs.ops.scatter import gather_splats, scatter_splats, words_of
+from blitzgs.table.table import GaussianTable
+from tests.frame.test_sharded_rendering import OPTIONS, cameras
+from tests.frame.transports import IdleEvent, rasterize_into
+from tests.helpers import sum_of_ranks
+from tests.training.tiny import random_gaussians
+
+VIEWS, PATIENCE = 3, 30.0
+INTERSECT = torch.ops.blitzgs.intersect
+
+
+class Host:
+    """The state that the ranks share."""
+
+    def __init__(self, world_size):
+        self.meeting = threading.Barrier(world_size, timeout=PATIENCE)
+        self.slots = [None] * world_size
+
+    def gather(self, rank, value):
+        """Return every rank's value. Collective."""
+        self.slots[rank] = value
+        self.meeting.wait()
+        values = list(self.slots)
+        self.meeting.wait()
+        return values
+
+
+class Memory:
+    """A stand-in for `SharedMemory` of one rank."""
+
+    def __init__(self, host, rank):
+        self.host, self.rank, self.generation, self.log = host, rank, 0, []
+        self.reserve(32 * WORDS_PER_SPLAT)
+
+    def barrier(self):
+        self.log.append("barrier")
+        self.host.meeting.wait()
+
+    def share(self, values):
+        self.log.append("share")
+        everyone = torch.stack(self.host.gather(self.rank, values))
+        return Shared(everyone, everyone.sum(0), everyone.clone())
+
+    def reserve(self, words):
+        self.log.append(("reserve", words))
+        self.buffers = self.host.gather(self.rank, torch.full((words,), -1, dtype=torch.int32))
+
+
+class ThreadRanks(Ranks):
+    """A stand-in for `Ranks` of one thread."""
+
+    def all_to_all(self, rows, sent, received):
+        self.memory.log.append("all_to_all")
+        parts = [groups[self.rank] for groups in self.memory.host.gather(self.rank, rows.split(list(sent)))]
+        assert [len(part) for part in parts] == list(received)
+        return torch.cat(parts)
+
+
+def _send(columns, masks, everyone, rank, buffers, capacity):
+    """Replaces `send_splats_`."""
+    world_size = len(buffers)
+    n_views = everyone.shape[1] - VIEW_TOTALS - 2 * world_size
+    splats = everyone[:, VIEW_TOTALS + n_views :: 2].tolist()
+    most = max(*everyone[:, 1].tolist(), *map(sum, splats), *map(sum, zip(*splats, strict=True)))
+    if most > capacity:
+        return torch.empty(0, world_size, dtype=torch.int64), torch.tensor([0])
+    count = int(everyone[rank, 1])
+    numbers = torch.arange(count, dtype=torch.int32)
+    packed, places = scatter_splats([numbers], masks[:count], splats[rank])
+    (numbers,) = gather_splats(packed, [numbers], splats[rank])
+    for m, which in enumerate(numbers.long().split(splats[rank])):
+        at, begin = sum(sent[m] for sent in splats[:rank]), 0
+        for column in columns:
+            words = words_of(column[:count])
+            width = words.shape[1]
+            buffers[m][begin + at * width :][: len(which) * width] = words[which].flatten()
+            begin += capacity * width
+    return places, torch.tensor([sum(sent[rank] for sent in splats)])
+
+
+def _intersect(*arguments):
+    """Replaces `intersect` for a capacity below the number of entries, which the CPU op refuses."""
+    *splats, grid, _, n_splats, _ = arguments
+    return INTERSECT(*splats, grid, -1, n_splats, True)
+
+
+@pytest.fixture(autouse=True)
+def without_gpu(monkeypatch):
+    monkeypatch.setattr(torch.ops.blitzgs, "send_splats_", _send)
+    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
+    monkeypatch.setattr(torch.ops.blitzgs, "intersect", _intersect)
+    monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
+    monkeypatch.setattr(peer, "current_stream", lambda _: None)
+    returned = PeerWayBack.return_gradients
+
+    def from_columns(self, gradients):
+        table = self.tables[self.ranks.rank]  # compositing on a GPU writes them here
+        flat = torch.cat([part.reshape(len(part), -1) for part in gradients.parts], 1)
+        table[: len(flat), :9] = flat
+        return returned(self, gradients)
+
+    monkeypatch.setattr(PeerWayBack, "return_gradients", from_columns)
+
+
+def _on_all(world_size, function):
+    """Return [function(ranks) of each rank] and the calls of each rank to the shared memory."""
+    host = Host(world_size)
+
+    def rank(number):
+        try:
+            ranks = ThreadRanks(number, world_size, memory=Memory(host, number))
+            return function(ranks), ranks.memory.log
+        except BaseException:
+            host.meeting.abort()
+            raise
+
+    with ThreadPoolExecutor(world_size) as pool:
+        return list(zip(*pool.map(rank, range(world_size)), strict=True))
+
+
+def _scene():
+    """Return a table, its views, and the owner of each Gaussian among three ranks; the last owns none."""
+    table, views = random_gaussians(600), cameras(VIEWS)
+    tiles = TileRanges((0, 1), VIEWS, views.width, views.height).tiles_per_view * VIEWS
+    ranges = TileRanges((0, tiles // 5, tiles // 2, tiles), VIEWS, views.width, views.height, halo=LOSS_HALO)
+    return table, views, ranges, torch.arange(len(table)) % 7 // 6
+
+
+def _part(table, owner, ranks):
+    rows = owner == ranks.rank
+    return GaussianTable({name: table[name][rows] for name in table})
+
+
+def _keys(ids, camera_ids):
+    return ids * VIEWS + camera_ids
+
+
+@pytest.mark.parametrize("backward_follows", [False, True])
+@pytest.mark.parametrize(
+    ("sizes", "frames"),
+    [
+        (None, 2),
+        (Sizes(10**4, 10**4, 10**5, 10), 1),
+        (Sizes(10**4, 1000, 10**5, 10), 2),  # too small for the splats of one rank, sufficient for the others
+        (Sizes(10**4, 10**4, 3000, 10), 2),  # sufficient for the lists of one rank, too small for the others
+        (Sizes(1, 1, 1), 2),
+    ],
+)
+def test_all_ranks_repeat_a_frame_that_did_not_fit(sizes, frames, backward_follows):
+    table, views, ranges, owner = _scene()
+    alone = pipeline.forward(table, views, OPTIONS)
+    weights = torch.linspace(-1, 1, alone.renders.numel()).view_as(alone.renders)
+    expected = torch.cat([p.reshape(len(p), -1) for p in pipeline.backward_splats(alone, weights).parts], 1)
+    order = _keys(table["id"][alone.projected.gaussian_ids.long()], alone.projected.camera_ids).argsort()
+
+    def rank(ranks):
+        transport, part = PeerTransport(ranks, CapacityEstimate(sizes)), _part(table, owner, ranks)
+        assignment, before = TileAssignment(ranks, ranges), ranks.memory.generation
+        for count in (frames, 1):  # a second frame has the capacity that the first one needed
+            frame = pipeline.forward(
+                part, views, OPTIONS, assignment=assignment, transport=transport,
+                backward_follows=backward_follows,
+            )  # fmt: skip
+            assert ranks.memory.generation == before + count
+            before = ranks.memory.generation
+            own = ranges.pixel_mask(ranks.rank, ranks.device)
+            assert torch.equal(frame.renders[own], alone.renders[own])
+            assert torch.equal(frame.visible, alone.visible)
+            for _ in range(2):
+                gradients = pipeline.backward_splats(frame, weights)
+                found = sum_of_ranks(gradients, len(frame.projected.depths))
+                ranks.memory.barrier()  # otherwise the next pass could write while other ranks read
+        ids = part["id"][frame.projected.gaussian_ids.long()]
+        return _keys(ids, frame.projected.camera_ids), found, transport.capacity.sizes
+
+    results, logs = _on_all(3, rank)
+    assert logs[0] == logs[1] == logs[2]
+    assert results[0][2] == results[1][2] == results[2][2]
+    keys, found, _ = (
+        torch.cat(parts) if torch.is_tensor(parts[0]) else parts for parts in zip(*results, strict=True)
+    )
+    assert len(results[2][0]) == 0 and expected.any()
+    torch.testing.assert_close(found[keys.argsort(), :9], expected[order], rtol=1e-4, atol=1e-4)
+
+
+def test_buffers_grow_rarely_while_a_model_grows():
+    words, lengths = room_for(100, 0), []
+    for splats in range(100, 10_000):
+        assert (grown := room_for(splats, words)) >= max(words, splats * WORDS_PER_SPLAT)
+        if grown > words:
+            lengths.append(words := grown)
+    assert len(lengths) <= 20 and room_for(100, words) == words
+    assert room_for(10**6, words) < (10**6 + 32) * WORDS_PER_SPLAT  # a single large request is not exceeded
+
+
+def test_ranks_survey_together():
+    table, views, ranges, owner = _scene()
+    ranges = replace(ranges, halo=0)  # each tile counts once
+    alone = survey(table, views, OPTIONS)
+    order = _keys(table["id"][alone.splats.gaussian_ids.long()], alone.splats.camera_ids).argsort()
+
+    def rank(ranks):
+        part = _part(table, owner, ranks)
+        got = survey(part, views, OPTIONS, TileAssignment(ranks, ranges), PeerTransport(ranks))
+        return (
+            _keys(part["id"][got.splats.gaussian_ids.long()], got.splats.camera_ids),
+            got.weights,
+            got.pixels,
+        )
+
+    results, logs = _on_all(3, rank)
+    assert logs[0] == logs[1] == logs[2]
+    keys, weights, pixels = map(torch.cat, zip(*results, strict=True))
+    assert torch.equal(weights[keys.argsort()], alone.weights[order]) and alone.weights.any()
+    assert torch.equal(pixels[keys.argsort()], alone.pixels[order])

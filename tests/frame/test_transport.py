@@ -1,0 +1,314 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splats reach the ranks that composite them, once each, and their gradients return."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
+from blitzgs.frame.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport, peer
+from blitzgs.frame.transport.peer import WORDS_PER_SPLAT
+from blitzgs.frame.transport.protocol import Traffic
+from blitzgs.frame.transport.way_back import CollectiveWayBack
+from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
+from blitzgs.ops.intersect import intersect
+from blitzgs.ops.project import project_splats
+from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
+from blitzgs.ops.scatter import scatter_splats
+from blitzgs.ops.splat_gradients import SplatGradients
+from tests.distributed.rank_harness import run_ranks
+from tests.frame.test_sharded_rendering import OPTIONS, cameras
+from tests.frame.transports import IdleEvent, LoneMemory, RecordingTransport, rasterize_into
+from tests.helpers import parameter_gradients, sum_of_ranks
+from tests.training.tiny import random_gaussians
+
+WIDTH, HEIGHT, CAMERAS = 100, 60, 2
+TILES = CAMERAS * 7 * 4
+
+
+def scene(n=240, dtype=torch.float32):
+    g = torch.Generator().manual_seed(1)
+    means = torch.randn(n, 3, generator=g) * torch.tensor([1.5, 1.0, 0.5])
+    quats = torch.randn(n, 4, generator=g)
+    scales = torch.randn(n, 3, generator=g) * 0.5 - 3
+    opacities, sh = torch.randn(n, generator=g), torch.randn(n, 1, 3, generator=g)
+    viewmats = torch.eye(4).repeat(CAMERAS, 1, 1)
+    viewmats[:, 2, 3] = torch.tensor([3.0, 4.0])
+    K = torch.tensor([[80.0, 0, 51], [0, 80, 29], [0, 0, 1]])
+    ids = torch.randperm(n, generator=g) + 2**40
+    return ProjectionInputs(
+        [t.to(dtype) for t in (means, quats, scales, opacities, sh)],
+        [t.to(dtype) for t in (viewmats, K.repeat(CAMERAS, 1, 1))],
+        ProjectionOptions(WIDTH, HEIGHT),
+        ids=ids,
+    )
+
+
+def ranges_for(world_size):
+    bounds = {1: (0, TILES), 2: (0, 17, TILES), 4: (0, 9, 9, 40, TILES)}[world_size]
+    return TileRanges(bounds, CAMERAS, WIDTH, HEIGHT, halo=LOSS_HALO)
+
+
+def owned_by(inputs, rank, world_size):
+    """The Gaussians of one rank; at four ranks rank 2 has none."""
+    owner = torch.arange(len(inputs.ids)) % world_size
+    if world_size == 4:
+        owner[owner == 2] = 3
+    mine = owner == rank
+    return inputs._replace(gaussians=[t[mine] for t in inputs.gaussians], ids=inputs.ids[mine])
+
+
+def weight_of(splats):
+    """A number per splat that depends on its id alone."""
+    return (((splats.ids * 2654435761) >> 7) % 1000).to(splats.means2d.dtype) / 1000
+
+
+def gradients_of(splats, rank):
+    """Gradients that depend on the splat and on the rank that composited it."""
+    w = weight_of(splats)[:, None] * (1 + rank)
+    return [
+        2 * w * splats.means2d, w.expand(-1, 3), 3 * w[:, 0] * splats.opacities**2, 2 * w * splats.colors
+    ]  # fmt: skip
+
+
+def _round_trip(ranks, half, capacity):
+    inputs = owned_by(scene(dtype=torch.float32 if half else torch.float64), ranks.rank, ranks.world_size)
+    transport = open_transport(ranks, half)
+    assignment = TileAssignment(ranks, ranges_for(ranks.world_size))
+    attempt = Attempt(capacity)
+    exchange = transport.project_and_send(inputs, assignment, attempt)
+    got = exchange.arrived.splats
+    assert exchange.gradient_table is None
+    projected, splats, visible, traffic, way_back = exchange.finish()
+    assert attempt.fits and list(attempt.needed[:3]) == projected.counts.tolist()
+    assert splats is got and sum(traffic.received) == len(got.ids)
+    for _ in range(2):
+        way_back.check_still_valid()
+        returned = way_back.return_gradients(SplatGradients(gradients_of(got, ranks.rank)))
+    assert returned.places is None
+    ids = (inputs.ids[projected.gaussian_ids.long()] - 2**40) * CAMERAS + projected.camera_ids
+    return ids, returned.parts, got._asdict(), visible, traffic.splats
+
+
+def masks_by_lists(projected, world_size):
+    """Return the ranks that each splat must reach, from the lists of each rank's intersection."""
+    masks, ranges = torch.zeros(len(projected.depths), dtype=torch.int64), ranges_for(world_size)
+    for rank in range(world_size):
+        begin, end = ranges.composited(rank)
+        listed, _ = intersect(
+            projected.means2d, projected.conics, projected.opacities, projected.depths, projected.camera_ids,
+            n_cameras=CAMERAS, width=WIDTH, height=HEIGHT, tile_begin=begin, tile_end=end,
+        )  # fmt: skip
+        masks[listed.long().unique()] |= 1 << rank
+    return masks
+
+
+@pytest.mark.parametrize("world_size", [2, 4])
+@pytest.mark.parametrize("capacity", [None, Sizes(1, 1, 1), Sizes(500, 1000, 1)])
+def test_splats_reach_their_tiles_and_gradients_return(world_size, capacity):
+    whole = scene(dtype=torch.float64)
+    projected = project_splats(whole)
+    masks = masks_by_lists(projected, world_size)
+    assert masks.unique().numel() > 2
+    answers = run_ranks(_round_trip, world_size, False, capacity)
+    ids = torch.cat([a[0] for a in answers])
+    keys = (whole.ids[projected.gaussian_ids.long()] - 2**40) * CAMERAS + projected.camera_ids
+    order, reference = ids.argsort(), keys.argsort()
+    assert torch.equal(ids[order], keys[reference])
+    times = sum(((masks >> m) & 1) * (1 + m) for m in range(world_size)).double()
+    w = times * ((whole.ids[projected.gaussian_ids.long()] * 2654435761 >> 7) % 1000).double() / 1000
+    wanted = [
+        2 * w[:, None] * projected.means2d, w[:, None].expand(-1, 3), 3 * w * projected.opacities**2,
+        2 * w[:, None] * projected.colors,
+    ]  # fmt: skip
+    for i, want in enumerate(wanted):
+        got = torch.cat([a[1][i] for a in answers])[order]
+        torch.testing.assert_close(got, want[reference], rtol=1e-12, atol=1e-12)
+    place = {int(key): at for at, key in enumerate(keys)}
+    counts = []
+    for owned, *_ in answers:
+        reaches = masks[[place[int(key)] for key in owned]]
+        counts.append([int((reaches >> m & 1).sum()) for m in range(world_size)])
+    for rank, (_, _, received, visible, splats) in enumerate(answers):
+        assert splats == counts  # every rank knows how many splats each rank sends to each other
+        key = (received["ids"] - 2**40) * CAMERAS + received["camera_ids"]
+        at = torch.tensor([place[int(k)] for k in key], dtype=torch.int64)
+        # Exactly the splats that touch this rank's tiles, once each, unchanged.
+        assert torch.equal(at.sort().values, ((masks >> rank) & 1).nonzero().squeeze(1))
+        for name, column in received.items():
+            if name != "ids":
+                assert torch.equal(column, getattr(projected, name)[at]), name
+        assert torch.equal(visible, torch.bincount(projected.camera_ids, minlength=CAMERAS))
+
+
+def test_half_precision_is_close():
+    answers = run_ranks(_round_trip, 2, True, None)
+    projected = project_splats(scene())
+    keys = (scene().ids[projected.gaussian_ids.long()] - 2**40) * CAMERAS + projected.camera_ids
+    place = {int(key): splat for splat, key in enumerate(keys)}
+    for _, gradients, received, *_ in answers:
+        key = (received["ids"] - 2**40) * CAMERAS + received["camera_ids"]
+        at = torch.tensor([place[int(k)] for k in key])
+        assert torch.equal(received["means2d"], projected.means2d[at])
+        assert torch.equal(received["depths"], projected.depths[at])
+        torch.testing.assert_close(received["colors"], projected.colors[at], rtol=1e-3, atol=1e-6)
+        torch.testing.assert_close(received["opacities"], projected.opacities[at], rtol=1e-3, atol=1e-6)
+        scale = (projected.conics[at, 0] * projected.conics[at, 2]).sqrt()[:, None]
+        assert ((received["conics"] - projected.conics[at]).abs() / scale).max() < 4e-3
+        a, b, c = received["conics"].unbind(1)
+        assert (a * c - b * b > 0).all()
+        assert all(g.isfinite().all() for g in gradients)
+    exact = [project_splats(owned_by(scene(), rank, 2)) for rank in range(2)]
+    for rank, (_, gradients, *_) in enumerate(answers):
+        mine, inputs = exact[rank], owned_by(scene(), rank, 2)
+        masks = masks_by_lists(mine, 2)
+        times = ((masks & 1) + (masks >> 1) * 2).float()
+        ids = inputs.ids[mine.gaussian_ids.long()]
+        w = times * ((ids * 2654435761 >> 7) % 1000).float() / 1000
+        torch.testing.assert_close(gradients[0], 2 * w[:, None] * mine.means2d, rtol=2e-2, atol=1e-4)
+        torch.testing.assert_close(gradients[2], 3 * w * mine.opacities**2, rtol=2e-2, atol=1e-4)
+
+
+@pytest.fixture
+def alone(monkeypatch):
+    """One rank that writes to its own memory, without a GPU: a function replaces the op that sends."""
+
+    def send(columns, masks, everyone, rank, buffers, capacity):
+        n_splats = int(everyone[0, 1])
+        plan = torch.tensor([int(everyone[0, -2]) if n_splats <= capacity else 0])
+        goes = (masks[:n_splats] == 1).nonzero().squeeze(1) if n_splats <= capacity else masks[:0]
+        begin = 0
+        for column in columns:
+            words = column.reshape(len(column), -1).view(torch.int32)
+            target = buffers[0][begin:][: capacity * words.shape[1]].view(capacity, words.shape[1])
+            target[: len(goes)] = words[goes]
+            begin += capacity * words.shape[1]
+        number = torch.arange(n_splats, dtype=torch.int32)
+        return scatter_splats([number], masks[:n_splats], [int((masks[:n_splats] == 1).sum())])[1], plan
+
+    monkeypatch.setattr(torch.ops.blitzgs, "send_splats_", send)
+
+    monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
+    monkeypatch.setattr(peer, "current_stream", lambda _: None)
+    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
+    return Ranks(memory=LoneMemory(64 * WORDS_PER_SPLAT))
+
+
+def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
+    ranges = ranges_for(1)
+    assignment, inputs = TileAssignment(alone, ranges), scene()
+    transport = PeerTransport(alone)
+
+    def finished():
+        for attempt in transport.capacity.attempts():
+            exchange = transport.project_and_send(inputs, assignment, attempt)
+            arrived, table = exchange.arrived, exchange.gradient_table
+            assert arrived.n_isects > 0 and len(arrived.splats.ids) >= len(table)
+            result = exchange.finish()
+            assert (result is None) != attempt.fits
+        return result, attempt.needed
+
+    result, needed = finished()
+    assert alone.memory.generation == 2  # the first attempt had too small a capacity
+    assert len(alone.memory.buffers[0]) >= len(result.projected.depths) * WORDS_PER_SPLAT
+    projected = project_splats(inputs)
+    assert all(torch.equal(a, b) for a, b in zip(result.projected[:11], projected[:11], strict=True))
+    masks = masks_by_lists(projected, 1)
+    assert torch.equal(result.splats.means2d, projected.means2d[masks == 1])
+    table = result.way_back.cleared_table()
+    table.copy_(torch.arange(table.numel()).view_as(table))
+    returned = result.way_back.return_gradients(SplatGradients([table]))
+    sums = sum_of_ranks(returned, len(projected.depths))
+    assert torch.equal(sums[masks == 1], table) and not sums[masks == 0].any()
+    later, _ = finished()
+    later.way_back.check_still_valid()
+    with pytest.raises(RuntimeError, match="a later exchange has overwritten"):
+        result.way_back.check_still_valid()
+    # One entry more than the capacity: the frame is repeated with a larger capacity.
+    short = CapacityEstimate(Sizes(1, 1, needed[2] - 1))
+    again = PeerTransport(alone, short)
+    transport, before = again, alone.memory.generation
+    finished()
+    assert alone.memory.generation == before + 2
+
+
+def test_a_frame_by_shared_memory_is_the_local_one(alone):
+    table, views = random_gaussians(700), cameras(3)
+    ranges = TileRanges((0, 3 * 60), 3, views.width, views.height)
+    expected = pipeline.forward(table, views, OPTIONS)
+    assignment, transport = TileAssignment(alone, ranges), PeerTransport(alone)
+    for backward_follows in (False, True):
+        frame = pipeline.forward(
+            table, views, OPTIONS, assignment=assignment, transport=transport,
+            backward_follows=backward_follows,
+        )  # fmt: skip
+        assert torch.equal(frame.renders, expected.renders)
+        assert torch.equal(frame.visible, expected.visible)
+
+
+def test_traffic_of_uneven_ranks():
+    # Visible Gaussians, splats, tiles and blocks; splats of two views; splats and tiles for each rank.
+    totals = [[4, 7, 30, 2, 3, 4, 5, 11, 1, 2, 6, 9], [2, 3, 8, 9, 1, 2, 0, 0, 3, 5, 2, 4], [0] * 12]
+    traffic = Traffic.of(totals, 2, 1)
+    assert traffic.own == Sizes(2, 3, 8, 9) and traffic.splats == [[5, 1, 6], [0, 3, 2], [0, 0, 0]]
+    assert (traffic.sent, traffic.received, traffic.starts) == ([0, 3, 2], [1, 3, 0], [5, 1, 6])
+    assert (traffic.most, traffic.n_isects, traffic.most_isects, traffic.most_blocks) == (12, 7, 13, 9)
+    assert traffic.needed == Sizes(12, 12, 13, 9)
+
+
+def test_a_transport_that_does_not_serve_the_job_says_so():
+    assignment = TileAssignment(Ranks(), ranges_for(1))
+    with pytest.raises(ValueError, match="serves one rank"):
+        LocalTransport().project_and_send(scene(), assignment, Attempt(None))
+    with pytest.raises(ValueError, match="need an assignment"):
+        CollectiveTransport(Ranks()).project_and_send(scene(), None, Attempt(None))
+    with pytest.raises(ValueError, match="share no memory"):
+        PeerTransport(Ranks())
+
+
+def test_one_rank_needs_no_way_back():
+    result = LocalTransport().project_and_send(scene(), None, Attempt(None)).finish()
+    assert result.way_back is None and result.traffic is None
+
+
+def test_a_frame_that_did_not_fit_is_rendered_again_but_not_for_ever():
+    table, views = random_gaussians(300), cameras(2)
+    expected = pipeline.forward(table, views, OPTIONS)
+    transport = RecordingTransport(LocalTransport(), too_small=2)
+    frame = pipeline.forward(table, views, OPTIONS, transport=transport)
+    names = [name for name, _ in transport.calls]
+    assert names == ["start", "finish"] * 3
+    capacities = [capacity for name, capacity in transport.calls if name == "start"]
+    assert capacities[0] is None and capacities[1].holds(expected.projected.counts)
+    assert torch.equal(frame.renders, expected.renders)
+    v_renders = torch.ones_like(frame.renders)
+    gradients = parameter_gradients(table, frame, v_renders)
+    for got, want in zip(gradients, parameter_gradients(table, expected, v_renders), strict=True):
+        assert torch.equal(got, want)
+    transport.too_small = 10
+    with pytest.raises(RuntimeError, match="4 attempts have each needed more .* needs \\("):
+        pipeline.forward(table, views, OPTIONS, transport=transport)
+    assert transport.too_small == 6
+
+
+@pytest.mark.parametrize("splats", [0, 1, 31, 32, 33, 5000])
+@pytest.mark.parametrize("world_size", [2, 4])
+def test_sums_return_to_the_splats_that_were_sent(splats, world_size):
+    g = torch.Generator().manual_seed(splats)
+    masks = torch.randint(0, 1 << world_size, (splats,), generator=g)
+    if world_size == 4:
+        masks &= 0b1011  # rank 2 composites nothing
+    sent = [(masks >> rank & 1).nonzero().squeeze(1) for rank in range(world_size)]
+    counts = [len(which) for which in sent]
+    _, places = scatter_splats([torch.zeros(splats)], masks, counts)
+    returned = torch.randint(-(2**40), 2**40, (sum(counts), 2), generator=g)
+    expected = torch.zeros(splats, 2, dtype=torch.int64)
+    for which, group in zip(sent, returned.split(counts), strict=True):
+        expected.index_add_(0, which, group)
+    ranks = SimpleNamespace(all_to_all=lambda *_: returned)
+    traffic = SimpleNamespace(sent=counts, received=counts, own=Sizes(0, splats, 0))
+    way_back = CollectiveWayBack(ranks, traffic, places, half=False)
+    assert torch.equal(way_back.return_sums(returned), expected)

@@ -1,0 +1,290 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+import os
+import resource
+import signal
+import warnings
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.runs import checkpoint
+from tests.distributed.rank_harness import CONTEXT, RankError, run_ranks
+
+ALONE = Ranks()
+POINTS = [
+    "begin",
+    "folder made",
+    "shard half written",
+    "shard written",
+    "shard synced",
+    "manifest written",
+    "manifest synced",
+    "renamed",
+    "finished",
+    "old one renamed",
+]
+
+
+def table(rows, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        "means": torch.randn(rows, 3, generator=generator),
+        "sh": torch.randn(rows, 4, 3, generator=generator),
+        "opacities": torch.randn(rows, generator=generator),
+        "id": torch.randperm(rows, generator=generator),
+        "level": torch.randint(0, 5, (rows,), generator=generator, dtype=torch.uint8),
+        "flag": torch.rand(rows, generator=generator) > 0.5,
+        "last_step": torch.randint(0, 99, (rows,), generator=generator, dtype=torch.int32),
+    }
+
+
+def equal(a, b):
+    return sorted(a) == sorted(b) and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def by_id(shards):
+    whole = {name: torch.cat([shard[name] for shard in shards]) for name in shards[0]}
+    order = whole["id"].argsort()
+    return {name: column[order] for name, column in whole.items()}
+
+
+def test_round_trip_and_format(tmp_path):
+    columns, state = table(101), {"iteration": 7, "note": ["ä", 1.5, None]}
+    path = checkpoint.save(tmp_path / "checkpoints", columns, state, ALONE)
+    loaded = checkpoint.load_latest(tmp_path / "checkpoints", ALONE, "cpu")
+    assert equal(loaded.columns, columns)
+    assert loaded.state == state and loaded.name == path.name
+    # The shard is an ordinary safetensors file.
+    assert equal(load_file(path / "shard_0000_of_0001.safetensors"), columns)
+    assert checkpoint.load_latest(tmp_path / "nothing here", ALONE, "cpu") is None
+    empty = table(0)
+    checkpoint.save(tmp_path / "checkpoints", empty, state, ALONE)
+    assert equal(checkpoint.load_latest(tmp_path / "checkpoints", ALONE, "cpu").columns, empty)
+
+
+def test_keeps_the_last_k(tmp_path):
+    for iteration in range(5):
+        checkpoint.save(tmp_path, table(3, iteration), {"iteration": iteration}, ALONE, keep=2)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint_000003", "checkpoint_000004"]
+    assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 4}
+
+
+def _flip_bit(path, offset):
+    data = bytearray(path.read_bytes())
+    data[offset] ^= 0x10
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda p: _flip_bit(p / "shard_0000_of_0001.safetensors", 700), "does not match its SHA-256"),
+        (lambda p: _flip_bit(p / "shard_0000_of_0001.safetensors", 9), "does not match its SHA-256"),
+        (lambda p: os.truncate(p / "shard_0000_of_0001.safetensors", 500), "has 500 bytes"),
+        (lambda p: (p / "shard_0000_of_0001.safetensors").unlink(), "safetensors is missing"),
+        (lambda p: (p / "manifest.json").unlink(), "manifest.json is missing"),
+        (lambda p: os.truncate(p / "manifest.json", 40), "not valid JSON"),
+        (lambda p: (p / "manifest.json").write_text(json.dumps({"format": 9})), "format 9"),
+        (lambda p: (p / "manifest.json").write_text('{"format": 1, "shards": [], "state": {}}'), "no files"),
+        (lambda p: (p / "manifest.json").write_text("[" * 5000), "recursion"),
+    ],
+)
+def test_a_damaged_checkpoint_is_refused_by_name(tmp_path, damage, reason):
+    checkpoint.save(tmp_path, table(50, 1), {"iteration": 1}, ALONE)
+    newest = checkpoint.save(tmp_path, table(50, 2), {"iteration": 2}, ALONE)
+    damage(newest)
+    with pytest.warns(
+        UserWarning, match=f"checkpoint_000001 is damaged.*{reason}.*; using checkpoint_000000"
+    ):
+        loaded = checkpoint.load_latest(tmp_path, ALONE, "cpu")
+    assert loaded.state == {"iteration": 1}
+    assert equal(loaded.columns, table(50, 1))
+    with pytest.raises(checkpoint.CheckpointError, match=f"checkpoint_000001 is damaged.*{reason}"):
+        checkpoint.load(newest, ALONE, "cpu")
+    # A new save does not reuse the damaged one's name.
+    assert checkpoint.save(tmp_path, table(5), {}, ALONE).name == "checkpoint_000002"
+
+
+def test_each_damaged_checkpoint_is_named_once(tmp_path):
+    paths = [checkpoint.save(tmp_path, table(5), {}, ALONE) for _ in range(3)]
+    for path in paths[1:]:
+        (path / "manifest.json").unlink()
+    with pytest.warns(UserWarning) as caught:
+        checkpoint.load_latest(tmp_path, ALONE, "cpu")
+    (warning,) = caught
+    (paths[0] / "manifest.json").unlink()
+    with (
+        warnings.catch_warnings(),
+        pytest.raises(checkpoint.CheckpointError, match="no sound checkpoint") as failure,
+    ):
+        warnings.simplefilter("error")
+        checkpoint.load_latest(tmp_path, ALONE, "cpu")
+    for path in paths:
+        assert str(warning.message).count(path.name) == 1
+        assert str(failure.value).count(path.name) == 1
+
+
+def _save_and_die(directory, point, keep):
+    def reached(label):
+        if label == point:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    checkpoint.save(directory, table(64, 2), {"iteration": 2}, ALONE, keep=keep, reached=reached)
+
+
+@pytest.mark.parametrize("point", POINTS)
+def test_kill_at_any_point_of_a_save(tmp_path, point):
+    for attempt in range(3):
+        directory = tmp_path / str(attempt)
+        checkpoint.save(directory, table(64, 0), {"iteration": 0}, ALONE)
+        checkpoint.save(directory, table(64, 1), {"iteration": 1}, ALONE)
+        process = CONTEXT.Process(target=_save_and_die, args=(directory, point, 2))
+        process.start()
+        process.join(60)
+        assert process.exitcode == -signal.SIGKILL
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            loaded = checkpoint.load_latest(directory, ALONE, "cpu")
+        complete = POINTS.index(point) >= POINTS.index("renamed")
+        assert loaded.state == {"iteration": 2 if complete else 1}
+        assert equal(loaded.columns, table(64, loaded.state["iteration"]))
+        # The next save clears what was left behind.
+        checkpoint.save(directory, table(4), {}, ALONE, keep=2)
+        assert len(list(directory.iterdir())) == 2
+
+
+def _save_on_a_full_disk(directory, limit):
+    # Past the limit every write fails, as on a full disk; Python ignores the signal that comes with it.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    try:
+        checkpoint.save(directory, table(5000, 1), {"iteration": 1}, ALONE)
+    except checkpoint.CheckpointError as error:
+        (directory / "message").write_text(str(error))
+
+
+def test_full_disk(tmp_path, monkeypatch):
+    checkpoint.save(tmp_path, table(64), {"iteration": 0}, ALONE)
+    process = CONTEXT.Process(target=_save_on_a_full_disk, args=(tmp_path, 100_000))
+    process.start()
+    process.join(60)
+    message = (tmp_path / "message").read_text()
+    assert "checkpoint_000001 was not saved: rank 0 could not write: the disk is full" in message
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint_000000", "message"]
+    usage = type("Usage", (), {"free": 10})
+    monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda path: usage)
+    with pytest.raises(checkpoint.CheckpointError, match="GB are needed and 0.00 GB are free"):
+        checkpoint.save(tmp_path, table(64), {}, ALONE)
+    assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 0}
+
+
+def _refuse(monkeypatch, method, folder):
+    original = getattr(checkpoint.Path, method)
+
+    def refused(path, *arguments):
+        if path == folder:
+            raise PermissionError(1, "Operation not permitted", str(path))
+        return original(path, *arguments)
+
+    monkeypatch.setattr(checkpoint.Path, method, refused)
+
+
+def test_an_old_checkpoint_that_cannot_be_deleted_is_named_and_stays(tmp_path, monkeypatch):
+    for iteration in range(2):
+        checkpoint.save(tmp_path, table(3), {"iteration": iteration}, ALONE, keep=2)
+    with monkeypatch.context() as patch:
+        _refuse(patch, "rename", tmp_path / "checkpoint_000000")
+        with pytest.warns(UserWarning, match="could not be deleted.*not permitted.*checkpoint_000000"):
+            checkpoint.save(tmp_path, table(3), {"iteration": 2}, ALONE, keep=2)
+    assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 2}
+    checkpoint.save(tmp_path, table(3), {"iteration": 3}, ALONE, keep=2)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint_000002", "checkpoint_000003"]
+
+
+def test_a_folder_that_cannot_be_read_is_a_failed_checkpoint(tmp_path, monkeypatch):
+    checkpoint.save(tmp_path, table(3), {}, ALONE)
+    _refuse(monkeypatch, "iterdir", tmp_path)
+    with pytest.raises(checkpoint.CheckpointError, match=f"could not read {tmp_path}"):
+        checkpoint.save(tmp_path, table(3), {}, ALONE)
+
+
+def test_bad_arguments(tmp_path):
+    with pytest.raises(ValueError, match="of one length"):
+        checkpoint.save(tmp_path, {"a": torch.zeros(2), "b": torch.zeros(3)}, {}, ALONE)
+    with pytest.raises(ValueError, match="keep must be at least 1"):
+        checkpoint.save(tmp_path, table(2), {}, ALONE, keep=0)
+    with pytest.raises(ValueError, match="column a has dtype torch.complex64"):
+        checkpoint.save(tmp_path, {"a": torch.zeros(2, dtype=torch.complex64)}, {}, ALONE)
+
+
+def _shard_of(whole, ranks, sizes):
+    start = sum(sizes[: ranks.rank])
+    return {name: column[start : start + sizes[ranks.rank]] for name, column in whole.items()}
+
+
+def _save_shard(ranks, directory, sizes):
+    return checkpoint.save(directory, _shard_of(table(sum(sizes)), ranks, sizes), {"m": 4}, ranks).name
+
+
+def _load_shard(ranks, directory):
+    loaded = checkpoint.load_latest(directory, ranks, "cpu")
+    return loaded.columns, loaded.state
+
+
+def _save_with_one_full_disk(ranks, directory, sizes):
+    if ranks.rank == 1:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+    return _save_shard(ranks, directory, sizes)
+
+
+def test_save_at_four_ranks_load_at_any_number(tmp_path):
+    sizes = [30, 0, 11, 60]
+    assert run_ranks(_save_shard, 4, tmp_path, sizes) == ["checkpoint_000000"] * 4
+    whole = by_id([table(sum(sizes))])
+    for world_size in (1, 2, 3, 4):
+        answers = run_ranks(_load_shard, world_size, tmp_path)
+        shards = [columns for columns, _ in answers]
+        assert all(state == {"m": 4} for _, state in answers)
+        assert equal(by_id(shards), whole)
+        lengths = [len(shard["id"]) for shard in shards]
+        if world_size == 4:
+            assert lengths == sizes  # as saved
+        else:
+            assert max(lengths) - min(lengths) <= 1
+    with pytest.raises(RankError) as failure:
+        run_ranks(_save_with_one_full_disk, 2, tmp_path, [50, 50])
+    for message in failure.value.messages.values():
+        assert "checkpoint_000001 was not saved: rank 1 could not write: the disk is full" in message
+    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint_000000"]
+
+
+def test_dealing_keeps_the_order_and_opens_only_what_it_needs(tmp_path):
+    whole = table(22)
+    four = [{name: column[m::4] for name, column in whole.items()} for m in range(4)]
+    # Four shards of a table dealt round-robin, written one by one.
+    shards = []
+    for m, columns in enumerate(four):
+        file = tmp_path / f"{m}.safetensors"
+        size, digest = checkpoint.write_shard(file, columns, lambda point: None)
+        shards.append(checkpoint.Shard(file.name, len(columns["id"]), size, digest))
+    assert equal(checkpoint.read_share(tmp_path, shards, ALONE, torch.device("cpu")), whole)
+    # Rows 1, 3, 5, ... are in the second and the fourth file; of the first, only the header is read.
+    first = tmp_path / shards[0].file
+    first.write_bytes(first.read_bytes()[:-1])
+    (tmp_path / shards[2].file).unlink()
+    share = checkpoint.read_share(tmp_path, shards, Ranks(rank=1, world_size=2), torch.device("cpu"))
+    assert equal(share, {name: column[1::2] for name, column in whole.items()})
+
+
+def test_shared_columns_are_saved_and_checked(tmp_path):
+    shared = {"costs": torch.rand(7), "views": torch.arange(3), "none": torch.empty(0, 4)}
+    path = checkpoint.save(tmp_path, table(5), {}, ALONE, shared=shared)
+    assert equal(checkpoint.load_latest(tmp_path, ALONE, "cpu").shared, shared)
+    _flip_bit(path / checkpoint.SHARED, -1)
+    with pytest.raises(checkpoint.CheckpointError, match="shared.safetensors does not match its SHA-256"):
+        checkpoint.load(path, ALONE, "cpu")
+    (path / checkpoint.SHARED).unlink()
+    with pytest.raises(checkpoint.CheckpointError, match="shared.safetensors is missing"):
+        checkpoint.load(path, ALONE, "cpu")

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lineage: its log, its sums after any events, and its error when they do not match the population."""
+
+import os
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.population.density import DensityRules, densify
+from blitzgs.population.redistribution import redistribute
+from blitzgs.spawn.candidates import FEATURES, spawn_features
+from blitzgs.spawn.lineage import (
+    Births,
+    Cause,
+    Ledger,
+    Lineage,
+    LineageError,
+    initial_births,
+)
+from blitzgs.spawn.lineage_parts import read_lineage
+from tests.distributed.rank_harness import run_ranks
+from tests.population.test_density import random_table
+
+pytest.importorskip("pyarrow")
+RULES = DensityRules(
+    grad_threshold=4e-4, clone_scale=0.02, min_opacity=0.02, max_screen_radius=25.0, max_scale=0.3
+)
+
+
+def some(ids, time=0):
+    ids = torch.tensor(ids, dtype=torch.int64)
+    return Births(ids, ids + 1, torch.ones(len(ids), 3), torch.full((len(ids), len(FEATURES)), 1.5 + time))
+
+
+def shaken(table, event):
+    """New statistics, as if trained."""
+    g = torch.Generator().manual_seed(100 + event)
+    draws = torch.rand(100_003, 3, generator=g)[table["id"] % 100_003].to(table.device)
+    table["grad_count"].copy_((5 * draws[:, 0]).int())
+    table["grad_sum"].copy_(1e-3 * draws[:, 1] * table["grad_count"])
+    table["max_radii"].copy_(30 * draws[:, 2])
+    table["exp_avg_sq.sh"].copy_(draws[:, :1, None].expand_as(table["exp_avg_sq.sh"]))
+
+
+def live(folder):
+    tables = read_lineage(folder)
+    births, deaths = tables["births"]["id"], tables["deaths"]["id"]
+    assert len(np.unique(births)) == len(births) and len(np.unique(deaths)) == len(deaths)
+    return np.setdiff1d(births, deaths), tables
+
+
+def test_a_run_of_events_is_logged_row_by_row(tmp_path):
+    table = random_table(300)
+    lineage = Lineage(tmp_path, Ranks(), 0, Ledger())
+    lineage.born(initial_births(table["id"], table["parent"], table["means"]), 0)
+    reports = []
+    for event in range(1, 4):
+        shaken(table, event)
+        before = {int(i): {n: table[n][row].clone() for n in table} for row, i in enumerate(table["id"])}
+        reports.append(
+            densify(
+                table, RULES, time=100 * event, step=event, seed=3, level_count=4, ranks=Ranks(), extent=2.0,
+                lineage=lineage,
+            )
+        )  # fmt: skip
+    ledger = lineage.flush_and_check(table["id"], 3)
+    lineage.close()
+    alive, tables = live(tmp_path)
+    assert alive.tolist() == sorted(table["id"].tolist())
+    births, deaths = tables["births"], tables["deaths"]
+    assert ledger.births == len(births["id"]) and ledger.deaths == len(deaths["id"])
+    grown = sum(r.cloned + 2 * r.split for r in reports)
+    assert len(births["id"]) == 300 + grown
+    assert (deaths["cause"] == Cause.SPLIT).sum() == sum(r.split for r in reports) > 10
+    assert {Cause.OPACITY, Cause.SIZE} <= set(deaths["cause"].tolist())
+    last = np.flatnonzero(births["time"] == 300)
+    assert len(last) > 10
+    for row in last:
+        parent = before[int(births["parent"][row])]
+        count = max(int(parent["grad_count"]), 1)
+        want = {
+            "gradient": float(parent["grad_sum"]) / count,
+            "parent_opacity": float(parent["opacities"].sigmoid()),
+            "parent_scale": float(parent["scales"].exp().mean()) / 2.0,
+            "parent_age": 300 - int(parent["birth"]),
+            "views": int(parent["grad_count"]),
+            "level": min(int(parent["level"]) + int(births["is_split"][row]), 3),
+            "is_split": float(parent["scales"].max().exp() > RULES.clone_scale),
+            "parent_color_gradient": float(parent["exp_avg_sq.sh"][0].mean().sqrt()),
+            "parent_flatness": float((parent["scales"].min() - parent["scales"].max()).exp()),
+        }
+        for name, value in want.items():
+            assert births[name][row] == pytest.approx(value, rel=1e-5), name
+    first = births["parent"] == -1
+    assert first.sum() == 300 and np.isnan(births["gradient"][first]).all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(data=st.data())
+def test_ledger_matches_the_log_after_random_events(data, tmp_path_factory):
+    """Births, deaths and checkpoints in any order: log and ledger match the live population."""
+    folder = tmp_path_factory.mktemp("lineage")
+    lineage, alive, next_id, step = Lineage(folder, Ranks(), 0, Ledger()), set(), 0, 0
+    for what in data.draw(st.lists(st.sampled_from(["birth", "death", "save", "resume"]), max_size=12)):
+        step += 1
+        if what == "birth":
+            count = data.draw(st.integers(0, 5))
+            lineage.born(some(range(next_id, next_id + count)), step)
+            alive |= set(range(next_id, next_id + count))
+            next_id += count
+        elif what == "death" and alive:
+            gone = data.draw(st.lists(st.sampled_from(sorted(alive)), unique=True))
+            lineage.died(torch.tensor(gone, dtype=torch.int64), torch.ones(len(gone)), step, step)
+            alive -= set(gone)
+        else:
+            ledger = lineage.flush_and_check(torch.tensor(sorted(alive), dtype=torch.int64), step)
+            assert ledger.births - ledger.deaths == len(alive)
+            if what == "resume":
+                lineage.born(some([next_id + 10_000]), step + 1)  # lost with the process
+                lineage.flush(step + 1)
+                lineage.close()
+                lineage = Lineage(folder, Ranks(), step, ledger)
+    lineage.flush_and_check(torch.tensor(sorted(alive), dtype=torch.int64), step + 1)
+    lineage.close()
+    if next_id:
+        assert live(folder)[0].tolist() == sorted(alive)
+
+
+def test_events_that_a_stop_kept_from_happening_are_logged_beside_those_of_the_same_step(tmp_path):
+    lineage = Lineage(tmp_path, Ranks(), 0, Ledger())
+    lineage.born(some([1, 2]), 3)
+    ledger = lineage.flush_and_check(torch.tensor([1, 2]), 3)
+    lineage.close()
+    for first in (7, 3):  # the first of two resumed processes is killed after it has written a part
+        lineage = Lineage(tmp_path, Ranks(), 3, ledger)
+        lineage.born(some([first, first + 1]), 3)
+        if first == 7:
+            lineage.died(torch.tensor([2]), torch.tensor([Cause.SIZE]), 10, 3)
+            lineage.flush(3)
+        else:
+            lineage.flush_and_check(torch.tensor([1, 2, 3, 4]), 3)
+        lineage.close()
+    assert live(tmp_path)[0].tolist() == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("ids", "message"),
+    [
+        ([1, 2, 3], "5 births less 1 deaths is not the live population of 3 Gaussians;"),
+        ([1, 2, 3, 9], r"the live population of 4 Gaussians \(their numbers agree, their ids do not\)"),
+    ],
+)
+def test_a_ledger_that_misses_the_population_stops_the_run(tmp_path, ids, message):
+    lineage = Lineage(tmp_path, Ranks(), 0, Ledger())
+    lineage.born(some([1, 2, 3, 4, 5]), 1)
+    lineage.died(torch.tensor([5]), torch.tensor([Cause.SIZE]), 10, 1)
+    with pytest.raises(LineageError, match=message):
+        lineage.flush_and_check(torch.tensor(ids), 1)
+    lineage.close()
+
+
+def _generations(ranks, folder):
+    torch.set_num_threads(1)
+    table = random_table(400)
+    mine = torch.arange(400) % 3 == 0 if ranks.rank == 0 else torch.arange(400) % 3 > 0
+    if ranks.world_size == 2:
+        table.keep(mine)
+    lineage = Lineage(folder, ranks, 0, Ledger())
+    lineage.born(initial_births(table["id"], table["parent"], table["means"]), 0)
+    for event in range(1, 4):
+        shaken(table, event)
+        densify(
+            table, RULES, time=100 * event, step=event, seed=3, level_count=4, ranks=ranks, lineage=lineage
+        )
+        redistribute(table, ranks, max_imbalance=1.0)
+        ledger = lineage.flush_and_check(table["id"], event)
+    lineage.close()
+    return ledger
+
+
+def test_two_ranks_log_the_same_births_and_deaths(tmp_path):
+    alone = _generations(Ranks(), tmp_path / "1")
+    both = run_ranks(_generations, 2, tmp_path / "2")
+    assert both[0] == both[1] == alone
+    tables = [live(tmp_path / name)[1] for name in ("1", "2")]
+    for name in ("births", "deaths"):
+        one, two = (t[name] for t in tables)
+        order, other = np.argsort(one["id"]), np.argsort(two["id"])
+        for column in one:
+            np.testing.assert_array_equal(one[column][order], two[column][other], column)
+
+
+def test_flushed_lineage_is_synced_to_disk(tmp_path, monkeypatch):
+    synced, fsync = set(), os.fsync
+    monkeypatch.setattr(os, "fsync", lambda file: (synced.add(os.fstat(file).st_ino), fsync(file)))
+    lineage = Lineage(tmp_path, Ranks(), 0, Ledger())
+    lineage.born(some([1, 2]), 1)
+    lineage.died(torch.tensor([1]), torch.tensor([Cause.SPLIT]), 4, 1)
+    lineage.flush_and_check(torch.tensor([2]), 1)
+    lineage.close()
+    parts = list(tmp_path.glob("*.parquet"))
+    assert len(parts) == 2
+    assert {path.stat().st_ino for path in (*parts, tmp_path)} <= synced
+
+
+def test_features_of_no_candidate(tmp_path):
+    table = random_table(5)
+    none = torch.zeros(0, dtype=torch.int64)
+    assert spawn_features(table, none, none.bool(), 5, 1.0, 4).shape == (0, len(FEATURES))
+    with pytest.raises(FileNotFoundError, match="holds no lineage: train with --population.lineage=true"):
+        read_lineage(tmp_path)
+
+
+def test_a_resumed_log_deletes_only_files_that_blitzgs_writes(tmp_path):
+    """Other programs keep hidden files and folders where they look at a run."""
+    (tmp_path / ".notes").mkdir()
+    (tmp_path / ".index").write_text("mine")
+    torn = tmp_path / ".0123456789ab.partial"  # of a process that was killed while it wrote
+    torn.write_text("torn")
+    Lineage(tmp_path, Ranks(), 0, Ledger()).close()
+    assert (tmp_path / ".notes").is_dir() and (tmp_path / ".index").read_text() == "mine"
+    assert not torn.exists()

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+import torch
+
+from blitzgs.table.table import NO_PARENT, PARAMETERS, REQUIRED, ZERO_AT_BIRTH, GaussianTable, schema
+
+
+def filled_table(count: int, seed: int = 0) -> GaussianTable:
+    """A table in which every entry of every column is derived from the row's id."""
+    generator = torch.Generator().manual_seed(seed)
+    ids = torch.randperm(1000, generator=generator)[:count]
+    columns = {}
+    for name, column in schema(sh_degree=1).items():
+        value = ids.reshape(-1, *([1] * len(column.shape))).expand(count, *column.shape) % 251
+        columns[name] = ids if name == "id" else value.to(column.dtype).contiguous()
+    return GaussianTable(columns)
+
+
+def assert_rows_whole(table: GaussianTable) -> None:
+    for name in table:
+        column = table[name]
+        expected = table["id"] if name == "id" else table["id"] % 251
+        expected = expected.reshape(-1, *([1] * (column.dim() - 1))).expand(column.shape)
+        assert torch.equal(column.long(), expected), name
+
+
+def test_permute_keep_and_append_move_whole_rows():
+    table = filled_table(100)
+    table["extra"] = (table["id"] % 251).double()
+    ids = table["id"].clone()
+    order = torch.randperm(100, generator=torch.Generator().manual_seed(1))
+    table.permute(order)
+    assert torch.equal(table["id"], ids[order])
+    assert_rows_whole(table)
+    mask = table["id"] % 3 != 0
+    table.keep(mask)
+    assert torch.equal(table["id"], ids[order][mask])
+    assert_rows_whole(table)
+    more = filled_table(7, seed=2)
+    before = len(table)
+    table.append({**more.columns, "extra": (more["id"] % 251).double()})
+    assert len(table) == before + 7
+    assert_rows_whole(table)
+
+
+@pytest.mark.parametrize("count, added", [(50, 9), (0, 9), (50, 0)])
+def test_renew_equals_append_keep_and_permute(count, added):
+    renewed, expected = filled_table(count), filled_table(count)
+    more = filled_table(added, seed=2)
+    new = {name: more[name] for name in more if not name.startswith("exp_avg")}
+    order = torch.randperm(count + added, generator=torch.Generator().manual_seed(1))
+    rows = order[: len(order) * 2 // 3]
+    renewed.renew(rows, new)
+    expected.append(new)
+    for name in expected:
+        assert torch.equal(renewed[name], expected[name][rows]), name
+
+
+def test_new_rows_start_with_zero_moments_and_statistics():
+    source = filled_table(5)
+    table = GaussianTable.create({name: source[name] for name in REQUIRED})
+    assert sorted(table) == sorted(REQUIRED + ZERO_AT_BIRTH)
+    for name in table:
+        if name in REQUIRED:
+            assert torch.equal(table[name], source[name])
+        else:
+            assert table[name].shape == source[name].shape and not table[name].any(), name
+
+
+def test_a_table_of_parameters_alone_holds_first_gaussians():
+    source = filled_table(5)
+    table = GaussianTable.create({name: source[name] for name in PARAMETERS})
+    assert table["id"].tolist() == [0, 1, 2, 3, 4] and (table["parent"] == NO_PARENT).all()
+    assert not any(table[name].any() for name in ("last_step", "moment_step", "birth", "level"))
+    with pytest.raises(ValueError, match=r"new rows lack the columns \['quats'\]"):
+        GaussianTable.create({name: source[name] for name in PARAMETERS if name != "quats"})
+
+
+def test_new_rows_without_a_column_that_was_added_later_are_refused():
+    table, new = filled_table(5), filled_table(2, seed=2).columns
+    table["phi"] = torch.arange(5.0)
+    with pytest.raises(ValueError, match=r"new rows lack the columns \['phi'\]"):
+        table.append(new)
+    with pytest.raises(ValueError, match=r"new rows lack the columns \['phi'\]"):
+        table.renew(torch.arange(7), new)
+    table.append(new | table.inherited(torch.tensor([3, 1])))
+    assert table["phi"].tolist() == [0, 1, 2, 3, 4, 3, 1]
+
+
+def test_empty_table():
+    table = filled_table(0)
+    table.keep(torch.zeros(0, dtype=torch.bool))
+    table.append(filled_table(3).columns)
+    assert len(table) == 3
+    assert_rows_whole(table)
+
+
+class LoopbackRanks:
+    """Two ranks in one process: data sent to rank 1 are dropped, and data from rank 1 are fixed."""
+
+    world_size = 2
+
+    def __init__(self, incoming):
+        self.incoming = incoming
+        self.calls = 0
+
+    def exchange_counts(self, counts):
+        self.sent = counts.tolist()
+        return torch.tensor([counts[0], len(self.incoming)])
+
+    def all_to_all(self, rows, sent, received):
+        assert rows.shape[0] == sum(sent) and sent == self.sent
+        name = list(schema(1))[self.calls]
+        self.calls += 1
+        return torch.cat((rows[: sent[0]], self.incoming[name]))
+
+
+def test_exchange_moves_every_column():
+    table, incoming = filled_table(20), filled_table(6, seed=3)
+    ids = table["id"].clone()
+    destination = ids % 2
+    table.exchange(destination, LoopbackRanks(incoming))
+    assert torch.equal(table["id"], torch.cat((ids[ids % 2 == 0], incoming["id"])))
+    assert_rows_whole(table)
+
+
+def test_errors_name_the_column():
+    columns = filled_table(4).columns
+    with pytest.raises(ValueError, match=r"columns \['quats'\] are missing"):
+        GaussianTable({k: v for k, v in columns.items() if k != "quats"})
+    with pytest.raises(ValueError, match=r"column 'means' must be torch.float32 \[4, 3\]"):
+        GaussianTable({**columns, "means": torch.zeros(4, 2)})
+    with pytest.raises(ValueError, match=r"rows lack the columns \['id'\]"):
+        filled_table(4).append({k: v for k, v in columns.items() if k != "id"})
+    with pytest.raises(ValueError, match=r"no columns \['colour'\]"):
+        filled_table(4).append({**columns, "colour": torch.zeros(4)})
+    with pytest.raises(ValueError, match=r"mask must be bool \[4\]"):
+        filled_table(4).keep(torch.ones(3, dtype=torch.bool))
+    with pytest.raises(ValueError, match=r"order must be int64 \[4\]"):
+        filled_table(4).permute(torch.arange(3))

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""No image name makes a file land outside its folder, or replace an input or another image's file."""
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from blitzgs.util.output import OutputFolder, new_file, write_file
+
+PARTS = st.sampled_from(
+    ["..", ".", "a", "A", "a.png", "a.jpg", "a.png.jpg", "b", "ä🏙", "x" * 300, "\udcff.png", ""]
+)
+NAMES = st.lists(
+    st.tuples(st.sampled_from(["", "/", "//", "../", "/etc/"]), st.lists(PARTS, max_size=4)).map(
+        lambda name: name[0] + "/".join(name[1])
+    ),
+    max_size=8,
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(NAMES, st.booleans())
+@example(["a.jpg", "a.png", "A.png", "a_2.png"], False)
+@example(["a/b.jpg", "a_b.jpg", "a_b"], True)
+@example(["a.png.jpg", "a.png/b.jpg", "a.png/c.jpg"], False)
+def test_paths_stay_inside_and_apart(names, flat):
+    root = Path("/nowhere/out")
+    paths = OutputFolder(root).paths(names, ".png", flat)
+    assert len({str(path).casefold() for path in paths}) == len(names)
+    folders = {parent for path in paths for parent in path.parents}
+    for path in paths:
+        assert os.path.normpath(path) == str(path) and root in path.parents and path not in folders
+        assert all(len(os.fsencode(part)) <= 255 for part in path.parts)
+        assert path.suffix == ".png" and (not flat or path.parent == root)
+
+
+def test_names_without_surprises_keep_their_shape(tmp_path):
+    found = OutputFolder(tmp_path).paths(["a/b.jpg", "c.v2.jpg", "d.jpg", "d.png"], ".png")
+    assert [str(path.relative_to(tmp_path)) for path in found] == [
+        "a/b.png", "c.v2.png", "d.jpg.png", "d.png.png",
+    ]  # fmt: skip
+    found = OutputFolder(tmp_path).paths(["a/b.jpg", "c.v2.jpg", "d.jpg", "d.png"], ".jpg", flat=True)
+    assert [path.name for path in found] == ["a_b.jpg", "c.v2.jpg", "d.jpg.jpg", "d.png.jpg"]
+
+
+def test_absolute_names_lose_the_folders_that_they_share(tmp_path):
+    found = OutputFolder(tmp_path).paths(["/data/city/x/1.jpg", "/data/city/y/1.jpg", "../z/1.jpg"], ".png")
+    assert [str(path.relative_to(tmp_path)) for path in found] == ["x/1.png", "y/1.png", "z/1.png"]
+
+
+def test_inputs_are_never_overwritten(tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "a.png").write_bytes(b"photograph")
+    (tmp_path / "out").mkdir()
+    inputs = [photos / "a.png"]
+    with pytest.raises(OSError, match="would lie among the inputs .*photos/a.png"):
+        OutputFolder(photos, inputs).paths(["b.png"], ".png")
+    (tmp_path / "alias").symlink_to(photos)
+    with pytest.raises(OSError, match="would lie among the inputs"):
+        OutputFolder(tmp_path / "alias", inputs).paths(["a.png"], ".png")
+    (tmp_path / "out" / "sub").symlink_to(photos)
+    with pytest.raises(OSError, match="out/sub leads out of .*remove that link"):
+        OutputFolder(tmp_path / "out", inputs).paths(["sub/a.png"], ".png")
+    os.link(photos / "a.png", tmp_path / "out" / "a.png")
+    with pytest.raises(OSError, match="would overwrite the input .*photos/a.png"):
+        OutputFolder(tmp_path / "out", inputs).paths(["a.png"], ".png")
+    assert (photos / "a.png").read_bytes() == b"photograph"
+
+
+def test_files_of_others_are_kept_and_own_files_are_replaced(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"a copy of a photograph")
+    with pytest.raises(FileExistsError, match="a.png exists, and no earlier call .* choose another --out"):
+        OutputFolder(tmp_path).paths(["a.jpg", "b.jpg"], ".png")
+    with pytest.raises(FileExistsError, match="a.png exists"):
+        OutputFolder(tmp_path).write(tmp_path / "a.png", b"render")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+    for content in (b"render", b"render again"):
+        output = OutputFolder(tmp_path / "out")
+        (path,) = output.paths(["a.jpg"], ".png")
+        output.write(path, content)
+        assert path.read_bytes() == content
+
+
+def test_a_link_that_appears_later_is_not_followed(tmp_path):
+    (tmp_path / "other").mkdir()
+    output = OutputFolder(tmp_path / "out")
+    (path,) = output.paths(["sub/a.png"], ".png")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "sub").symlink_to(tmp_path / "other")
+    with pytest.raises(OSError, match="leads out of"):
+        output.write(path, b"x")
+    assert not list((tmp_path / "other").iterdir())
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling link", "folder", "pipe", "device"])
+def test_only_regular_files_are_replaced(tmp_path, kind):
+    path = tmp_path / "file"
+    if kind == "link":
+        (tmp_path / "target").write_text("old")
+        path.symlink_to(tmp_path / "target")
+    elif kind == "dangling link":
+        path.symlink_to(tmp_path / "target")
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path = Path("/dev/null")
+    before = path.lstat()
+    with pytest.raises(OSError, match="which is not overwritten"):
+        write_file(path, b"new")
+    assert path.lstat().st_ino == before.st_ino and path.lstat().st_mode == before.st_mode
+
+
+def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
+    write_file(tmp_path / "file", "old")
+    with pytest.raises(RuntimeError), new_file(tmp_path / "file") as partial:
+        partial.write_text("half")
+        raise RuntimeError
+    assert (tmp_path / "file").read_text() == "old" and len(list(tmp_path.iterdir())) == 1
+    write_file(tmp_path / "file", "new")
+    assert (tmp_path / "file").read_text() == "new" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_an_error_names_the_file_that_was_asked_for(tmp_path):
+    path = tmp_path / "missing" / "figures.json"
+    with pytest.raises(FileNotFoundError) as caught:
+        write_file(path, "{}")
+    assert caught.value.filename == str(path)
+
+
+def test_a_full_disk_names_the_file_that_was_asked_for(tmp_path):
+    path = tmp_path / "figures.json"
+    with pytest.raises(OSError, match="No space left") as caught, new_file(path) as partial:
+        partial.unlink()
+        partial.symlink_to("/dev/full")
+        partial.write_bytes(b"x")
+    assert caught.value.filename == str(path) and not list(tmp_path.iterdir())
