@@ -71,6 +71,8 @@ class ModelConfig:
         scale_floor: smallest standard deviation of a Gaussian, in pixels of the training view that samples it
             most finely, which is found anew at every tenth density event; 0: none. Mip-Splatting's 3D filter
             has 0.447.
+        exposure: each training photograph has a gain and a bias of its channels, if the photographs differ;
+            the model has the mean exposure.
     """
 
     sh_degree: int = 3
@@ -82,6 +84,7 @@ class ModelConfig:
     deterministic: bool = False
     initial_opacity: float = 0.1
     scale_floor: float = 0.0
+    exposure: bool = False
 
 
 @dataclass(frozen=True)

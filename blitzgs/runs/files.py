@@ -72,6 +72,7 @@ class Progress:
             without a gate, and in old checkpoints.
         train_views: digest of the names of the training views, in their order; empty in old checkpoints.
         signals: result of `blitzgs.training.adaptive.Signals.saved`, with `schedule.adaptive`.
+        curve: result of `blitzgs.training.curve.Curve.saved`; empty in old checkpoints.
         gate: digest of the spawn gate's files; empty without a gate, and in old checkpoints.
         events_left: (time, order, kind) of the events of the last step that a signal kept from running.
     """
@@ -89,6 +90,7 @@ class Progress:
     least_kept: float = 0.0
     train_views: str = ""
     signals: dict[str, Any] = dataclasses.field(default_factory=dict)
+    curve: dict[str, Any] = dataclasses.field(default_factory=dict)
     gate: str = ""
     events_left: list[tuple[Any, ...]] = dataclasses.field(default_factory=list)
 
@@ -167,7 +169,7 @@ class Restored:
         config: configuration of the run.
         run_id: identifies the run in its log.
         source: name of the checkpoint and why it was chosen, as text.
-        shared: tensors that are the same on all ranks: `TileOwners.columns`.
+        shared: tensors that are the same on all ranks: `TileOwners.columns`, and those of the exposures.
     """
 
     table: GaussianTable

@@ -36,6 +36,8 @@ from blitzgs.training.adaptive import Signals
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.inputs import check_alike, check_capture
 from blitzgs.training.loss import weighted
+from blitzgs.training.curve import Curve
+from blitzgs.training.exposure import Exposures
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.population_report import PICTURE
 from blitzgs.training.sampler import BatchSampler
@@ -101,6 +103,14 @@ def set_up(
     sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed)
     if config.memory.resident_gb > 0:
         table = HostTable(table.release(), pinned=ranks.device.type == "cuda")
+    stepper = _stepper(
+        config, table, optimiser, owners, space.extent, UpcomingCameras(sampler, capture.train, views)
+    )
+    if config.model.exposure:
+        stepper.exposures = Exposures(capture.train, ranks)
+        # As with the tiles, rows are those of the same training views.
+        if restored is not None and restored.progress.train_views in ("", progress.train_views):
+            stepper.exposures.restore(restored.shared)
     return TrainingState(
         config=config,
         capture=capture,
@@ -114,9 +124,7 @@ def set_up(
         views=views,
         sampler=sampler,
         optimiser=optimiser,
-        stepper=_stepper(
-            config, table, optimiser, owners, space.extent, UpcomingCameras(sampler, capture.train, views)
-        ),
+        stepper=stepper,
         owners=owners,
         lpips=lpips,
         run_id=run_id,
@@ -124,6 +132,7 @@ def set_up(
         save_clock=SaveClock(config.log.checkpoint_seconds),
         veto=veto,
         lineage=_start_lineage(config, capture, folder, table, progress, ranks),
+        curve=Curve.of(progress.curve),
         signals=Signals.of(progress.signals) if config.schedule.adaptive else None,
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )
@@ -167,7 +176,7 @@ def _resolved(config: Config, capture: Capture, restored: run_files.Restored | N
 def _tile_owners(ranks: Ranks, progress: Progress, restored: run_files.Restored | None) -> TileOwners:
     """Return the division of tiles, with the costs that the checkpoint has if they can be used."""
     owners = TileOwners(ranks)
-    if restored is None or not restored.shared or ranks.world_size == 1:
+    if restored is None or "bounds" not in restored.shared or ranks.world_size == 1:
         return owners
     # Tile costs and plans are stored by view index. With other views, they would belong to other images.
     if restored.progress.train_views in ("", progress.train_views):

@@ -31,6 +31,7 @@ from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.adaptive import Signals
 from blitzgs.training.agreement import SaveClock
+from blitzgs.training.curve import Curve
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
 from blitzgs.view.views import Space, ViewSet, render_options
@@ -70,6 +71,7 @@ class TrainingState:
         log: log of the run; it does nothing until the loop opens the run's log.
         stops: returns whether the run has to stop soon, the same on every rank; long events call it every few
             seconds. The loop sets it.
+        curve: training PSNR of the run.
         signals: measurements of a run with `schedule.adaptive`, or None.
         clock: returns monotonic seconds, by which training time is measured.
     """
@@ -96,6 +98,7 @@ class TrainingState:
     lineage: Lineage | None
     log: RunLog
     growth_was_limited: bool = False
+    curve: Curve = field(default_factory=Curve)
     signals: Signals | None = None
     stops: Callable[[], bool] = never
     clock: Callable[[], float] = time.monotonic

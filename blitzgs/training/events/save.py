@@ -79,10 +79,13 @@ def _write(state: TrainingState) -> None:
         except OSError as error:
             raise CheckpointError(f"no checkpoint was written, because {error}.") from error
         state.progress = replace(state.progress, ledger=ledger_state(ledger))
+    state.progress = replace(state.progress, curve=state.curve.saved())
     if state.signals is not None:
         state.progress = replace(state.progress, signals=state.signals.saved())
     # The division of tiles decides the order of sums, and therefore their last bits.
-    shared = state.owners.columns() if state.ranks.world_size > 1 else None
+    shared = state.owners.columns() if state.ranks.world_size > 1 else {}
+    if state.stepper.exposures is not None:
+        shared |= state.stepper.exposures.columns()
     run_files.save(
         state.folder,
         state.table,
