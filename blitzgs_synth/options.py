@@ -63,7 +63,11 @@ class CityOptions:
         Those added later are left out where they change nothing, so that older cities need not be made anew.
         """
         values = asdict(self)
-        same = [field.name for field in fields(self) if field.name in _LATER and values[field.name] == field.default]
+        same = [
+            field.name
+            for field in fields(self)
+            if field.name in _LATER and values[field.name] == field.default
+        ]
         return {"format_version": FORMAT_VERSION, **{k: v for k, v in values.items() if k not in same}}
 
 
@@ -77,6 +81,13 @@ PRESETS = {
     # Flat crops from straight above, with grain: a capture on which training can lose what it has learnt
     # (docs/decisions/recipe.md).
     "farmland": CityOptions(
-        extent=240.0, views=166, width=800, height=600, points_per_view=1200, oblique=0.0, built=False, grain=5.0
+        extent=240.0,
+        views=166,
+        width=800,
+        height=600,
+        points_per_view=1200,
+        oblique=0.0,
+        built=False,
+        grain=5.0,
     ),
 }

@@ -176,8 +176,8 @@ def _set_shares(table: GaussianTable, sources: Tensor, copies: Tensor, min_opaci
 def _keep_moments(table: GaussianTable, sources: Tensor, copies: Tensor, before: Tensor) -> None:
     """Scale the moments of the rows `sources`, of which there are now `copies` each, as their gradients are.
 
-    Each of N Gaussians in one place has 1/N of the gradient of the Gaussian before. That of the logit l of its
-    opacity changes by do'/dl' / (do/dl) = o' / o, since (1 - o')^N = 1 - o.
+    Each of N Gaussians in one place has 1/N of the gradient of the Gaussian before. That of the logit l of
+    its opacity o changes by the factor o' / o, since (1 - o')^N = 1 - o.
 
     With moments of zero instead, a row would move by several times its learning rate in its next steps, as
     Adam's bias correction is that of the run and not of the row. In each event the most opaque Gaussians are

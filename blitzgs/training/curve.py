@@ -71,8 +71,8 @@ class Curve:
         """Return the warning about the largest fall."""
         best = self.best if self.best is not None else float("nan")
         return (
-            f"training PSNR fell by {self.fall:.1f} dB, from {best:.1f} dB after {self.best_at:,} images: the "
-            "run goes on unchanged. If it ends below that, train with half of optimiser.position and "
+            f"training PSNR fell by {self.fall:.1f} dB, from {best:.1f} dB after {self.best_at:,} images: "
+            "the run goes on unchanged. If it ends below that, train with half of optimiser.position and "
             "optimiser.opacity, or fewer Gaussians (population.max_gaussians)"
         )
 

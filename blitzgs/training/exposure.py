@@ -61,7 +61,7 @@ class Exposures:
         return torch.where(differs, self.measured - mean + same, same)
 
     def of(self, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Return gains and biases, float32 [B, 1, 1, 3] each, of cameras; those of other views are 1 and 0."""
+        """Return gains and biases, float32 [B, 1, 1, 3] each; of views without any, 1 and 0."""
         chosen = self.effective()[[self._rows.get(index, 0) for index in indices]].float()
         for place, index in enumerate(indices):
             if index not in self._rows:
