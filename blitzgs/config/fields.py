@@ -202,8 +202,8 @@ class PopulationConfig:
 
     Some fields have no effect on some runs. With "relocation": `grad_threshold`, `clone_scale`,
     `min_observations` and `phi`. With "density": `growth`. Without
-    `importance`: `score`, `pass1_keep`, `pass2_mass`, `pass2_keep` and `phi`. Without `gate`: `gate_rate` and
-    `gate_rule`. With the gate "random": `gate_rule`.
+    `importance`: `score`, `pass1_keep`, `pass2_mass`, `pass2_keep`, `pass2_views` and `phi`. Without `gate`:
+    `gate_rate` and `gate_rule`. With the gate "random": `gate_rule`.
 
     Attributes:
         strategy: what a density event does: "density" (clone and split by gradients, prune) or "relocation"
@@ -236,10 +236,12 @@ class PopulationConfig:
         pass2_keep: largest share of the Gaussians that the second pass keeps, those of the highest scores,
             without those below `min_opacity`; 1: no such limit. If `pass2_mass` and `pass2_keep` are both 1,
             the pass keeps all Gaussians and only computes phi and the cull matrix.
+        pass2_views: with fewer training views the second pass keeps all Gaussians, because scores add up what
+            the views show, and say little about places that few of them see.
         phi: from the first pass on, density control multiplies the gradients that it sums with phi: among the
             views that see a Gaussian, the share of those in which it counts.
         gate: model file of a spawn gate (`blitzgs gate fit`), or "default" for the one that comes with
-            BlitzGS, for configs/compact.yaml with schedule.t1=8999, pass1_keep=0.85 and score=weight; or
+            BlitzGS, for configs/density.yaml with schedule.t1=8999, pass1_keep=0.85 and score=weight; or
             "random" to withhold as many at random, which a gate has to surpass; null: none.
         gate_rate: share of the candidates, clones and splits apart, that the gate withholds at each density
             event from `schedule.gate_from` on.
@@ -270,6 +272,7 @@ class PopulationConfig:
     pass1_keep: float = 0.7
     pass2_mass: float = 0.99
     pass2_keep: float = 1.0
+    pass2_views: int = 0
     phi: bool = True
     gate: str | None = None
     gate_rate: float = 0.6
