@@ -20,7 +20,7 @@ from blitzgs.config.files import ConfigError, from_dict, load_config, to_dict
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs import checkpoint
+from blitzgs.runs import checkpoint, exposure
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.guard import bad_column, check_before_saving
 from blitzgs.runs.identity import check_own
@@ -101,6 +101,7 @@ class TrainedModel:
         progress: progress of the run at the checkpoint.
         space: maps between the trained world and the capture's world.
         table: this rank's Gaussians.
+        exposures: gain and bias of each training photograph, [T, 2, 3]; None if the run has none.
         pool_bytes: bytes of a device that the Gaussians may take, if the run trained with a pool; else 0.
     """
 
@@ -109,6 +110,7 @@ class TrainedModel:
     space: Space
     table: GaussianTable
     pool_bytes: int = 0
+    exposures: torch.Tensor | None = None
 
     def scene(self, device: torch.device) -> Scene:
         """Return the scene that views are rendered from on a device.
@@ -258,7 +260,7 @@ def open_model(
         config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
     optimiser = TableAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
     optimiser.catch_up(table, None, progress.step)
-    return TrainedModel(config, progress, restored.space, table, pool_bytes)
+    return TrainedModel(config, progress, restored.space, table, pool_bytes, exposure.stored(restored.shared))
 
 
 def _resident_gb(path: Path) -> float:

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.runs.exposure import SHARED, effective
 from blitzgs.training.batch import Batch
 
-# Photographs whose gains differ by less than this, as a standard deviation, have the same exposure.
-LEAST_SPREAD = 0.02
 # One step in so many measures the photographs of its batch, at one pixel in so many of each row and column.
 _EVERY, _STRIDE = 4, 4
 # A new measurement replaces at least this share of the earlier ones: the model that it refers to improves.
@@ -23,7 +22,6 @@ _RIDGE = 1e-3
 _DARKEST, _BRIGHTEST = 3, 252
 # Colours are added up as integers, so that the sums are the same in any order, and at any number of ranks.
 _UNIT = 65535
-_SHARED = "exposures"
 
 
 class Exposures:
@@ -54,11 +52,7 @@ class Exposures:
 
     def effective(self) -> Tensor:
         """Return gain and bias of each training view as they are used, float64 [T, 2, 3]; does not wait."""
-        mean = self.measured.mean(0)
-        same = torch.zeros_like(mean)
-        same[0] = 1
-        differs = self.measured[:, 0].std(0, correction=0).mean() >= LEAST_SPREAD
-        return torch.where(differs, self.measured - mean + same, same)
+        return effective(self.measured)
 
     def of(self, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Return gains and biases, float32 [B, 1, 1, 3] each; of views without any, 1 and 0."""
@@ -107,11 +101,11 @@ class Exposures:
 
     def columns(self) -> dict[str, Tensor]:
         """Return what a resumed run needs; the same on every rank."""
-        return {_SHARED: torch.cat([self.measured.flatten(1), self.counts[:, None]], dim=1)}
+        return {SHARED: torch.cat([self.measured.flatten(1), self.counts[:, None]], dim=1)}
 
     def restore(self, columns: Mapping[str, Tensor]) -> None:
         """Restore the state from `columns`; those of other training views are ignored."""
-        found = columns.get(_SHARED)
+        found = columns.get(SHARED)
         if found is not None and len(found) == len(self.counts):
             found = found.to(self.measured.device)
             self.measured, self.counts = found[:, :-1].reshape(-1, 2, 3).clone(), found[:, -1].clone()

@@ -3,10 +3,18 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import torch
 
+from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
-from blitzgs.training.exposure import LEAST_SPREAD, Exposures
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.runs.exposure import LEAST_SPREAD, stored
+from blitzgs.training.exposure import Exposures
+from blitzgs.training.trainer import Trainer
+from tests.distributed.rank_harness import run_ranks
+from tests.training.tiny import tiny_config, tiny_scene
+from tests.training.tiny_runs import assert_same_table, stop_at
 
 GAINS = torch.tensor([0.8, 0.9, 1.0, 1.1, 1.2])
 BIASES = torch.tensor([0.02, 0.0, -0.02, 0.01, -0.01])
@@ -59,6 +67,55 @@ def test_saved_exposures_are_restored():
     second = Exposures(TRAIN, Ranks())
     second.restore(first.columns())
     assert torch.equal(first.effective(), second.effective()) and torch.equal(first.counts, second.counts)
+    assert torch.equal(stored(first.columns()), first.effective()) and stored({}) is None
     other = Exposures(TRAIN[1:], Ranks())
     other.restore(first.columns())
     assert other.counts.sum() == 0
+
+
+def train_on_unequal_photographs(folder, resume=False):
+    capture, images = tiny_scene()
+    gains = np.linspace(0.75, 1.25, len(images.images))
+    images.images = [
+        (image.float() * gain).clamp(0, 255).byte() for image, gain in zip(images.images, gains, strict=True)
+    ]
+    config = tiny_config("model.exposure=true", "population.strategy=relocation")
+    trainer = Trainer(config, capture, images, folder, Ranks(), resume)
+    return trainer, trainer.train()
+
+
+def test_a_resumed_run_repeats_every_bit_and_a_render_shows_the_exposures(tmp_path, monkeypatch):
+    whole, summary = train_on_unequal_photographs(tmp_path / "whole")
+    assert summary["exposure"]["least"] < 0.95 < 1.05 < summary["exposure"]["most"]
+    assert summary["warnings"] == [] and summary["largest_fall"] == 0
+    stop_at(monkeypatch, 50)
+    train_on_unequal_photographs(tmp_path / "parts")
+    monkeypatch.undo()
+    resumed, _ = train_on_unequal_photographs(tmp_path / "parts", resume=True)
+    assert_same_table(resumed.state.table, whole.state.table)
+    assert torch.equal(resumed.state.stepper.exposures.measured, whole.state.stepper.exposures.measured)
+    out = {}
+    for name, flags in (("mean", []), ("own", ["--exposure"])):
+        folder = tmp_path / name
+        arguments = ["render", str(tmp_path / "whole"), "--split", "all", "--raw", "--out", str(folder)]
+        assert main([*arguments, *flags]) == 0
+        out[name] = [np.load(path) for path in sorted(folder.glob("*.npy"))]
+    brighter = [own.mean() > mean.mean() for own, mean in zip(out["own"], out["mean"], strict=True)]
+    assert not brighter[0] and brighter[-1] and np.array_equal(out["own"][3], out["mean"][3])
+
+
+def measure_with(ranks):
+    generator = torch.Generator().manual_seed(1)
+    renders = torch.rand(2, 64, 96, 3, generator=generator)
+    targets = (renders * 200).byte()
+    ranges = TileOwners(ranks).divide([0, 1], 96, 64, 16) if ranks.world_size > 1 else None
+    exposures = Exposures([0, 1], ranks)
+    exposures.measure(4, renders, SimpleNamespace(indices=[1, 0], targets=targets, masks=None, ranges=ranges))
+    return exposures.columns()["exposures"]
+
+
+def test_any_number_of_ranks_measures_the_same_bits():
+    alone = measure_with(Ranks())
+    assert (alone[:, 0] != 1).all()
+    for found in run_ranks(measure_with, 3):
+        assert torch.equal(found, alone)
