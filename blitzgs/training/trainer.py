@@ -340,12 +340,16 @@ class Trainer:
             "config_hash": config_hash(state.config),
             "run": state.run_id,
             "versions": run_files.versions(state.ranks.device),
+            "largest_fall": state.curve.fall,
+            "warnings": state.curve.warnings(),
         }
         if state.config.schedule.minutes > 0:
             figures |= {
                 "budget_seconds": 60 * state.config.schedule.minutes,
                 "scale": state.images_seen / state.config.schedule.iterations,
             }
+        if state.stepper.exposures is not None:
+            figures["exposure"] = state.stepper.exposures.describe()
         return figures
 
 
