@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `blitzgs train | eval | render | export | gate | synth`, one file per command."""
+"""The command line: `blitzgs train | eval | render | view | export | gate | synth`, one file per command."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rich.console import Console
 
 from blitzgs import __version__
 from blitzgs.capture.images import PhotographError
-from blitzgs.cli import evaluate, export, gate, render, train
+from blitzgs.cli import evaluate, export, gate, render, train, view
 from blitzgs.cli.arguments import add_command
 from blitzgs.distributed.group import MismatchError
 from blitzgs.runs.checkpoint import CheckpointError
@@ -31,6 +31,7 @@ Train 3D Gaussian Splatting models of photographs with known cameras: models of 
 These commands lead from a capture (a COLMAP model and its photographs) to pictures and a file for viewers:
 
   blitzgs train --data CAPTURE --out RUN
+  blitzgs view RUN
   blitzgs render RUN --out PICTURES
   blitzgs export RUN --ply MODEL.ply
 """
@@ -108,7 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"blitzgs {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for command in (train, evaluate, render, export, gate):
+    for command in (train, evaluate, render, view, export, gate):
         command.add_to(commands)
     city = add_command(
         commands, "synth", synth.run, "make a synthetic city: photographs, cameras and points to train on"
