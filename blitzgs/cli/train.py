@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from blitzgs.cli.arguments import Commands, add_command, add_device, named_path
+from blitzgs.cli.live import add_live_page, check_live_page, live_page
 from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, load_config, to_dict
 from blitzgs.config.recipes import default_recipe, recipe_path
@@ -75,6 +76,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--show-config", action="store_true", help="print the resulting configuration and stop"
     )
+    add_live_page(parser)
     add_device(parser)
 
 
@@ -87,6 +89,7 @@ def run(args: argparse.Namespace) -> int:
     if args.show_config:
         print(json.dumps(to_dict(config), indent=1))
         return 0
+    check_live_page(args.viewer)
     if args.resume and not config.data.path and not (args.out / run_files.CONFIG).exists():
         raise FileNotFoundError(
             f"{args.out} holds no run to continue (it has no config.yaml): check --out, or name the capture "
@@ -103,7 +106,10 @@ def run(args: argparse.Namespace) -> int:
         # A capture that cannot be read leaves no empty folder behind.
         capture, images = open_capture(config, ranks)
         with locked(args.out, ranks):
-            summary = Trainer(config, capture, images, args.out, ranks, args.resume).train()
+            trainer = Trainer(config, capture, images, args.out, ranks, args.resume)
+            if args.viewer is not None:
+                trainer.watch(live_page(trainer.state, args.viewer, args.viewer_host))
+            summary = trainer.train()
         if summary is not None and ranks.rank == 0:
             _print_summary(summary, args.out)
     return 0

@@ -193,7 +193,9 @@ def restore(
     Raises:
         CheckpointError: there are checkpoints, but all are damaged, or the newest is of another version.
     """
-    loaded = checkpoint.load_latest(folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns, only)
+    loaded = checkpoint.load_latest(
+        folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns, only
+    )
     if loaded is None:
         return None
     state = loaded.state

@@ -61,7 +61,7 @@ def compare(
     affine = np.array(
         [[step[0], 0, shift[0] + step[0] / 2 - 0.5], [0, step[1], shift[1] + step[1] / 2 - 0.5]]
     )
-    placed = cv2.warpAffine(photograph, affine, (width, height), flags=cv2.INTER_AREA)
+    placed = cv2.warpAffine(photograph, affine, (width, height), flags=cv2.INTER_AREA).astype(np.uint8)
     inside = cv2.warpAffine(
         np.full(photograph.shape[:2], 255, np.uint8), affine, (width, height), flags=cv2.INTER_NEAREST
     )
@@ -71,7 +71,9 @@ def compare(
     )
     psnr = -10 * math.log10(max(mean, 1e-12))
     brightness = np.clip(difference / (255 * _BRIGHTEST), 0, 1)
-    error = cv2.applyColorMap((255 * brightness).astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1]
+    error = cv2.applyColorMap((255 * brightness).astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1].astype(
+        np.uint8
+    )
     if kind == "side by side":
         parts = [_labelled(placed, "photograph"), _labelled(render, "render"), _labelled(error, "error")]
         return Compared(np.concatenate(parts, axis=1), psnr)

@@ -16,7 +16,9 @@ _POWER = 1.4
 class Pace:
     """Predicts the time of pictures from the last one."""
 
-    def __init__(self) -> None:
+    def __init__(self, moving_ms: float = MOVING_MS) -> None:
+        """Begin without a prediction; `moving_ms` is the time of a picture while the camera moves."""
+        self._moving = moving_ms
         self._full: float | None = None  # milliseconds of a picture at full quality
 
     def measured(self, scale: float, milliseconds: float) -> None:
@@ -28,7 +30,7 @@ class Pace:
         """Return the largest scale that is fast enough for movement."""
         if self._full is None:
             return SCALES[3]
-        return next((scale for scale in SCALES if self._full * scale**_POWER <= MOVING_MS), SCALES[-1])
+        return next((scale for scale in SCALES if self._full * scale**_POWER <= self._moving), SCALES[-1])
 
     def next_scale(self, drawn: float | None, moving: bool) -> float | None:
         """Return the scale of the next picture; None: the one that is shown is good enough.
@@ -43,5 +45,5 @@ class Pace:
         if moving or drawn >= 1.0:
             return None
         # One step in between, if full quality takes long.
-        middle = 0.5 if drawn < 0.45 and self._full is not None and self._full > 10 * MOVING_MS else 1.0
+        middle = 0.5 if drawn < 0.45 and self._full is not None and self._full > 10 * self._moving else 1.0
         return max(middle, coarse)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import secrets
 import threading
 import time
@@ -17,6 +18,7 @@ from blitzgs.viewer.door import Door, is_loopback
 from blitzgs.viewer.exhibit import Exhibit
 from blitzgs.viewer.frustums import Frustums
 from blitzgs.viewer.overlay import overlay
+from blitzgs.viewer.pace import MOVING_MS
 from blitzgs.viewer.panel import Panel
 from blitzgs.viewer.visitor import Ask, Shown, Visitor
 from blitzgs.viewer.world import World
@@ -48,7 +50,8 @@ class Page:
         url: address to open.
         visitors: those who look at present, by viser's numbers.
         woken: set when a picture may be needed.
-        folders: called for each new visitor with the panel's GUI, to add folders of the caller's own.
+        send_seconds: seconds of a processor that packing pictures has taken so far.
+        folders: called for each new visitor with viser's handle, to add folders of the caller's own.
     """
 
     def __init__(
@@ -58,6 +61,7 @@ class Page:
         port: int = 8080,
         folders: Callable[[Any], None] | None = None,
         memory: Callable[[], str] = lambda: "",
+        moving_ms: float = MOVING_MS,
     ) -> None:
         """Start to serve.
 
@@ -67,6 +71,7 @@ class Page:
             port: 0: any free one.
             folders: see the class.
             memory: returns the memory of the model as text.
+            moving_ms: milliseconds that a picture may take while the camera moves.
 
         Raises:
             ImportError: viser is not installed.
@@ -79,13 +84,17 @@ class Page:
         self.woken = threading.Event()
         self.visitors: dict[int, Visitor] = {}
         self.panels: dict[int, Panel] = {}
+        self.send_seconds = 0.0
+        self._moving_ms = moving_ms
         self._figured: dict[int, float] = {}
         self._turn = 0
         self._sender = ThreadPoolExecutor(1, "viewer sender")
         self._sending = threading.Semaphore(2)
         box = exhibit.box
         self.world = World(exhibit.space, exhibit.cameras, box.mean(axis=0))
-        self._server = viser.ViserServer(host="127.0.0.1", port=0, label=exhibit.title, verbose=False)
+        # Its address behind the door is nobody's concern.
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server = viser.ViserServer(host="127.0.0.1", port=0, label=exhibit.title, verbose=False)
         try:
             token = "" if is_loopback(host) else secrets.token_urlsafe(16)
             self._door = Door(host, port, self._server.get_port(), token)
@@ -114,10 +123,10 @@ class Page:
         server.on_client_disconnect(self._leave)
 
     def _enter(self, client: viser.ClientHandle) -> None:
-        visitor = Visitor(client, self.world, self.exhibit, self.woken.set)
-        panel = Panel(visitor, self)
+        visitor = Visitor(client, self.world, self.exhibit, self.woken.set, self._moving_ms)
+        panel = Panel(visitor, self.frustums)
         if self.folders is not None:
-            self.folders(client.gui)
+            self.folders(client)
         panel.build()
         self.panels[client.client_id] = panel
         self.visitors[client.client_id] = visitor
@@ -153,6 +162,7 @@ class Page:
             self._sending.release()
 
     def _send(self, visitor: Visitor, ask: Ask, picture: Picture) -> None:
+        begin = time.thread_time()
         try:
             shown = visitor.take(ask, picture)
             if shown is None:
@@ -168,6 +178,7 @@ class Page:
             if visitor.client.client_id in self.visitors:
                 warnings.warn(f"the viewer could not send a picture: {error}", stacklevel=2)
         finally:
+            self.send_seconds += time.thread_time() - begin
             self._sending.release()
 
     def _figures(self, visitor: Visitor, shown: Shown, sharp: bool) -> None:
@@ -181,6 +192,6 @@ class Page:
     def close(self) -> None:
         """Stop to serve."""
         self._door.close()
-        with contextlib.suppress(Exception):
+        with contextlib.suppress(Exception), contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
         self._sender.shutdown(wait=False, cancel_futures=True)

@@ -3,25 +3,21 @@
 
 from __future__ import annotations
 
-import re
 import time
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
 from blitzgs.capture.pictures import encode_image
-from blitzgs.util.output import write_file
 from blitzgs.view.look import MODES
 from blitzgs.viewer import compare
+from blitzgs.viewer.files import note, safe_name, save_beside
+from blitzgs.viewer.frustums import Frustums
 from blitzgs.viewer.route import Route
 from blitzgs.viewer.settings import Triple
 from blitzgs.viewer.visitor import Visitor
 from blitzgs.viewer.world import SCALE
-
-if TYPE_CHECKING:
-    from blitzgs.viewer.page import Page
 
 HELP = (
     "**Orbit**: drag turns around a point, right drag moves it, the wheel nears it. "
@@ -39,9 +35,9 @@ class Panel:
 
     figures: Any
 
-    def __init__(self, visitor: Visitor, page: Page) -> None:
+    def __init__(self, visitor: Visitor, frustums: Frustums) -> None:
         """Prepare the controls of a visitor."""
-        self._visitor, self._page, self._exhibit = visitor, page, visitor.exhibit
+        self._visitor, self._frustums, self._exhibit = visitor, frustums, visitor.exhibit
         self._gui: Any = visitor.client.gui
 
     def build(self) -> None:
@@ -75,9 +71,9 @@ class Panel:
     def _photographs(self) -> None:
         visitor, gui, exhibit = self._visitor, self._gui, self._exhibit
         shown = gui.add_checkbox("Show cameras", True, hint="Blue: trained on. Orange: held out.")
-        shown.on_update(lambda _: self._page.frustums.show(shown.value))
+        shown.on_update(lambda _: self._frustums.show(shown.value))
         size = gui.add_slider("Camera size", min=0.1, max=4.0, step=0.1, initial_value=1.0)
-        size.on_update(lambda _: self._page.frustums.resize(size.value, visitor.world))
+        size.on_update(lambda _: self._frustums.resize(size.value, visitor.world))
         number = gui.add_slider(
             "Camera", min=0, max=max(1, len(exhibit.cameras) - 1), step=1, initial_value=0
         )
@@ -155,12 +151,12 @@ class Panel:
     def _crop(self) -> None:
         visitor, gui, exhibit = self._visitor, self._gui, self._exhibit
         offset, unit = np.array(exhibit.space.offset), exhibit.space.unit
-        low, high = exhibit.box * unit + offset
+        least, most = exhibit.box * unit + offset
         crops = gui.add_checkbox("Crop", False)
         sliders = [
             gui.add_multi_slider(
-                axis, min=float(low[k]), max=float(high[k]), step=float((high[k] - low[k]) / 200) or 1.0,
-                initial_value=(float(low[k]), float(high[k])),
+                axis, min=float(least[k]), max=float(most[k]), step=float((most[k] - least[k]) / 200) or 1.0,
+                initial_value=(float(least[k]), float(most[k])),
             )
             for k, axis in enumerate("xyz")
         ]  # fmt: skip
@@ -172,8 +168,9 @@ class Panel:
             ends = np.array([slider.value for slider in sliders], dtype=np.float64)
             corners = ((ends.T - offset) / unit).tolist()
             box: tuple[Triple, Triple] = (tuple(corners[0]), tuple(corners[1]))
-            outline.dimensions = tuple(SCALE * (b - a) for a, b in zip(*box, strict=True))
-            outline.position = tuple(SCALE * (a + b) / 2 for a, b in zip(*box, strict=True))
+            low, high = SCALE * np.array(box)
+            outline.dimensions = tuple(high - low)
+            outline.position = (low + high) / 2
             outline.visible = crops.value
             visitor.change(crops=crops.value, box=box)
 
@@ -189,23 +186,3 @@ class Panel:
         name = f"{safe_name(self._exhibit.title)}_{time.strftime('%Y%m%d_%H%M%S')}.png"
         visitor.client.send_file_download(name, content, save_immediately=True)
         note(visitor, save_beside(self._exhibit.paths, name, content))
-
-
-def save_beside(folder: Path, name: str, content: bytes | str) -> str:
-    """Write a file into the folder for paths and screenshots; return what to tell the visitor."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_file(folder / name, content)
-    except OSError as error:
-        return f"the file is in the browser's downloads; {folder} cannot be written: {error}"
-    return f"saved as {folder / name}"
-
-
-def note(visitor: Visitor, text: str) -> None:
-    """Show a note on the visitor's page for some seconds."""
-    visitor.client.add_notification("BlitzGS", text, auto_close_seconds=6.0)
-
-
-def safe_name(text: str) -> str:
-    """Return a text as the name of a file."""
-    return re.sub(r"[^\w.-]+", "_", text).strip("._") or "view"

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from blitzgs.viewer.files import note, safe_name, save_beside
 from blitzgs.viewer.paths import CameraPath, Keyframe, from_json, to_json
 from blitzgs.viewer.world import Stance
 
@@ -107,8 +108,6 @@ class Route:
 
     def save(self) -> None:
         """Write the path beside the run, and give it to the browser."""
-        from blitzgs.viewer.panel import note, safe_name, save_beside
-
         if not self.path.keyframes:
             note(self._visitor, "add a viewpoint first")
             return
@@ -118,8 +117,6 @@ class Route:
 
     def load(self, content: bytes) -> None:
         """Take over a path from a file, and go to its first viewpoint."""
-        from blitzgs.viewer.panel import note
-
         try:
             self.path = from_json(content.decode())
         except (ValueError, UnicodeDecodeError) as error:

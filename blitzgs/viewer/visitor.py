@@ -76,9 +76,22 @@ class Visitor:
     """
 
     def __init__(
-        self, client: viser.ClientHandle, world: World, exhibit: Exhibit, wake: Callable[[], None]
+        self,
+        client: viser.ClientHandle,
+        world: World,
+        exhibit: Exhibit,
+        wake: Callable[[], None],
+        moving_ms: float,
     ) -> None:
-        """Begin with the browser's camera; `wake` is called whenever a picture is needed."""
+        """Begin with the browser's camera.
+
+        Args:
+            client: viser's handle.
+            world: the page's coordinates.
+            exhibit: what is shown.
+            wake: called whenever a picture is needed.
+            moving_ms: milliseconds that a picture may take while the camera moves.
+        """
         self.client, self.world, self.exhibit, self._wake = client, world, exhibit, wake
         self.settings = Settings()
         self.shown: Shown | None = None
@@ -90,8 +103,9 @@ class Visitor:
         self._version, self._drawn = 0, -1
         self._drawn_scale = 0.0
         self._moved, self._stance = 0.0, self._read()
-        self._pace = Pace()
+        self._pace = Pace(moving_ms)
         self._sounded = -1
+        self._stale = False
         self._gone = threading.Event()
         self.listeners: list[Callable[[], None]] = []
         client.camera.on_update(self._on_camera)
@@ -194,9 +208,8 @@ class Visitor:
         self.go(self.stance, distance)
 
     def refresh(self) -> None:
-        """Ask for a new picture of the same, for a model that has changed."""
-        with self._lock:
-            self._version += 1
+        """Ask for a new picture of the same, as fine as the last, for a model that has changed."""
+        self._stale = True
 
     # -- pictures ------------------------------------------------------------------------------------------
 
@@ -214,6 +227,10 @@ class Visitor:
                 self._pace.next_scale(drawn, moving) if settings.adapts else (1.0 if drawn is None else None)
             )
             stance, index = self.stance, self.standing
+            if scale is None and self._stale and not moving:
+                scale = drawn
+            if scale == 1.0:
+                self._stale = False
             if scale is None:
                 if self.motion == "walk" and not moving and self._sounded != version:
                     self._sounded = version
