@@ -15,6 +15,8 @@ from blitzgs.view.views import CameraLike
 UInt8 = npt.NDArray[np.uint8]
 Matrix = npt.NDArray[np.float64]
 KINDS = ("off", "side by side", "wipe", "error")
+# Rows of a grid for three images, by its columns.
+ROWS = {3: 1, 2: 2, 1: 3}
 # The difference that has the brightest colour, as a share of white.
 _BRIGHTEST = 0.25
 
@@ -40,31 +42,27 @@ def fitting_fov(camera: CameraLike, aspect: float) -> float:
 
 
 def compare(
-    kind: str, render: UInt8, photograph: UInt8, camera: CameraLike, K: Matrix, wipe: float = 0.5
+    kind: str,
+    render: UInt8,
+    photograph: UInt8,
+    camera: CameraLike,
+    K: Matrix,
+    wipe: float = 0.5,
+    columns: int = 3,
 ) -> Compared:
     """Compose a render with the photograph of a camera at the same place.
 
     Args:
-        kind: one of `KINDS`, not "off". "side by side" returns an image three times as wide as the render.
+        kind: one of `KINDS`, not "off". "side by side" returns a grid of images of the render's size.
         render: the render, uint8 [H, W, 3], from the camera's pose with the intrinsics `K`.
         photograph: uint8 [h, w, 3].
         camera: the photograph's camera.
         K: intrinsics of the render, [3, 3].
         wipe: share of the width that shows the photograph.
+        columns: of the grid of "side by side".
     """
     height, width = render.shape[:2]
-    # From pixels of the photograph to pixels of the render: both have the same pose.
-    ratio = np.array([camera.width / photograph.shape[1], camera.height / photograph.shape[0]])
-    scale = np.array([K[0, 0] / camera.K[0, 0], K[1, 1] / camera.K[1, 1]])
-    shift = K[:2, 2] - scale * camera.K[:2, 2]
-    step = scale * ratio
-    affine = np.array(
-        [[step[0], 0, shift[0] + step[0] / 2 - 0.5], [0, step[1], shift[1] + step[1] / 2 - 0.5]]
-    )
-    placed = cv2.warpAffine(photograph, affine, (width, height), flags=cv2.INTER_AREA).astype(np.uint8)
-    inside = cv2.warpAffine(
-        np.full(photograph.shape[:2], 255, np.uint8), affine, (width, height), flags=cv2.INTER_NEAREST
-    )
+    placed, inside = _placed(photograph, camera, K, width, height)
     difference = np.abs(render.astype(np.float32) - placed).mean(axis=2) * (inside > 0)
     mean = (
         float((((render.astype(np.float32) - placed) / 255) ** 2)[inside > 0].mean()) if inside.any() else 1.0
@@ -75,8 +73,9 @@ def compare(
         np.uint8
     )
     if kind == "side by side":
-        parts = [_labelled(placed, "photograph"), _labelled(render, "render"), _labelled(error, "error")]
-        return Compared(np.concatenate(parts, axis=1), psnr)
+        framed = render * (inside > 0)[..., None]
+        parts = [_labelled(placed, "photograph"), _labelled(framed, "render"), _labelled(error, "error")]
+        return Compared(_gridded(parts, columns), psnr)
     dark = (render * 0.35).astype(np.uint8)  # outside of the photograph
     shown = np.where((inside > 0)[..., None], error if kind == "error" else render, dark)
     if kind == "wipe":
@@ -84,6 +83,45 @@ def compare(
         shown[:, :edge] = np.where((inside[:, :edge] > 0)[..., None], placed[:, :edge], dark[:, :edge])
         shown[:, max(0, edge - 1) : edge + 1] = 255
     return Compared(np.ascontiguousarray(shown), psnr)
+
+
+def grid_columns(camera: CameraLike, width: int, height: int) -> int:
+    """Return in how many columns three images of a camera are largest in an area of a size."""
+
+    def scale(columns: int) -> float:
+        return min(width / columns / camera.width, height / ROWS[columns] / camera.height)
+
+    return max(ROWS, key=scale)
+
+
+def _gridded(parts: list[UInt8], columns: int) -> UInt8:
+    """Put images of one size into a grid, row by row."""
+    count = columns * ROWS[columns]
+    cells = parts + [np.zeros_like(parts[0])] * (count - len(parts))
+    rows = [np.concatenate(cells[k : k + columns], axis=1) for k in range(0, count, columns)]
+    return np.concatenate(rows, axis=0)
+
+
+def _placed(photograph: UInt8, camera: CameraLike, K: Matrix, width: int, height: int) -> tuple[UInt8, UInt8]:
+    """Draw a photograph where an image with the same pose and the intrinsics `K` shows its pixels.
+
+    Returns:
+        The photograph, uint8 [H, W, 3], and where it is: uint8 [H, W], 0 outside.
+    """
+    focal = np.array([K[0, 0] / camera.K[0, 0], K[1, 1] / camera.K[1, 1]])
+    shrink = np.minimum(
+        1.0, focal * [camera.width / photograph.shape[1], camera.height / photograph.shape[0]]
+    )
+    if shrink.min() < 0.9:  # averaged, because the next step only interpolates
+        size = np.maximum(1, np.round(shrink * photograph.shape[1::-1])).astype(int)
+        photograph = cv2.resize(photograph, size.tolist(), interpolation=cv2.INTER_AREA).astype(np.uint8)
+    scale = focal * [camera.width / photograph.shape[1], camera.height / photograph.shape[0]]
+    shift = K[:2, 2] - focal * camera.K[:2, 2] + scale / 2 - 0.5
+    affine = np.array([[scale[0], 0, shift[0]], [0, scale[1], shift[1]]])
+    white = np.full(photograph.shape[:2], 255, np.uint8)
+    placed = cv2.warpAffine(photograph, affine, (width, height), flags=cv2.INTER_LINEAR)
+    inside = cv2.warpAffine(white, affine, (width, height), flags=cv2.INTER_NEAREST)
+    return placed.astype(np.uint8), inside.astype(np.uint8)
 
 
 def _labelled(image: UInt8, text: str) -> UInt8:

@@ -87,7 +87,7 @@ def frustum_size(world: World) -> float:
     distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     np.fill_diagonal(distances, np.inf)
     nearest = float(np.median(distances.min(axis=1)))
-    return float(np.clip(0.35 * nearest, 0.01, 0.4))
+    return float(np.clip(0.12 * nearest, 0.01, 0.2))
 
 
 def quaternion(rotation: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

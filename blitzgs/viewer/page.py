@@ -111,6 +111,7 @@ class Page:
             control_width="large", dark_mode=True, show_logo=False, show_share_button=False
         )
         server.gui.set_panel_label(self.exhibit.title)
+        server.gui.main_panel.dock_right()
         server.scene.set_up_direction(world.up)
         server.scene.world_axes.visible = False
         start = world.start()

@@ -42,6 +42,7 @@ class Ask:
         scale: side relative to full quality.
         settings: the choices.
         camera: index of the photograph's camera to compare with; None: no comparison.
+        columns: of the grid of images side by side.
         is_sounding: the look is down from the camera, to find the ground.
     """
 
@@ -50,6 +51,7 @@ class Ask:
     scale: float
     settings: Settings
     camera: int | None = None
+    columns: int = 1
     is_sounding: bool = False
 
 
@@ -258,17 +260,18 @@ class Visitor:
             index = None
         elif index is None:
             settings = replace(settings, comparison="off")
-        beside = index is not None and settings.comparison == "side by side"
+        columns = 1
         share = scale * min(1.0, settings.most_side / max(width, height, 1))
         w, h = max(16, round(width * share)), max(16, round(height * share))
-        if beside:
-            w = max(16, w // 3)
+        if index is not None and settings.comparison == "side by side":
+            columns = compare.grid_columns(self.exhibit.cameras[index], w, h)
+            w, h = max(16, w // columns), max(16, h // compare.ROWS[columns])
         if index is not None:
             K = compare.fitted(self.exhibit.cameras[index], w, h)  # noqa: N806
         else:
             K = intrinsics(w, h, stance.fov)  # noqa: N806
         look = settings.look(self.world.viewmat(stance), K, w, h)
-        return Ask(look, version, scale, settings, index)
+        return Ask(look, version, scale, settings, index, columns)
 
     def _sounding(self, stance: Stance, version: int, settings: Settings) -> Ask:
         """Return a look straight down, to find the ground under a visitor who walks."""
@@ -299,7 +302,7 @@ class Visitor:
                 return Shown(result.image, ask, picture, None, None, None)
             camera = self.exhibit.cameras[ask.camera]
             kind, wipe = ask.settings.comparison, ask.settings.wipe
-            compared = compare.compare(kind, result.image, photograph, camera, ask.look.K, wipe)
+            compared = compare.compare(kind, result.image, photograph, camera, ask.look.K, wipe, ask.columns)
             result, psnr = Shaded(compared.image), compared.psnr
         return Shown(result.image, ask, picture, result.low, result.high, psnr)
 

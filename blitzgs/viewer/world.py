@@ -87,7 +87,9 @@ class World:
         distance, fov = 1.2 * SCALE * self.space.extent, math.radians(50)
         if self.poses:
             centres = SCALE * camera_centres(np.stack(self.poses))
-            distance = float(np.clip(np.median(np.linalg.norm(centres - self.middle, axis=1)), 0.2, distance))
+            distance = (
+                float(np.clip(np.median(np.linalg.norm(centres - self.middle, axis=1)), 0.2, distance)) * 1.3
+            )
         side = np.array([1.0, 0, 0]) if abs(self.up[0]) < 0.9 else np.array([0, 1.0, 0])
         side -= self.up * (side @ self.up)
         side /= np.linalg.norm(side)
