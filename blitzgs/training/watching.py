@@ -45,15 +45,15 @@ class Watching:
             stops: returns whether the run has to stop, the same on every rank.
         """
         wish = self._next()
+        if wish.pause:
+            with self._state.paused_clock():
+                while wish.pause and not stops():
+                    self._fulfil(wish)
+                    if wish.look is None:
+                        time.sleep(_PAUSE_SECONDS)
+                    wish = self._next()
         if not wish.pause:
             self._fulfil(wish)
-            return
-        with self._state.paused_clock():
-            while wish.pause and not stops():
-                self._fulfil(wish)
-                if wish.look is None:
-                    time.sleep(_PAUSE_SECONDS)
-                wish = self._next()
 
     def close(self) -> None:
         """Tell the watcher that the training has ended."""

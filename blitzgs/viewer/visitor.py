@@ -102,7 +102,7 @@ class Visitor:
         self._place: Stance | None = None  # of the camera at which the visitor stands
         self._arrived = 0.0
         self._lock = threading.Lock()
-        self._version, self._drawn = 0, -1
+        self.version, self._drawn = 0, -1
         self._drawn_scale = 0.0
         self._moved, self._stance = 0.0, self._read()
         self._pace = Pace(moving_ms)
@@ -142,10 +142,10 @@ class Visitor:
                     return
                 self.standing = None
             elif same:
-                self._version += self._size_changed()
+                self.version += self._size_changed()
                 self._wake()
                 return
-            self._version += 1
+            self.version += 1
             self._moved = time.monotonic()
         self._wake()
         self._tell()
@@ -154,7 +154,8 @@ class Visitor:
         shown = self.shown
         if shown is None:
             return True
-        return abs(shown.ask.look.width / shown.ask.look.height - self.client.camera.aspect) > 0.02
+        height, width = shown.image.shape[:2]
+        return abs(width / height / self.client.camera.aspect - 1) > 0.05
 
     def _tell(self) -> None:
         for listener in self.listeners:
@@ -189,7 +190,7 @@ class Visitor:
         distance = float(np.linalg.norm(stance.position - self.world.middle))
         with self._lock:
             self.standing, self._place, self._arrived = index, stance, time.monotonic()
-            self._version += 1
+            self.version += 1
         self.go(stance, max(0.1, distance), up=-stance.rotation[:, 1])
         self._wake()
         self._tell()
@@ -198,7 +199,7 @@ class Visitor:
         """Change some of the settings."""
         with self._lock:
             self.settings = replace(self.settings, **choices)  # type: ignore[arg-type]
-            self._version += 1
+            self.version += 1
         self._wake()
 
     def choose_motion(self, motion: str) -> None:
@@ -223,7 +224,7 @@ class Visitor:
     def next_ask(self) -> Ask | None:
         """Return what to draw next; None: nothing at present."""
         with self._lock:
-            moving, version, settings = self.is_moving, self._version, self.settings
+            moving, version, settings = self.is_moving, self.version, self.settings
             drawn = self._drawn_scale if self._drawn == version else None
             scale = (
                 self._pace.next_scale(drawn, moving) if settings.adapts else (1.0 if drawn is None else None)
@@ -309,7 +310,7 @@ class Visitor:
     def _step_to_ground(self, ask: Ask, picture: Picture) -> None:
         """Put a visitor who walks at eye height above the ground under them."""
         known = picture.values[picture.values > 0]
-        if len(known) == 0 or self.motion != "walk" or ask.version != self._version:
+        if len(known) == 0 or self.motion != "walk" or ask.version != self.version:
             return
         eye = EYE_HEIGHT * self.exhibit.space.extent * SCALE
         height = float(np.median(known)) / self.exhibit.space.unit * SCALE
