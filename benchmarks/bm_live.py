@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures what the live page costs a training: without it, with nobody looking, and with a client that orbits.
+"""Measures what the live page costs a training: without it, with nobody looking, with a client that orbits.
 
     python benchmarks/bm_live.py --data CAPTURE [--config smoke] [--repeats 3] [--device cpu]
                                  [--json FILE] [section.field=value ...]
