@@ -21,10 +21,9 @@ gsplat-default-reset (with the resets of opacities that 1.5.3 skips by mistake) 
 Every run is a process. By default, each GPU has one run at a time. With more (--per-gpu) the models are as
 good, but times no longer compare, and the table says so. When a run ends, it writes a JSON file into
 RESULTS/runs. The same command then skips the runs that are finished and repeats those that failed.
-quality.json has all runs, quality.csv one line per evaluation, quality.md the tables, and quality.png
-held-out PSNR against training time (with matplotlib). --collect adds the runs of other folders, or of their
-quality.json, for example if several machines share the runs. In a copy without a repository, BLITZGS_COMMIT
-names the commit.
+quality.json has all runs, quality.csv one line per evaluation, quality.md the tables. --collect adds the
+runs of other folders, or of their quality.json, for example if several machines share the runs. In a copy
+without a repository, BLITZGS_COMMIT names the commit.
 """
 
 from __future__ import annotations
@@ -185,7 +184,7 @@ def work(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> None:
                 count += 1
                 result = json.loads(pool.result_path(job.spec).read_text())
                 print(f"[{count}/{total}, {elapsed:.0f} s] {job.spec.name}: {summary(result)}", flush=True)
-                quality_report.report(pool.out, plot=False)
+                quality_report.report(pool.out)
             if elapsed > printed + PRINT_EVERY:
                 printed = elapsed
                 for job in pool.jobs:

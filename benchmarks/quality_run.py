@@ -160,7 +160,7 @@ def train_ours(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:
         if trainer.train() is None:
             raise InterruptedError("stopped by a signal")
     found = figures(recorder, trainer.state.progress.peak_gaussians) | {"population": trainer.population}
-    return found | ({"placed": trainer.state.placed_times} if config.schedule.adaptive else {})
+    return found
 
 
 def train_opponent(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:

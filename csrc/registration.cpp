@@ -61,8 +61,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "color_rows_(Tensor[] tables, Tensor[] sh, Tensor[] cameras, Tensor[] splats, Tensor(a!)[] shown, "
       "int[] ints, float[] floats, Tensor? totals=None) -> Tensor[] rows");
-  // views: cameras and, of each view, weights of the Gaussians' smallest axes, opacities and mean axes:
-  // (viewmats, Ks[, scale_reg[, opacity_reg[, size_reg]]]). v_splats: (v_means2d, v_conics, v_opacities[,
+  // views: cameras and, of each view, weights of the Gaussians' smallest axes and opacities:
+  // (viewmats, Ks[, scale_reg[, opacity_reg]]). v_splats: (v_means2d, v_conics, v_opacities[,
   // v_colors]) or, on CUDA, one table of splat gradients.
   m.def(
       "project_bwd(Tensor[] gaussians, Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, "
@@ -72,12 +72,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // project_bwd, then lazy_adam_step_ of the visible Gaussians. splats: (camera_ids, visible_ids,
   // splat_offsets[, places]); with places, v_splats are the tables of the ranks that composited the splats.
   // Groups of the optimiser, as blitzgs/ops/lazy_adam.py names them: state (params, exp_avgs, exp_avg_sqs,
-  // last_step, moment_step); tables (table, lr_table[, final_rules]); steps (step, explicit_steps,
-  // sparse); decays (beta1, beta2, eps).
+  // last_step, moment_step); tables (table, lr_table[, final_rules]).
   m.def(
-      "project_bwd_step_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, "
-      "Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, Tensor[] v_splats, "
-      "Tensor? level=None, Tensor(b!)? means2d_sums=None, bool absolute_sums=False) -> ()");
+      "project_bwd_step_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
+      "float beta2, float eps, Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, "
+      "Tensor[] v_splats, Tensor? level=None, Tensor(b!)? means2d_sums=None) -> ()");
   // The offsets of mean2d, conic, opacity, color and mean2d_abs in the floats of a splat gradient, then the
   // number of these floats.
   m.def("splat_gradient_layout() -> int[]");
@@ -191,25 +190,17 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "l1_ssim_fwd_bwd(Tensor renders, Tensor targets, Tensor[] weights, float[] factors) -> (Tensor loss, "
       "Tensor v_renders)");
 
-  // The optimiser: dense Adam over a list of rows, with the groups of arguments of project_bwd_step_; and the
-  // statistics of density control.
+  // The optimiser: dense Adam over a list of rows, with the arguments of project_bwd_step_; and the
+  // statistics of density control. current: the parameters of all rows are at the step before.
   m.def(
-      "lazy_adam_step_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, Tensor[] grads, "
-      "Tensor ids) -> ()");
+      "lazy_adam_step_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
+      "float beta2, float eps, Tensor[] grads, Tensor ids, bool current=False) -> ()");
   m.def(
-      "lazy_adam_catch_up_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, Tensor? ids, "
-      "Tensor? count=None) -> ()");
+      "lazy_adam_catch_up_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
+      "float beta2, float eps, Tensor? ids, Tensor? count=None) -> ()");
   // The rules of the total drift of a row, by the step of its parameters; `like` has the dtype of the
   // parameters.
   m.def("lazy_adam_final_rules(Tensor table, Tensor like, int explicit_steps, float eps) -> Tensor");
-  // Adds a step to the tables of T schedules and takes it, as lazy_adam_step_, for the same rows of the T
-  // tables of parameters that have these schedules. terms: (decays, shares); states and grads: of each table;
-  // rates: 6 T learning rates; indices: int64, of a sparse gradient; current: for each table, 1 if the
-  // parameters of all rows stand at the step before, so that none has to catch up.
-  m.def(
-      "drift_step_(Tensor(a!) tables, Tensor(b!) lr_tables, Tensor[] terms, Tensor(c!)[] states, int[] "
-      "steps, "
-      "float[] decays, float[] rates, Tensor[] grads, Tensor indices, int[] current) -> ()");
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
       "Tensor splat_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "

@@ -28,9 +28,9 @@ Needs the package viser: pip install "blitzgs[view]".
 """
 
 
-def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "view", run, "look at a model in the browser", HELP)
+    parser = add_command(commands, "view", run, summary, HELP)
     parser.add_argument("model", type=named_path, metavar="MODEL", help="run, checkpoint or PLY file")
     add_address(parser)
     add_capture(parser)

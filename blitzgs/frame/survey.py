@@ -50,7 +50,7 @@ def survey(
         options: how to render; no colour is computed.
         assignment: the tiles of each rank; every rank of the job calls this with its table. None: this rank
             composites all tiles.
-        transport: as for `forward`, but not in half precision, which would change the contributions.
+        transport: as for `forward`.
         active: as for `forward`.
         squares: whether to sum the squares as well.
 

@@ -150,8 +150,6 @@ def differentiable_splats(
     if not torch.compiler.is_compiling():
         splats = project_splats(inputs) if splats is None else splats
         tables = inputs.gaussians if rows is None else [*inputs.gaussians, *rows.sh]
-        if rows is not None and rows.hand_over is not None:
-            tables = [rows.hand_over.ticket]
         call = ProjectCall(inputs, sparse_grad, splats, rows)
         columns = Project.apply(viewmats, call, *tables)  # type: ignore[no-untyped-call]
         means2d, conics, depths, opacities, colors = columns

@@ -13,7 +13,7 @@ from blitzgs.ops.color_rows import VisibleRows
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.gather_rows import split_rows
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
-from blitzgs.ops.sparse_rows import HandOver, full_gradients
+from blitzgs.ops.sparse_rows import full_gradients
 from blitzgs.ops.splat_gradients import packed_table
 
 
@@ -23,19 +23,16 @@ class TableRows(NamedTuple):
     Attributes:
         visible: the rows.
         sh: the SH of all Gaussians in parts, from which the rows' SH were joined; empty: without SH.
-        hand_over: takes the gradients of the tables, if autograd is not to have them.
     """
 
     visible: VisibleRows
     sh: Sequence[Tensor]
-    hand_over: HandOver | None
 
 
 def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats, rows: TableRows | None = None) -> None:
     """Save what `_gradients` needs: the rows that were projected, their splats, and the shapes of tables."""
     ctx.set_materialize_grads(False)
     read, visible_ids, ids, ctx.tables, ctx.parts = inputs, splats.visible_ids, None, None, []
-    ctx.hand_over = None if rows is None else rows.hand_over
     if rows is not None:
         read, visible_ids, ids = rows.visible
         # The tables are not saved: the gradient does not depend on their values, which may change.
@@ -135,10 +132,7 @@ def _first_gradients(
         found[4:] = split_rows(gradients[4], ctx.parts)
     if not dense:
         found = [gradient if wanted else None for gradient, wanted in zip(found, needed, strict=True)]
-    if ctx.hand_over is not None:
-        ctx.hand_over.give(saved.ids, found)
-        found = [None]  # of the ticket
-    elif not dense and not complete:
+    if not dense and not complete:
         ids = visible_ids if saved.ids is None else saved.ids
         shapes = [table.shape for table in ctx.tables or saved.gaussians]
         found = full_gradients(ids, found, shapes, sparse)
@@ -189,10 +183,6 @@ class Project(torch.autograd.Function):
     def backward(ctx: Any, *v_output: Tensor | None) -> Any:
         """Return the gradients of viewmats and of the tables, from those of the columns."""
         need_viewmats, _, *needed = ctx.needs_input_grad
-        if ctx.hand_over is not None:
-            # Autograd runs the ticket's node unless it was asked for other gradients only, as of viewmats.
-            wanted = torch._C._will_engine_execute_node(ctx.next_functions[-1][0])
-            needed = [wanted and need for need in ctx.hand_over.needed]
         v = _Differentiable(*v_output)
         v_viewmats, *gradients = _gradients(ctx, needed, need_viewmats, ctx.sparse, v)
         return (v_viewmats, None, *gradients)

@@ -24,7 +24,6 @@ def project_bwd_step_(
     gradients: SplatGradients,
     level: Tensor | None = None,
     means2d_sums: Tensor | None = None,
-    absolute_sums: bool = False,
 ) -> None:
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their splats.
 
@@ -44,7 +43,6 @@ def project_bwd_step_(
         gradients: of the splats.
         level: uint8 [N], octree levels, if opacities fade with them (`options.fade`).
         means2d_sums: [P, 2], receives the gradient of `splats.means2d` if `gradients` has a part per rank.
-        absolute_sums: `means2d_sums` receives the sum over pixels of its absolute values instead.
 
     Raises:
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
@@ -56,8 +54,7 @@ def project_bwd_step_(
         torch.ops.blitzgs.project_bwd_step_(
             state.tensors,
             [schedule.table, schedule.lr_table],
-            schedule.steps(step),
-            schedule.decays,
+            *schedule.constants(step),
             list(views),
             of_splats,
             options.ints,
@@ -65,7 +62,6 @@ def project_bwd_step_(
             list(gradients.parts),
             level,
             means2d_sums,
-            absolute_sums,
         )
 
 

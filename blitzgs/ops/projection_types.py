@@ -147,14 +147,12 @@ class WeightedViews(NamedTuple):
         scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such
             term.
         opacity_reg: the same of the opacity (without the compensation of antialiased splats).
-        size_reg: the same of the mean of the three axes.
     """
 
     viewmats: Tensor
     Ks: Tensor
     scale_reg: Tensor | None = None
     opacity_reg: Tensor | None = None
-    size_reg: Tensor | None = None
 
 
 class ProjectionInputs(NamedTuple):

@@ -23,7 +23,6 @@ from blitzgs.ops.projection_types import (
     first_rows,
     lengths_of,
 )
-from blitzgs.ops.sparse_rows import HandOver
 
 
 class Rendered(NamedTuple):
@@ -53,12 +52,10 @@ class ShTables(NamedTuple):
         parts: the SH of all Gaussians in parts, [N, L, 3] each; empty: no SH are rendered.
         before: called before rows are read, with the rows, int32 [A], and the number of those that are
             valid, int32 [1] on the device, or None if all are.
-        hand_over: takes the gradients of all tables, if autograd is not to have them.
     """
 
     parts: Sequence[Tensor]
     before: Callable[[Tensor, Tensor | None], object]
-    hand_over: HandOver | None
 
 
 def render_queued(
@@ -108,9 +105,7 @@ def render_queued(
             attempt.end(sizes[:3], capacity is None or capacity.holds(sizes))
         if capacity is not None:
             splats, isect_splats, rows = _without_spare(splats, isect_splats, rows, sizes)
-        of_tables = None
-        if tables is not None and rows is not None:
-            of_tables = TableRows(rows, tables.parts, tables.hand_over)
+        of_tables = None if tables is None or rows is None else TableRows(rows, tables.parts)
         in_views = totals[VIEW_TOTALS : VIEW_TOTALS + inputs.n_views]
         return Rendered(splats, isect_splats, tile_offsets, composited, of_tables, 0 in in_views)
 

@@ -77,7 +77,6 @@ class OffloadingStepper(Stepper):
         owners: TileOwners,
         loss: LossConfig,
         extent: float,
-        half_exchange: bool = False,
         noise: PositionNoise | None = None,
     ) -> None:
         """Prepare to step.
@@ -89,13 +88,12 @@ class OffloadingStepper(Stepper):
             owners: records what the tiles cost.
             loss: weights of the loss.
             extent: size of the scene in the unit of the means.
-            half_exchange: send splats in half precision, see `open_transport`.
             noise: noise on the means after each step; None: none.
         """
         self._residence, self._upcoming = residence, upcoming
         self._reported = residence.moved
         self._up_to_date_at: int | None = None
-        super().__init__(residence.pool, optimiser, owners, loss, extent, half_exchange, noise)
+        super().__init__(residence.pool, optimiser, owners, loss, extent, noise)
         self.scene = residence
 
     def reindex(self) -> None:
@@ -148,9 +146,8 @@ class OffloadingStepper(Stepper):
         terms: LossTerms,
         mark: Mark = unmarked,
         keep_means2d: bool = False,
-        absolute: bool = False,
     ) -> Tensor | None:
         """See `Stepper.backward`."""
-        v_means2d = super().backward(step, frame, terms, mark, keep_means2d, absolute)
+        v_means2d = super().backward(step, frame, terms, mark, keep_means2d)
         self._residence.store_bounds(self._blocks)
         return v_means2d

@@ -16,7 +16,6 @@ from blitzgs.frame.transport import Mark, open_transport, unmarked
 from blitzgs.ops.view_gate import gate_views_
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.position_noise import PositionNoise
-from blitzgs.population.scale_floor import FLOOR, raise_scales
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batch import Batch
@@ -44,7 +43,6 @@ class Stepper:
         owners: TileOwners,
         loss: LossConfig,
         extent: float,
-        half_exchange: bool = False,
         noise: PositionNoise | None = None,
     ) -> None:
         """Prepare to step.
@@ -55,13 +53,12 @@ class Stepper:
             owners: records what the tiles cost.
             loss: weights of the loss.
             extent: size of the scene in the unit of the means.
-            half_exchange: send splats in half precision, see `open_transport`.
             noise: noise on the means after each step; None: none.
         """
         self.table = self.scene = table
         self._optimiser, self._owners = optimiser, owners
         self._loss, self._extent, self._noise = loss, extent, noise
-        self._transport = open_transport(owners.ranks, half_exchange)
+        self._transport = open_transport(owners.ranks)
         self.reindex()
 
     def reindex(self) -> None:
@@ -143,7 +140,6 @@ class Stepper:
         terms: LossTerms,
         mark: Mark = unmarked,
         keep_means2d: bool = False,
-        absolute: bool = False,
     ) -> Tensor | None:
         """Propagate the gradients of `forward`'s loss to the Gaussians, and take an optimiser step.
 
@@ -153,28 +149,21 @@ class Stepper:
             terms: from `forward`.
             mark: called at the end of each stage with the stage's name.
             keep_means2d: whether to return the gradient of the splats' means2d.
-            absolute: return the sum over pixels of absolute gradients instead (AbsGS, Ye et al. 2024).
 
         Returns:
             The gradient of means2d, [P, 2] per pixel; None without `keep_means2d`.
         """
         table = self.table
-        absolute &= keep_means2d
-        gradients = pipeline.backward_splats(frame, terms.v_renders, mark, absolute)
+        gradients = pipeline.backward_splats(frame, terms.v_renders, mark)
         v_means2d = means2d_sums = None
         if keep_means2d:
-            v_means2d = gradients.means2d_abs if absolute else gradients.means2d
+            v_means2d = gradients.means2d
             if v_means2d is None:
                 # The gradients are in the memory of several ranks. The optimiser's kernel adds them up.
                 v_means2d = means2d_sums = torch.empty_like(frame.projected.means2d)
-        self._optimiser.step(
-            table, frame, gradients, terms.scale_reg, terms.opacity_reg, terms.size_reg, step, means2d_sums,
-            absolute,
-        )  # fmt: skip
+        self._optimiser.step(table, frame, gradients, terms.scale_reg, terms.opacity_reg, step, means2d_sums)
         if self._noise is not None:
             self._noise.add(table, frame.projected.visible_ids, step, self._optimiser.position_rate(step))
-        if FLOOR in table.columns:
-            raise_scales(table, frame.projected.visible_ids)
         mark("optimiser")
         self._blocks.update(table, frame.projected.visible_ids)
         mark("other")

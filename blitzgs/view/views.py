@@ -145,14 +145,17 @@ class ViewSet:
         return unpack_views(numbers.to(self._device), *self.size(indices))
 
 
+# The far plane, relative to the scene's extent: nothing is cut off.
+FAR = 1e6
+
+
 def render_options(config: Config, space: Space, sh_degree: int, lod: LodGate | None = None) -> RenderOptions:
     """Return the render options of a run at a spherical-harmonics degree, with the fading of its LOD gate."""
     model = config.model
     return RenderOptions(
         sh_degree=sh_degree,
         near_plane=model.near * space.extent,
-        far_plane=model.far * space.extent,
-        eps2d=model.eps2d,
+        far_plane=FAR * space.extent,
         antialiased=model.antialiased,
         background=model.background,
         deterministic=model.deterministic,

@@ -144,10 +144,10 @@ def test_a_long_run_stays_with_dense_adam_and_needs_no_more_memory(tmp_path, dev
     table, optimiser = state.table, state.optimiser
     dense, start, lazy_step = DenseAdam(table, optimiser), flat(table.parameters), optimiser.step
 
-    def both(table, frame, gradients, scale_reg, opacity_reg, size_reg, step, *others):
-        assert opacity_reg is None and size_reg is None  # `DenseAdam` has no such terms
+    def both(table, frame, gradients, scale_reg, opacity_reg, step, *others):
+        assert opacity_reg is None  # `DenseAdam` has no such term
         dense.step(table, frame, gradients, scale_reg, step)
-        lazy_step(table, frame, gradients, scale_reg, opacity_reg, size_reg, step, *others)
+        lazy_step(table, frame, gradients, scale_reg, opacity_reg, step, *others)
 
     optimiser.step = both
     for step in range(1, steps + 1):

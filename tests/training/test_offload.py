@@ -65,7 +65,6 @@ VARIANTS = {
         "schedule.checkpoint_every=35",
     ),
     "smooth": (
-        "schedule.adaptive=true",
         "population.importance=true",
         "schedule.t1=24",
         "schedule.t2=40",
@@ -76,18 +75,14 @@ VARIANTS = {
     ),
     "relocation": (
         "population.relocate=true",
-        "population.absolute_gradients=true",
         "population.min_opacity=0.08",
         "population.reset_opacity=0.09",
         "loss.opacity=0.01",
-        "loss.size=0.01",
-        "model.scale_floor=0.447",
     ),
     "resets": (
         "schedule.reset_every=15",
         "population.opacity_decay=0.01",
         "optimiser.position_noise=1000",
-        "optimiser.sparse=true",
         "model.antialiased=true",
     ),
 }

@@ -14,7 +14,7 @@ from blitzgs.config.schedule import Event, EventKind
 from blitzgs.population.importance import SweepStoppedError
 from blitzgs.runs.files import Progress
 from blitzgs.table.pool import ResidenceError
-from blitzgs.training.events import clear_cull, densify, evaluate, importance, place, reset_opacities, save
+from blitzgs.training.events import clear_cull, densify, evaluate, importance, reset_opacities, save
 from blitzgs.training.state import TrainingState
 
 HANDLERS: Mapping[EventKind, Callable[[TrainingState, Event], object]] = {
@@ -23,7 +23,6 @@ HANDLERS: Mapping[EventKind, Callable[[TrainingState, Event], object]] = {
     "pass_1": importance.run,
     "pass_2": importance.run,
     "clear_cull": clear_cull.run,
-    "place": place.run,
     "evaluate": evaluate.run,
     "checkpoint": save.run,
 }
