@@ -52,7 +52,8 @@ class Live:
         self._count = 0
         self._paused = self._saves = False
         self._allowed, self._refreshed, self._left_alone = 0.0, 0.0, 0.0
-        self._last: tuple[Visitor, Ask] | None = None
+        self._next: tuple[Visitor, Ask] | None = None  # to be drawn
+        self._last: tuple[Visitor, Ask] | None = None  # being drawn
         self._sent = 0.0
         self._folders: dict[int, Any] = {}
         self._ends = threading.Event()
@@ -68,10 +69,24 @@ class Live:
         """Tell whether there is something to do between two steps."""
         if self._saves or self._paused:
             return True
-        return bool(self.page.visitors) and time.monotonic() >= self._allowed
+        if self._next is None and self.page.visitors and time.monotonic() >= self._allowed:
+            self._next = self._asked_for()
+        return self._next is not None
+
+    def _asked_for(self) -> tuple[Visitor, Ask] | None:
+        """Return a picture that a visitor waits for, if there is one."""
+        now = time.monotonic()
+        if not self._paused and now >= self._refreshed + _REFRESH_SECONDS:
+            self._refreshed = now
+            for visitor in list(self.page.visitors.values()):
+                visitor.refresh()
+        found = self.page.next_ask()
+        if found is None:
+            self._allowed = now + _IDLE_SECONDS
+        return found
 
     def wish(self) -> Wish:
-        """Return what to do: a picture if the visitors' share of the time allows it."""
+        """Return what to do: the picture that `wants` has found and, in a pause, whatever is asked for."""
         now = time.monotonic()
         saves, self._saves = self._saves, False
         if self.page.visitors:
@@ -80,15 +95,9 @@ class Live:
             self._left_alone = self._left_alone or now
             if now > self._left_alone + ALONE_SECONDS:
                 self._paused = False
-        self._last = None
-        if self.page.visitors and (self._paused or now >= self._allowed):
-            if not self._paused and now >= self._refreshed + _REFRESH_SECONDS:
-                self._refreshed = now
-                for visitor in list(self.page.visitors.values()):
-                    visitor.refresh()
-            self._last = self.page.next_ask()
-            if self._last is None:
-                self._allowed = now + _IDLE_SECONDS
+        self._last, self._next = self._next, None
+        if self._last is None and self._paused and self.page.visitors:
+            self._last = self._asked_for()
         return Wish(None if self._last is None else self._last[1].look, self._paused, saves)
 
     def show(self, picture: Picture, seconds: float) -> None:

@@ -149,7 +149,13 @@ class Page:
         visitors = list(self.visitors.values())
         for shift in range(len(visitors)):
             visitor = visitors[(self._turn + shift) % len(visitors)]
-            if (ask := visitor.next_ask()) is not None:
+            try:
+                ask = visitor.next_ask()
+            except Exception as error:  # a browser may send anything
+                warnings.warn(f"the viewer has dropped a visitor: {error}", stacklevel=2)
+                self.visitors.pop(visitor.client.client_id, None)
+                continue
+            if ask is not None:
                 self._turn += shift + 1
                 return visitor, ask
         return None

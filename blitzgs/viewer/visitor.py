@@ -242,7 +242,7 @@ class Visitor:
         camera = self.client.camera
         try:
             return self._ask(stance, index, camera.image_width, camera.image_height, scale, version, settings)
-        except ValueError:  # an impossible choice, such as a near plane behind the far one
+        except (ValueError, ArithmeticError):  # an impossible choice, such as a near plane behind the far one
             with self._lock:
                 self._drawn, self._drawn_scale = version, 1.0
             return None

@@ -72,7 +72,10 @@ def live(data: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "blitzgs", "train", "--config", "smoke", "--data", str(data)]
         training = subprocess.Popen(
-            [*command, "--out", f"{folder}/city", f"--viewer={port}"], stdout=subprocess.PIPE, text=True
+            [*command, "--out", f"{folder}/city", f"--viewer={port}"],
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONUNBUFFERED": "1"},
         )
         for line in training.stdout:
             if "viewer: open" in line:
@@ -80,7 +83,7 @@ def live(data: Path) -> None:
         with Browser(f"http://localhost:{port}/", 1600, 900) as browser:
             wait_for(browser.figures, 120, "a picture")
             for line in training.stdout:
-                if line.strip().startswith("800/"):
+                if line.strip().startswith("400/"):
                     break
             time.sleep(8)
             save(browser, "view_live.jpg")

@@ -4,6 +4,7 @@
 import contextlib
 import json
 import math
+import socket
 import threading
 import time
 
@@ -62,6 +63,27 @@ def browser(studio):
     with Browser(studio.page.url) as browser:
         settled(studio)
         yield browser
+
+
+def test_pictures_take_their_share_of_a_training(tmp_path):
+    trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
+    live = live_page(trainer.state, 0, "127.0.0.1")
+    try:
+        assert not live.wants()  # nobody looks
+        live._last = (None, None)
+        live.page.deliver = lambda *_: None
+        before = time.monotonic()
+        live.show(None, 0.3)
+        assert live._allowed - before == pytest.approx(0.3 / 0.03, abs=0.5)
+    finally:
+        live.close()
+
+
+def test_a_port_in_use_does_not_end_a_training(tmp_path, capsys):
+    trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        assert live_page(trainer.state, taken.getsockname()[1], "127.0.0.1") is None
+    assert "training goes on without the viewer" in capsys.readouterr().out
 
 
 @needs_chromium
