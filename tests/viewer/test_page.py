@@ -245,16 +245,21 @@ def test_the_live_page_follows_a_training(tmp_path, monkeypatch):
     thread.start()
     with Browser(live.page.url) as browser:
         wait_for(browser.figures, 60, "a picture")
+        wait_for(lambda: picture(browser).std() > 3, 60, "the picture is on the page")
         first = picture(browser)
-        assert first.std() > 3
         wait_for(lambda: np.abs(picture(browser) - first).mean() > 1, 60, "another picture")
-        assert browser.evaluate("document.querySelectorAll('.uplot').length") == 3
+        plots = "document.querySelectorAll('.uplot').length"
+        wait_for(lambda: browser.evaluate(plots) == 3, 30, "three curves")
         browser.press("Pause")
         wait_for(lambda: browser.place_of("Go on"), 20, "the training pauses")
-        time.sleep(0.3)
+
+        def rests():
+            before = trainer.state.progress.step
+            time.sleep(1.0)
+            return trainer.state.progress.step == before
+
+        wait_for(rests, 30, "the training rests")
         at = trainer.state.progress.step
-        time.sleep(0.5)
-        assert trainer.state.progress.step == at
         browser.press("Save now")
         wait_for(lambda: list((tmp_path / "checkpoints").glob("checkpoint_*")), 20, "the model is saved")
         browser.press("Go on")
