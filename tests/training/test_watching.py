@@ -118,3 +118,14 @@ def test_all_ranks_draw_for_the_first(tmp_path):
 def test_intrinsics_are_centred():
     K = intrinsics(200, 100, np.pi / 2)  # noqa: N806
     np.testing.assert_allclose(K, [[50, 0, 100], [0, 50, 50], [0, 0, 1]])
+
+
+def test_a_model_in_host_memory_is_shown(tmp_path):
+    settings = ("schedule.iterations=20", "memory.resident_gb=0.001")
+    trainer, watcher, summary = watched_run(tmp_path, *settings)
+    assert trainer.state.stepper.scene is not trainer.state.table
+    assert len(watcher.pictures) == 19
+    assert watcher.failures == []
+    assert watcher.pictures[-1].values.std() > 10
+    _, alone = train(tmp_path / "alone", *settings)
+    assert summary["psnr"] == pytest.approx(alone["psnr"], abs=1e-3)
