@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from blitzgs.population.position_noise import PositionNoise
     from blitzgs.table.table import GaussianTable
     from blitzgs.training.batch import Batch
+    from blitzgs.training.exposure import Exposures
     from blitzgs.view.gate import ViewGate
     from blitzgs.view.visible import Scene
 
@@ -37,10 +38,12 @@ class Stepper:
         table: the table whose rows a frame's ids refer to: all of this rank's Gaussians, or a pool with those
             that a step may need.
         scene: all of this rank's Gaussians, for rendering between steps; call `catch_up` before.
+        exposures: of the training photographs; None: all are taken as they are.
     """
 
     table: GaussianTable
     scene: Scene
+    exposures: Exposures | None = None
 
     def __init__(
         self,
@@ -129,7 +132,14 @@ class Stepper:
         frame = pipeline.forward(
             table, views, options, active, assignment, self._transport, mark, backward_follows=True
         )
-        terms = loss_terms(frame, batch, self._loss, self._extent)
+        if self.exposures is None:
+            terms = loss_terms(frame, batch, self._loss, self._extent)
+        else:
+            self.exposures.measure(step, frame.renders, batch)
+            gains, biases = self.exposures.of(batch.indices)
+            shown = torch.addcmul(biases, frame.renders, gains)
+            terms = loss_terms(frame, batch, self._loss, self._extent, shown)
+            terms.v_renders.mul_(gains)
         mark("loss")
         if batch.ranges is None:
             sums = HostSum(ranks, terms.parts)
