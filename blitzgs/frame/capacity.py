@@ -32,6 +32,9 @@ class CapacityEstimate:
         with self._lock:
             before = self._sizes or Sizes(0, 0, 0)
             # Views differ, so the estimate exceeds the largest recent size, and it shrinks slowly.
-            self._sizes = Sizes._make(
-                max(1, n * 9 // 8, size - size // 256) for n, size in zip(Sizes(*needed), before, strict=True)
+            self._sizes = Sizes(
+                *[
+                    max(1, n * 9 // 8, size - size // 256)
+                    for n, size in zip(Sizes(*needed), before, strict=True)
+                ]
             )
