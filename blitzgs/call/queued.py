@@ -12,12 +12,14 @@ from torch import Tensor
 
 from blitzgs._torch import saved_tensors_are_hooked
 from blitzgs.call.arguments import Gaussians
+from blitzgs.frame.capacity import NoEstimate
 from blitzgs.frame.run import run
 from blitzgs.frame.transport.local import LocalExchange, LocalTransport
 from blitzgs.frame.transport.protocol import Exchange
 from blitzgs.ops.project_gradient import TableRows
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, first_rows
 
+_EXACT = LocalTransport(NoEstimate())
 # What the op `render` returns before the colours and rows.
 _LISTS, _IMAGES = 2, 8
 
@@ -99,7 +101,7 @@ def render_queued(
     """
     options, means = inputs.options, inputs.gaussians[0]
     gaussians, sh = ((), ()) if tables is None else (inputs.gaussians, tables.parts)
-    transport = LocalTransport() if exact else _transport(means.device, means.shape[0], inputs.n_views)
+    transport = _EXACT if exact else _transport(means.device, means.shape[0], inputs.n_views)
 
     def composite(exchange: Exchange) -> tuple[LocalExchange, list[Tensor]]:
         assert isinstance(exchange, LocalExchange)

@@ -71,7 +71,10 @@ class LocalExchange:
         needed = Sizes(*self.totals()[:VIEW_TOTALS])
         if self._capacity is not None and not self._capacity.holds(needed):
             return needed, None  # the splats are undefined
-        own = self.projected.first(needed, self._copy.read()[:3])
-        composited = self.arrived.splats if self._capacity is None else own.for_compositing
-        visible = own.totals[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
-        return needed, ExchangeResult(own.splats, composited, visible, None, None)
+        counts, projected = self._copy.read()[:3], self.projected
+        visible = projected.totals[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
+        if self._capacity is None:
+            splats = projected.splats._replace(counts=counts)
+            return needed, ExchangeResult(splats, self.arrived.splats, visible, None, None)
+        own = projected.first(needed, counts)
+        return needed, ExchangeResult(own.splats, own.for_compositing, visible, None, None)
