@@ -129,7 +129,7 @@ class Browser:
         )
         return None if found is None else tuple(found)
 
-    def press(self, text: str, timeout: float = 20):
+    def press(self, text: str, timeout: float = 60):
         """Click on the element with a text."""
         wait_for(lambda: self.place_of(text), timeout, f"{text!r} is on the page")
         time.sleep(0.2)
