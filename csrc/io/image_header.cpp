@@ -92,7 +92,6 @@ ImageHeader read_png(ImageBytes file, const std::string& name) {
     if (chunk == "tRNS" && (kind == 0 || kind == 2 || kind == 3)) header.alpha = Alpha::kStraight;
     at += 12 + static_cast<std::size_t>(length);
   }
-  if (header.width == 0 || header.height == 0) throw FormatError(name, "damaged PNG: no size in its header");
   return header;
 }
 
