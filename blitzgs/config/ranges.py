@@ -52,7 +52,7 @@ RANGES: Mapping[str, Range] = {
     "data.prefetch": Range(0, 1000),
     "model.sh_degree": Range(0, 3),
     "model.background": Range(0, 1),
-    "model.near": Range(1e-9, 1e6),
+    "model.near": Range(0, 1e6),
     "model.far": Range(1e-9, 1e12),
     "model.eps2d": Range(0, 100),
     "model.initial_opacity": Range(1e-4, 0.9999),
@@ -147,8 +147,9 @@ def problems(config: Config) -> Iterator[str]:
         if name in CHOICES and value not in CHOICES[name]:
             yield f"{name}: must be one of {', '.join(CHOICES[name])}, got {value}"
     model, schedule, population = config.model, config.schedule, config.population
-    if not model.near < model.far:
-        yield f"model.near: must be below model.far ({model.far}), got {model.near}"
+    near = model.near or 0.01  # of a plane that the capture decides on, the largest
+    if not near < model.far:
+        yield f"model.near: must be below model.far ({model.far}), got {near}"
     if 0 < config.optimiser.position < 1e-20:
         # The rate falls by a power of the ratio of position_final to it, which must stay a number.
         yield f"optimiser.position: must be 0 or at least 1e-20, got {config.optimiser.position}"

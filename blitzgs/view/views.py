@@ -145,12 +145,21 @@ class ViewSet:
         return unpack_views(numbers.to(self._device), *self.size(indices))
 
 
+# The near plane of a configuration that leaves it to the capture, where no capture has decided on it.
+_NEAR = 0.01
+
+
+def near_plane(config: Config, space: Space) -> float:
+    """Return the distance of a run's near plane in the trained world."""
+    return (config.model.near or _NEAR) * space.extent
+
+
 def render_options(config: Config, space: Space, sh_degree: int, lod: LodGate | None = None) -> RenderOptions:
     """Return the render options of a run at a spherical-harmonics degree, with the fading of its LOD gate."""
     model = config.model
     return RenderOptions(
         sh_degree=sh_degree,
-        near_plane=model.near * space.extent,
+        near_plane=near_plane(config, space),
         far_plane=model.far * space.extent,
         eps2d=model.eps2d,
         antialiased=model.antialiased,

@@ -16,6 +16,7 @@ from blitzgs.population.relocation import relocate
 from blitzgs.population.scale_floor import FLOOR, scale_floors
 from blitzgs.runs.guard import ModelLostError, check_table
 from blitzgs.training.state import TrainingState
+from blitzgs.view.views import near_plane
 
 
 def run(state: TrainingState, event: Event) -> None:
@@ -116,10 +117,9 @@ def change_population(state: TrainingState, time: int, rules: DensityRules) -> D
 
 def find_floors(state: TrainingState) -> None:
     """Compute the smallest allowed scale of each Gaussian (`model.scale_floor`)."""
-    model = state.config.model
     views = (state.views.pick([index]) for index in state.capture.train)
-    near = model.near * state.space.extent
-    state.table[FLOOR] = scale_floors(state.table["means"], views, near, model.scale_floor)
+    near = near_plane(state.config, state.space)
+    state.table[FLOOR] = scale_floors(state.table["means"], views, near, state.config.model.scale_floor)
 
 
 def _finds_floors(state: TrainingState, time: int) -> bool:
