@@ -25,11 +25,14 @@ from blitzgs.capture.cameras import (
     same_shape,
     scaled_matrix,
 )
-from blitzgs.capture.files import find_mask
+from blitzgs.capture.files import MissingImagesError, existing
 from blitzgs.capture.image_files import ImageHeader, read_header
 from blitzgs.capture.layouts import Source, SourceView, read_layout
 from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_extent
 from blitzgs.capture.lens import Lens
+from blitzgs.capture.masks import excluded_share, find_masks
+from blitzgs.capture.names import check_inside
+from blitzgs.capture.points import SourcePoints
 from blitzgs.capture.splits import split_capture, without_unused
 from blitzgs.capture.undistort import Rectification, rectify
 from blitzgs.capture.usable import (
@@ -43,7 +46,6 @@ from blitzgs.capture.usable import (
 # In pixels. SSIM compares windows of 11 pixels, and a much smaller image shows too little to train on.
 _LEAST_SIDE = 8
 _HEADER_THREADS = 16
-_MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp")
 
 
 @dataclass(eq=False)
@@ -95,10 +97,18 @@ class About:
     """Number of views that see none of the points."""
     random_points: bool
     """Whether the capture has no points, so that training starts from random ones."""
-
-
-class MissingImagesError(FileNotFoundError):
-    """Some of the images that a capture names are not on disk."""
+    points_from: str = ""
+    """The file of the points, relative to the capture."""
+    colors_from: str = ""
+    """What in it gives their colours; empty: nothing."""
+    with_alpha: int = 0
+    """Number of photographs that have alpha."""
+    extra_bands: int = 0
+    """Number of photographs with a band that is neither colour nor alpha; it is not used."""
+    with_mask: int = 0
+    """Number of photographs that have a mask."""
+    mask_share: float | None = None
+    """Mean share of the pixels that masks exclude, of a few masks."""
 
 
 def load_capture(
@@ -113,6 +123,7 @@ def load_capture(
     allow_missing: bool = False,
     sparse: str = "largest",
     stray_cameras: str = "drop",
+    inside_only: bool = False,
 ) -> Capture:
     """Load a capture without decoding its images.
 
@@ -136,6 +147,8 @@ def load_capture(
             world coordinates, or a folder such as "sparse/1", relative to `path`.
         stray_cameras: "drop" the cameras that lie apart from all others and hardly show a point, or "keep"
             them; no length is measured by them either way.
+        inside_only: refuse names that lead outside the capture, for captures that somebody else has made;
+            otherwise they are read with a warning.
 
     Raises:
         FileNotFoundError: the folder has no capture, or images are missing on disk (`MissingImagesError`).
@@ -166,7 +179,8 @@ def load_capture(
     centres = camera_centres(np.stack([view.world_to_camera for view in views]))
     offset = centres[~apart].mean(axis=0)
     train_centres = centres[[i for i in train if not apart[i]] or train] - offset
-    kept = _existing(views, root, images, allow_missing)
+    _check_inside(root, views, points, images, masks, inside_only)
+    kept = existing([v.name for v in views], [v.path for v in views], root, images, allow_missing)
     missing = len(views) - len(kept)
     kept = without_strays(views, kept, strays, keep=stray_cameras == "keep")
     place = {index: position for position, index in enumerate(kept)}
@@ -177,15 +191,20 @@ def load_capture(
         raise MissingImagesError(f"{root}: no image of a training view is on disk")
     with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # the files may be on a slow network disk
         headers = list(pool.map(lambda view: read_header(view.path), views))
-    mask_folder = _mask_folder(root, masks)
-    if masks is False:
-        views = [replace(view, mask_path=None) for view in views]
+    extra_bands = [view for view, header in zip(views, headers, strict=True) if header.extra_bands]
+    if extra_bands:
+        warnings.warn(
+            f"{len(extra_bands)} of {len(views)} photographs have a further band that their file does not call "
+            f"alpha (first: {extra_bands[0].name}), near infrared for example; it is not used",
+            stacklevel=2,
+        )
+    found = find_masks(root, masks, [view.name for view in views], [view.mask_path for view in views])
+    views = [replace(view, mask_path=mask) for view, mask in zip(views, found, strict=True)]
     plans: dict[Lens, Rectification] = {}
     cameras = [
-        _camera(view, header, offset, downscale, undistort, exif, mask_folder, plans)
+        _camera(view, header, offset, downscale, undistort, exif, plans)
         for view, header in zip(views, headers, strict=True)
     ]
-    _check_masks(cameras, mask_folder)
     has_points = len(points.positions) > 0
     if not has_points:
         points = points_at_random(root, [c for i, c in enumerate(cameras) if i not in apart_left], offset)
@@ -208,72 +227,42 @@ def load_capture(
         has_alpha=any(header.has_alpha for header in headers),
         near=near,
         apart=apart_left,
-        about=About(source, why, strays, unused, missing, blind, not has_points),
+        about=About(
+            source,
+            why,
+            strays,
+            unused,
+            missing,
+            blind,
+            not has_points,
+            points_from=_relative(points.path, root),
+            colors_from=points.colors_from,
+            with_alpha=sum(header.has_alpha for header in headers),
+            extra_bands=len(extra_bands),
+            with_mask=sum(mask is not None for mask in found),
+            mask_share=excluded_share(found),
+        ),
     )
 
 
-def _existing(views: list[SourceView], root: Path, images: str, allow_missing: bool) -> list[int]:
-    """Return the indices of the views whose image is on disk."""
-    exists = [view.path.is_file() for view in views]
-    missing = [view.name for view, there in zip(views, exists, strict=True) if not there]
-    found = [index for index, there in enumerate(exists) if there]
-    if not missing:
-        return found
-    shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
-    # The names of a transforms.json are paths in the capture; those of a COLMAP model, in its image folder.
-    are_paths = all(view.path == root / view.name for view in views if not view.path.is_file())
-    folder = root if are_paths else root / images
-    message = f"{len(missing)} of {len(views)} images are not in {folder}: {shown}"
-    if not found and are_paths:
-        raise FileNotFoundError(f"{message}; put them there, or correct file_path in its transforms.json")
-    if not found:
-        # A user may name the folder of the model, CAPTURE/sparse/0.
-        above = next((folder for folder in root.resolve().parents[:2] if (folder / images).is_dir()), None)
-        if above is not None and not (root / images).is_dir():
-            raise FileNotFoundError(f"{message}; the capture may be the folder above: --data={above}")
-        raise FileNotFoundError(
-            f"{message}; name their folder, relative to the capture, with --data.images=FOLDER"
-        )
-    if not allow_missing:
-        raise MissingImagesError(f"{message}; put them back, or leave those views out with allow_missing")
-    warnings.warn(f"{message}; dropped", stacklevel=3)
-    return found
+def _relative(path: Path | None, root: Path) -> str:
+    if path is None:
+        return ""
+    return str(path.relative_to(root) if path.is_relative_to(root) else path)
 
 
-def _mask_folder(root: Path, masks: str | bool | None) -> Path | None:
-    if masks is False:
-        return None
-    folder = root / (masks if isinstance(masks, str) else "masks")
-    if folder.is_dir():
-        return folder
-    if masks is not None:
-        raise FileNotFoundError(f"{folder}: no such folder of masks")
-    return None
-
-
-def _check_masks(cameras: Sequence[Camera], folder: Path | None) -> None:
-    """Check that the masks belong to the images, so that no mask is ignored without a message."""
-    used = {camera.mask_path for camera in cameras if camera.mask_path is not None}
-    missing = sorted(str(path) for path in used if not path.is_file())
-    if missing:
-        raise FileNotFoundError(
-            f"{len(missing)} masks are missing (first: {missing[0]}); use --data.masks=false to train without"
-        )
-    if folder is None:
-        return
-    files = {path for path in folder.rglob("*") if path.suffix.lower() in _MASK_SUFFIXES}
-    unused = sorted(str(path.relative_to(folder)) for path in files - used)
-    if files and not used:
-        raise ValueError(
-            f"none of the {len(files)} masks in {folder} belongs to an image: they are called like "
-            f"{unused[0]}, the images like {cameras[0].name}; rename them to NAME.png, or use "
-            "--data.masks=false"
-        )
-    if unused:
-        warnings.warn(
-            f"{len(unused)} of {len(files)} masks in {folder} belong to no image (first: {unused[0]})",
-            stacklevel=3,
-        )
+def _check_inside(
+    root: Path,
+    views: Sequence[SourceView],
+    points: SourcePoints,
+    images: str,
+    masks: str | bool | None,
+    refuse: bool,
+) -> None:
+    """See `names.check_inside`; the folders that the options name may be anywhere."""
+    named = [path for view in views for path in (view.path, view.mask_path) if path is not None]
+    folders = [root / images] + ([root / masks] if isinstance(masks, str) else [])
+    check_inside(named + ([points.path] if points.path else []), root, folders, refuse)
 
 
 def _camera(
@@ -283,7 +272,6 @@ def _camera(
     downscale: float,
     policy: str,
     exif: str,
-    mask_folder: Path | None,
     plans: dict[Lens, Rectification],
 ) -> Camera:
     orientation = _orientation(view, header, exif)
@@ -317,9 +305,6 @@ def _camera(
         )
     pose = view.world_to_camera.copy()
     pose[:3, 3] += pose[:3, :3] @ offset
-    mask = view.mask_path
-    if mask is None and mask_folder is not None:
-        mask = find_mask(mask_folder, view.name)
     return Camera(
         name=view.name,
         width=size[0],
@@ -327,7 +312,7 @@ def _camera(
         K=scaled_matrix(plan.K, (plan.width, plan.height), size),
         world_to_camera=pose,
         image_path=view.path,
-        mask_path=mask,
+        mask_path=view.mask_path,
         orientation=orientation,
         rectification=plan,
     )

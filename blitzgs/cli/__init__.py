@@ -24,6 +24,7 @@ from blitzgs.runs.folder_checks import FolderError
 from blitzgs.runs.guard import ModelLostError, NonFiniteError
 from blitzgs.table.host_table import HostMemoryError
 from blitzgs.table.pool import ResidenceError
+from blitzgs.util.printable import printable
 from blitzgs_synth import command as synth
 
 HELP = """\
@@ -68,12 +69,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         args.parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
     args.overrides = rest
     # Our warnings are about the user's data, so they are shown without the line of code that raised them.
-    warnings.formatwarning = lambda message, *_, **__: f"blitzgs {args.command}: warning: {message}\n"
+    warnings.formatwarning = lambda message, *_, **__: (
+        f"blitzgs {args.command}: warning: {printable(str(message))}\n"
+    )
     try:
         status: int = args.run(args)
     except USER_ERRORS as error:
         Console(stderr=True, highlight=False, emoji=False).print(
-            f"blitzgs {args.command}: {_message(error)}", style="red", markup=False, soft_wrap=True
+            f"blitzgs {args.command}: {printable(_message(error))}", style="red", markup=False, soft_wrap=True
         )
         return 1
     except KeyboardInterrupt:
