@@ -25,7 +25,8 @@ from blitzgs.capture.cameras import (
     same_shape,
     scaled_matrix,
 )
-from blitzgs.capture.files import MissingImagesError, existing
+from blitzgs.capture.files import MissingImagesError as MissingImagesError
+from blitzgs.capture.files import existing
 from blitzgs.capture.image_files import ImageHeader, read_header
 from blitzgs.capture.layouts import Source, SourceView, read_layout
 from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_extent
@@ -194,8 +195,8 @@ def load_capture(
     extra_bands = [view for view, header in zip(views, headers, strict=True) if header.extra_bands]
     if extra_bands:
         warnings.warn(
-            f"{len(extra_bands)} of {len(views)} photographs have a further band that their file does not call "
-            f"alpha (first: {extra_bands[0].name}), near infrared for example; it is not used",
+            f"{len(extra_bands)} of {len(views)} photographs have a further band that their file does not "
+            f"call alpha (first: {extra_bands[0].name}), near infrared for example; it is not used",
             stacklevel=2,
         )
     found = find_masks(root, masks, [view.name for view in views], [view.mask_path for view in views])

@@ -42,12 +42,12 @@ class ImageFinder:
                 if problem is None:
                     return [path for path in paths if path is not None]
                 warnings.warn(f"{problem}; downscaling {self.images} instead", stacklevel=2)
-        paths = [self._find(name) for name in names]
-        there = [path.is_file() for path in paths]
+        files = [self._find(name) for name in names]
+        there = [path.is_file() for path in files]
         lost = [name for name, found in zip(names, there, strict=True) if not found]
         found = [name for name, is_there in zip(names, there, strict=True) if is_there]
         matches = match_names(lost, found, self.root / self.images)
-        return [matches.get(name, path) for name, path in zip(names, paths, strict=True)]
+        return [matches.get(name, path) for name, path in zip(names, files, strict=True)]
 
     def _find(self, name: str) -> Path:
         first = self.root / self.images / name

@@ -93,7 +93,8 @@ def _check_supported(header: dict[str, Any], name: str) -> None:
     if header["samples"] != "uint" or bits > 16:
         number = f"{header['samples']}{bits}"
         raise ValueError(
-            f"{name}: pixels must be of 8 or 16 bits, got {number}; not supported: {number} {kind}; {_CONVERT}"
+            f"{name}: pixels must be of 8 or 16 bits, got {number}; not supported: {number} {kind}; "
+            f"{_CONVERT}"
         )
     reason = None
     if kind != "JPEG" and bands > max(4, colors):

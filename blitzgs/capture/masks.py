@@ -14,8 +14,8 @@ from blitzgs.capture.names import files_below, unified, what_is_at
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp", ".avif", ".jp2")
 # What programs call the mask of a.jpg, the names that are tried first first.
-_FORMS = ("{name}.png", "{stem}.png", "{name}", "{stem}_mask.png", "{stem}_mask{suffix}", "{name}_mask.png")
-_FORMS += ("{name}.mask.png", "{stem}.mask.png")
+_FORMS: tuple[str, ...] = ("{name}.png", "{stem}.png", "{name}", "{stem}_mask.png", "{stem}_mask{suffix}")
+_FORMS += ("{name}_mask.png", "{name}.mask.png", "{stem}.mask.png")
 # Masks are decoded when the capture is loaded to see what they exclude.
 _SAMPLED = 8
 
@@ -41,8 +41,8 @@ def find_masks(
     if missing:
         kind = what_is_at(missing[0])
         raise FileNotFoundError(
-            f"{len(missing)} masks are missing (first: {missing[0]}{f' is {kind}' if kind else ''}); put them "
-            "there, correct mask_path in transforms.json, or use --data.masks=false to train without"
+            f"{len(missing)} masks are missing (first: {missing[0]}{f' is {kind}' if kind else ''}); put "
+            "them there, correct mask_path in transforms.json, or use --data.masks=false to train without"
         )
     folder = root / (masks if isinstance(masks, str) else "masks")
     if not folder.is_dir():
@@ -111,8 +111,8 @@ def _owners(folder: Path, files: Sequence[str], names: Sequence[str | None]) -> 
         file, images = doubtful[0]
         first, second = (str(names[index]) for index in images[:2])
         raise ValueError(
-            f"{folder}: {len(doubtful)} masks could belong to several images: {file} to {first} and {second}; "
-            f"put the mask of {first} at {first}.png in that folder, or use --data.masks=false"
+            f"{folder}: {len(doubtful)} masks could belong to several images: {file} to {first} and {second}"
+            f"; put the mask of {first} at {first}.png in that folder, or use --data.masks=false"
         )
     return {index: file for index, (_, file) in owners.items()}
 
@@ -154,8 +154,8 @@ def excluded_share(masks: Sequence[Path | None]) -> float | None:
     elif min(shares) == 1:
         warnings.warn(
             f"the masks exclude every pixel ({len(shares)} of {len(paths)} were looked at; first: "
-            f"{sample[0]}): black or transparent pixels are excluded, and so are, in lossy files (JPEG), dark "
-            "ones; write masks as PNG with white where pixels count, or use --data.masks=false",
+            f"{sample[0]}): black or transparent pixels are excluded, and in lossy files (JPEG) dark ones "
+            "too; write masks as PNG with white where pixels count, or use --data.masks=false",
             stacklevel=3,
         )
     return sum(shares) / len(shares)

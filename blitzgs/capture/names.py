@@ -98,8 +98,8 @@ def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dic
 def _say(new: dict[str, str], count: int, folder: Path, ignored: str) -> None:
     name, file = next(iter(new.items()))
     warnings.warn(
-        f"{len(new)} of {count} files have other names in {folder} than in the capture's file: {file} is used "
-        f"for {name} (names that differ only in {ignored})",
+        f"{len(new)} of {count} files have other names in {folder} than in the capture's file: {file} is "
+        f"used for {name} (names that differ only in {ignored})",
         stacklevel=4,
     )
 

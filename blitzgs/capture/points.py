@@ -89,8 +89,8 @@ def _model_points(root: Path, content: Transforms, folder: Path) -> SourcePoints
     reason = _differs(model, content)
     if reason is not None:
         warnings.warn(
-            f"{content.files[0]} names no points, and the {len(moved)} points of {shown} are not used: {reason}"
-            "; name a PLY with ply_file_path",
+            f"{content.files[0]} names no points, and the {len(moved)} points of {shown} are not used: "
+            f"{reason}; name a PLY with ply_file_path",
             stacklevel=5,
         )
         return None
@@ -99,9 +99,7 @@ def _model_points(root: Path, content: Transforms, folder: Path) -> SourcePoints
         read = ply_points(model.points_path)
         read.positions = content.moved(read.positions)
         return read
-    return SourcePoints(
-        moved, points.colors, points.track_lengths, points.errors, folder, "the model's own colours"
-    )
+    return SourcePoints(moved, points.colors, points.track_lengths, points.errors, folder, "the model")
 
 
 def _differs(model: colmap.ColmapModel, content: Transforms) -> str | None:

@@ -151,14 +151,12 @@ def _found(root: Path, names: Sequence[str]) -> dict[str, Path]:
         for name in names
     }
     there = [
-        path.relative_to(root).as_posix() for path in paths.values() if path.is_file() and _inside(path, root)
+        path.relative_to(root).as_posix()
+        for path in paths.values()
+        if path.is_relative_to(root) and ".." not in path.parts and path.is_file()
     ]
     lost = [name for name, path in paths.items() if not path.is_file()]
     return paths | match_names(lost, there, root)
-
-
-def _inside(path: Path, root: Path) -> bool:
-    return path.is_relative_to(root) and ".." not in path.parts
 
 
 def _read_file(path: Path) -> tuple[dict[str, Any], list[Any]]:

@@ -34,8 +34,8 @@ class DataConfig:
             turns it, "ignore" never.
         allow_missing: drop views whose image is missing or damaged instead of failing.
         inside_only: refuse captures with names that lead outside their folder.
-        sparse: which of several COLMAP models (sparse/0, sparse/1, ...) is read: the "largest", "all" of them,
-            which must have the same world coordinates, or a folder inside the capture.
+        sparse: which of several COLMAP models (sparse/0, sparse/1, ...) is read: the "largest", "all" of
+            them, which must have the same world coordinates, or a folder inside the capture.
         stray_cameras: "drop" leaves out cameras that lie far apart from all others and hardly show a point,
             "keep" trains on them. The scene's lengths are measured without them either way.
         cache_bytes: memory for compressed images, of all ranks of a host together, at most half of the host's

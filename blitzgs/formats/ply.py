@@ -265,6 +265,6 @@ def _are_fractions(colors: npt.NDArray[Any]) -> bool:
 def _check_colors(usable: npt.NDArray[np.bool_], colors: npt.NDArray[Any], path: Path | str) -> None:
     if not usable.all():
         raise ValueError(
-            f"{path}: a point has the colour {colors[~usable][0]}: numbers from 0 to 255 are read, or fractions "
-            "of white; write the colours as uchar"
+            f"{path}: a point has the colour {colors[~usable][0]}: numbers from 0 to 255 are read, or "
+            "fractions of white; write the colours as uchar"
         )

@@ -214,19 +214,23 @@ class Checker {
     while (end + 1 < file_.size() && (file_[end] != 0xff || file_[end + 1] == 0)) ++end;
     const std::size_t begin = at_ - std::min(at_, std::size_t{(held_ - padding_) / 8});
     const bool is_scan_end = end + 1 < file_.size() && (file_[end + 1] < kRst0 || file_[end + 1] >= kSoi);
-    if (!is_scan_end || end - begin > kMostForeignBytes || are_blocks(blocks, band)) return;
+    const std::size_t foreign = end - begin;
+    if (!is_scan_end || foreign == 0 || foreign > kMostForeignBytes || are_blocks(blocks, band)) return;
     at_ = end;
     held_ = padding_ = 0;
   }
 
   // Tells whether the rest of a scan's data are further blocks, without a rest.
   bool are_blocks(const std::vector<Block>& blocks, const Band& band) const {
-    Checker rest = *this;
+    Checker rest(file_, name_);
+    rest.at_ = at_;
+    rest.bits_ = bits_;
+    rest.held_ = held_;
+    rest.padding_ = padding_;
+    rest.progressive_ = progressive_;
+    Component any{0, 1, 1, {0}};
     std::vector<Block> copies = blocks;
-    for (Block& block : copies) {
-      block.component = &rest.components_[static_cast<std::size_t>(block.component - components_.data())];
-      block.component->nonzero.assign(1, 0);
-    }
+    for (Block& block : copies) block.component = &any;
     try {
       for (std::size_t unit = 0; unit < 8 * kMostForeignBytes; ++unit) {
         rest.refill();
