@@ -80,12 +80,20 @@ def load_results(folder: Path = RESULTS) -> Results:
     return results
 
 
-def machine_line(file: Json) -> str:
-    """Return the hardware and the command of a result as text."""
+def machine_of(file: Json) -> str:
+    """Return the hardware, versions and commit of a result as text."""
     about = file["environment"]
-    machine = f"{about['device']}, CUDA {about['cuda']}" if "device" in about else about["processor"]
+    machine = about.get("device", about["processor"])
     peers = f", gsplat {about['gsplat']}" if "gsplat" in about else ""
-    return f"`{file['command']}`, {machine}, torch {about['torch']}{peers}, commit {file['commit']}."
+    return f"{machine}, torch {about['torch']}{peers}, commit {file['commit']}"
+
+
+def machine_lines(files: list[Json]) -> list[str]:
+    """Return a line for each machine and commit: the commands that ran there, and what it is."""
+    commands: dict[str, list[str]] = {}
+    for file in files:
+        commands.setdefault(machine_of(file), []).append(f"`{file['command']}`")
+    return [f"- {', '.join(found)}: {machine}." for machine, found in commands.items()]
 
 
 def section_lines(name: str, results: Results) -> list[str]:
@@ -105,10 +113,7 @@ def section_lines(name: str, results: Results) -> list[str]:
         return ["Not measured yet. The commands that measure it:", "",
                 *(f"    {command}" for command in commands)]  # fmt: skip
     files = [results[file] for file in section.files]
-    lines = section.lines(*files)
-    if name.startswith("summary"):  # each of its lines has its command
-        return [*lines, "", f"{machine_line(files[0]).split('`, ', 1)[1]}"]
-    return [*lines, "", *("- " + machine_line(file) for file in files)]
+    return [*section.lines(*files), "", *machine_lines(files)]
 
 
 def render_page(text: str, results: Results) -> str:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import city_report
-from report_files import COMMANDS
 
 Json = dict[str, Any]
 
@@ -31,29 +30,11 @@ QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaus
 ABLATION_COLUMNS = (
     "scene", "arm", "seeds", "PSNR", "corrected PSNR", "SSIM", "peak M", "final M", "peak GB"
 )  # fmt: skip
-GATE_COLUMNS = ("arm", "seeds", "PSNR", "SSIM", "seconds", "peak M", "final M", "peak GB", "mean GB",
-                "paper PSNR", "paper peak", "paper time")  # fmt: skip
 OFFLOAD_COLUMNS = {
     "arm": "arm", "order": "views in order", "pool_gb": "GB on the GPU", "step_ms": "ms a step",
     "cost": "relative", "resident_hits": "blocks already there", "moved_mb_per_step": "MB moved a step",
     "sweep_s": "s for a sweep",
 }  # fmt: skip
-# Arms of benchmarks/ablation.yaml and adaptive.yaml that the paper does not have.
-OUR_ARMS = {
-    "full_60": "full, pass 2 keeps 0.6",
-    "from_5000": "gate from 5,000 on, pass 2 keeps 0.65",
-    "early": "gate from 2,000 on with rate 0.3, pass 2 keeps 0.65",
-    "early_60": "gate from 2,000 on, pass 2 keeps 0.75",
-    "early_alone": "gate from 2,000 on, no pass 1, pass 2 keeps 0.7",
-    "early_32": "gate from 2,000 on with rate 0.3, 32 pixels for each Gaussian, pass 2 keeps 0.64",
-}
-ADAPTIVE_ARMS = {
-    "fixed": "fixed schedule",
-    "adaptive": "adaptive schedule",
-    "short": "shorter fixed schedule",
-}
-# Arms of the tables rho and onset that are arms of the ablation.
-SAME_ARMS = {"rate_0": "no_gate", "rate_60": "full", "from_24k": "full"}
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
@@ -224,56 +205,16 @@ def arm_lines(file: Json, arms: dict[str, Json], columns: Iterable[str]) -> list
     return table(columns, ([str(row[column]) for column in columns] for row in rows))
 
 
-def ablation_lines(ablation: Json) -> list[str]:
-    """Tabulate the arms of the model level."""
-    ours = {name: {"title": title} for name, title in OUR_ARMS.items()}
-    return arm_lines(ablation, arms_of("ablation") | ours, ABLATION_COLUMNS)
-
-
 def compact_lines(compact: Json) -> list[str]:
     """Tabulate configs/compact.yaml against the whole model level and against none of it, with times."""
     arms = {"half": {"title": "compact.yaml"}, "full": {"title": "full"}, "all_off": {"title": "all off"}}
-    columns = (*ABLATION_COLUMNS, "images/s", "seconds")
-    return arm_lines(compact, arms, columns)
+    return arm_lines(compact, arms, (*ABLATION_COLUMNS, "seconds"))
 
 
 def town_parts_lines(town: Json) -> list[str]:
     """Tabulate the arms of the model level on the town, with times."""
-    ours = {name: {"title": title} for name, title in OUR_ARMS.items()}
-    return arm_lines(town, arms_of("ablation") | ours, (*ABLATION_COLUMNS, "images/s", "seconds"))
-
-
-def town_lines(town: Json) -> list[str]:
-    """Tabulate compact.yaml, the whole model level and none of it; without times, as runs shared the host."""
-    arms = {"half": "compact.yaml", "full_60": OUR_ARMS["full_60"], "all_off": "all off"}
-    return arm_lines(town, {name: {"title": title} for name, title in arms.items()}, ABLATION_COLUMNS)
-
-
-def gate_random_lines(gates: Json) -> list[str]:
-    """Tabulate both rules of the learned gate against a random veto."""
-    arms = {"rank": "gate, by rank", "sample": "gate, sampled", "random": "random veto"}
-    return arm_lines(gates, {name: {"title": title} for name, title in arms.items()}, ABLATION_COLUMNS)
-
-
-def adaptive_lines(adaptive: Json) -> list[str]:
-    """Tabulate the fixed and the adaptive schedule."""
-    arms = {name: {"title": title} for name, title in ADAPTIVE_ARMS.items()}
-    return arm_lines(adaptive, arms, (*ABLATION_COLUMNS, "seconds"))
-
-
-def gate_lines(name: str) -> Callable[[Json], list[str]]:
-    """Return the function that makes the table rho or onset of the captures that have all of its arms."""
-
-    def lines(ablation: Json) -> list[str]:
-        arms = arms_of(name)
-        recipes = {SAME_ARMS.get(arm, arm): about for arm, about in arms.items()}
-        trained: dict[str, set[str]] = {}
-        for run in ablation["runs"]:
-            trained.setdefault(run["capture"], set()).add(run["recipe"])
-        runs = [run for run in ablation["runs"] if trained[run["capture"]] >= set(recipes)]
-        return arm_lines({"runs": runs}, recipes, GATE_COLUMNS)
-
-    return lines
+    columns = ("arm", "seeds", "PSNR", "SSIM", "peak M", "final M", "seconds")
+    return arm_lines(town, arms_of("ablation"), columns)
 
 
 def offload_lines(offload: Json) -> list[str]:
@@ -285,96 +226,46 @@ def offload_lines(offload: Json) -> list[str]:
     return table(OFFLOAD_COLUMNS.values(), rows)
 
 
-SUMMARY_HEAD = ["work", "BlitzGS", "compared with", "ratio", "command"]
-
-
-def summary_row(
-    work: str, ours: float, theirs: float | None, unit: str, other: str, command: str
-) -> list[str]:
-    """Return one line of the README's tables: a figure, the figure compared with it, and their ratio."""
-    their_cells = [f"{other} {theirs:.2f} {unit}", f"{theirs / ours:.1f}"] if theirs else ["–", "–"]
-    return [work, f"{ours:.2f} {unit}", *their_cells, f"`{command}`"]
-
-
-def summary_lines(render: Json, step_1: Json, step_4: Json) -> list[str]:
-    """Return the README's table for one GPU: one line for each kind of work."""
+def summary_lines(render: Json, step: Json, exchange: Json) -> list[str]:
+    """Return the README's table: one line for each kind of work, against gsplat or one GPU."""
     rows = []
 
-    def add(*cells: Any) -> None:
-        rows.append(summary_row(*cells))
+    def add(work: str, ours: float, other: str, theirs: float | None, unit: str) -> None:
+        cells = [f"{other} {theirs:.2f} {unit}", f"{theirs / ours:.1f}"] if theirs else ["–", "–"]
+        rows.append([work, f"{ours:.2f} {unit}", *cells])
 
     for result in render["results"]:
-        ours, theirs = result["blitzgs"], fastest_gsplat(result)
-        total = theirs["total"] if theirs else None
-        add(f"render forward + backward, {result['scene']}", ours["total"], total, "ms", "gsplat",
-            COMMANDS["render"])  # fmt: skip
-    last = render["results"][-1]
-    for result in render["results"]:
-        last = result if result["blitzgs"]["peak_gb"] > last["blitzgs"]["peak_gb"] else last
-    theirs = fastest_gsplat(last)
-    add(f"memory above the parameters, {last['scene']}", last["blitzgs"]["peak_gb"],
-        theirs["peak_gb"] if theirs else None, "GB", "gsplat", COMMANDS["render"])  # fmt: skip
-    for name, file in (("step_1", step_1), ("step_4", step_4)):
-        for result in file["results"]:
-            their = result.get("gsplat + fused Adam")
-            add(f"whole training step, {result['scene']}, {result['views']} view(s)",
-                result["blitzgs"]["ms"]["total"], their["ms"]["total"] if their else None, "ms",
-                "gsplat + fused Adam", COMMANDS[name])  # fmt: skip
-    return table(SUMMARY_HEAD, rows)
-
-
-def summary_ranks_lines(exchange: Json) -> list[str]:
-    """Return the README's table for several GPUs: their step against one GPU's."""
+        ours, theirs = result["blitzgs"], fastest_gsplat(result) or {}
+        work = f"render forward + backward, {result['scene']}"
+        add(work, ours["total"], "gsplat", theirs.get("total"), "ms")
+    last = max(render["results"], key=lambda result: result["blitzgs"]["peak_gb"])
+    theirs = fastest_gsplat(last) or {}
+    add(f"its memory, {last['scene']}", last["blitzgs"]["peak_gb"], "gsplat", theirs.get("peak_gb"), "GB")
+    for result in step["results"]:
+        theirs = result.get("gsplat + fused Adam", {}).get("ms", {})
+        work = f"training step of {result['views']} views, {result['scene']}"
+        add(work, result["blitzgs"]["ms"]["total"], "gsplat + fused Adam", theirs.get("total"), "ms")
     one = exchange["results"][0]
-    rows = [
-        summary_row(
-            f"step of 4 views, {report['gaussians'] / 1e6:.0f} M Gaussians, on {report['ranks']} GPUs",
-            report["ms"]["step"],
-            one["ms"]["step"],
-            "ms",
-            f"{one['ranks']} GPU",
-            COMMANDS["exchange"],
-        )  # fmt: skip
-        for report in exchange["results"][1:]
-    ]
-    return table(SUMMARY_HEAD, rows)
+    for report in exchange["results"][1:]:
+        work = f"step of 4 views on {report['ranks']} GPUs, {report['gaussians'] / 1e6:.0f} M Gaussians"
+        add(work, report["ms"]["step"], f"{one['ranks']} GPU", one["ms"]["step"], "ms")
+    return table(["work", "BlitzGS", "compared with", "times as fast, or as small"], rows)
 
 
 SECTIONS = {
     "render": Section(("render",), render_lines),
     "stages": Section(("render",), stage_lines),
     "call": Section(("render",), call_lines),
-    "call_quiet": Section(("call",), call_lines),
     "step": Section(("step_1", "step_4"), step_lines),
     "exchange": Section(("exchange",), exchange_lines),
-    "training": Section(("training",), row_lines),
-    "training_2": Section(("training_2",), row_lines),
     "drop_in_full": Section(("drop_in_full",), row_lines),
-    "importance": Section(("importance",), row_lines),
-    "gate": Section(("gate",), row_lines),
-    "lineage": Section(("lineage",), row_lines),
-    "lineage_training": Section(("lineage_training",), row_lines),
-    "scratch": Section(("scratch",), row_lines),
     "photometric": Section(("photometric",), photometric_lines),
     "accuracy": Section(("accuracy",), accuracy_lines),
     "quality": Section(("quality",), quality_lines),
-    "ablation": Section(("ablation",), ablation_lines),
-    "energy": Section(("energy",), ablation_lines),
-    "rho": Section(("ablation",), gate_lines("rho")),
-    "onset": Section(("ablation",), gate_lines("onset")),
-    "oracle": Section(("oracle",), row_lines),
-    "gate_judged": Section(("gate_judged",), row_lines),
     "compact": Section(("compact",), compact_lines),
-    "compact_later": Section(("compact_later",), compact_lines),
-    "gate_random": Section(("gate_random",), gate_random_lines),
-    "gate_random_town": Section(("gate_random_town",), gate_random_lines),
     "town_parts": Section(("town_parts",), town_parts_lines),
-    "town": Section(("town",), town_lines),
-    "adaptive": Section(("adaptive",), adaptive_lines),
     "offload": Section(("offload",), offload_lines),
-    "summary": Section(("render", "step_1", "step_4"), summary_lines),
-    "summary_ranks": Section(("exchange",), summary_ranks_lines),
-    "city_exchange": Section(("city_exchange",), exchange_lines),
+    "summary": Section(("render", "step_4", "exchange"), summary_lines),
 }
 SECTIONS |= {
     name: Section(("city_ranks",) if name == "city_ranks" else ("city",), city_lines(rows_of))

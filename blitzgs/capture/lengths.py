@@ -187,7 +187,16 @@ class Sight:
         depths = depths[np.isfinite(depths)]
         if len(depths) == 0:
             return most
-        return min(most, _NEAR_OF_DEPTH * float(depths[int(_SKIPPED_VIEWS * len(depths))]))
+        near = min(most, _NEAR_OF_DEPTH * float(depths[int(_SKIPPED_VIEWS * len(depths))]))
+        lost = int((depths <= most).sum())
+        if 2 * lost > len(depths):
+            # The cameras are spread over far more than they are away from what they show, as along a street.
+            warnings.warn(
+                f"{lost} of {len(depths)} views begin to see points at less than {NEAR_OF_EXTENT:g} x the "
+                f"extent ({most:.4g}), so the near plane is at {near:.4g}; model.near sets another",
+                stacklevel=3,
+            )
+        return near
 
 
 def measured_extent(centres: Float64, points: Float64) -> float:

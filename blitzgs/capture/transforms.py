@@ -164,13 +164,13 @@ def _read_file(path: Path) -> tuple[dict[str, Any], list[Any]]:
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not a JSON file ({error}): export it again") from error
+        raise ValueError(f"{path}: not a transforms file: no JSON ({error}); export it again") from error
     if not isinstance(content, dict):
         kind = "null" if content is None else "a list" if isinstance(content, list) else f"{content!r:.40}"
-        raise ValueError(f"{path}: must be an object with a list of frames, but it is {kind}")
+        raise ValueError(f"{path}: not a transforms file with a list of frames: its content is {kind}")
     if not isinstance(content.get("frames"), list):
-        what = "has none" if "frames" not in content else f"has {content['frames']!r:.40}"
-        raise ValueError(f"{path}: must be an object with a list of frames under 'frames', but it {what}")
+        what = "there are none" if "frames" not in content else f"they are {content['frames']!r:.40}"
+        raise ValueError(f"{path}: not a transforms file with a list of frames: {what}")
     return content, content["frames"]
 
 

@@ -32,7 +32,7 @@ from blitzgs.distributed.host_sum import HostSum
 # Number of events over which demand is averaged.
 EVENTS = 3
 # Demand relative to its highest value: at T1, and at the end of densification. No other values were measured
-# (docs/performance.md, "The adaptive schedule").
+# (docs/decisions/population.md).
 FALLEN, GONE = 0.5, 0.1
 # The loss is compared between neighbouring spans of whole epochs, each at least this share of the schedule.
 SPAN = 1 / 60

@@ -147,9 +147,10 @@ def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
 def _resolved(config: Config, capture: Capture, restored: run_files.Restored | None) -> Config:
     """Return `config` with the values that depend on the training views and on what the run has measured.
 
-    The depths of what the views see decide on the near plane (`model.near`). The number of views decides the length of the run (`schedule.images_per_view`) and the opacity term
-    (`loss.opacity_total`). A run that is resumed with fewer or more photographs (`data.allow_missing`) keeps
-    the values that it began with. `run_files.with_pace_of` says what a run measures.
+    The depths of what the views see decide on the near plane (`model.near`). The number of views decides the
+    length of the run (`schedule.images_per_view`) and the opacity term (`loss.opacity_total`). A run that is
+    resumed with fewer or more photographs (`data.allow_missing`) keeps the values that it began with.
+    `run_files.with_pace_of` says what a run measures.
     """
     schedule, loss = config.schedule, config.loss
     if restored is not None:

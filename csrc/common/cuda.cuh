@@ -77,7 +77,7 @@ inline int multiprocessors() {
 //   block occupies a multiprocessor, so a kernel that spins for another GPU or stream must not let its
 //   successor in. For other kernels it would cost time, because the blocks of the next kernel are spread
 //   unevenly over the multiprocessors if they are placed while others still run
-//   (docs/decisions/launch-earlier.md).
+//   (docs/decisions/host.md).
 // - Kernels of other libraries are launched plainly; they wait for all earlier kernels by themselves.
 
 // A kernel that is launched by launch_early calls this first.

@@ -123,8 +123,8 @@ def test_the_pages_match_the_results_in_the_repository(capsys):
         ("step", "| aerial 1M | 4 | other 0.10 | **2.00** | render 9.00 | **13.00** | **6.50** |"),
         ("exchange", "| speed-up of steps in a row | 1.00 | 3.20 |"),
         ("exchange", "| MB between ranks | 0 | 12 |"),
-        ("summary_ranks", "| step of 4 views, 16 M Gaussians, on 4 GPUs | 2.50 ms | 1 GPU 8.00 ms | 3.2 | "),
-        ("summary", "| memory above the parameters, aerial 1M | 0.50 GB | gsplat 1.00 GB | 2.0 | "),
+        ("summary", "| step of 4 views on 4 GPUs, 16 M Gaussians | 2.50 ms | 1 GPU 8.00 ms | 3.2 |"),
+        ("summary", "| its memory, aerial 1M | 0.50 GB | gsplat 1.00 GB | 2.0 |"),
     ],
 )  # fmt: skip
 def test_a_table_is_made_of_the_results(results, name, line):
@@ -159,10 +159,10 @@ def test_results_that_do_not_belong_together_are_refused(results, name, change, 
 def test_several_gpus_may_be_of_another_commit_than_the_ops_of_one(results):
     rows = {"title": "steps", "rows": [{"ranks": 2}], "commit": "def", "command": "c", "environment": {}}
     (results / "exchange.json").unlink(missing_ok=True)
-    (results / "training_2.json").write_text(json.dumps(rows))
-    assert report.load_results(results)["training_2"]["commit"] == "def"
-    (results / "training.json").write_text(json.dumps(rows | {"commit": "abc"}))
-    with pytest.raises(report.ReportError, match="training_2.json is of commit def, training.json of abc"):
+    (results / "drop_in_full.json").write_text(json.dumps(rows))
+    assert report.load_results(results)["drop_in_full"]["commit"] == "def"
+    (results / "exchange.json").write_text(json.dumps(rows | {"commit": "abc"}))
+    with pytest.raises(report.ReportError, match="exchange.json is of commit abc, drop_in_full.json of def"):
         report.load_results(results)
 
 
