@@ -25,6 +25,7 @@ from blitzgs.capture.cameras import (
     same_shape,
     scaled_matrix,
 )
+from blitzgs.capture.check_files import damaged
 from blitzgs.capture.files import MissingImagesError as MissingImagesError
 from blitzgs.capture.files import existing
 from blitzgs.capture.image_files import ImageHeader, read_header
@@ -110,6 +111,8 @@ class About:
     """Number of photographs that have a mask."""
     mask_share: float | None = None
     """Mean share of the pixels that masks exclude, of a few masks."""
+    damaged: int = 0
+    """Number of views that `allow_missing` left out because their image or mask is damaged."""
 
 
 def load_capture(
@@ -142,7 +145,8 @@ def load_capture(
         undistort: "crop" or "mask" the part of a pinhole image that the distorted image does not cover.
         exif: "auto" turns an image by its EXIF orientation only if its stored size does not fit the camera
             and its turned size does (COLMAP itself ignores the tag); "apply" always turns it, "ignore" never.
-        allow_missing: drop views whose image is not on disk, with a warning, instead of failing. The world's
+        allow_missing: drop views whose image is not on disk, or whose image or mask is damaged, with a
+            warning, instead of failing; all files are read for that. The world's
             origin, the extent and the split are still computed from all views with a pose.
         sparse: which of several COLMAP models is read: the "largest", "all" of them, which must have the same
             world coordinates, or a folder such as "sparse/1", relative to `path`.
@@ -183,9 +187,10 @@ def load_capture(
     _check_inside(root, views, points, images, masks, inside_only)
     kept = existing([v.name for v in views], [v.path for v in views], root, images, allow_missing)
     missing = len(views) - len(kept)
+    kept, found, damage = _with_files(views, kept, root, masks, allow_missing)
     kept = without_strays(views, kept, strays, keep=stray_cameras == "keep")
     place = {index: position for position, index in enumerate(kept)}
-    views = [views[index] for index in kept]
+    views = [replace(views[index], mask_path=found[index]) for index in kept]
     train, test = ([place[index] for index in part if index in place] for part in (train, test))
     apart_left = [place[index] for index in kept if apart[index]]
     if not train:
@@ -199,8 +204,6 @@ def load_capture(
             f"call alpha (first: {extra_bands[0].name}), near infrared for example; it is not used",
             stacklevel=2,
         )
-    found = find_masks(root, masks, [view.name for view in views], [view.mask_path for view in views])
-    views = [replace(view, mask_path=mask) for view, mask in zip(views, found, strict=True)]
     plans: dict[Lens, Rectification] = {}
     cameras = [
         _camera(view, header, offset, downscale, undistort, exif, plans)
@@ -240,10 +243,28 @@ def load_capture(
             colors_from=points.colors_from,
             with_alpha=sum(header.has_alpha for header in headers),
             extra_bands=len(extra_bands),
-            with_mask=sum(mask is not None for mask in found),
-            mask_share=excluded_share(found),
+            with_mask=sum(view.mask_path is not None for view in views),
+            mask_share=excluded_share([view.mask_path for view in views]),
+            damaged=len(damage),
         ),
     )
+
+
+def _with_files(
+    views: Sequence[SourceView], kept: list[int], root: Path, masks: str | bool | None, allow: bool
+) -> tuple[list[int], dict[int, Path | None], dict[int, str]]:
+    """Return the views that are left, the mask of each, and what is wrong with those that are left out."""
+    some = [views[index] for index in kept]
+    found = find_masks(root, masks, [view.name for view in some], [view.mask_path for view in some])
+    damage = damaged([(view.path, mask) for view, mask in zip(some, found, strict=True)]) if allow else {}
+    if damage:
+        warnings.warn(
+            f"{len(damage)} of {len(some)} images or their masks are damaged; dropped (first: "
+            f"{next(iter(damage.values()))})",
+            stacklevel=3,
+        )
+    left = [place for place in range(len(kept)) if place not in damage]
+    return [kept[place] for place in left], {kept[place]: found[place] for place in left}, damage
 
 
 def _relative(path: Path | None, root: Path) -> str:

@@ -190,6 +190,26 @@ def decode_rgb(data: bytes, name: str, background: tuple[float, float, float] | 
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
 
 
+def check_photograph(path: Path) -> bool:
+    """Check that a photograph can be decoded, and tell whether some pixel is not fully transparent.
+
+    JPEG and PNG files without alpha are not decoded: `read_whole` finds their damage.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: the file is damaged or not supported; names it.
+    """
+    data, name = read_whole(path), str(path)
+    header = _describe(data, name)
+    _check_supported(header, name)
+    if header["format"] in ("JPEG", "PNG") and not header["alpha"]:
+        return True
+    pixels = _imdecode(data, cv2.IMREAD_UNCHANGED, name, header)
+    if header["alpha"] and pixels.ndim == 3 and pixels.shape[2] == 4:
+        return bool(pixels[..., 3].any())
+    return True
+
+
 def _full(pixels: npt.NDArray[Any], header: dict[str, Any]) -> float:
     """Return the number that stands for white or opaque."""
     if pixels.dtype.kind == "f":

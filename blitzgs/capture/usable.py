@@ -96,6 +96,8 @@ def finite_points(points: SourcePoints) -> SourcePoints:
         points.colors[finite],
         points.track_lengths[finite] if points.track_lengths is not None else None,
         points.errors[finite] if points.errors is not None else None,
+        points.path,
+        points.colors_from,
     )
 
 
