@@ -94,7 +94,7 @@ def _owners(folder: Path, files: Sequence[str], names: Sequence[str | None]) -> 
             for file in by_path.get(place.casefold(), ()):
                 # The folder of masks may have a folder in front of the whole name: half a rank worse.
                 exact = unified(file).casefold() == place.casefold()
-                if file not in seen and (exact or rank < len(_FORMS)):
+                if file not in seen and (exact or rank <= len(_FORMS)):
                     seen.add(file)
                     claims[file].append((2 * rank + (not exact), index))
     owners: dict[int, tuple[int, str]] = {}
@@ -127,7 +127,8 @@ def _places(name: str) -> Iterator[str]:
     path = PurePosixPath(unified(name))
     parts = path.parts[-1:] if path.is_absolute() or ".." in path.parts else path.parts
     for begin in range(len(parts)):
-        for form in _FORMS:
+        # A PNG's own name is better than that stem's: a.png belongs to the image a.png before a.jpg.
+        for form in (_FORMS[0], "{name}" if path.suffix.lower() == ".png" else "", *_FORMS[1:]):
             own = form.format(name=path.name, stem=path.stem, suffix=path.suffix)
             yield "/".join((*parts[begin:-1], own))
 

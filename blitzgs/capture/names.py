@@ -80,7 +80,7 @@ def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dic
         new = {
             claimed[0]: files[place][0]
             for place, claimed in claims.items()
-            if len(claimed) == 1 and len(files.get(place, ())) == 1
+            if len(claimed) == 1 and len(files.get(place, ())) == 1 and (folder / files[place][0]).is_file()
         }
         if not new:
             continue
