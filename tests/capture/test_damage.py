@@ -125,6 +125,8 @@ def test_damage_is_found_in_the_background_and_ends_every_read(tmp_path, kind, i
     assert store.get(7).shape == (48, 64, 3)
     camera = capture.cameras[index]
     spoil(camera.image_path if kind == "image" else camera.mask_path)
+    store.close()
+    store = ImageStore(capture)  # which has no copy of the file in memory
     store.check_files(range(9)).wait()
     with pytest.raises(
         ValueError, match=("the mask " if kind == "mask" else "") + rf".*{index}.png: at byte"
