@@ -8,8 +8,8 @@ Errors are against the float64 reference of the same mode in a few windows of th
 absolute error of the image away from the declared cut pixels, and the largest error of a parameter's gradient
 (max |difference| / max |reference|). The benchmark fails if the default setting misses its bounds.
 
-Writes a table (Markdown), the figures (JSON) and, with matplotlib, a Pareto plot. They are written again
-after each option, so that an interrupted run keeps its measurements.
+Writes a table (Markdown) and the figures (JSON), again after each option, so that an interrupted run keeps
+its measurements.
 
 The row "exact exponential" needs a second build of the kernels, whose folder --exact-library names:
 
@@ -56,7 +56,6 @@ class Option:
     deterministic: bool = False
     views: int = 1
     exchanged: bool = False  # splats pass through the exchange of one rank: all costs but the transfer
-    half: bool = False
     dtype: torch.dtype = torch.float32
 
 
@@ -78,7 +77,6 @@ def options_for(device: str) -> list[Option]:
         Option("antialiased", antialiased=True),
         Option("batch of 4 views", views=4),
         Option("exchange", exchanged=True),
-        Option("exchange in half precision", exchanged=True, half=True),
     ]
     if device == "cpu":
         return [*options, Option("float64", dtype=torch.float64)]
@@ -118,7 +116,7 @@ class Renderer:
             ranges = TileRanges(bounds, len(Ks), scene.width, scene.height, option.tile_size)
             ranks = Ranks(device=device)
             self.assignment = TileAssignment(ranks, ranges)
-            self.transport = CollectiveTransport(ranks, option.half)
+            self.transport = CollectiveTransport(ranks)
 
     def forward(self) -> Frame:
         """Render."""
@@ -216,49 +214,11 @@ def line(figures: Figures) -> str:
     return f"| {f.name} | {f.milliseconds:.2f} | {errors} | {f.cut_pixels:.2%} |"
 
 
-def plot(rows: list[Figures], title: str, path: Path) -> None:
-    """Draw time against error, better towards the lower left, and the Pareto front.
-
-    Without matplotlib there is no plot.
-    """
-    try:
-        import matplotlib
-
-        matplotlib.use("Agg")
-        from matplotlib import pyplot as plt
-    except ImportError:
-        return
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharex=True)
-    bounds = (("image_error", IMAGE_BOUND), ("gradient_error", GRADIENT_BOUND))
-    for axis, (name, bound) in zip(axes, bounds, strict=True):
-        best = float("inf")
-        front = []
-        for i, row in enumerate(sorted(rows, key=lambda row: row.milliseconds)):
-            error = max(getattr(row, name), 1e-17)
-            axis.scatter(
-                row.milliseconds, error, s=36, color=f"C{i % 10}", marker="osD^"[i // 10], label=row.name
-            )
-            if error < best:
-                best = error
-                front.append((row.milliseconds, error))
-        axis.step(*zip(*front, strict=True), where="post", color="0.6", linewidth=1, zorder=0)
-        axis.axhline(bound, color="0.3", linestyle=":", linewidth=1)
-        axis.set_yscale("log")
-        axis.set_xlabel("forward + backward, ms a view")
-        axis.set_title(f"{name.replace('_', ' ')} (dotted: bound of the default)", fontsize=9)
-        axis.grid(True, which="major", alpha=0.2)
-    axes[-1].legend(loc="center left", bbox_to_anchor=(1.02, 0.5), fontsize=8, title=title, title_fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=80)
-    plt.close(figure)
-
-
-def write(rows: list[Figures], title: str, folder: Path) -> None:
-    """Write the table, the figures and the plot."""
+def write(rows: list[Figures], folder: Path) -> None:
+    """Write the table and the figures."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "accuracy.md").write_text("\n".join([HEAD, *map(line, rows)]) + "\n")
     (folder / "accuracy.json").write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n")
-    plot(rows, title, folder / "accuracy.png")
 
 
 def require_bounds(default: Figures) -> None:
@@ -275,7 +235,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, help="default: 1600 px on CUDA, 400 px on the CPU")
     parser.add_argument("--only", help="the one option to measure")
     parser.add_argument("--exact-library", type=Path, help="kernels built with BLITZGS_EXACT_EXP=ON")
-    parser.add_argument("--out", type=Path, help="folder for accuracy.json, accuracy.md and accuracy.png")
+    parser.add_argument("--out", type=Path, help="folder for accuracy.json and accuracy.md")
     args = parser.parse_args()
     on_gpu = args.device.startswith("cuda")
     gaussians = args.gaussians or (4_000_000 if on_gpu else 100_000)
@@ -290,7 +250,7 @@ def main() -> None:
         rows.append(figures)
         print(line(figures), flush=True)
         if args.out:
-            write(rows, title, args.out)
+            write(rows, args.out)
         if args.json:
             write_json(args.json, args.device, title=title, rows=[asdict(row) for row in rows])
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures a training step on several ranks: time by stage, bytes exchanged, balance, half precision's error.
+"""Measures a training step on several ranks: time by stage, bytes exchanged, balance.
 
     python benchmarks/bm_exchange.py --data DIR [--downscale 2] [--device cuda] [--ranks 1 2 4] [--batch 4]
     python benchmarks/bm_exchange.py --gaussians 16000000 --device cuda [--ranks 1 2 4]
@@ -32,7 +32,6 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import torch
-from gradients import parameter_gradients
 from harness import make_parser, write_json
 from scenes import aerial
 
@@ -40,19 +39,16 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.config.fields import Config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TILE_COST, TileOwners, cost_balance
-from blitzgs.frame.pixels import collect_images
-from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
-from blitzgs.frame.transport import Mark, Traffic, open_transport, unmarked
+from blitzgs.frame.tiles import LOSS_HALO, TileRanges
+from blitzgs.frame.transport import Mark, Traffic, unmarked
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.runs.guard import LossGuard
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batch import Batch
-from blitzgs.training.loss import loss_terms
 from blitzgs.training.step import Stepper
 from blitzgs.view.levels import measure_levels
 from blitzgs.view.views import Space, ViewSet, render_options, trained_centres
@@ -116,7 +112,7 @@ def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
         points,
         torch.from_numpy(capture.colors),
         centres,
-        measure_levels(points.to(device), centres, lod.fork, lod.base_resolution),
+        measure_levels(points.to(device), centres, lod.fork),
         args.visible_threshold,
     ).table(sh_degree=3, opacity=0.5)
     views = ViewSet(list(capture.cameras), space, device)
@@ -217,29 +213,6 @@ def _sent_elsewhere(traffic: Traffic, rank: int) -> int:
     return sum(traffic.sent) - traffic.sent[rank]
 
 
-def half_precision_error(load: Workload) -> dict[str, float]:
-    """Compare a step with half-precision exchange to the exact one: image and gradients of the means."""
-    keys, views = load.batches[0]
-    batch, images, gradients = load.batch(keys, views), [], []
-    for half in (False, True):
-        assignment = TileAssignment(load.ranks, batch.ranges) if batch.ranges is not None else None
-        transport = open_transport(load.ranks, half)
-        frame = pipeline.forward(load.table, views, load.options, assignment=assignment, transport=transport)
-        terms = loss_terms(frame, batch, load.loss, 1.0)
-        gradients.append(parameter_gradients(load.table, frame, terms.v_renders)[0])
-        images.append(frame.renders)
-        if batch.ranges is not None:
-            collect_images(frame.renders, batch.ranges, load.ranks, 0)
-    error = (images[0] - images[1]).abs()
-    a, b = gradients
-    sums = load.ranks.all_reduce(torch.stack(((a - b).square().sum(), a.square().sum())))
-    return {
-        "image max": error.max().item(),
-        "image mean": error.mean().item(),
-        "gradient": (sums[0] / sums[1]).sqrt().item(),
-    }
-
-
 def measure(args: argparse.Namespace) -> None:
     """Run on this process's rank; rank 0 prints one JSON line."""
     with Ranks.from_environment(args.device) as ranks:
@@ -272,8 +245,6 @@ def measure(args: argparse.Namespace) -> None:
         }
         report["bytes per visible gaussian"] = sum(report["bytes per step"].values()) / max(visible, 1)
         report["ms"] |= {"alone": statistics.median(sum(t) for t in times), "step": row}
-        if ranks.world_size > 1:
-            report["half precision"] = half_precision_error(load)
         if ranks.rank == 0:
             print("REPORT " + json.dumps(report), flush=True)
 
@@ -298,7 +269,6 @@ def show(report: dict[str, Any]) -> None:
         print(
             "  largest cost over the mean: " + "  ".join(f"{k} {v:.3f}" for k, v in report["balance"].items())
         )
-        print("  half precision: " + "  ".join(f"{k} {v:.2e}" for k, v in report["half precision"].items()))
 
 
 def main() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of `bm_quality.py`: JSON, CSV, Markdown tables and a plot of all runs of a folder."""
+"""Results of `bm_quality.py`: JSON, CSV and Markdown tables of all runs of a folder."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def is_done(out: Path, name: str) -> bool:
     return path.exists() and read_runs(path)[0]["status"] == "done"
 
 
-def report(out: Path, plot: bool = True) -> str:
-    """Write quality.json, quality.csv, quality.md and, where matplotlib is installed, quality.png into `out`.
+def report(out: Path) -> str:
+    """Write quality.json, quality.csv and quality.md into `out`.
 
     Returns:
         The Markdown.
@@ -69,8 +69,6 @@ def report(out: Path, plot: bool = True) -> str:
     (out / "quality.json").write_text(json.dumps({"runs": runs}))
     (out / "quality.md").write_text(text)
     write_csv(out / "quality.csv", done)
-    if plot and done and not draw(out / "quality.png", done):
-        text += "\nNo plot: pip install matplotlib\n"
     return text
 
 
@@ -202,47 +200,3 @@ def write_csv(path: Path, runs: Sequence[Run]) -> None:
                 if evaluation["images"] == run["images"]:
                     row |= {"is_end": 1, **{key: run[key] for key in ("peak_gaussians", "peak_memory_bytes")}}
                 writer.writerow(row)
-
-
-def draw(path: Path, runs: Sequence[Run]) -> bool:
-    """Plot the median held-out PSNR against the median training time; False without matplotlib."""
-    try:
-        import matplotlib
-    except ImportError:
-        return False
-    matplotlib.use("Agg")
-    from matplotlib import pyplot, ticker
-
-    groups = grouped(runs)
-    captures, recipes = list(dict.fromkeys(c for c, _ in groups)), list(dict.fromkeys(r for _, r in groups))
-    figure, axes = pyplot.subplots(
-        1, len(captures), figsize=(5.5 * len(captures), 4.2), squeeze=False, layout="constrained"
-    )
-    for axis, capture in zip(axes[0], captures, strict=True):
-        for (where, label), group in groups.items():
-            if where != capture:
-                continue
-            seconds, psnr = curve(group)
-            style = "--" if group[0]["source"].startswith("gsplat-") else "-"
-            color = f"C{recipes.index(label) % 10}"
-            axis.plot(seconds, psnr, style, color=color, marker="o", markersize=3, label=label)
-        axis.set(xscale="log", xlabel="training time, s", ylabel="held-out PSNR, dB", title=capture)
-        axis.xaxis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
-        axis.xaxis.set_minor_formatter(ticker.NullFormatter())
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=7)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
-    return True
-
-
-def curve(group: Sequence[Run]) -> tuple[list[float], list[float]]:
-    """Return the medians over the seeds of seconds and PSNR at each image count that all have."""
-    counts = [{e["images"] for e in run["evaluations"]} for run in group]
-    seconds, psnr = [], []
-    for images in sorted(set.intersection(*counts)):
-        found = [evaluation_at(run, images) for run in group]
-        seconds.append(statistics.median(e["seconds"] for e in found))
-        psnr.append(statistics.median(e.get("test", e.get("train"))["psnr"] for e in found))
-    return seconds, psnr

@@ -44,6 +44,7 @@ from blitzgs.capture.usable import (
     with_finite_poses,
     without_strays,
 )
+from blitzgs.util.arguments import check_number
 
 # In pixels. SSIM compares windows of 11 pixels, and a much smaller image shows too little to train on.
 _LEAST_SIDE = 8
@@ -160,6 +161,7 @@ def load_capture(
         ValueError: a file is damaged, or sizes, poses or options are invalid.
     """
     root = Path(path)
+    check_number("downscale", downscale)
     if not downscale >= 1:  # NaN too
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     for option, value, allowed in (

@@ -39,19 +39,15 @@ all births and deaths of Gaussians. The repository's docs/guide/fewer-gaussians.
 """
 
 
-def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(
-        commands, "gate", lambda _: 2, "fit and evaluate spawn gates, which make smaller models", HELP
-    )
+    parser = add_command(commands, "gate", lambda _: 2, summary, HELP)
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     fit = add_command(actions, "fit", run_fit, "fit a gate on the lineage of runs")
     fit.add_argument(
         "runs", type=named_path, nargs="+", metavar="RUN", help="folder of a run with lineage, or a sample"
     )
-    fit.add_argument(
-        "--out", type=named_path, required=True, metavar="FILE", help="file for the gate, .json or .ubj"
-    )
+    fit.add_argument("--out", type=named_path, required=True, metavar="FILE", help="file for the gate, .json")
     fit.add_argument(
         "--gate-from",
         type=float,
@@ -102,8 +98,8 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
 
 def run_fit(args: argparse.Namespace) -> int:
     """Fit a gate; returns the exit status."""
-    if args.out.suffix not in (".json", ".ubj"):
-        raise ValueError(f"--out {args.out}: a gate's file ends in .json or .ubj")
+    if args.out.suffix != ".json":
+        raise ValueError(f"--out {args.out}: a gate's file ends in .json")
     if not args.gate_from >= 0:
         raise ValueError(f"--gate-from: must be 0 or more, got {args.gate_from}")
     runs = [_spawns(path) for path in args.runs]

@@ -73,24 +73,17 @@ class ModelConfig:
             classic 3DGS.
         near: near plane, relative to extent. 0: a quarter of the depth of the nearest points that training
             views see, 0.01 at most; the run's own configuration has the result.
-        far: far plane, relative to extent.
-        eps2d: screen-space blur added to the projected covariance, pixels squared.
         deterministic: make a run repeat bit for bit on CUDA too, at some cost in time (the CPU always does).
-        initial_opacity: opacity of the initial Gaussians.
-        scale_floor: smallest standard deviation of a Gaussian, in pixels of the training view that samples it
-            most finely, which is found anew at every tenth density event; 0: none. Mip-Splatting's 3D filter
-            has 0.447.
+        exposure: each training photograph has a gain and a bias of its channels, if the photographs differ;
+            the model has the mean exposure.
     """
 
     sh_degree: int = 3
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     antialiased: bool = False
     near: float = 0.0
-    far: float = 1e6
-    eps2d: float = 0.3
     deterministic: bool = False
-    initial_opacity: float = 0.1
-    scale_floor: float = 0.0
+    exposure: bool = False
 
 
 @dataclass(frozen=True)
@@ -101,12 +94,10 @@ class LodConfig:
         fork: ratio f of the voxel sizes of neighbouring levels.
         visible_threshold: a voxel is kept when its level is resolvable in more than this share of the
             cameras.
-        base_resolution: finest sensible voxel relative to the scene's box; sets the coarsest level's size.
     """
 
     fork: float = 2.0
     visible_threshold: float = 0.9
-    base_resolution: float = 0.001
 
 
 # The largest factor by which `schedule.images_per_view` makes a run longer.
@@ -132,13 +123,6 @@ class ScheduleConfig:
             measures its speed and changes its pace; `scale` stays 1. 0: no limit.
         pace: pairs (image of the run, factor): from that image on, `scale` is multiplied by the factor. A run
             with `minutes` writes its changes of pace here; a run without `minutes` repeats them.
-        adaptive: the run places `t1`, `densify_until` and `t2`, in this order, by the demand of density
-            control and by its loss (`blitzgs/training/adaptive.py`). `t1` and `t2` have no effect without
-            `population.importance`. With "relocation", the demand hardly changes: `t1` comes at its latest
-            time, and the loss decides on the others.
-        adaptive_limit: largest change of these times by `adaptive`, earlier or later, as a share of each.
-        placed: the times placed so far, up to three. A run with `adaptive` writes them here; a run without it
-            repeats them.
         batch_size: B, views per optimiser step; a step advances the clock by B images.
         densify_from, densify_until, densify_every: density events happen at from, from + every, ... < until.
         size_prune_after: density events later than this also prune by size.
@@ -148,14 +132,12 @@ class ScheduleConfig:
             gate.
         t1, t2: times of the first and the second importance pass, if `population.importance` is set; 0: no
             pass. A pass happens after the density event of the same time.
-        levels_until: from here on `view.lod` may keep all octree levels; at the start it keeps those up to
-            `view.first_levels`. 0: `densify_until`.
         sh_every: the spherical-harmonics degree grows by one at every multiple of this.
         position_decay: length of the exponential decay of the position learning rate.
         checkpoint_every: a checkpoint is written at every multiple of this, in addition to those by
             `log.checkpoint_seconds`. 0: none.
-        evaluate_every: the held-out views are measured at every multiple of this, and at the end. 0: only at
-            the end.
+        evaluate_every: the held-out views are measured at every multiple of this, and at the end. 0: all of
+            them only at the end, and a few now and then, in less than 1 % of the time.
     """
 
     iterations: int = 30_000
@@ -163,9 +145,6 @@ class ScheduleConfig:
     images_per_view: float = 0.0
     minutes: float = 0.0
     pace: tuple[tuple[int, float], ...] = ()
-    adaptive: bool = False
-    adaptive_limit: float = 0.4
-    placed: tuple[int, ...] = ()
     batch_size: int = 1
     densify_from: int = 500
     densify_until: int = 15_000
@@ -175,7 +154,6 @@ class ScheduleConfig:
     gate_from: int = 11_250
     t1: int = 7_500
     t2: int = 16_000
-    levels_until: int = 0
     sh_every: int = 1_000
     position_decay: int = 30_000
     checkpoint_every: int = 0
@@ -192,11 +170,6 @@ class OptimiserConfig:
         sh_dc, sh_rest, opacity, scale, rotation: learning rates.
         position_noise: strength of the random steps of almost transparent Gaussians, relative to the position
             rate (3DGS-MCMC's noise, with lengths relative to extent); 0: none.
-        final_share: sh_dc, sh_rest, opacity, scale and rotation fall exponentially to this share of
-            themselves at the end of the run; 1: they stay constant.
-        beta1, beta2, eps: Adam's constants for B = 1.
-        sparse: ordinary sparse Adam: rows outside a step's active set keep their moments and do not move.
-            False: the steps that they miss are applied later, as in dense Adam.
     """
 
     position: float = 1.6e-4
@@ -207,16 +180,11 @@ class OptimiserConfig:
     scale: float = 5e-3
     rotation: float = 1e-3
     position_noise: float = 0.0
-    final_share: float = 1.0
-    beta1: float = 0.9
-    beta2: float = 0.999
-    eps: float = 1e-15
-    sparse: bool = False
 
 
 @dataclass(frozen=True)
 class LossConfig:
-    """(1 - ssim) L1 + ssim (1 - SSIM) + scale L_scale + opacity L_opacity + size L_size per view.
+    """(1 - ssim) L1 + ssim (1 - SSIM) + scale L_scale + opacity L_opacity per view.
 
     Attributes:
         ssim: weight of the SSIM term.
@@ -228,8 +196,6 @@ class LossConfig:
             the result in `opacity`, and 0 here. 0: `opacity` is the weight.
         scale: weight of the mean smallest axis of the visible Gaussians.
         scale_reference: that axis is measured in units of extent x scale_reference.
-        size: weight of the mean of all three axes of the visible Gaussians, in units of the extent; the other
-            regulariser of 3DGS-MCMC.
     """
 
     ssim: float = 0.2
@@ -237,17 +203,16 @@ class LossConfig:
     opacity_total: float = 0.0
     scale: float = 10.0
     scale_reference: float = 10.0
-    size: float = 0.0
 
 
 @dataclass(frozen=True)
 class PopulationConfig:
     """Density control: which Gaussians are cloned, split and pruned, and the two importance passes.
 
-    Some fields have no effect on some runs. With "relocation": `grad_threshold`, `absolute_gradients`,
-    `absolute_threshold`, `clone_scale`, `min_observations` and `phi`. With "density": `growth`. Without
-    `importance`: `score`, `pass1_keep`, `pass2_mass`, `pass2_keep` and `phi`. Without `gate`: `gate_rate` and
-    `gate_rule`. With the gate "random": `gate_rule`.
+    Some fields have no effect on some runs. With "relocation": `grad_threshold`, `clone_scale`,
+    `min_observations` and `phi`. With "density": `growth`. Without
+    `importance`: `score`, `pass1_keep`, `pass2_mass`, `pass2_keep`, `pass2_views` and `phi`. Without `gate`:
+    `gate_rate` and `gate_rule`. With the gate "random": `gate_rule`.
 
     Attributes:
         strategy: what a density event does: "density" (clone and split by gradients, prune) or "relocation"
@@ -257,9 +222,6 @@ class PopulationConfig:
         growth: share of the population that "relocation" adds at each event.
         grad_threshold: mean norm of the 2D-mean gradient (half-image units) above which a Gaussian is
             densified.
-        absolute_gradients: use the sum over pixels of the absolute gradients instead (AbsGS), in which
-            opposite gradients of a Gaussian's two halves do not cancel.
-        absolute_threshold: replaces `grad_threshold` with `absolute_gradients`.
         clone_scale: Gaussians up to this largest axis (relative to extent) are cloned, larger ones split; 0:
             all are split.
         min_opacity: Gaussians of lower opacity are pruned.
@@ -268,8 +230,9 @@ class PopulationConfig:
         prune_screen_radius: pixels; Gaussians with a larger radius are pruned after
             `schedule.size_prune_after`.
         prune_world_scale: relative to extent; Gaussians with a larger axis are pruned after the same time.
-        max_gaussians: limit of the population's growth; the candidates with the largest gradients are
-            densified first. A population that begins above it stays. 0: no limit.
+        max_gaussians: largest population. The initial Gaussians are thinned to it (whole octree levels are
+            kept, from the coarsest on, and a random part of the next); later the candidates with the largest
+            gradients are densified first. 0: no limit.
         importance: at `schedule.t1` and `schedule.t2` score all Gaussians by their contributions to the
             training views, and prune those of low score.
         score: the score of the passes, summed over the views: "density" (BlitzGS: contribution per pixel),
@@ -282,10 +245,12 @@ class PopulationConfig:
         pass2_keep: largest share of the Gaussians that the second pass keeps, those of the highest scores,
             without those below `min_opacity`; 1: no such limit. If `pass2_mass` and `pass2_keep` are both 1,
             the pass keeps all Gaussians and only computes phi and the cull matrix.
+        pass2_views: with fewer training views the second pass keeps all Gaussians, because scores add up what
+            the views show, and say little about places that few of them see.
         phi: from the first pass on, density control multiplies the gradients that it sums with phi: among the
             views that see a Gaussian, the share of those in which it counts.
         gate: model file of a spawn gate (`blitzgs gate fit`), or "default" for the one that comes with
-            BlitzGS, for configs/compact.yaml with schedule.t1=8999, pass1_keep=0.85 and score=weight; or
+            BlitzGS, for configs/density.yaml with schedule.t1=8999, pass1_keep=0.85 and score=weight; or
             "random" to withhold as many at random, which a gate has to surpass; null: none.
         gate_rate: share of the candidates, clones and splits apart, that the gate withholds at each density
             event from `schedule.gate_from` on.
@@ -304,8 +269,6 @@ class PopulationConfig:
     relocate: bool = False
     growth: float = 0.05
     grad_threshold: float = 2e-4
-    absolute_gradients: bool = False
-    absolute_threshold: float = 8e-4
     clone_scale: float = 0.01
     min_opacity: float = 0.005
     reset_opacity: float = 0.01
@@ -318,6 +281,7 @@ class PopulationConfig:
     pass1_keep: float = 0.7
     pass2_mass: float = 0.99
     pass2_keep: float = 1.0
+    pass2_views: int = 0
     phi: bool = True
     gate: str | None = None
     gate_rate: float = 0.6
@@ -335,10 +299,6 @@ class ViewConfig:
     Attributes:
         lod: from `schedule.densify_until` on, views leave out Gaussians whose octree level is too fine for
             their distance. The trained model is evaluated and rendered in the same way.
-        first_levels: finest level that views may keep at the start of the run, as a share of the number of
-            levels.
-        level_ratio: the finer levels are added one by one until `schedule.levels_until`; each wait is shorter
-            than the one before by this factor.
         most_kept: views that would keep at least this share of all Gaussians are rendered with all of them.
         smooth: opacities fade out over half a level around the distance at which `lod` would cut them off.
             All views then have the gate, and `most_kept` is ignored. Needs `lod`.
@@ -348,8 +308,6 @@ class ViewConfig:
     """
 
     lod: bool = False
-    first_levels: float = 0.5
-    level_ratio: float = 1.5
     most_kept: float = 0.8
     smooth: bool = False
     cull: bool = False
@@ -369,7 +327,7 @@ class MemoryConfig:
 
 @dataclass(frozen=True)
 class RanksConfig:
-    """How several processes share a run; only `half_exchange` changes the result beyond rounding.
+    """How several processes share a run; no field changes the result beyond rounding.
 
     Attributes:
         timeout_seconds: the job ends if a rank does not arrive at a collective within this time.
@@ -377,14 +335,12 @@ class RanksConfig:
             Gloo) or "auto" ("peer" if it works, else "collective").
         share_gpus: if a host has fewer GPUs than ranks, let several ranks use one GPU, in turns; slow, for
             development.
-        half_exchange: send splats and their gradients in half precision, by collectives; for slow links.
         max_imbalance: Gaussians are redistributed when the largest shard exceeds the smallest by this factor.
     """
 
     timeout_seconds: float = 120.0
     transport: str = "auto"
     share_gpus: bool = False
-    half_exchange: bool = False
     max_imbalance: float = 1.1
 
 

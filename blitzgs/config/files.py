@@ -17,13 +17,41 @@ from typing import Any
 
 import yaml
 
+from blitzgs.config.errors import ConfigError as ConfigError
 from blitzgs.config.fields import Config
 from blitzgs.config.ranges import problems
+from blitzgs.config.recipes import base_file
 from blitzgs.util.output import write_file
 
 
-class ConfigError(ValueError):
-    """A configuration that cannot be used; the message names the field, the value and the remedy."""
+class Ignored:
+    """Marks a removed field whose values have no effect any more."""
+
+
+# Fields of earlier versions, each with the value that stands for what BlitzGS does now. Files and checkpoints
+# that have this value are still read.
+REMOVED: typing.Mapping[str, Any] = {
+    "model.far": 1e6,
+    "model.eps2d": 0.3,
+    "model.initial_opacity": 0.1,
+    "model.scale_floor": 0.0,
+    "lod.base_resolution": 0.001,
+    "schedule.adaptive": False,
+    "schedule.adaptive_limit": Ignored(),
+    "schedule.placed": [],
+    "schedule.levels_until": 0,
+    "optimiser.final_share": 1.0,
+    "optimiser.beta1": 0.9,
+    "optimiser.beta2": 0.999,
+    "optimiser.eps": 1e-15,
+    "optimiser.sparse": False,
+    "loss.size": 0.0,
+    "population.absolute_gradients": False,
+    "population.absolute_threshold": Ignored(),
+    "view.first_levels": Ignored(),
+    "view.level_ratio": Ignored(),
+    "ranks.half_exchange": False,
+}
 
 
 def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -> Config:
@@ -31,7 +59,7 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
 
     Args:
         path: YAML file with sections as in `Config`, or None. A file may name another one under `base`
-            (relative to itself); it then changes the values of that file.
+            (relative to itself, or the name of a recipe); it then changes the values of that file.
         overrides: "section.field=value" with a YAML value; leading dashes are allowed.
 
     Raises:
@@ -129,8 +157,8 @@ def _read(path: Path, seen: set[Path]) -> dict[str, Any]:
     if base is None:
         return values
     if not isinstance(base, str):
-        raise ConfigError(f"{path}: base must be a file name, got {base!r}")
-    merged = _read(path.parent / base, seen | {path})
+        raise ConfigError(f"{path}: base must be a file name or the name of a recipe, got {base!r}")
+    merged = _read(base_file(base, path), seen | {path})
     _merge(merged, values, str(path))
     return merged
 
@@ -165,10 +193,32 @@ def _build(kind: type, values: Any, where: str) -> Any:
     arguments = {}
     for name, value in values.items():
         path = f"{where}.{name}" if where else str(name)
+        if path in REMOVED:
+            _check_removed(path, value)
+            continue
         if name not in hints:
             raise ConfigError(f"{path}: unknown field; {_hint(str(name), list(hints))}")
         arguments[name] = _convert(hints[name], value, path)
     return kind(**arguments)
+
+
+def _check_removed(name: str, value: Any) -> None:
+    """Refuse a value of a removed field, unless it stood for what BlitzGS does without the field."""
+    if not without_effect(name, value):
+        raise ConfigError(
+            f"{name}: this field was removed: BlitzGS now does what {REMOVED[name]!r} stood for, got "
+            f"{value!r}; leave the field out, or go on with a run that was trained with it by the version "
+            "that wrote it"
+        )
+
+
+def without_effect(name: str, value: Any) -> bool:
+    """Tell whether a field is a removed one, with a value that stood for what BlitzGS does now."""
+    if name not in REMOVED:
+        return False
+    known = REMOVED[name]
+    found = _convert(float, value, name) if isinstance(known, float) else value
+    return isinstance(known, Ignored) or bool(found == known)
 
 
 def _hint(name: str, known: list[str]) -> str:

@@ -42,7 +42,6 @@ _EVERY = Range(1, 1e9)
 _EVERY_OR_NEVER = Range(0, 1e9)
 _SHARE = Range(0, 1, low_open=True)
 _RATE = Range(0, 10)
-_BETA = Range(0, 1, high_open=True)
 _LENGTH = Range(0, 1e6)
 
 RANGES: Mapping[str, Range] = {
@@ -53,20 +52,13 @@ RANGES: Mapping[str, Range] = {
     "model.sh_degree": Range(0, 3),
     "model.background": Range(0, 1),
     "model.near": Range(0, 1e6),
-    "model.far": Range(1e-9, 1e12),
-    "model.eps2d": Range(0, 100),
-    "model.initial_opacity": Range(1e-4, 0.9999),
-    "model.scale_floor": Range(0, 100),
     "lod.fork": Range(1.01, 100),
     "lod.visible_threshold": Range(0, 1, high_open=True),
-    "lod.base_resolution": Range(1e-6, 1),
     "schedule.iterations": Range(1, 1e9),
     "schedule.scale": SCALE,
     "schedule.images_per_view": Range(0, 1e6),
     "schedule.minutes": Range(0, 1e6),
     "schedule.pace": Range(1e-4, 1e9),
-    "schedule.adaptive_limit": Range(0, 1, high_open=True),
-    "schedule.placed": _TIME,
     "schedule.batch_size": Range(1, 32),
     "schedule.densify_from": _TIME,
     "schedule.densify_until": _TIME,
@@ -76,7 +68,6 @@ RANGES: Mapping[str, Range] = {
     "schedule.gate_from": _TIME,
     "schedule.t1": _EVERY_OR_NEVER,
     "schedule.t2": _EVERY_OR_NEVER,
-    "schedule.levels_until": _TIME,
     "schedule.sh_every": _EVERY,
     "schedule.position_decay": _EVERY,
     "schedule.checkpoint_every": _EVERY_OR_NEVER,
@@ -89,19 +80,13 @@ RANGES: Mapping[str, Range] = {
     "optimiser.scale": _RATE,
     "optimiser.rotation": _RATE,
     "optimiser.position_noise": Range(0, 1e12),
-    "optimiser.final_share": Range(1e-6, 1),
-    "optimiser.beta1": _BETA,
-    "optimiser.beta2": _BETA,
-    "optimiser.eps": Range(1e-30, 1),
     "loss.ssim": Range(0, 1),
     "loss.opacity": Range(0, 1e6),
     "loss.opacity_total": Range(0, 1e6),
     "loss.scale": Range(0, 1e6),
     "loss.scale_reference": Range(1e-6, 1e6),
-    "loss.size": Range(0, 1e6),
     "population.growth": Range(0, 10),
     "population.grad_threshold": Range(0, 1e30),
-    "population.absolute_threshold": Range(0, 1e6),
     "population.clone_scale": _LENGTH,
     "population.min_opacity": Range(0, 1, high_open=True),
     "population.reset_opacity": Range(0, 1, low_open=True, high_open=True),
@@ -116,8 +101,7 @@ RANGES: Mapping[str, Range] = {
     "population.pass1_keep": _SHARE,
     "population.pass2_mass": _SHARE,
     "population.pass2_keep": _SHARE,
-    "view.first_levels": Range(0, 1),
-    "view.level_ratio": Range(1.001, 100),
+    "population.pass2_views": Range(0, 1e6),
     "view.most_kept": Range(0, 1),
     "memory.resident_gb": Range(0, 1e6),
     "ranks.timeout_seconds": Range(1, 1e6),
@@ -146,22 +130,11 @@ def problems(config: Config) -> Iterator[str]:
             yield f"{name}: must be {RANGES[name]}, got {value}"
         if name in CHOICES and value not in CHOICES[name]:
             yield f"{name}: must be one of {', '.join(CHOICES[name])}, got {value}"
-    model, schedule, population = config.model, config.schedule, config.population
-    near = model.near or 0.01  # of a plane that the capture decides on, the largest
-    if not near < model.far:
-        yield f"model.near: must be below model.far ({model.far}), got {near}"
+    schedule, population = config.schedule, config.population
     if 0 < config.optimiser.position < 1e-20:
         # The rate falls by a power of the ratio of position_final to it, which must stay a number.
         yield f"optimiser.position: must be 0 or at least 1e-20, got {config.optimiser.position}"
-    beta1, beta2 = config.optimiser.beta1, config.optimiser.beta2
-    if beta1 * beta1 >= beta2:
-        # Otherwise the steps of a row without gradients do not fade, and cannot be applied later.
-        yield (
-            f"optimiser.beta1: must be below the square root of optimiser.beta2 ({beta2}), or Adam's steps "
-            f"grow without gradients; got {beta1}"
-        )
     yield from _problems_of_length(schedule)
-    yield from _problems_of_places(schedule)
     if schedule.reset_every > 0 and not population.min_opacity < population.reset_opacity:
         yield (
             f"population.reset_opacity: must be above population.min_opacity ({population.min_opacity}), or "
@@ -204,19 +177,6 @@ def _problems_of_length(schedule: ScheduleConfig) -> Iterator[str]:
         yield (
             f"schedule.scale: must be 1 with schedule.minutes (--minutes), which chooses the scale; got "
             f"{schedule.scale}: add --schedule.scale=1 or leave out the minutes"
-        )
-
-
-def _problems_of_places(schedule: ScheduleConfig) -> Iterator[str]:
-    """Name the problems with the times of T1, the end of densification and T2."""
-    placed = [time for time in schedule.placed if time > 0]
-    if len(schedule.placed) > 3 or placed != sorted(placed):
-        yield f"schedule.placed: must be up to 3 times, none before the last, got {list(schedule.placed)}"
-    times = [time for time in (schedule.t1, schedule.densify_until, schedule.t2) if time > 0]
-    if schedule.adaptive and times != sorted(times):
-        yield (
-            "schedule.adaptive: needs t1 <= densify_until <= t2, of which t1 and t2 may be 0; got "
-            f"{schedule.t1}, {schedule.densify_until} and {schedule.t2}"
         )
 
 

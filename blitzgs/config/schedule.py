@@ -13,13 +13,7 @@ from torch import Tensor
 from blitzgs.config.fields import MOST_STRETCH, OptimiserConfig, ScheduleConfig
 from blitzgs.config.pace import Pace
 
-EventKind = Literal[
-    "densify", "reset_opacities", "pass_1", "pass_2", "clear_cull", "place", "evaluate", "checkpoint"
-]
-# What `schedule.placed` holds, in this order.
-PLACED = ("t1", "densify_until", "t2")
-# No time is placed later than this share of the run, unless the fixed schedule has it later.
-_LAST_PLACE = 0.95
+EventKind = Literal["densify", "reset_opacities", "pass_1", "pass_2", "clear_cull", "evaluate", "checkpoint"]
 # The events of this number of images are searched at once.
 _SEARCHED = 1024
 # The columns of the learning-rate table.
@@ -33,25 +27,6 @@ class Event:
     time: int
     order: int
     kind: EventKind
-
-
-def latest_times(config: ScheduleConfig) -> list[int]:
-    """Return the latest places of T1, the end of densification and T2, in times of the configuration."""
-    most = 1 + config.adaptive_limit if config.adaptive else 1.0
-    last = int(_LAST_PLACE * config.iterations)
-    times = (config.t1, config.densify_until, config.t2)
-    return [min(int(most * time), max(time, last)) for time in times]
-
-
-def _with_places(config: ScheduleConfig) -> ScheduleConfig:
-    """Return a configuration in which T1, the end of densification and T2 have their placed values.
-
-    A time that is not placed yet has its latest possible value.
-    """
-    if not (config.adaptive or config.placed):
-        return config
-    t1, until, t2 = (*config.placed, *latest_times(config)[len(config.placed) :])
-    return replace(config, t1=t1, densify_until=until, t2=t2)
 
 
 def stretched(config: ScheduleConfig, views: int) -> ScheduleConfig:
@@ -84,7 +59,7 @@ class Schedule:
     """
 
     def __init__(self, config: ScheduleConfig) -> None:
-        self._config = _with_places(config)
+        self._config = config
         self.pace = Pace(config.scale, config.pace)
         self.batch_size = config.batch_size
         self.steps = max(1, math.ceil(self._scaled(config.iterations) / self.batch_size))
@@ -115,7 +90,6 @@ class Schedule:
             ("pass_1", config.t1, config.t1 + 1, min(config.t1, 1)),
             ("pass_2", config.t2, config.t2 + 1, min(config.t2, 1)),
             self._clear_cull(),
-            ("place", config.densify_from, config.iterations, self._placing_interval()),
             ("evaluate", config.evaluate_every, math.inf, config.evaluate_every),
             ("checkpoint", config.checkpoint_every, math.inf, config.checkpoint_every),
         ]
@@ -126,12 +100,6 @@ class Schedule:
             for time in self._series(first, until, every, begin, end)
         ]
         return sorted(found)
-
-    def _placing_interval(self) -> int:
-        """Return the interval at which a run checks whether to place its next time; 0: never."""
-        config = self._config
-        is_open = config.adaptive and len(config.placed) < len(PLACED)
-        return config.densify_every if is_open else 0
 
     def _clear_cull(self) -> tuple[EventKind, float, float, float]:
         """Return when the cull mask is dropped: halfway between the last importance pass and the end."""
@@ -169,25 +137,6 @@ class Schedule:
         """
         return not self.gathers_statistics(begin)
 
-    def finest_level(self, begin: int, count: int, first_levels: float, ratio: float) -> int:
-        """Return L_max(t), the finest octree level that the step at [begin, begin + B) may keep.
-
-        It is floor(K x `first_levels`) at the start and K - 1 from `levels_until` on. Each wait for the next
-        level is shorter than the one before by `ratio` (Octree-GS, Ren et al. 2024).
-
-        Args:
-            begin: t.
-            count: number of levels K.
-            first_levels: L_max(0), relative to K.
-            ratio: ratio of consecutive waits.
-        """
-        first = min(count - 1, math.floor(count * first_levels))
-        config, waits = self._config, count - 1 - first
-        until = config.levels_until or config.densify_until
-        unlocked = (1 - ratio**-k for k in range(1, waits + 1))
-        whole = 1 - ratio**-waits
-        return first + sum(begin + 1e-6 >= self.pace.image(until * share / whole) for share in unlocked)
-
     def has_spawn_gate(self, time: int) -> bool:
         """Tell whether the spawn gate judges the candidates of a density event at `time`."""
         return time >= self._scaled(self._config.gate_from)
@@ -217,6 +166,5 @@ class Schedule:
         constants = (config.rotation, config.scale, config.opacity, config.sh_dc, config.sh_rest)
         table = torch.zeros(self.steps + 1, len(RATES), dtype=torch.float64)
         table[1:, 0] = position
-        share = config.final_share ** (times / self._config.iterations)
-        table[1:, 1:] = torch.tensor(constants, dtype=torch.float64) * share[:, None]
+        table[1:, 1:] = torch.tensor(constants, dtype=torch.float64)
         return (table * math.sqrt(self.batch_size)).float()

@@ -24,7 +24,6 @@ def project_bwd_step_(
     gradients: SplatGradients,
     level: Tensor | None = None,
     means2d_sums: Tensor | None = None,
-    absolute_sums: bool = False,
 ) -> None:
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their splats.
 
@@ -44,28 +43,24 @@ def project_bwd_step_(
         gradients: of the splats.
         level: uint8 [N], octree levels, if opacities fade with them (`options.fade`).
         means2d_sums: [P, 2], receives the gradient of `splats.means2d` if `gradients` has a part per rank.
-        absolute_sums: `means2d_sums` receives the sum over pixels of its absolute values instead.
 
     Raises:
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
-    of_splats = [splats.camera_ids, splats.visible_ids, splats.splat_offsets]
-    if gradients.places is not None:
-        of_splats.append(gradients.places)
     with below_autograd():
         torch.ops.blitzgs.project_bwd_step_(
             state.tensors,
             [schedule.table, schedule.lr_table],
-            schedule.steps(step),
-            schedule.decays,
-            list(views),
-            of_splats,
-            options.ints,
-            options.floats,
-            list(gradients.parts),
+            *schedule.constants(step),
+            *views,
+            splats.camera_ids,
+            splats.visible_ids,
+            splats.splat_offsets,
             level,
+            *options,
+            gradients.parts,
+            gradients.places,
             means2d_sums,
-            absolute_sums,
         )
 
 

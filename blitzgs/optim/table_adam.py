@@ -16,6 +16,9 @@ from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.ops.splat_gradients import SplatGradients
 from blitzgs.table.table import GaussianTable
 
+# Adam's constants for one view a step.
+BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
+
 
 class TableAdam:
     """Adam over the rows of a table, batch-scaled as Grendel does: lr sqrt(B), beta^B, eps / sqrt(B).
@@ -27,17 +30,15 @@ class TableAdam:
 
     Attributes:
         lr_table: float32 [S + 1, 6], the learning rates of every step; see `Schedule.learning_rates`.
-        pending_table: table that bounds the movement by pending steps (`AdamSchedule.table`); None with
-            `optimiser.sparse`, which has no pending steps.
+        pending_table: table that bounds the movement by pending steps (`AdamSchedule.table`).
     """
 
     def __init__(self, config: OptimiserConfig, schedule: Schedule, extent: float, device: object) -> None:
         """Tabulate the run's learning rates on `device`; `extent` is in the unit of the means."""
         batch = schedule.batch_size
         self._config, self._extent, self._device = config, extent, device
-        self._betas = (config.beta1**batch, config.beta2**batch)
-        self._eps = config.eps / math.sqrt(batch)
-        self._sparse = config.sparse
+        self._betas = (BETA1**batch, BETA2**batch)
+        self._eps = EPS / math.sqrt(batch)
         self.follow(schedule)
 
     def follow(self, schedule: Schedule) -> None:
@@ -48,8 +49,8 @@ class TableAdam:
         rates = schedule.learning_rates(self._config, self._extent)
         self._position_rates = rates[:, 0].tolist()
         self.lr_table: Tensor = rates.to(self._device)  # type: ignore[call-overload]
-        self._schedule = AdamSchedule(self.lr_table, *self._betas, self._eps, self._sparse)
-        self.pending_table = None if self._sparse else self._schedule.table
+        self._schedule = AdamSchedule(self.lr_table, *self._betas, self._eps)
+        self.pending_table = self._schedule.table
 
     def position_rate(self, step: int) -> float:
         """Return the learning rate of the means in step `step` (from 1), in their unit."""
@@ -63,8 +64,6 @@ class TableAdam:
 
         ``count``, int32 [1]: only the first `count` of `ids` are rows.
         """
-        if self._sparse:
-            return
         lazy_adam_catch_up_(_state_of(table), self._schedule, step, ids, count)
 
     def step(
@@ -74,10 +73,8 @@ class TableAdam:
         gradients: SplatGradients,
         scale_reg: Tensor | None,
         opacity_reg: Tensor | None,
-        size_reg: Tensor | None,
         step: int,
         means2d_sums: Tensor | None = None,
-        absolute_sums: bool = False,
     ) -> None:
         """Take step number `step` (from 1) for the Gaussians that a frame shows.
 
@@ -89,24 +86,20 @@ class TableAdam:
                 such term.
             opacity_reg: weight per view, [B], of the opacity of each Gaussian visible in it; None: no such
                 term.
-            size_reg: weight per view, [B], of the mean axis of each Gaussian visible in it; None: no such
-                term.
             step: number of the step; the visible rows must be current up to `step` - 1.
             means2d_sums: [P, 2], receives the gradient of the splats' means2d if its parts are at several
                 ranks.
-            absolute_sums: `means2d_sums` receives the sum over pixels of absolute gradients instead.
         """
         project_bwd_step_(
             _state_of(table),
             self._schedule,
             step,
-            WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg, size_reg),
+            WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg),
             frame.projected,
             frame.options.projection(frame.views),
             gradients,
             table["level"] if frame.options.fade else None,
             means2d_sums,
-            absolute_sums,
         )
 
 

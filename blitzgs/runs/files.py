@@ -20,11 +20,12 @@ from blitzgs.config.files import ConfigError, from_dict, load_config, to_dict
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs import checkpoint
+from blitzgs.runs import checkpoint, exposure
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.guard import bad_column, check_before_saving
+from blitzgs.runs.identity import check_own
 from blitzgs.table.host_table import HostTable
-from blitzgs.table.pool import Residence
+from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.views import Space
 from blitzgs.view.visible import Scene
@@ -48,8 +49,6 @@ FREE_FIELDS = (
     "schedule.checkpoint_every",
     "schedule.evaluate_every",
 )
-# Half precision changes the result by 1e-3.
-BOUND_FIELDS = ("ranks.half_exchange",)
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class Progress:
         least_kept: the smallest share of the Gaussians that a training view keeps with the LOD gate; 0
             without a gate, and in old checkpoints.
         train_views: digest of the names of the training views, in their order; empty in old checkpoints.
-        signals: result of `blitzgs.training.adaptive.Signals.saved`, with `schedule.adaptive`.
+        curve: result of `blitzgs.training.curve.Curve.saved`; empty in old checkpoints.
         gate: digest of the spawn gate's files; empty without a gate, and in old checkpoints.
         events_left: (time, order, kind) of the events of the last step that a signal kept from running.
     """
@@ -88,7 +87,7 @@ class Progress:
     gated_views: str = ""
     least_kept: float = 0.0
     train_views: str = ""
-    signals: dict[str, Any] = dataclasses.field(default_factory=dict)
+    curve: dict[str, Any] = dataclasses.field(default_factory=dict)
     gate: str = ""
     events_left: list[tuple[Any, ...]] = dataclasses.field(default_factory=list)
 
@@ -102,6 +101,7 @@ class TrainedModel:
         progress: progress of the run at the checkpoint.
         space: maps between the trained world and the capture's world.
         table: this rank's Gaussians.
+        exposures: gain and bias of each training photograph, [T, 2, 3]; None if the run has none.
         pool_bytes: bytes of a device that the Gaussians may take, if the run trained with a pool; else 0.
     """
 
@@ -110,6 +110,7 @@ class TrainedModel:
     space: Space
     table: GaussianTable
     pool_bytes: int = 0
+    exposures: torch.Tensor | None = None
 
     def scene(self, device: torch.device) -> Scene:
         """Return the scene that views are rendered from on a device.
@@ -117,12 +118,12 @@ class TrainedModel:
         With a pool, the first call moves the table into memory that the pool can reach.
 
         Raises:
-            ResidenceError: the pool has room for fewer than two blocks.
+            PoolError: the pool has room for fewer than two blocks.
         """
         if self.pool_bytes == 0:
             return self.table
         self.table = HostTable(self.table.release(), pinned=device.type == "cuda")
-        return Residence(self.table, device, self.pool_bytes, None)
+        return Pool(self.table, device, self.pool_bytes, None)
 
 
 def save(
@@ -167,7 +168,7 @@ class Restored:
         config: configuration of the run.
         run_id: identifies the run in its log.
         source: name of the checkpoint and why it was chosen, as text.
-        shared: tensors that are the same on all ranks: `TileOwners.columns`.
+        shared: tensors that are the same on all ranks: `TileOwners.columns`, and those of the exposures.
     """
 
     table: GaussianTable
@@ -188,19 +189,22 @@ def restore(folder: Path, ranks: Ranks, device: torch.device | None = None) -> R
         device: device of the Gaussians; None: the ranks' device.
 
     Raises:
-        CheckpointError: there are checkpoints, but all are damaged, or the newest is of another version.
+        CheckpointError: there are checkpoints, but all are damaged, or the newest is of another version or
+            of another run.
     """
     loaded = checkpoint.load_latest(folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns)
     if loaded is None:
         return None
     state = loaded.state
+    check_own(folder, folder / CHECKPOINTS / loaded.name, str(state.get("run", "")), ranks)
     why = "the newest sound one" if loaded.refused else "the newest"
     skipped = f"; {len(loaded.refused)} newer refused" if loaded.refused else ""
     try:
-        progress = Progress(**state["progress"])
+        known = {field.name for field in dataclasses.fields(Progress)}
+        progress = Progress(**{name: value for name, value in state["progress"].items() if name in known})
         space = Space(**(state["space"] | {"offset": tuple(state["space"]["offset"])}))
         config = from_dict(state["config"])
-    except (LookupError, TypeError, ConfigError) as error:
+    except (LookupError, TypeError, AttributeError, ConfigError) as error:
         raise CheckpointError(
             f"checkpoint {folder / CHECKPOINTS / loaded.name} belongs to another version of BlitzGS: {error}"
         ) from error
@@ -256,7 +260,7 @@ def open_model(
         config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
     optimiser = TableAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
     optimiser.catch_up(table, None, progress.step)
-    return TrainedModel(config, progress, restored.space, table, pool_bytes)
+    return TrainedModel(config, progress, restored.space, table, pool_bytes, exposure.stored(restored.shared))
 
 
 def _resident_gb(path: Path) -> float:
@@ -289,32 +293,30 @@ def check_resumable(saved: Config, wanted: Config) -> None:
         # The number of minutes may change: the rest of the run is then fitted into the rest of the new time.
         is_budget = name == "schedule.minutes" and old > 0 and new > 0
         if not (_is_free(name) or is_budget):
+            longer = name in ("schedule.scale", "schedule.iterations", "schedule.minutes")
+            remedy = ", or train a finished run longer with --extend" if longer else ""
             raise ConfigError(
                 f"{name}: the checkpoint was trained with {old!r}, now {new!r}; "
                 "leave out --config and the fields to resume with the run's own configuration, or start "
-                "another run"
+                f"another run{remedy}"
             )
 
 
 def with_pace_of(config: Config, saved: Config | None) -> Config:
-    """Return `config` with the pace and the placed times of the checkpoint's configuration, `saved`.
+    """Return `config` with the pace of the checkpoint's configuration, `saved`.
 
     With `schedule.minutes`, the pace comes from `saved`, because the run has measured it; `saved` is None at
     the start of a run, which has not measured any yet. Without `schedule.minutes`, the pace of `config` is
-    kept. The same rule applies to the times that `schedule.adaptive` places.
+    kept.
     """
     schedule = config.schedule
     if schedule.minutes > 0:
         schedule = dataclasses.replace(schedule, pace=() if saved is None else saved.schedule.pace)
-    if schedule.adaptive:
-        schedule = dataclasses.replace(schedule, placed=() if saved is None else saved.schedule.placed)
     return dataclasses.replace(config, schedule=schedule)
 
 
 def _is_free(name: str) -> bool:
-    return name not in BOUND_FIELDS and any(
-        name == free or name.startswith(free + ".") for free in FREE_FIELDS
-    )
+    return any(name == free or name.startswith(free + ".") for free in FREE_FIELDS)
 
 
 def _changed_fields(saved: Config, found: Config) -> list[str]:

@@ -194,7 +194,7 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0, seed: int = 
 
     Args:
         runs: at least one run.
-        path: path of the model, `NAME.json` or `NAME.ubj`; its metadata are written beside it.
+        path: path of the model, `NAME.json`; its metadata are written beside it.
         gate_from: time in images from which on a gate is going to judge spawns; see `judge`.
         seed: seed of the draws of rows.
 
@@ -227,7 +227,7 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0, seed: int = 
     protocol = "leave one scene out" if len(scenes) > 1 else "a quarter of the parents held out"
     result = {"protocol": protocol, "held_out": figures}
     booster = _train(xgboost, runs, [np.ones(len(run.survived), bool) for run in runs], seed)
-    write_file(path, bytes(booster.save_raw(path.suffix[1:])))
+    write_file(path, bytes(booster.save_raw("json")))
     write_info(path, GateInfo(FEATURES, runs[0].schedule, {run.name: run.scene for run in runs}, auc=result))
     return result
 

@@ -11,12 +11,8 @@ does not need XGBoost.
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
 import math
-import signal
-import subprocess
-import sys
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -33,30 +29,13 @@ from blitzgs.spawn.candidates import FEATURES, Candidates
 from blitzgs.util.output import check_replaceable, write_file
 
 FORMAT = 1
-# Name of the gate that is included in BlitzGS, for configs/compact.yaml.
+# Name of the gate that is included in BlitzGS, for configs/density.yaml.
 DEFAULT = "default"
 # Takes the place of a gate's name: vetoes at random, which a gate has to surpass.
 RANDOM = "random"
 _SHIPPED = Path(__file__).with_name("gates") / "compact.json"
 # Leaf values are rounded to integers in units of 2^-32.
 _LEAF_BITS = 32
-# XGBoost may crash when it reads a damaged file, so a process of its own reads the file, and writes the model
-# as JSON. It gets the search path of this one as its argument. A wrong length in the file must not fill the
-# host's memory either.
-_TO_JSON = """
-import json, resource, sys
-sys.path[:] = json.loads(sys.argv[1])
-result, sys.stdout = sys.stdout.buffer, sys.stderr  # XGBoost prints its messages
-import xgboost
-data = sys.stdin.buffer.read()
-most, hard = (4 << 30) + 100 * len(data), resource.getrlimit(resource.RLIMIT_DATA)[1]
-resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
-try:
-    result.write(xgboost.Booster(model_file=bytearray(data)).save_raw("json"))
-except xgboost.core.XGBoostError as error:
-    sys.exit(str(error).partition("\\n")[0])  # the lines after the first are the stack of the library
-"""
-_READING_SECONDS = 120
 # The draws of a veto are those of the event `time` + 2^40. An importance pass of the same time draws among
 # the same Gaussians by their ids and `time` itself, and would prune those that the veto has just withheld.
 _VETO_EVENTS = 1 << 40
@@ -102,8 +81,7 @@ def check_no_other(path: Path) -> None:
     """Check that a new gate would replace only the files of a gate, which its metadata show.
 
     Raises:
-        FileExistsError: there is a model file without metadata, another file at the path of the metadata, or
-            a gate in the other format, to which the metadata belong.
+        FileExistsError: there is a model file without metadata, or another file at the path of the metadata.
         OSError: one of the two is no regular file.
     """
     metadata = info_path(path)
@@ -119,12 +97,6 @@ def check_no_other(path: Path) -> None:
             foreign = path
     except (ValueError, RecursionError):
         foreign = metadata
-    for other in (path.with_suffix(suffix) for suffix in (".json", ".ubj") if suffix != path.suffix):
-        if other.exists():
-            raise FileExistsError(
-                f"{other} exists, whose metadata {metadata.name} the new gate would replace: choose another "
-                "--out"
-            )
     if foreign is not None:
         raise FileExistsError(f"{foreign} exists and does not belong to a gate: choose another --out")
 
@@ -171,16 +143,19 @@ class SpawnGate:
         """Read a model and its metadata.
 
         Args:
-            path: a model in XGBoost's JSON, or in UBJSON where xgboost is installed.
+            path: a model in XGBoost's JSON.
 
         Raises:
-            GateError: a file is missing, damaged or of another kind.
+            GateError: a file is missing, damaged or of another kind; for UBJSON it says how to convert it.
         """
         self.info = read_info(path)
+        if path.suffix == ".ubj":
+            raise GateError(
+                f"{path}: only XGBoost's JSON is read: xgboost.Booster(model_file='{path.name}').save_model("
+                f"'{path.stem}.json') converts it"
+            )
         try:
-            self._trees = _Trees.of(_read_model(path))
-        except GateError:
-            raise
+            self._trees = _Trees.of(json.loads(path.read_text()))
         except OSError as error:
             raise GateError(f"{path} cannot be read: {error.strerror or error}") from error
         except (ValueError, LookupError, TypeError, OverflowError, RuntimeError) as error:
@@ -268,33 +243,6 @@ def veto_lowest(scores: Tensor, candidates: Candidates, rate: float, ranks: Rank
         k = math.ceil(decimal_share(rate) * count)
         vetoed[rows] = smallest(scores[rows], candidates.parents[rows], k, ranks)
     return vetoed
-
-
-def _read_model(path: Path) -> dict[str, Any]:
-    """Read a model as XGBoost's JSON."""
-    if path.suffix == ".json":
-        content: dict[str, Any] = json.loads(path.read_text())
-        return content
-    if importlib.util.find_spec("xgboost") is None:
-        raise GateError(
-            f"{path}: only .json is read without xgboost (pip install xgboost); save the model as .json"
-        )
-    command = [sys.executable, "-c", _TO_JSON, json.dumps(sys.path)]
-    try:
-        read = subprocess.run(
-            command, input=path.read_bytes(), capture_output=True, timeout=_READING_SECONDS, check=False
-        )
-    except subprocess.TimeoutExpired as error:
-        raise GateError(f"{path} is damaged: XGBoost did not read it within {_READING_SECONDS} s") from error
-    if read.returncode < 0:
-        raise GateError(
-            f"{path} is damaged: XGBoost crashed when it read it ({signal.strsignal(-read.returncode)})"
-        )
-    if read.returncode > 0:
-        lines = read.stderr.decode(errors="replace").strip().splitlines()
-        raise ValueError(lines[-1] if lines else f"XGBoost ended with status {read.returncode}")
-    content = json.loads(read.stdout)
-    return content
 
 
 @dataclass(frozen=True)

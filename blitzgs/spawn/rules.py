@@ -11,7 +11,7 @@ from typing import Any
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.fingerprint import capture_fingerprint
 from blitzgs.config.fields import Config
-from blitzgs.config.files import to_dict
+from blitzgs.config.files import to_dict, without_effect
 from blitzgs.distributed.group import Ranks
 from blitzgs.spawn.candidates import Veto
 from blitzgs.spawn.gate import (
@@ -28,7 +28,7 @@ from blitzgs.spawn.gate import (
 # The sections whose fields decide how long Gaussians live, each with the fields that do not. The effect of
 # `schedule.minutes` is in `schedule.pace`, once it is measured.
 _IDLE: dict[str, tuple[str, ...]] = {
-    "schedule": ("checkpoint_every", "evaluate_every", "gate_from", "minutes", "adaptive_limit", "placed"),
+    "schedule": ("checkpoint_every", "evaluate_every", "gate_from", "minutes"),
     "population": ("lineage", "gate", "gate_rate", "gate_rule"),
     "optimiser": (),
     "loss": (),
@@ -104,7 +104,8 @@ def reasons_against(gate: SpawnGate, config: Config, capture: Capture) -> list[s
     if known := [name for name, other in gate.info.scenes.items() if other == scene]:
         found.append(f"it was fitted on this very capture ({', '.join(known)}): its figures say nothing here")
     # A field that the gate's file lacks is newer than the file; its default is the earlier behaviour.
-    fields, fitted = life_fields(config), life_fields(Config()) | gate.info.schedule
+    old = {name: value for name, value in gate.info.schedule.items() if not without_effect(name, value)}
+    fields, fitted = life_fields(config), life_fields(Config()) | old
     if different := sorted(name for name in fields | fitted if fields.get(name) != fitted.get(name)):
         listed = ", ".join(f"{name} ({fitted.get(name)}, here {fields.get(name)})" for name in different)
         found.append(f"it was fitted under another schedule, and survival follows the schedule: {listed}")

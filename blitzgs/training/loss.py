@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loss: (1 - lambda) L1 + lambda (1 - SSIM) and three regularisers, averaged over a batch."""
+"""The training loss: (1 - lambda) L1 + lambda (1 - SSIM) and two regularisers, averaged over a batch."""
 
 from __future__ import annotations
 
@@ -29,15 +29,12 @@ class LossTerms(NamedTuple):
             `loss.scale` is 0.
         opacity_reg: gradient of the loss by the opacity of each visible Gaussian, per view [B]; None if
             `loss.opacity` is 0.
-        size_reg: gradient of the loss by the mean of the three axes of each visible Gaussian, per view [B];
-            None if `loss.size` is 0.
     """
 
     parts: Tensor
     v_renders: Tensor
     scale_reg: Tensor | None
     opacity_reg: Tensor | None
-    size_reg: Tensor | None
 
 
 def weighted(config: LossConfig, views: int) -> LossConfig:
@@ -56,7 +53,9 @@ def weighted(config: LossConfig, views: int) -> LossConfig:
     return replace(config, opacity=opacity, opacity_total=0.0)
 
 
-def loss_terms(frame: Frame, batch: Batch, config: LossConfig, extent: float) -> LossTerms:
+def loss_terms(
+    frame: Frame, batch: Batch, config: LossConfig, extent: float, shown: Tensor | None = None
+) -> LossTerms:
     """Compare rendered views with their photographs.
 
     On several ranks each compares its own tiles.
@@ -65,7 +64,9 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, extent: float) ->
         frame: rendered batch of B views.
         batch: their photographs.
         config: weights.
-        extent: size of the scene in the unit of the means; L_scale and L_size are relative to it.
+        extent: size of the scene in the unit of the means; L_scale is relative to it.
+        shown: the images to compare, [B, H, W, 3], instead of the frame's; `v_renders` is then their
+            gradient.
 
     Raises:
         ValueError: a rank has not composited all pixels that its loss reads.
@@ -74,7 +75,7 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, extent: float) ->
     if assignment is not None and assignment.ranges.halo < LOSS_HALO:
         raise ValueError(f"the loss reads {LOSS_HALO} px beyond a rank's tiles: divide them with that halo")
     parts, v_renders, scale_reg, opacity_reg = photometric_fwd_bwd(
-        frame.renders,
+        frame.renders if shown is None else shown,
         batch.targets,
         batch.masks,
         *_weights(config.ssim, count, batch.samples.device),
@@ -85,13 +86,11 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, extent: float) ->
         scale_weight=config.scale / (extent * config.scale_reference * count),
         opacity_weight=config.opacity,
     )
-    size_reg = config.size / (extent * count * frame.visible.clamp(min=1)) if config.size > 0 else None
     return LossTerms(
         parts,
         v_renders,
         scale_reg if config.scale > 0 else None,
         opacity_reg if config.opacity > 0 else None,
-        size_reg,
     )
 
 
@@ -124,12 +123,6 @@ def scale_term(frame: Frame, table: GaussianTable, length_unit: float) -> Tensor
 def opacity_term(frame: Frame, table: GaussianTable) -> Tensor:
     """Return L_opacity of each view, float32 [B]: the mean opacity of the Gaussians visible in it."""
     return _mean_over_visible(frame, table["opacities"][frame.projected.gaussian_ids].sigmoid())
-
-
-def size_term(frame: Frame, table: GaussianTable, extent: float) -> Tensor:
-    """Return L_size of each view, float32 [B]: the mean of all axes of the Gaussians visible in it."""
-    sizes = table["scales"][frame.projected.gaussian_ids].exp().mean(dim=1) / extent
-    return _mean_over_visible(frame, sizes)
 
 
 def _mean_over_visible(frame: Frame, values: Tensor) -> Tensor:

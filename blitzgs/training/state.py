@@ -9,14 +9,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.images import Images
 from blitzgs.config.fields import Config
-from blitzgs.config.schedule import PLACED, Schedule
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.frame import RenderOptions
 from blitzgs.frame.ownership import TileOwners
@@ -29,8 +28,8 @@ from blitzgs.spawn.candidates import Veto
 from blitzgs.spawn.lineage import Lineage
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
-from blitzgs.training.adaptive import Signals
 from blitzgs.training.agreement import SaveClock
+from blitzgs.training.curve import Curve
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
 from blitzgs.view.views import Space, ViewSet, render_options
@@ -70,7 +69,7 @@ class TrainingState:
         log: log of the run; it does nothing until the loop opens the run's log.
         stops: returns whether the run has to stop soon, the same on every rank; long events call it every few
             seconds. The loop sets it.
-        signals: measurements of a run with `schedule.adaptive`, or None.
+        curve: training PSNR of the run.
         clock: returns monotonic seconds, by which training time is measured.
     """
 
@@ -96,7 +95,7 @@ class TrainingState:
     lineage: Lineage | None
     log: RunLog
     growth_was_limited: bool = False
-    signals: Signals | None = None
+    curve: Curve = field(default_factory=Curve)
     stops: Callable[[], bool] = never
     clock: Callable[[], float] = time.monotonic
     _started: float = field(default_factory=time.monotonic)
@@ -116,14 +115,6 @@ class TrainingState:
         """The render options at the run's present spherical-harmonics degree."""
         lod = lod_gate(self.config, self.progress)
         return render_options(self.config, self.space, self.progress.sh_degree, lod)
-
-    @property
-    def placed_times(self) -> dict[str, dict[str, Any]]:
-        """What `schedule.adaptive` has placed: {name: {"time": as in `schedule.placed`, "reason": text}}."""
-        if self.signals is None:
-            return {}
-        places = zip(PLACED, self.config.schedule.placed, self.signals.reasons, strict=False)
-        return {name: {"time": time, "reason": reason} for name, time, reason in places}
 
     def start_clock(self) -> None:
         """Count training time from now on, in addition to the time before a resume."""

@@ -13,13 +13,15 @@ from blitzgs.frame.frame import Frame, RenderOptions
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import Mark, open_transport, unmarked
+from blitzgs.ops.blocks import ActiveRows
+from blitzgs.ops.projection_types import Sizes
 from blitzgs.ops.view_gate import gate_views_
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.position_noise import PositionNoise
-from blitzgs.population.scale_floor import FLOOR, raise_scales
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batch import Batch
+from blitzgs.training.exposure import Exposures
 from blitzgs.training.loss import LossTerms, loss_terms
 from blitzgs.view.gate import ViewGate
 from blitzgs.view.visible import Scene
@@ -32,10 +34,12 @@ class Stepper:
         table: the table whose rows a frame's ids refer to: all of this rank's Gaussians, or a pool with those
             that a step may need.
         scene: all of this rank's Gaussians, for rendering between steps; call `catch_up` before.
+        exposures: of the training photographs; None: all are taken as they are.
     """
 
     table: GaussianTable
     scene: Scene
+    exposures: Exposures | None = None
 
     def __init__(
         self,
@@ -44,7 +48,6 @@ class Stepper:
         owners: TileOwners,
         loss: LossConfig,
         extent: float,
-        half_exchange: bool = False,
         noise: PositionNoise | None = None,
     ) -> None:
         """Prepare to step.
@@ -55,13 +58,12 @@ class Stepper:
             owners: records what the tiles cost.
             loss: weights of the loss.
             extent: size of the scene in the unit of the means.
-            half_exchange: send splats in half precision, see `open_transport`.
             noise: noise on the means after each step; None: none.
         """
         self.table = self.scene = table
         self._optimiser, self._owners = optimiser, owners
         self._loss, self._extent, self._noise = loss, extent, noise
-        self._transport = open_transport(owners.ranks, half_exchange)
+        self._transport = open_transport(owners.ranks)
         self.reindex()
 
     def reindex(self) -> None:
@@ -103,30 +105,37 @@ class Stepper:
         """
         table, ranks, views = self.table, self._owners.ranks, batch.views
         rules = None if view_gate is None else view_gate.rules(table)
-
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
         on_gpu = views.viewmats.is_cuda
-        for attempt in self._transport.capacity.attempts():
+
+        def active(sizes: Sizes | None) -> ActiveRows:
             # On the CPU the number of blocks is known at once: lists of this size need no estimate, and are
             # complete at the first attempt.
-            capacity_blocks = attempt.sizes.blocks if attempt.sizes is not None and on_gpu else None
-            active = self._blocks.active(
+            capacity_blocks = sizes.blocks if sizes is not None and on_gpu else None
+            rows = self._blocks.active(
                 table, views.viewmats, views.Ks, views.width, views.height, options.near_plane,
                 options.far_plane, options.eps2d, rules, capacity_blocks,
             )  # fmt: skip
             if not on_gpu:
-                active = active._replace(blocks=None)
+                rows = rows._replace(blocks=None)
             mark("other")
-            self._optimiser.catch_up(table, active.ids, step - 1, active.length)
+            self._optimiser.catch_up(table, rows.ids, step - 1, rows.length)
             mark("optimiser")
             if rules is not None:
-                gate_views_(active, table["means"], views.viewmats, rules)
-            frame = pipeline.forward_once(
-                table, views, options, active, assignment, self._transport, attempt, mark,
-                backward_follows=True,
-            )  # fmt: skip
-        assert frame is not None  # or there would be another attempt
-        terms = loss_terms(frame, batch, self._loss, self._extent)
+                gate_views_(rows, table["means"], views.viewmats, rules)
+            return rows
+
+        frame = pipeline.forward(
+            table, views, options, active, assignment, self._transport, mark, backward_follows=True
+        )
+        if self.exposures is None:
+            terms = loss_terms(frame, batch, self._loss, self._extent)
+        else:
+            self.exposures.measure(step, frame.renders, batch)
+            gains, biases = self.exposures.of(batch.indices)
+            shown = torch.addcmul(biases, frame.renders, gains)
+            terms = loss_terms(frame, batch, self._loss, self._extent, shown)
+            terms.v_renders.mul_(gains)
         mark("loss")
         if batch.ranges is None:
             sums = HostSum(ranks, terms.parts)
@@ -143,7 +152,6 @@ class Stepper:
         terms: LossTerms,
         mark: Mark = unmarked,
         keep_means2d: bool = False,
-        absolute: bool = False,
     ) -> Tensor | None:
         """Propagate the gradients of `forward`'s loss to the Gaussians, and take an optimiser step.
 
@@ -153,28 +161,21 @@ class Stepper:
             terms: from `forward`.
             mark: called at the end of each stage with the stage's name.
             keep_means2d: whether to return the gradient of the splats' means2d.
-            absolute: return the sum over pixels of absolute gradients instead (AbsGS, Ye et al. 2024).
 
         Returns:
             The gradient of means2d, [P, 2] per pixel; None without `keep_means2d`.
         """
         table = self.table
-        absolute &= keep_means2d
-        gradients = pipeline.backward_splats(frame, terms.v_renders, mark, absolute)
+        gradients = pipeline.backward_splats(frame, terms.v_renders, mark)
         v_means2d = means2d_sums = None
         if keep_means2d:
-            v_means2d = gradients.means2d_abs if absolute else gradients.means2d
+            v_means2d = gradients.means2d
             if v_means2d is None:
                 # The gradients are in the memory of several ranks. The optimiser's kernel adds them up.
                 v_means2d = means2d_sums = torch.empty_like(frame.projected.means2d)
-        self._optimiser.step(
-            table, frame, gradients, terms.scale_reg, terms.opacity_reg, terms.size_reg, step, means2d_sums,
-            absolute,
-        )  # fmt: skip
+        self._optimiser.step(table, frame, gradients, terms.scale_reg, terms.opacity_reg, step, means2d_sums)
         if self._noise is not None:
             self._noise.add(table, frame.projected.visible_ids, step, self._optimiser.position_rate(step))
-        if FLOOR in table.columns:
-            raise_scales(table, frame.projected.visible_ids)
         mark("optimiser")
         self._blocks.update(table, frame.projected.visible_ids)
         mark("other")

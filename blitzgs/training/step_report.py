@@ -13,7 +13,7 @@ from blitzgs.frame.frame import Frame
 from blitzgs.ops.host import HostCopy
 from blitzgs.runs.guard import check_table, find_bad
 from blitzgs.training.batch import Batch
-from blitzgs.training.loss import batch_psnr, opacity_term, photometric, scale_term, size_term
+from blitzgs.training.loss import batch_psnr, opacity_term, photometric, scale_term
 from blitzgs.training.state import TrainingState
 
 
@@ -21,9 +21,9 @@ class StepRecord(NamedTuple):
     """The figures of a step, which the host reads later, so that it does not wait for the device.
 
     Attributes:
-        figures: float64 as int64 [8 + B]. Of all ranks: the number of ranks with parameters that are not
+        figures: float64 as int64 [7 + B]. Of all ranks: the number of ranks with parameters that are not
             finite, the Gaussians that the step projected, those of them that are visible in a view, and all
-            Gaussians. Of the batch: L_scale, L_opacity and L_size (0 if their weights are), PSNR (nan if all
+            Gaussians. Of the batch: L_scale and L_opacity (0 if their weights are), PSNR (nan if all
             pixels are masked), and `Batch.samples` [B].
         sums: `LossTerms.parts` over all ranks.
     """
@@ -41,14 +41,12 @@ def measure_step(state: TrainingState, frame: Frame, batch: Batch, sums: HostSum
         active.new_full((), count) for count in (len(frame.projected.visible_ids), len(state.table))
     )
     counts = state.ranks.all_reduce(torch.stack([find_bad(table), active, visible, population]))
-    scale = opacity = size = batch.samples.new_zeros(())
+    scale = opacity = batch.samples.new_zeros(())
     if loss.scale > 0:
         scale = scale_term(frame, table, extent * loss.scale_reference).mean()
     if loss.opacity > 0:
         opacity = opacity_term(frame, table).mean()
-    if loss.size > 0:
-        size = size_term(frame, table, extent).mean()
-    terms = torch.stack([scale, opacity, size, batch_psnr(frame, batch)])
+    terms = torch.stack([scale, opacity, batch_psnr(frame, batch)])
     figures = torch.cat([counts.double(), terms.double(), batch.samples.double()])
     return StepRecord(HostCopy(figures.view(torch.int64)), sums)
 
@@ -65,13 +63,13 @@ def log_step(state: TrainingState, record: StepRecord) -> None:
     """
     with state.ranks.watchdog.waiting("read_figures"):
         figures = record.figures.read().view(torch.float64)
-    bad, active, visible, population, scale, opacity, size, psnr = figures[:8].tolist()
+    bad, active, visible, population, scale, opacity, psnr = figures[:7].tolist()
     if bad:
         check_table(state.stepper.table, state.progress.step)
-    samples, loss = figures[8:].float(), state.config.loss
+    samples, loss = figures[7:].float(), state.config.loss
     losses = photometric(record.sums.read()[: 2 * len(samples)], samples, loss)
     values = {
-        "loss": losses.mean().item() + loss.scale * scale + loss.opacity * opacity + loss.size * size,
+        "loss": losses.mean().item() + loss.scale * scale + loss.opacity * opacity,
         # Without a pixel that counts there is no PSNR, and JSON has no nan.
         **({} if math.isnan(psnr) else {"psnr": psnr}),
         "active": active,
@@ -82,3 +80,6 @@ def log_step(state: TrainingState, record: StepRecord) -> None:
     if loss.scale > 0:
         values["l_scale"] = scale
     state.log.scalars(state.images_seen, values)
+    warning = None if math.isnan(psnr) else state.curve.add(state.images_seen, psnr)
+    if warning is not None:
+        state.log.event(state.images_seen, "warning", {"warning": warning}, f"warning: {warning}")

@@ -10,10 +10,11 @@ import numpy as np
 
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.images import Images
-from blitzgs.capture.lengths import depths_seen, sampled
+from blitzgs.capture.lengths import NEAR_OF_EXTENT, depths_seen, sampled
 from blitzgs.config.fields import Config
 from blitzgs.config.schedule import Schedule, stretched
 from blitzgs.population.growth import growth_limit
+from blitzgs.util.terminal import printable
 
 # Photographs that are decoded before the training, and views that are compared with the points.
 _DECODED, _PROJECTED = 16, 100
@@ -21,6 +22,7 @@ _DECODED, _PROJECTED = 16, 100
 _BLACK, _SATURATED = 4.0, 251.0
 # What a Gaussian needs in bytes: its row with the optimiser's state, and the scratch memory of a step.
 _ROW_BYTES, _SCRATCH_BYTES = 750, 500
+_PROGRAM_BYTES = 400_000_000
 # Rough speeds of one CPU core and of one data-centre GPU: seconds of a step, for each megapixel and million
 # Gaussians of the model, as measured with one view a step.
 _CPU_SECONDS, _GPU_SECONDS = (0.0, 0.3, 0.6), (0.003, 0.004, 0.004)
@@ -55,7 +57,7 @@ def check_worlds(capture: Capture) -> None:
     if capture.about.blind == views:
         raise HopelessCaptureError(
             f"{views} of {views} views see none of the {len(capture.points):,} points, so there is nothing "
-            f"to train: the cameras of {capture.about.source.cameras} and the points belong to different worlds "
+            f"to train: the cameras of {capture.about.source.cameras} and the points have different worlds "
             "(give points that were reconstructed with these cameras, in the same coordinates), or the "
             "cameras look along another axis than +z (COLMAP) or -z (transforms.json)"
         )
@@ -76,11 +78,11 @@ def understood(config: Config, capture: Capture, images: Images) -> list[str]:
         ("alpha", _alpha(capture, config)),
         ("points", _points(capture)),
         ("exposure", _exposure(pictures)),
-        ("extent", f"{capture.extent:.6g}; near plane {near:.4g}" + _why_near(config)),
+        ("extent", f"{capture.extent:.6g}; near plane {near:.4g} ({_why_near(config, capture)})"),
         *(("note", note) for note in capture.about.source.notes),
     ]
     # A name may have characters that a terminal would obey.
-    return [f"{name + ':':15}{_printable(text)}" for name, text in lines]
+    return [f"{name + ':':15}{printable(text)}" for name, text in lines]
 
 
 def estimate(config: Config, capture: Capture, on_gpu: bool, cores: int) -> str:
@@ -95,7 +97,8 @@ def estimate(config: Config, capture: Capture, on_gpu: bool, cores: int) -> str:
         population.gaussians_per_point,
         None,
     )
-    count = max(len(capture.points), limit.count if limit is not None else 5 * len(capture.points))
+    # The octree begins with more Gaussians than points, whatever limits its growth.
+    count = max(int(1.3 * len(capture.points)), limit.count if limit is not None else 5 * len(capture.points))
     schedule = Schedule(stretched(config.schedule, len(capture.train)))
     pixels = float(np.mean(sizes))
     fixed, per_megapixel, per_million = _GPU_SECONDS if on_gpu else _CPU_SECONDS
@@ -103,7 +106,7 @@ def estimate(config: Config, capture: Capture, on_gpu: bool, cores: int) -> str:
     minutes = schedule.iterations * step / (1 if on_gpu else max(1, cores)) / 60
     if config.schedule.minutes > 0:
         minutes = config.schedule.minutes
-    memory = count * (_ROW_BYTES + _SCRATCH_BYTES) + 100 * max(sizes)
+    memory = _PROGRAM_BYTES + count * (_ROW_BYTES + _SCRATCH_BYTES) + 100 * max(sizes)
     device = "a data-centre GPU" if on_gpu else f"{cores} CPU cores"
     return (
         f"about {_rounded(count):,} Gaussians at most, {memory / 1e9:.1f} GB and {max(1, round(minutes)):,} "
@@ -114,10 +117,6 @@ def estimate(config: Config, capture: Capture, on_gpu: bool, cores: int) -> str:
 def _rounded(count: int) -> int:
     digits = max(0, len(str(count)) - 2)
     return round(count / 10**digits) * 10**digits
-
-
-def _printable(text: str) -> str:
-    return "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode() for c in text)
 
 
 def _look(capture: Capture, images: Images) -> Pictures:
@@ -172,7 +171,7 @@ def _warn_of_pictures(capture: Capture, pictures: Pictures, near: float) -> None
     if 2 * cut > len(views):
         warnings.warn(
             f"{cut} of the first {len(views)} training views have all their points in front of the near "
-            f"plane ({near:.4g}) and will be black: lower model.near, or set it to 0 for a plane by these depths",
+            f"plane ({near:.4g}) and will be black: lower model.near, or set it to 0 for a plane by depths",
             stacklevel=3,
         )
 
@@ -274,5 +273,9 @@ def _exposure(pictures: Pictures) -> str:
     )
 
 
-def _why_near(config: Config) -> str:
-    return f" (model.near={config.model.near:g})" if config.model.near else " (by the depths of the points)"
+def _why_near(config: Config, capture: Capture) -> str:
+    if config.model.near:
+        return f"model.near={config.model.near:g} x extent"
+    if capture.near == NEAR_OF_EXTENT * capture.extent:
+        return f"{NEAR_OF_EXTENT:g} x extent, well before the points"
+    return "a quarter of the depth of the nearest points"

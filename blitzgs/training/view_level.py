@@ -18,14 +18,14 @@ from blitzgs.view.gate import ViewGate, lod_bits
 
 
 def follow_schedule(state: TrainingState, begin: int) -> None:
-    """Open the LOD gate, or change its finest level, if the step at [begin, begin + B) requires it.
+    """Open the LOD gate, if the step at [begin, begin + B) is the first that has it.
 
     Collective: every rank calls this before every step.
     """
-    view, schedule, progress = state.config.view, state.schedule, state.progress
-    if not (view.lod and schedule.has_lod_gate(begin)):
+    progress = state.progress
+    if not (state.config.view.lod and state.schedule.has_lod_gate(begin)):
         return
-    finest = schedule.finest_level(begin, progress.level_count, view.first_levels, view.level_ratio)
+    finest = progress.level_count - 1
     if finest != progress.finest_level or not progress.gated_views:
         state.progress = dataclasses.replace(progress, finest_level=finest)
         choose_views(state)
@@ -34,7 +34,7 @@ def follow_schedule(state: TrainingState, begin: int) -> None:
 def choose_views(state: TrainingState) -> None:
     """If the LOD gate is open, choose the training views in which it leaves out enough to pay. Collective.
 
-    The choice holds until the gate's levels change or an importance pass prunes Gaussians. It is saved with
+    The choice holds until an importance pass prunes Gaussians. It is saved with
     the checkpoints: a resumed run has other Gaussians than at the time of the choice, and might choose
     other views.
     """

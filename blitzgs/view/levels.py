@@ -11,6 +11,8 @@ from torch import Tensor
 
 from blitzgs.view.point_blocks import BLOCK_POINTS, PointBlocks
 
+# Finest sensible voxel relative to the box of the points; it sets the coarsest level's size.
+BASE_RESOLUTION = 0.001
 # Voxel keys have 21 bits per axis. With this many levels, the finest grid of `measure_levels` uses all of
 # them.
 MAX_LEVELS = 22
@@ -55,7 +57,9 @@ def farthest(level: int, reference_distance: float, fork: float) -> float:
     return math.inf if level == 0 else reference_distance * fork ** (0.5 - level)
 
 
-def measure_levels(points: Tensor, centres: Tensor, fork: float, base_resolution: float) -> Levels:
+def measure_levels(
+    points: Tensor, centres: Tensor, fork: float, base_resolution: float = BASE_RESOLUTION
+) -> Levels:
     """Choose the levels of a scene from its SfM points and training cameras.
 
     d_max and d_min are the 99.9 % and 0.1 % quantiles over cameras of the same quantiles of each camera's

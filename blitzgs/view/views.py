@@ -145,13 +145,10 @@ class ViewSet:
         return unpack_views(numbers.to(self._device), *self.size(indices))
 
 
+# The far plane, relative to the scene's extent: nothing is cut off.
+FAR = 1e6
 # The near plane of a configuration that leaves it to the capture, where no capture has decided on it.
 _NEAR = 0.01
-
-
-def near_plane(config: Config, space: Space) -> float:
-    """Return the distance of a run's near plane in the trained world."""
-    return (config.model.near or _NEAR) * space.extent
 
 
 def render_options(config: Config, space: Space, sh_degree: int, lod: LodGate | None = None) -> RenderOptions:
@@ -159,9 +156,8 @@ def render_options(config: Config, space: Space, sh_degree: int, lod: LodGate | 
     model = config.model
     return RenderOptions(
         sh_degree=sh_degree,
-        near_plane=near_plane(config, space),
-        far_plane=model.far * space.extent,
-        eps2d=model.eps2d,
+        near_plane=(model.near or _NEAR) * space.extent,
+        far_plane=FAR * space.extent,
         antialiased=model.antialiased,
         background=model.background,
         deterministic=model.deterministic,

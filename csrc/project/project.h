@@ -113,7 +113,6 @@ struct RankSplatGradients {
   const SplatGradient* tables[kMaxPeers];
   std::int32_t sizes[kMaxPeers];  // the number of this rank's splats in each table
   float* means2d;                 // null, or [P, 2]: the backward pass writes the sums of v_means2d here
-  bool absolute;                  // writes the sums of mean2d_abs to means2d instead
 
   BLITZGS_HD bool colored() const { return true; }
   BLITZGS_HD GeometryGradient<float> geometry(std::int64_t r) const {
@@ -253,11 +252,10 @@ struct ZeroedArrays {
 
 // The terms of the training loss that do not depend on pixels, as weights per view, [B] each, or null (zero).
 // For each Gaussian that has a splat in view b, the loss has these summands: scale[b] times the smallest axis
-// of the Gaussian (BlitzGS, L_scale), and opacity[b] times its opacity and size[b] times the mean of its
-// three axes (3DGS-MCMC, Kheradmand et al. 2024).
+// of the Gaussian (BlitzGS, L_scale), and opacity[b] times its opacity (3DGS-MCMC, Kheradmand et al. 2024).
 template <class T>
 struct Regularisers {
-  const T *scale, *opacity, *size;
+  const T *scale, *opacity;
 };
 
 // The outputs of the forward pass that the backward pass reads (ProjectIds); n_visible is U.

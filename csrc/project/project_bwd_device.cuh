@@ -174,8 +174,7 @@ class SplatGradientReader<RankSplatGradients> {
   };
 
   __device__ __forceinline__ float2 mean2d_of(const SplatGradient& v) const {
-    // Returns values: with a pointer to one of the two members, the compiler would keep `v` on the stack.
-    return source_.absolute ? float2{v.mean2d_abs[0], v.mean2d_abs[1]} : float2{v.mean2d[0], v.mean2d[1]};
+    return {v.mean2d[0], v.mean2d[1]};
   }
   static __device__ __forceinline__ int lane() { return static_cast<int>(threadIdx.x) % 32; }
   // The number of segments of splats [begin, end): runs that these splats touch, times ranks.
@@ -335,14 +334,7 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   if constexpr (QUADS) stage.write(lane, v_sh);
   float v_quat[4] = {}, v_opacity = 0.f;
   if (id >= 0) {
-    // Summed only here, so that this weight occupies no register beside the SH coefficients.
-    float size_weight = 0.f;
-    if (args.regularisers.size) {
-      for (std::int32_t r = begin; r < end; ++r) {
-        size_weight += args.regularisers.size[args.splats.camera_ids[r]];
-      }
-    }
-    activate_gaussian_vjp(gaussian, in.options.raw, gradient, axis_weight, size_weight,
+    activate_gaussian_vjp(gaussian, in.options.raw, gradient, axis_weight,
                           ParameterGradients<float>{&v_mean.x, v_quat, &v_scale.x, &v_opacity});
   }
   sink.take(shared, own, warp, triple, v_mean, {v_quat[0], v_quat[1], v_quat[2], v_quat[3]}, v_scale,

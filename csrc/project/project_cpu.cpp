@@ -130,7 +130,7 @@ void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& came
   const std::int64_t stride = 3 * in.options.sh_stride;
   const ActivatedGaussian<T> gaussian = load_gaussian(in, id);
   GaussianGradient<T> gradient{};
-  T axis_weight = T(0), size_weight = T(0);
+  T axis_weight = T(0);
   const std::int64_t at = out.dense ? id : u;
   if (out.sh) std::fill_n(out.sh + stride * at, stride, T(0));
   for (std::int64_t r = splats.splat_offsets[u]; r < splats.splat_offsets[u + 1]; ++r) {
@@ -143,9 +143,8 @@ void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& came
     }
     if (regularisers.scale) axis_weight += regularisers.scale[view];
     if (regularisers.opacity) gradient.opacity += regularisers.opacity[view];
-    if (regularisers.size) size_weight += regularisers.size[view];
   }
-  activate_gaussian_vjp(gaussian, in.options.raw, gradient, axis_weight, size_weight,
+  activate_gaussian_vjp(gaussian, in.options.raw, gradient, axis_weight,
                         {out.means + 3 * at, out.quats + 4 * at, out.scales + 3 * at, out.opacities + at});
 }
 

@@ -261,19 +261,17 @@ struct ParameterGradients {
 };
 
 // Takes the gradients of the activated Gaussian back to the stored parameters (log scales and logit if raw)
-// and writes them to `out`. axis_weight and size_weight: the weights of the smallest axis and of the mean
-// axis in the regularisers, summed over the splats.
+// and writes them to `out`. axis_weight: the weight of the smallest axis in the regularisers, summed over the
+// splats.
 template <class T>
 BLITZGS_HD void activate_gaussian_vjp(const ActivatedGaussian<T>& gaussian, bool raw,
-                                      const GaussianGradient<T>& gradient, T axis_weight, T size_weight,
+                                      const GaussianGradient<T>& gradient, T axis_weight,
                                       const ParameterGradients<T>& out) {
   store3(gradient.mean, out.mean);
   Vec3<T> v_scale;
   Columns3<T> v_rotation;
   scaled_axes_vjp(gaussian.rotation, gaussian.scale, gradient.axes, &v_scale, &v_rotation);
   smallest_axis_vjp(gaussian.scale, axis_weight, &v_scale);
-  const T each = size_weight * (T(1) / T(3));
-  v_scale = v_scale + Vec3<T>{each, each, each};
   for (int i = 0; i < 4; ++i) out.quat[i] = T(0);
   rotation_columns_vjp(gaussian.quat, v_rotation, out.quat);
   const Vec3<T>& s = gaussian.scale;

@@ -83,7 +83,7 @@ Projected project(const ProjectInputs<double>& in, const RankTiles& ranks = {}) 
 // A scalar function of the splats, the weighted sum of all their differentiable values and the regularisers.
 struct Weights {
   std::vector<double> means2d, conics, depths, opacities, colors;
-  std::vector<double> scale_reg{0.3, 0.0, -0.2}, opacity_reg{-0.1, 0.4, 0.2}, size_reg{20.0, -10.0, 5.0};
+  std::vector<double> scale_reg{0.3, 0.0, -0.2}, opacity_reg{-0.1, 0.4, 0.2};
 
   explicit Weights(std::int64_t splats) {
     std::mt19937 engine(6);
@@ -109,7 +109,6 @@ struct Weights {
       const double* s = &world.scales[3 * p.gaussian_ids[splat]];
       sum += scale_reg[p.camera_ids[splat]] * std::exp(std::min({s[0], s[1], s[2]}));
       sum += opacity_reg[p.camera_ids[splat]] * sigmoid(world.opacities[p.gaussian_ids[splat]]);
-      sum += size_reg[p.camera_ids[splat]] * (std::exp(s[0]) + std::exp(s[1]) + std::exp(s[2])) / 3;
     }
     return sum;
   }
@@ -208,7 +207,7 @@ TEST_CASE("the backward pass is the derivative of the splats") {
       world.inputs(), SplatIndex{p.camera_ids.data(), p.visible_ids.data(), p.splat_offsets.data(), U},
       SplatGradientColumns<double>{weights.means2d.data(), weights.conics.data(), weights.depths.data(),
                                    weights.opacities.data(), weights.colors.data()},
-      Regularisers<double>{weights.scale_reg.data(), weights.opacity_reg.data(), weights.size_reg.data()},
+      Regularisers<double>{weights.scale_reg.data(), weights.opacity_reg.data()},
       ProjectGradients<double>{v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(),
                                v_sh.data(), v_viewmats.data()},
       workspace, nullptr);

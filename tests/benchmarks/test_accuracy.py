@@ -27,23 +27,19 @@ def errors(scene, name, **changes):
     return bm_accuracy.errors(scene, bm_accuracy.Renderer(scene, replace(option, **changes)))
 
 
-def test_the_default_is_exact_to_float_rounding_and_half_precision_is_not(scene):
+def test_the_default_is_exact_to_float_rounding(scene):
     image_error, gradient_error, cut = errors(scene, "default")
     assert 0 < image_error < 1e-5 and 0 < gradient_error < 1e-4 and cut < 0.05
     assert errors(scene, "exchange")[0] == image_error
-    assert errors(scene, "exchange in half precision")[0] > 30 * image_error
 
 
 @pytest.mark.cuda
 @needs_cuda
 @pytest.mark.parametrize("option", bm_accuracy.options_for("cuda"), ids=lambda option: option.name)
-def test_every_option_but_half_precision_keeps_the_bounds_on_cuda(option):
+def test_every_option_keeps_the_bounds_on_cuda(option):
     scene = aerial(300_000, "cuda", views=option.views, width=1200, height=800)
     image_error, gradient_error, _ = bm_accuracy.errors(scene, bm_accuracy.Renderer(scene, option))
-    if option.half:
-        assert image_error < 5e-3 and gradient_error < 5e-2
-    else:
-        assert image_error <= bm_accuracy.IMAGE_BOUND and gradient_error <= bm_accuracy.GRADIENT_BOUND
+    assert image_error <= bm_accuracy.IMAGE_BOUND and gradient_error <= bm_accuracy.GRADIENT_BOUND
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -59,15 +55,13 @@ def test_the_accuracy_report_is_written_and_bounds_are_required(scene, tmp_path)
     exact = bm_accuracy.Option("float64", dtype=torch.float64)
     figures = bm_accuracy.measure(exact, {1: scene}, repeats=1)
     assert figures.image_error < 1e-12 and figures.milliseconds > 0
-    bm_accuracy.write([figures], "title", tmp_path)
+    bm_accuracy.write([figures], tmp_path)
     assert (tmp_path / "accuracy.md").read_text().splitlines()[-1].startswith("| float64 |")
     assert json.loads((tmp_path / "accuracy.json").read_text()) == [asdict(figures)]
     bm_accuracy.require_bounds(figures)
     figures.gradient_error = 2e-4
     with pytest.raises(SystemExit, match="gradients 2.0e-04 of 1e-04"):
         bm_accuracy.require_bounds(figures)
-    pytest.importorskip("matplotlib")
-    assert (tmp_path / "accuracy.png").stat().st_size > 1000
 
 
 def test_an_interrupted_run_keeps_its_measurements(scene, tmp_path, monkeypatch, capsys):

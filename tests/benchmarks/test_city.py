@@ -128,16 +128,3 @@ def test_phases_divide_the_time_between_records():
     assert [phase["seconds"] for phase in phases] == pytest.approx([4.0, 1.5, 1.5])
     assert [phase["median_images_per_second"] for phase in phases] == pytest.approx([100, 200, 200])
     assert phases[0]["active"] == pytest.approx(0.03) and phases[0]["visible"] == pytest.approx(0.01)
-
-
-def test_costs_compare_runs_of_one_batch_size():
-    def run(recipe, size, rate):
-        phase = {"median_images_per_second": rate}
-        about = {"recipe": recipe, "batch_size": size, "ranks": 1, "finished": True, "psnr": 25.0}
-        return about | {
-            "images_per_second": rate, "phases": [phase] * 5, "population": {"peak_memory_bytes": [1]}
-        }  # fmt: skip
-
-    runs = [run("full", 4, 1000.0), run("full", 8, 2000.0), run("all_off", 4, 1000.0)]
-    (row,) = city_report.cost_rows({"results": runs})
-    assert row["images/s, whole run"] == row["median images/s, after it"] == "1.00 ×"

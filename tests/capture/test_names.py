@@ -10,7 +10,6 @@ import pytest
 
 from blitzgs.capture.capture import MissingImagesError, load_capture
 from blitzgs.capture.names import match_names, unified
-from blitzgs.util.printable import printable
 from tests.capture.helpers import edit_model, smooth_image, write_capture, write_image
 
 E_ACUTE, DECOMPOSED = "\xe9.jpg", unicodedata.normalize("NFD", "\xe9.jpg")
@@ -165,11 +164,6 @@ def test_folders_that_the_caller_names_may_be_anywhere(tmp_path, recwarn):
     (root / "images").rename(tmp_path / "photographs")
     assert len(load_capture(root, images="../photographs", inside_only=True).cameras) == 4
     assert not [str(warning.message) for warning in recwarn.list]
-
-
-def test_printable_text_does_not_steer_a_terminal():
-    assert printable("a\x1b[31m\tb\r\n\x07\udce4.jpg") == "a\\x1b[31m\\tb\\r\n\\x07\\udce4.jpg"
-    assert printable("stra\xdfe \u6f22.jpg") == "stra\xdfe \u6f22.jpg"
 
 
 def test_unified_names():

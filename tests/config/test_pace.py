@@ -13,7 +13,7 @@ from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
 from blitzgs.config.files import ConfigError, from_dict, load_config, save_config, to_dict
 from blitzgs.config.pace import Pace
 from blitzgs.config.schedule import Schedule
-from blitzgs.optim.table_adam import TableAdam
+from blitzgs.optim.table_adam import BETA1, BETA2, EPS, TableAdam
 from tests.training.tiny import random_gaussians
 
 CHANGES = ((40, 0.5), (120, 2.5), (128, 0.01), (131, 3.0))
@@ -37,7 +37,6 @@ def phases_of(schedule, begin):
     """Return all properties of the step that begins with an image, except for events and rates."""
     return (
         schedule.sh_degree(begin, 3),
-        schedule.finest_level(begin, 9, 0.2, 1.5),
         schedule.gathers_statistics(begin),
         schedule.has_lod_gate(begin),
         schedule.has_spawn_gate(begin),
@@ -61,11 +60,10 @@ def test_a_change_of_pace_does_not_change_past_events():
             sh_every=100,
             gate_from=900,
             size_prune_after=400,
-            levels_until=2_000,
             position_decay=2_500,
             evaluate_every=333,
         )
-        optimiser = OptimiserConfig(final_share=0.1)
+        optimiser = OptimiserConfig()
         schedule, happened, phases, step = Schedule(config), [], [], 0
         rates = schedule.learning_rates(optimiser, 2.0)
         while step < schedule.steps:
@@ -82,7 +80,7 @@ def test_a_change_of_pace_does_not_change_past_events():
         assert len(config.pace) > 10
         assert happened == schedule.events(0, schedule.iterations)
         assert phases == [phases_of(schedule, i * batch_size) for i in range(schedule.steps)]
-        assert len(set(phases)) > 10
+        assert len(set(phases)) > 5
         kinds = [event.kind for event in happened]
         assert kinds.count("pass_1") == kinds.count("pass_2") == 1
         # Two events at one image become one; no other event is lost.
@@ -92,7 +90,7 @@ def test_a_change_of_pace_does_not_change_past_events():
 
 def test_rates_follow_the_configurations_own_times():
     config = ScheduleConfig(iterations=1_000, position_decay=500, pace=((100, 0.5), (200, 4.0)))
-    optimiser = OptimiserConfig(final_share=0.2)
+    optimiser = OptimiserConfig()
     schedule = Schedule(config)
     # 100 images are the first 100 of the configuration, 100 more the next 200, and 4 are one of the rest.
     assert schedule.iterations == 200 + 700 * 4
@@ -100,14 +98,14 @@ def test_rates_follow_the_configurations_own_times():
     for image, time in ((0, 0), (60, 60), (100, 100), (150, 200), (200, 300), (600, 400), (2_999, 999.75)):
         fall = (optimiser.position_final / optimiser.position) ** min(time / 500, 1)
         assert table[image + 1, 0] == pytest.approx(2.0 * optimiser.position * fall, rel=1e-6)
-        assert table[image + 1, 3] == pytest.approx(optimiser.opacity * 0.2 ** (time / 1_000), rel=1e-6)
+        assert table[image + 1, 3] == pytest.approx(optimiser.opacity, rel=1e-6)
 
 
 @pytest.mark.parametrize("factor", [0.1, 5.0])
 def test_pending_steps_are_the_same_after_a_change_of_pace(factor):
     """Steps without a gradient on both sides of a change: dense Adam in float64, step by step."""
     before = ScheduleConfig(iterations=200, position_decay=100)
-    config, changed_at, end = OptimiserConfig(final_share=0.01), 60, 70
+    config, changed_at, end = OptimiserConfig(), 60, 70
     after = ScheduleConfig(iterations=200, position_decay=100, pace=((changed_at, factor),))
     table, g = random_gaussians(200), torch.Generator().manual_seed(0)
     for first, second in zip(table.exp_avgs, table.exp_avg_sqs, strict=True):
@@ -122,10 +120,10 @@ def test_pending_steps_are_the_same_after_a_change_of_pace(factor):
     assert not torch.equal(rates[changed_at + 2 : end], old_rates[changed_at + 2 : end])
     for step in range(2, end + 1):
         rows = stand < step
-        first[rows] *= config.beta1
-        second[rows] *= config.beta2
-        corrected = first / (1 - config.beta1**step)
-        root = (second / (1 - config.beta2**step)).sqrt() + config.eps
+        first[rows] *= BETA1
+        second[rows] *= BETA2
+        corrected = first / (1 - BETA1**step)
+        root = (second / (1 - BETA2**step)).sqrt() + EPS
         means[rows] -= (rates[step, 0] * corrected / root)[rows]
     optimiser = TableAdam(config, Schedule(before), 3.0, "cpu")
     # Some rows are caught up in between, the others are not.
@@ -138,9 +136,7 @@ def test_pending_steps_are_the_same_after_a_change_of_pace(factor):
 
 @pytest.mark.parametrize("pace", [(), ((300, 0.1), (700, 4.0))])
 def test_every_phase_begins_at_its_own_time(pace):
-    config = ScheduleConfig(
-        sh_every=100, densify_until=600, gate_from=500, size_prune_after=450, levels_until=1_000, pace=pace
-    )
+    config = ScheduleConfig(sh_every=100, densify_until=600, gate_from=500, size_prune_after=450, pace=pace)
     schedule = Schedule(config)
     plain = Schedule(replace(config, pace=()))
     for time in range(10, 4_000, 10):

@@ -109,9 +109,8 @@ def test_size_pruning_starts_after_its_time():
     assert schedule.prunes_by_size(1_501)
 
 
-@pytest.mark.parametrize("share", [1.0, 0.1])
-def test_learning_rates(share):
-    config = OptimiserConfig(final_share=share)
+def test_learning_rates():
+    config = OptimiserConfig()
     schedule = Schedule(ScheduleConfig(iterations=1_000, batch_size=4, position_decay=500))
     table = schedule.learning_rates(config, extent=2.0).double()
     assert table.shape == (251, 6)
@@ -122,8 +121,7 @@ def test_learning_rates(share):
             (1 - fraction) * math.log(config.position) + fraction * math.log(config.position_final)
         )
         others = [config.rotation, config.scale, config.opacity, config.sh_dc, config.sh_rest]
-        left = share ** ((step - 1) * 4 / 1_000)
-        expected = torch.tensor([position, *[rate * left for rate in others]]).double()
+        expected = torch.tensor([position, *others]).double()
         torch.testing.assert_close(table[step], 2.0 * expected, rtol=1e-6, atol=0.0)
 
 

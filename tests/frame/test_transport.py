@@ -8,15 +8,16 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
+from blitzgs.frame.capacity import CapacityEstimate
+from blitzgs.frame.run import run
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.frame.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport, peer
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT
 from blitzgs.frame.transport.protocol import Traffic
 from blitzgs.frame.transport.way_back import CollectiveWayBack
-from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project_splats
-from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
+from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Sizes
 from blitzgs.ops.scatter import scatter_splats
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.distributed.rank_harness import run_ranks
@@ -74,16 +75,16 @@ def gradients_of(splats, rank):
     ]  # fmt: skip
 
 
-def _round_trip(ranks, half, capacity):
-    inputs = owned_by(scene(dtype=torch.float32 if half else torch.float64), ranks.rank, ranks.world_size)
-    transport = open_transport(ranks, half)
+def _round_trip(ranks, capacity):
+    inputs = owned_by(scene(dtype=torch.float64), ranks.rank, ranks.world_size)
+    transport = open_transport(ranks)
     assignment = TileAssignment(ranks, ranges_for(ranks.world_size))
-    attempt = Attempt(capacity)
-    exchange = transport.project_and_send(inputs, assignment, attempt)
+    exchange = transport.project_and_send(inputs, assignment, capacity)
     got = exchange.arrived.splats
     assert exchange.gradient_table is None
-    projected, splats, visible, traffic, way_back = exchange.finish()
-    assert attempt.fits and list(attempt.needed[:3]) == projected.counts.tolist()
+    needed, result = exchange.finish()
+    projected, splats, visible, traffic, way_back = result
+    assert list(needed[:3]) == projected.counts.tolist()
     assert splats is got and sum(traffic.received) == len(got.ids)
     for _ in range(2):
         way_back.check_still_valid()
@@ -113,7 +114,7 @@ def test_splats_reach_their_tiles_and_gradients_return(world_size, capacity):
     projected = project_splats(whole)
     masks = masks_by_lists(projected, world_size)
     assert masks.unique().numel() > 2
-    answers = run_ranks(_round_trip, world_size, False, capacity)
+    answers = run_ranks(_round_trip, world_size, capacity)
     ids = torch.cat([a[0] for a in answers])
     keys = (whole.ids[projected.gaussian_ids.long()] - 2**40) * CAMERAS + projected.camera_ids
     order, reference = ids.argsort(), keys.argsort()
@@ -144,34 +145,6 @@ def test_splats_reach_their_tiles_and_gradients_return(world_size, capacity):
         assert torch.equal(visible, torch.bincount(projected.camera_ids, minlength=CAMERAS))
 
 
-def test_half_precision_is_close():
-    answers = run_ranks(_round_trip, 2, True, None)
-    projected = project_splats(scene())
-    keys = (scene().ids[projected.gaussian_ids.long()] - 2**40) * CAMERAS + projected.camera_ids
-    place = {int(key): splat for splat, key in enumerate(keys)}
-    for _, gradients, received, *_ in answers:
-        key = (received["ids"] - 2**40) * CAMERAS + received["camera_ids"]
-        at = torch.tensor([place[int(k)] for k in key])
-        assert torch.equal(received["means2d"], projected.means2d[at])
-        assert torch.equal(received["depths"], projected.depths[at])
-        torch.testing.assert_close(received["colors"], projected.colors[at], rtol=1e-3, atol=1e-6)
-        torch.testing.assert_close(received["opacities"], projected.opacities[at], rtol=1e-3, atol=1e-6)
-        scale = (projected.conics[at, 0] * projected.conics[at, 2]).sqrt()[:, None]
-        assert ((received["conics"] - projected.conics[at]).abs() / scale).max() < 4e-3
-        a, b, c = received["conics"].unbind(1)
-        assert (a * c - b * b > 0).all()
-        assert all(g.isfinite().all() for g in gradients)
-    exact = [project_splats(owned_by(scene(), rank, 2)) for rank in range(2)]
-    for rank, (_, gradients, *_) in enumerate(answers):
-        mine, inputs = exact[rank], owned_by(scene(), rank, 2)
-        masks = masks_by_lists(mine, 2)
-        times = ((masks & 1) + (masks >> 1) * 2).float()
-        ids = inputs.ids[mine.gaussian_ids.long()]
-        w = times * ((ids * 2654435761 >> 7) % 1000).float() / 1000
-        torch.testing.assert_close(gradients[0], 2 * w[:, None] * mine.means2d, rtol=2e-2, atol=1e-4)
-        torch.testing.assert_close(gradients[2], 3 * w * mine.opacities**2, rtol=2e-2, atol=1e-4)
-
-
 @pytest.fixture
 def alone(monkeypatch):
     """One rank that writes to its own memory, without a GPU: a function replaces the op that sends."""
@@ -193,7 +166,7 @@ def alone(monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
     monkeypatch.setattr(peer, "current_stream", lambda _: None)
-    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
+    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_", rasterize_into)
     return Ranks(memory=LoneMemory(64 * WORDS_PER_SPLAT))
 
 
@@ -203,13 +176,13 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
     transport = PeerTransport(alone)
 
     def finished():
-        for attempt in transport.capacity.attempts():
-            exchange = transport.project_and_send(inputs, assignment, attempt)
+        def check(exchange):
             arrived, table = exchange.arrived, exchange.gradient_table
             assert arrived.n_isects > 0 and len(arrived.splats.ids) >= len(table)
-            result = exchange.finish()
-            assert (result is None) != attempt.fits
-        return result, attempt.needed
+            return exchange
+
+        result, exchange = run(transport, lambda _: inputs, assignment, check)
+        return result, exchange.finish()[0]
 
     result, needed = finished()
     assert alone.memory.generation == 2  # the first attempt had too small a capacity
@@ -262,15 +235,15 @@ def test_traffic_of_uneven_ranks():
 def test_a_transport_that_does_not_serve_the_job_says_so():
     assignment = TileAssignment(Ranks(), ranges_for(1))
     with pytest.raises(ValueError, match="serves one rank"):
-        LocalTransport().project_and_send(scene(), assignment, Attempt(None))
+        LocalTransport().project_and_send(scene(), assignment, None)
     with pytest.raises(ValueError, match="need an assignment"):
-        CollectiveTransport(Ranks()).project_and_send(scene(), None, Attempt(None))
+        CollectiveTransport(Ranks()).project_and_send(scene(), None, None)
     with pytest.raises(ValueError, match="share no memory"):
         PeerTransport(Ranks())
 
 
 def test_one_rank_needs_no_way_back():
-    result = LocalTransport().project_and_send(scene(), None, Attempt(None)).finish()
+    _, result = LocalTransport().project_and_send(scene(), None, None).finish()
     assert result.way_back is None and result.traffic is None
 
 
@@ -310,5 +283,5 @@ def test_sums_return_to_the_splats_that_were_sent(splats, world_size):
         expected.index_add_(0, which, group)
     ranks = SimpleNamespace(all_to_all=lambda *_: returned)
     traffic = SimpleNamespace(sent=counts, received=counts, own=Sizes(0, splats, 0))
-    way_back = CollectiveWayBack(ranks, traffic, places, half=False)
+    way_back = CollectiveWayBack(ranks, traffic, places)
     assert torch.equal(way_back.return_sums(returned), expected)

@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs import rasterization
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.photometric import photometric_loss
 from blitzgs.reference import render
 from blitzgs.training.trainer import Trainer
-from tests.helpers import needs_cuda
 from tests.training.tiny import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 STATISTICS = ("grad_sum", "grad_count", "max_radii")
@@ -64,7 +62,6 @@ def of_one_view(trainer: Trainer, index: int, sh_degree: int) -> tuple[torch.Ten
         HEIGHT,
         sh_degree=sh_degree,
         near_plane=model.near * extent,
-        eps2d=model.eps2d,
         antialiased=model.antialiased,
     )
     loss = photometric_loss(image.image[None], state.images.get(index)[None], None, state.config.loss.ssim)
@@ -121,70 +118,6 @@ def test_statistics_are_those_of_autograd(tmp_path, batch_size):
     excess = table["max_radii"] - radii  # rounded up to whole pixels
     assert excess.min() > -1e-3 and excess.max() < 1 + 1e-3
     trainer.close()
-
-
-def absolute_of_one_view(trainer: Trainer, index: int, sh_degree: int) -> torch.Tensor:
-    """Return the norm of the sums of absolute gradients (half images) of each Gaussian in a view.
-
-    From the public call in float64, whose sums a test of its own holds against autograd pixel by pixel.
-    """
-    state, table = trainer.state, trainer.state.table
-    views, model = state.views.pick([index]), state.config.model
-    renders, _, meta = rasterization(
-        table["means"].double().requires_grad_(),
-        table["quats"].double(),
-        table["scales"].double().exp(),
-        table["opacities"].double().sigmoid(),
-        table["sh"].double(),
-        views.viewmats.double(),
-        views.Ks.double(),
-        WIDTH,
-        HEIGHT,
-        sh_degree=sh_degree,
-        near_plane=model.near * state.space.extent,
-        eps2d=model.eps2d,
-        rasterize_mode="antialiased",
-        packed=False,
-        absgrad=True,
-    )
-    photometric_loss(renders, state.images.get(index)[None], None, state.config.loss.ssim).sum().backward()
-    return (meta["means2d"].absgrad[0] * torch.tensor([WIDTH / 2, HEIGHT / 2])).norm(dim=1)
-
-
-def test_absolute_gradients_are_summed_pixel_by_pixel(tmp_path):
-    trainer = make_trainer(tmp_path, "population.absolute_gradients=true", "schedule.batch_size=3", *STILL)
-    table, sums, batches = trainer.state.table, 0.0, []
-    get = trainer.loader.get
-    trainer.loader.get = lambda *step: batches.append(get(*step)) or batches[-1]
-    with torch.enable_grad():
-        for step in range(2):
-            take_steps(trainer, 1)
-            degree = trainer.state.schedule.sh_degree(3 * step, 3)
-            sums += sum(absolute_of_one_view(trainer, index, degree) for index in batches[step].indices)
-    error = (table["grad_sum"] - sums).abs() / sums.mean()
-    assert error.median() < 1e-6 and error.quantile(0.9) < 2e-5 and error.max() < 0.02
-    signed = make_trainer(tmp_path / "signed", "schedule.batch_size=3", *STILL)
-    take_steps(signed, 2)
-    seen = sums > 0
-    assert (table["grad_sum"][seen] >= 0.999 * signed.state.table["grad_sum"][seen]).all()
-    assert table["grad_sum"].sum() > 1.2 * signed.state.table["grad_sum"].sum()
-    trainer.close()
-    signed.close()
-
-
-@pytest.mark.cuda
-@needs_cuda
-def test_cuda_sums_the_same_absolute_gradients(tmp_path):
-    sums = []
-    for device in ("cpu", "cuda"):
-        options = ("population.absolute_gradients=true", "schedule.batch_size=3", *STILL)
-        trainer = make_trainer(tmp_path / device, *options, device=device)
-        take_steps(trainer, 2)
-        table = trainer.state.table
-        sums.append(table["grad_sum"][table["id"].argsort()].cpu())
-        trainer.close()
-    error = (sums[0] - sums[1]).abs() / sums[0].mean()
-    assert error.quantile(0.9) < 1e-3 and error.max() < 0.1
 
 
 @pytest.mark.parametrize("batch_size", [2, 4, 8])

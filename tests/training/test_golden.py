@@ -142,7 +142,7 @@ def test_training_repeats_the_golden_curves(golden, tmp_path):
         ("optimiser", "position", 1.1),
         ("optimiser", "scale", 1.1),
         ("loss", "scale", 1.1),
-        ("model", "eps2d", 1.1),
+        ("loss", "ssim", 1.2),
         ("population", "reset_opacity", 1.1),
     ],
 )

@@ -9,14 +9,15 @@ from blitzgs.config.fields import LossConfig
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.population.initialisation import INITIAL_OPACITY
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batch import Batch
-from blitzgs.training.loss import loss_terms, opacity_term, scale_term, size_term, weighted
+from blitzgs.training.loss import loss_terms, opacity_term, scale_term, weighted
 from blitzgs.training.trainer import Trainer
 from tests.helpers import DEVICES, parameter_gradients
 from tests.training.tiny import look_at_origin, random_gaussians, tiny_config, tiny_scene
 
-EXTENT, CONFIG = 1.7, LossConfig(opacity=0.3, scale=0.5, scale_reference=2.0, size=0.7)
+EXTENT, CONFIG = 1.7, LossConfig(opacity=0.3, scale=0.5, scale_reference=2.0)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -39,14 +40,14 @@ def test_regularisers_are_means_over_the_visible_gaussians_of_a_view(device):
         seen = ids_of[views_of == view]
         assert 50 < len(seen) < 300  # so that the views' means differ
         axes = scales[seen].exp() / EXTENT
-        expected.append(torch.stack([axes.amin(1).mean() / 2, opacities[seen].sigmoid().mean(), axes.mean()]))
-    found = scale_term(frame, table, 2 * EXTENT), opacity_term(frame, table), size_term(frame, table, EXTENT)
+        expected.append(torch.stack([axes.amin(1).mean() / 2, opacities[seen].sigmoid().mean()]))
+    found = scale_term(frame, table, 2 * EXTENT), opacity_term(frame, table)
     torch.testing.assert_close(torch.stack(found, 1).double(), torch.stack(expected), rtol=1e-5, atol=0)
 
-    weights = torch.tensor([0.5, 0.3, 0.7], dtype=torch.float64, device=device)
+    weights = torch.tensor([0.5, 0.3], dtype=torch.float64, device=device)
     (torch.stack(expected) @ weights).mean().backward()
     no_images = torch.zeros_like(frame.renders)
-    regularisers = terms.scale_reg, terms.opacity_reg, terms.size_reg
+    regularisers = terms.scale_reg, terms.opacity_reg
     _, _, v_scales, v_opacities, _ = parameter_gradients(table, frame, no_images, *regularisers)
     visible = frame.projected.visible_ids.long()
     for got, want in ((v_scales, scales.grad[visible]), (v_opacities, opacities.grad[visible])):
@@ -55,18 +56,14 @@ def test_regularisers_are_means_over_the_visible_gaussians_of_a_view(device):
 
 def test_the_logged_loss_has_all_terms(tmp_path):
     """In the first step all Gaussians are round and have the same opacity, so the terms are known."""
-    first, fixed = {}, ("log.every=1", "schedule.iterations=8", "model.initial_opacity=0.25", "loss.scale=0")
-    for override in ("loss.opacity=0", "loss.opacity=2", "loss.size=3", "loss.scale=5"):
+    first, fixed = {}, ("log.every=1", "schedule.iterations=8", "loss.scale=0")
+    for override in ("loss.opacity=0", "loss.opacity=2", "loss.scale=5"):
         Trainer(tiny_config(*fixed, override), *tiny_scene(), tmp_path / override, Ranks()).train()
         lines = (tmp_path / override / "log.jsonl").read_text().splitlines()
         first[override] = next(record for record in map(json.loads, lines) if "loss" in record)
     plain = first["loss.opacity=0"]
-    axis, reference = first["loss.scale=5"]["l_scale"], LossConfig().scale_reference
-    for override, term in (
-        ("loss.opacity=2", 2 * 0.25),
-        ("loss.size=3", 3 * axis * reference),
-        ("loss.scale=5", 5 * axis),
-    ):
+    axis = first["loss.scale=5"]["l_scale"]
+    for override, term in (("loss.opacity=2", 2 * INITIAL_OPACITY), ("loss.scale=5", 5 * axis)):
         assert first[override]["loss"] - plain["loss"] == pytest.approx(term, rel=1e-4)
 
 
@@ -74,7 +71,7 @@ def test_the_logged_loss_has_all_terms(tmp_path):
     ("views", "opacity"), [(1, 0.05), (22, 0.05), (50, 0.022), (110, 0.01), (5_000, 0.005)]
 )
 def test_the_opacity_term_follows_the_number_of_views_within_what_was_measured(views, opacity):
-    found = weighted(LossConfig(opacity_total=1.1, size=0.7), views)
-    assert found.opacity == pytest.approx(opacity) and found.opacity_total == 0 and found.size == 0.7
+    found = weighted(LossConfig(opacity_total=1.1, scale=0.7), views)
+    assert found.opacity == pytest.approx(opacity) and found.opacity_total == 0 and found.scale == 0.7
     assert weighted(found, views + 1) == found  # a resumed run keeps its weight
     assert weighted(CONFIG, views) == CONFIG

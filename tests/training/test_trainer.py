@@ -10,7 +10,8 @@ from blitzgs.config.files import ConfigError
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.guard import NonFiniteError
-from blitzgs.training.trainer import Trainer, small_batch_hint
+from blitzgs.training.hints import small_batch_hint
+from blitzgs.training.trainer import Trainer
 from tests.helpers import DEVICES, needs_cuda
 from tests.training.tiny import tiny_config, tiny_scene
 from tests.training.tiny_runs import assert_same_table, events_of, steps_of, stop_at, train
@@ -126,7 +127,7 @@ def test_a_world_scaled_by_a_power_of_two_trains_to_the_same_bits(whole_run, tmp
     assert summary["psnr"] == expected["psnr"]
 
 
-def test_batches_masks_background_and_sparse_adam(tmp_path):
+def test_batches_masks_and_background(tmp_path):
     capture, images = tiny_scene()
     images.masks = [torch.ones(32, 48, dtype=torch.uint8) for _ in images.images]
     for image, mask in zip(images.images, images.masks, strict=True):
@@ -137,7 +138,6 @@ def test_batches_masks_background_and_sparse_adam(tmp_path):
         "schedule.batch_size=4",
         "schedule.iterations=120",
         "model.background=[0.2, 0.2, 0.2]",
-        "optimiser.sparse=true",
         "population.max_gaussians=420",
     )
     trainer = Trainer(config, capture, images, tmp_path, Ranks())

@@ -26,7 +26,7 @@ from blitzgs.training.trainer import Trainer
 from blitzgs.view.gate import centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training import tiny_runs
-from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene, write_tiny_capture
 from tests.training.tiny_runs import assert_same_table, events_of, steps_of, stop_at
 
 # The passes follow the density event at 40 and come at 70; the window ends at 60; the mask is cleared at 85.
@@ -167,7 +167,7 @@ def test_a_run_on_two_ranks_opens_the_gate_and_clears_the_mask(whole_run, tmp_pa
 
 def test_render_honours_the_gate(tmp_path):
     write_tiny_capture(tmp_path / "capture")
-    out, flags = tmp_path / "run", [f"--{flag}" for flag in ("config=defaults", *OVERRIDES, *FLAGS)]
+    out, flags = tmp_path / "run", as_flags("config=defaults", *OVERRIDES, *FLAGS)
     data = ["--data", str(tmp_path / "capture"), "--out", str(out)]
     assert main(["train", *data, "--schedule.scale=0.8", *flags]) == 0
     arguments = ["--out", str(tmp_path / "images"), "--raw", "--device", "cpu"]
@@ -282,36 +282,6 @@ def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path, monkeypat
     assert any(text.endswith(" finest 1 smooth") for text in read_ply(path).comments)
     with pytest.raises(ConfigError, match="view.smooth: needs view.lod=true"):
         tiny_config("view.smooth=true")
-
-
-def test_levels_are_unlocked_as_octree_gs_does():
-    """Its intervals: a geometric series that ends at `levels_until`."""
-    config = ScheduleConfig(iterations=2000, densify_until=1000, scale=2.0)
-    schedule, count, ratio = Schedule(config), 8, 1.5
-    first, waits = count // 2, count - 1 - count // 2
-    wait = 2000 * (1 - 1 / ratio) / (1 - ratio**-waits)
-    times = [sum(wait / ratio**k for k in range(n + 1)) for n in range(waits)]
-    assert times[-1] == pytest.approx(2000)
-    for n, time in enumerate(times):
-        assert schedule.finest_level(round(time - 2), count, 0.5, ratio) == first + n
-        assert schedule.finest_level(round(time + 2), count, 0.5, ratio) == first + n + 1
-    assert schedule.finest_level(0, count, 0.0, ratio) == 0
-    assert [schedule.finest_level(t, 1, 0.5, ratio) for t in (0, 5000)] == [0, 0]
-    assert [schedule.finest_level(t, 2, 0.5, ratio) for t in (0, 5000)] == [1, 1]
-    assert not schedule.has_lod_gate(1999) and schedule.has_lod_gate(2000)
-    late = Schedule(ScheduleConfig(iterations=2000, densify_until=1000, levels_until=1500))
-    assert late.finest_level(1499, count, 0.5, ratio) == 6 and late.finest_level(1500, count, 0.5, ratio) == 7
-
-
-def test_the_gate_follows_levels_that_come_later(tmp_path):
-    trainer, _ = train(
-        tmp_path, "schedule.levels_until=90", "view.first_levels=0", "lod.fork=1.3", "schedule.t2=65",
-        "view.cull=false",
-    )  # fmt: skip
-    levels = [record["finest_level"] for record in events_of(tmp_path, "lod_gate")]
-    count = trainer.state.progress.level_count
-    assert levels == sorted(levels) and levels[-1] == count - 1 and len(set(levels)) >= 2
-    assert CULL not in trainer.state.table
 
 
 def test_the_mask_is_cleared_halfway_after_the_last_pass():

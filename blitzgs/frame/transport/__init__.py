@@ -34,16 +34,14 @@ __all__ = [
 ]
 
 
-def open_transport(ranks: Ranks, half: bool = False) -> Transport:
+def open_transport(ranks: Ranks) -> Transport:
     """Return the fastest transport of a job.
 
     Args:
         ranks: the job; the transport is valid until it ends.
-        half: send splats in half precision, which only the collective transport can; see
-            `collective.HalfCodec`.
     """
     if ranks.world_size == 1:
         return LocalTransport()
-    if ranks.memory is None or half:
-        return CollectiveTransport(ranks, half)
+    if ranks.memory is None:
+        return CollectiveTransport(ranks)
     return PeerTransport(ranks)

@@ -16,7 +16,7 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import SharedMemory
 from blitzgs.frame.transport.protocol import Traffic
-from blitzgs.ops.scatter import RUN, as_column, words_of
+from blitzgs.ops.scatter import RUN
 from blitzgs.ops.splat_gradients import SplatGradients
 
 
@@ -27,13 +27,11 @@ class CollectiveWayBack(NamedTuple):
         ranks: the job.
         traffic: numbers of splats sent between the ranks.
         places: positions of this rank's own splats among those that it sent, from `scatter_splats`.
-        half: whether gradients are sent in bfloat16.
     """
 
     ranks: Ranks
     traffic: Traffic
     places: Tensor
-    half: bool
 
     def check_still_valid(self) -> None:
         """Do nothing, because a frame does not overwrite the data of an earlier one."""
@@ -44,13 +42,7 @@ class CollectiveWayBack(NamedTuple):
     def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
         """See `WayBack.return_gradients`."""
         columns, traffic = gradients.side_by_side(), self.traffic
-        if self.half:
-            # Gradients span too many magnitudes for float16.
-            halves = columns.bfloat16()
-            words = self.ranks.all_to_all(words_of(halves), traffic.received, traffic.sent)
-            returned = as_column(words, halves).to(columns.dtype)
-        else:
-            returned = self.ranks.all_to_all(columns, traffic.received, traffic.sent)
+        returned = self.ranks.all_to_all(columns, traffic.received, traffic.sent)
         return gradients.sum_returned(returned, self.places, traffic.sent, traffic.own.splats)
 
     def return_sums(self, sums: Tensor) -> Tensor:

@@ -13,10 +13,8 @@ from blitzgs.population.density import STATISTICS, DensityReport, DensityRules, 
 from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit
 from blitzgs.population.redistribution import redistribute
 from blitzgs.population.relocation import relocate
-from blitzgs.population.scale_floor import FLOOR, scale_floors
 from blitzgs.runs.guard import ModelLostError, check_table
 from blitzgs.training.state import TrainingState
-from blitzgs.view.views import near_plane
 
 
 def run(state: TrainingState, event: Event) -> None:
@@ -40,13 +38,9 @@ def run(state: TrainingState, event: Event) -> None:
             "and points belong together, or prune less (population.min_opacity, prune_screen_radius, "
             "prune_world_scale; schedule.size_prune_after)"
         )
-    if state.signals is not None:
-        state.signals.densified(counts)
     if redistribute(state.table, state.ranks, state.config.ranks.max_imbalance):
         counts["redistributed"] = 1
         state.sort()
-    if state.config.model.scale_floor > 0 and _finds_floors(state, event.time):
-        find_floors(state)
     state.stepper.reindex()
     peak = max(state.progress.peak_gaussians, counts["gaussians"])
     state.progress = dataclasses.replace(state.progress, peak_gaussians=peak)
@@ -115,22 +109,6 @@ def change_population(state: TrainingState, time: int, rules: DensityRules) -> D
     return dataclasses.replace(report, cloned=report.cloned + moved.cloned, relocated=moved.relocated)
 
 
-def find_floors(state: TrainingState) -> None:
-    """Compute the smallest allowed scale of each Gaussian (`model.scale_floor`)."""
-    views = (state.views.pick([index]) for index in state.capture.train)
-    near = near_plane(state.config, state.space)
-    state.table[FLOOR] = scale_floors(state.table["means"], views, near, state.config.model.scale_floor)
-
-
-def _finds_floors(state: TrainingState, time: int) -> bool:
-    """Tell whether a density event recomputes the floors of scales: the first does, and then every tenth."""
-    if FLOOR not in state.table:
-        return True  # the times of a much compressed schedule are too coarse to number its events
-    schedule, unscaled = state.config.schedule, state.schedule.pace.time(time)
-    count = round((unscaled - schedule.densify_from) / schedule.densify_every)
-    return count % 10 == 0
-
-
 def training_pixels(state: TrainingState) -> int:
     """Count the pixels of all training photographs."""
     cameras = state.capture.cameras
@@ -141,9 +119,8 @@ def density_rules(state: TrainingState, time: int, limit: GrowthLimit | None) ->
     """Return the rules of a density event at `time`, with lengths in the unit of the means."""
     population, extent = state.config.population, state.space.extent
     by_size = state.schedule.prunes_by_size(time)
-    absolute, threshold = population.absolute_threshold, population.grad_threshold
     return DensityRules(
-        grad_threshold=absolute if population.absolute_gradients else threshold,
+        grad_threshold=population.grad_threshold,
         clone_scale=population.clone_scale * extent,
         min_opacity=population.min_opacity,
         max_screen_radius=(population.prune_screen_radius or None) if by_size else None,
