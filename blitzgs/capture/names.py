@@ -8,6 +8,7 @@ photographs may have been converted or moved since. A file is taken only if it i
 from __future__ import annotations
 
 import os
+import re
 import stat
 import unicodedata
 import warnings
@@ -16,6 +17,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".avif", ".jp2", ".gif")
+# Folders of what belongs to photographs and has their names, but shows something else.
+_BY_PRODUCT = re.compile(r"(?i)(^|/)(depth|normal|disp|mask|alpha|segmentation|semantic)[^/]*/")
 # Of folders in each other.
 _DEEPEST = 8
 
@@ -80,7 +83,10 @@ def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dic
         new = {
             claimed[0]: files[place][0]
             for place, claimed in claims.items()
-            if len(claimed) == 1 and len(files.get(place, ())) == 1 and (folder / files[place][0]).is_file()
+            if _is_alike(claimed[0], files.get(place, [""])[0])
+            and len(claimed) == 1
+            and len(files.get(place, ())) == 1
+            and (folder / files[place][0]).is_file()
         }
         if not new:
             continue
@@ -93,6 +99,10 @@ def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dic
         if not wanted:
             break
     return matches
+
+
+def _is_alike(name: str, file: str) -> bool:
+    return bool(_BY_PRODUCT.search(unified(name))) == bool(_BY_PRODUCT.search(file))
 
 
 def _say(new: dict[str, str], count: int, folder: Path, ignored: str) -> None:

@@ -147,7 +147,7 @@ def _applied(file: Path, content: Mapping[str, Any]) -> Float64 | None:
 def _found(root: Path, names: Sequence[str]) -> dict[str, Path]:
     """Return the file of each name, also if it is written in another notation (`names.match_names`)."""
     paths = {
-        name: next((p for s in _SUFFIXES if (p := root / (name + s)).is_file()), root / name)
+        name: next((p for s in _SUFFIXES if (p := root / (name + s)).is_file()), root / _name(name))
         for name in names
     }
     there = [

@@ -144,8 +144,8 @@ class Trainer:
             self._stop(f"saved after {state.images_seen:,} images, before a photograph that cannot be read")
             what = "mask" if "the mask " in str(error) else "photograph"
             raise PhotographError(
-                f"{error}. The model so far is saved: put the {what} back and continue with --resume, or leave "
-                "damaged ones out with --data.allow_missing=true"
+                f"{error}. The model so far is saved: put the {what} back and continue with --resume, or "
+                "leave damaged ones out with --data.allow_missing=true"
             ) from error
         finally:
             state.stops = never

@@ -35,6 +35,8 @@ NOTATIONS = [
     ({"a.jpg": None}, ["b.jpg"], ["a.png"]),
     ({"a.jpg": None}, ["a.png"], []),
     ({"a.jpg": None}, [], ["b.jpg"]),
+    ({"images/a.png": None}, [], ["masks/a.png"]),
+    ({"images/a.png": None}, [], ["depths/a.png"]),
 ]
 
 
