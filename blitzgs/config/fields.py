@@ -32,7 +32,8 @@ class DataConfig:
             cuts it off, "mask" masks it.
         exif: "auto" turns an image by its EXIF tag if only the turned image fits its camera; "apply" always
             turns it, "ignore" never.
-        allow_missing: drop views whose image is missing instead of failing.
+        allow_missing: drop views whose image is missing or damaged instead of failing.
+        inside_only: refuse captures with names that lead outside their folder.
         sparse: which of several COLMAP models (sparse/0, sparse/1, ...) is read: the "largest", "all" of
             them, which must have the same world coordinates, or a folder inside the capture.
         stray_cameras: "drop" leaves out cameras that lie far apart from all others and hardly show a point,
@@ -53,6 +54,7 @@ class DataConfig:
     undistort: str = "crop"
     exif: str = "auto"
     allow_missing: bool = False
+    inside_only: bool = False
     sparse: str = "largest"
     stray_cameras: str = "drop"
     cache_bytes: int = 8_000_000_000
