@@ -10,9 +10,7 @@ The loop, learning rates and density strategy are those of gsplat's `simple_trai
 - gsplat: `gsplat.rasterization`, `torch.optim.Adam(fused=True)`, and L1 and SSIM by fused_ssim, or by our
   kernel where fused_ssim is not installed (the column "loss" says which);
 - import: the same with `blitzgs.rasterization` in place of gsplat's function;
-- four: `blitzgs.raw_rasterization`, `blitzgs.optim.LazyAdam`, `blitzgs.l1_ssim` and Morton order, with
-  gradients that go straight to the optimisers (`direct_grad=True`);
-- four_grad (only if it is named): the same with gradients in `.grad`.
+- four: `blitzgs.raw_rasterization`, `blitzgs.optim.LazyAdam`, `blitzgs.l1_ssim` and Morton order.
 
 Times are of the whole training, of the two steps around each time at which the strategy may change the
 population, and of the steps between two such times at the end; PSNR is the mean over held-out views.
@@ -42,7 +40,7 @@ from torch import Tensor
 import blitzgs
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.images import ImageStore
-from blitzgs.optim import LazyAdam, step_together
+from blitzgs.optim import LazyAdam
 
 
 class OneImport(GsplatTrainer):
@@ -108,14 +106,9 @@ SORT_EVERY = 5
 
 
 class FourSwaps(OneImport):
-    """The loop with our renderer of raw parameters, optimiser and loss, and rows in Morton order.
-
-    Attributes:
-        direct_grad: of the renderer.
-    """
+    """The loop with our renderer of raw parameters, optimiser and loss, and rows in Morton order."""
 
     loss_name = "blitzgs.l1_ssim"
-    direct_grad = True
 
     def initialise(self, capture: Any) -> Any:
         """Make the parameters and a `LazyAdam` for each."""
@@ -136,13 +129,8 @@ class FourSwaps(OneImport):
         image, _, info = blitzgs.raw_rasterization(
             p["means"], p["quats"], p["scales"], p["opacities"], p["sh0"], p["shN"], views.viewmats, views.Ks,
             views.width, views.height, sh_degree=self.sh_degree, optimizers=self._optimisers,
-            direct_grad=self.direct_grad,
         )  # fmt: skip
         return image, info
-
-    def move(self) -> None:
-        """Take the optimisers' step in two calls of the op."""
-        step_together(self._optimisers, set_to_none=True)
 
     def change_population(self, info: Any) -> None:
         """Bring all rows up to date before the strategy reads them; now and then sort them afterwards."""
@@ -150,7 +138,7 @@ class FourSwaps(OneImport):
         refines = self.step < strategy.refine_stop_iter and self.step % strategy.refine_every == 0
         if refines:  # the strategy then reads and replaces parameters and their state
             for optimiser in self._optimisers.values():
-                optimiser.bring_up_to_date()
+                optimiser.catch_up()
         super().change_population(info)
         if refines and self.step % (SORT_EVERY * strategy.refine_every) == 0:
             order = blitzgs.morton_order(self.params["means"].detach())
@@ -159,12 +147,6 @@ class FourSwaps(OneImport):
             for key, value in self._state.items():
                 if isinstance(value, Tensor) and len(value) == len(order):
                     self._state[key] = value[order]
-
-
-class FourGrad(FourSwaps):
-    """The same with gradients in `.grad`."""
-
-    direct_grad = False
 
 
 class Gsplat(OneImport):
@@ -178,7 +160,7 @@ class Gsplat(OneImport):
         super().__init__(*arguments)
 
 
-ARMS = {"gsplat": Gsplat, "import": OneImport, "four": FourSwaps, "four_grad": FourGrad}
+ARMS = {"gsplat": Gsplat, "import": OneImport, "four": FourSwaps}
 
 
 def seconds_of(trainer: GsplatTrainer, until: int) -> float:

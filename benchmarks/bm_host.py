@@ -8,10 +8,10 @@ thread. The first table has `blitzgs.rasterization`, forward and backward. On th
 includes the kernels. On CUDA each pass ends with a synchronisation, so a figure is the longer of host and
 device. Each figure is a median over repeats.
 
-The second table has the steps of a trainer made of `raw_rasterization`, `l1_ssim` and `LazyAdam`
-(`step_together`), by part, without synchronisations, with gradients in `.grad` and with `direct_grad=True`;
-each figure is a mean over repeats. It also says how many of torch's operations a step takes. To compare with
-another version of the package, put its folder into PYTHONPATH.
+The second table has the steps of a trainer made of `raw_rasterization`, `l1_ssim` and a `LazyAdam` for each
+parameter, or one for all, by part, without synchronisations; each figure is a mean over repeats. It also
+says how many of torch's operations a step takes. To compare with another version of the package, put its
+folder into PYTHONPATH.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from scenes import aerial
 from step_parts import Parts, trace
 
 from blitzgs import l1_ssim, rasterization, raw_rasterization
-from blitzgs.optim import LazyAdam, step_together
+from blitzgs.optim import LazyAdam
 
 GAUSSIANS, WIDTH, HEIGHT = 50, 32, 32
 CALLS: dict[str, dict[str, Any]] = {
@@ -80,9 +80,8 @@ class Trainer:
         part: times the parts of a step.
     """
 
-    def __init__(self, device: str, direct_grad: bool = False) -> None:
-        """Take the Gaussians and the view of the benchmark's scene; `direct_grad`: of the renderer."""
-        self._direct_grad = direct_grad
+    def __init__(self, device: str, in_one: bool = False) -> None:
+        """Take the Gaussians and the view of the benchmark's scene; `in_one`: one optimiser for all."""
         self._scene = scene = aerial(GAUSSIANS, device, width=WIDTH, height=HEIGHT)
         values = {
             "means": scene.means, "quats": scene.quats, "scales": scene.scales.log(),
@@ -91,9 +90,8 @@ class Trainer:
         self.params = {
             name: torch.nn.Parameter(value.detach().clone().contiguous()) for name, value in values.items()
         }
-        self._optimizers = {
-            name: LazyAdam([{"params": [param], "name": name}]) for name, param in self.params.items()
-        }
+        groups = [{"params": [param], "name": name} for name, param in self.params.items()]
+        self._optimizers = [LazyAdam(groups)] if in_one else [LazyAdam([group]) for group in groups]
         self._target = torch.full((1, HEIGHT, WIDTH, 3), 0.5, device=device)
         self.part = Parts(torch.device(device))
 
@@ -103,19 +101,21 @@ class Trainer:
         with self.part("render"):
             image, _, _ = raw_rasterization(
                 *self.params.values(), scene.viewmats, scene.Ks, WIDTH, HEIGHT, sh_degree=1,
-                optimizers=self._optimizers, direct_grad=self._direct_grad,
+                optimizers=self._optimizers,
             )  # fmt: skip
         with self.part("loss"):
             loss = l1_ssim(image, self._target)
         with self.part("backward"):
             loss.backward()
         with self.part("optimisers"):
-            step_together(self._optimizers, set_to_none=True)
+            for optimizer in self._optimizers:
+                optimizer.step()
+                optimizer.zero_grad()
 
 
-def measure_trainer(device: str, repeats: int, direct_grad: bool) -> dict[str, float]:
+def measure_trainer(device: str, repeats: int, in_one: bool) -> dict[str, float]:
     """Return the host's microseconds for each part of a trainer's step, and the operations of a step."""
-    trainer, counted = Trainer(device, direct_grad), 5
+    trainer, counted = Trainer(device, in_one), 5
 
     def steps(count: int) -> None:
         for _ in range(count):
@@ -139,10 +139,10 @@ def main() -> None:
             rows.append({"call": name, "forward us": forward, "backward us": backward,
                          "total us": forward + backward})  # fmt: skip
         report("Host time of a call", rows, None, args.device)
-        plain, direct = (measure_trainer(args.device, args.repeats, direct) for direct in (False, True))
+        apart, in_one = (measure_trainer(args.device, args.repeats, in_one) for in_one in (False, True))
     steps = [
-        {"part": part, "host us": figure, "direct_grad, host us": direct[part]}
-        for part, figure in plain.items()
+        {"part": part, "host us": figure, "one optimiser, host us": in_one[part]}
+        for part, figure in apart.items()
     ]
     report("Host time of a trainer's step", steps, None, args.device)
     if args.json:

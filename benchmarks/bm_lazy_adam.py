@@ -33,9 +33,7 @@ class State:
         self.last_step = torch.empty(n, dtype=torch.int32, device=device)
         self.moment_step = torch.empty_like(self.last_step)
         lr_table = torch.full((30_001, 6), 1e-6, device=device)
-        self.dense, self.sparse = (
-            AdamSchedule(lr_table, BETA1, BETA2, EPS, sparse) for sparse in (False, True)
-        )
+        self.schedule = AdamSchedule(lr_table, BETA1, BETA2, EPS)
 
     def state(self) -> AdamState:
         """Return parameters, moments and the steps that they stand at."""
@@ -43,11 +41,11 @@ class State:
 
     def catch_up(self, ids: Tensor) -> None:
         """Bring rows to the step before `STEP`."""
-        lazy_adam_catch_up_(self.state(), self.dense, STEP - 1, ids)
+        lazy_adam_catch_up_(self.state(), self.schedule, STEP - 1, ids)
 
-    def step(self, ids: Tensor, grads: list[Tensor], sparse: bool) -> None:
+    def step(self, ids: Tensor, grads: list[Tensor]) -> None:
         """Take step `STEP`."""
-        lazy_adam_step_(self.state(), self.sparse if sparse else self.dense, STEP, grads, ids)
+        lazy_adam_step_(self.state(), self.schedule, STEP, grads, ids)
 
     def time(self, work: Callable[[], None], gaps: Tensor, repeats: int) -> float:
         """Return the median ms of `work` on rows that are `gaps` steps behind `STEP` - 1."""
@@ -93,9 +91,8 @@ def main() -> None:
         grads = [1e-6 * torch.randn((len(ids), *p.shape[1:]), device=device) for p in state.params]
         for label, work, gaps, touched in (
             # The step reads gradients, and reads and writes parameters and moments.
-            ("step, up to date", partial(state.step, ids, grads, False), none, 7),
-            ("step, 1..39 steps behind", partial(state.step, ids, grads, False), some, 7),
-            ("step, sparse variant", partial(state.step, ids, grads, True), none, 7),
+            ("step, up to date", partial(state.step, ids, grads), none, 7),
+            ("step, 1..39 steps behind", partial(state.step, ids, grads), some, 7),
             # Catching up reads parameters and moments, and writes parameters.
             ("catch-up, 1..39 steps behind", partial(state.catch_up, ids), some, 4),
         ):

@@ -59,7 +59,7 @@ class Model:
         height, width = view["image"].shape[1:3]
         image, _, meta = blitzgs.raw_rasterization(
             *self.params.values(), view["pose"], view["K"], width, height, sh_degree=degree,
-            optimizers=self.optimizer, direct_grad=True,
+            optimizers=self.optimizer,
         )  # fmt: skip
         return image, meta
 

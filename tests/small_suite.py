@@ -49,10 +49,9 @@ TESTS = [
         "splats_arrive_and_their_gradients_are_found",
         "a_barrier_exchanges_values_when_all_ranks_have_arrived", "copies_to_the_host_need_pinned_memory",
     )),
-    # Rows, coefficients, degree, views, sparse.
+    # Rows, coefficients, degree, views.
     *(f"{OPS}project_step.py::test_equals_backward_and_step[{case}-cuda]" for case in (
-        "1007-16-3-3-False", "1007-16-2-1-True", "1007-16-1-2-False", "333-16-0-1-False", "333-4-1-2-False",
-        "333-25-3-1-False",
+        "1007-16-3-3", "1007-16-2-1", "1007-16-1-2", "333-16-0-1", "333-4-1-2", "333-25-3-1",
     )),
     # Rows, coefficients, degree, views.
     *(f"{OPS}project_step.py::test_gradients_are_read_from_the_tables_of_several_ranks[{case}]" for case in (
@@ -82,8 +81,8 @@ TESTS = [
         "tree_sums.py::test_sums_equal_a_walk_down_each_tree[700-cuda]",
         "view_sums.py::test_equals_dense_sums[density-cuda]",
         "report_op.py::test_each_target_gets_this_ranks_share[3000-cuda]",
-        "residence_ops.py::test_swapped_blocks_have_the_right_contents[cuda]",
-        "residence_ops.py::test_views_have_sizes_of_their_own[cuda]",
+        "pool_ops.py::test_swapped_blocks_have_the_right_contents[cuda]",
+        "pool_ops.py::test_views_have_sizes_of_their_own[cuda]",
         "project.py::test_dense_gradients_equal_scattered_compact_ones[2-9-cuda-float32]",
         "take_rows.py::test_bits_and_unaligned_columns[cuda]",
         "arrange_splats.py::test_columns_are_at_their_places_and_come_back[700-False-cuda]",

@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
 import torch
@@ -17,22 +15,17 @@ from blitzgs.call.arguments import (
     MAX_SH_DEGREE,
     RAW_DEFAULTS,
     Gaussians,
-    Scene,
     background_rows,
     check_further,
     check_options,
     check_tensors,
     gaussians_of,
-    warn_of_intrinsics,
 )
-from blitzgs.call.groups import Group, groups_of
+from blitzgs.call.groups import gathered_groups, groups_of
 from blitzgs.call.images import ImageOptions, may_queue, render
-from blitzgs.call.lazy_dict import LazyDict
-from blitzgs.ops.gather_rows import gather_rows, split_rows
-from blitzgs.ops.project import project_splats
+from blitzgs.call.intrinsics import check_intrinsics
+from blitzgs.call.queued import ShTables
 from blitzgs.ops.projection_types import ProjectionOptions
-from blitzgs.ops.render import ShTables
-from blitzgs.ops.sparse_rows import HandOver, full_gradients
 
 
 class CatchesUp(Protocol):
@@ -45,16 +38,6 @@ class CatchesUp(Protocol):
         count: Tensor | None = None,
     ) -> None:
         """Apply the pending steps of rows of parameters, see `blitzgs.optim.LazyAdam.catch_up`."""
-
-
-class TakesGradients(CatchesUp, Protocol):
-    """An optimiser that takes gradients of its parameters from the backward pass, such as `LazyAdam`."""
-
-    def param_ids(self) -> set[int]:
-        """Return the `id` of every parameter."""
-
-    def receive(self, rows: Tensor, gradients: Mapping[Tensor, Tensor]) -> None:
-        """Take gradients, see `blitzgs.optim.LazyAdam.receive`."""
 
 
 def raw_rasterization(
@@ -80,7 +63,6 @@ def raw_rasterization(
     absgrad: bool = False,
     rasterize_mode: str = "classic",
     optimizers: CatchesUp | Iterable[Any] | Mapping[str, Any] = (),
-    direct_grad: bool = False,
     **further: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render Gaussians from the parameters that gsplat's trainer learns, before their activation.
@@ -98,7 +80,8 @@ def raw_rasterization(
         sh0: [N, 1, 3], the first SH coefficient; or all of them, [N, K, 3], with shN None.
         shN: [N, K - 1, 3], the other SH coefficients.
         viewmats: [C, 4, 4] world to camera, a rotation and a translation.
-        Ks: [C, 3, 3] intrinsics in px, without skew. They get no gradient.
+        Ks: [C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1, which is
+            checked on the CPU. They get no gradient.
         width: image width in px.
         height: image height in px.
         near_plane: Gaussians have z > near_plane, world units; less than far_plane.
@@ -116,12 +99,6 @@ def raw_rasterization(
         optimizers: the parameters' optimisers: one, a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
             among them catches up the rows that this call reads: the geometry of all Gaussians, and the SH of
             the visible ones.
-        direct_grad: whether the backward pass hands the parameters' gradients to `optimizers`, in less time
-            than autograd needs for sparse tensors. The optimisers then do what they do with `.grad`, but
-            `.grad` of the parameters stays None: hooks on parameters, gradient clipping and `GradScaler` do
-            not see the gradients, `torch.autograd.grad` does not return them, and `p.grad = None` does not
-            remove them (`zero_grad` of the optimisers does). It needs `sparse_grad`, and a `LazyAdam` for
-            each parameter that requires a gradient.
         further: gsplat's other arguments; only those values are accepted that do not change the result
             (`packed=True`, `distributed=False`, `camera_model="pinhole"`, `covars=None`, ...).
 
@@ -135,8 +112,7 @@ def raw_rasterization(
         TypeError: an argument is not a tensor, or not the kind of number it should be, or gsplat has no such
             argument; or the tensors are neither float32 nor float64.
         ValueError: an argument is not supported, has a wrong shape or value, or another dtype or device than
-            the others; a parameter is not a leaf, but would get a sparse gradient; or `direct_grad` is not
-            possible. The message names it.
+            the others; or a parameter is not a leaf, but would get a sparse gradient. The message names it.
         RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
     """
     check_further("raw_rasterization", further, RAW_DEFAULTS)
@@ -147,7 +123,7 @@ def raw_rasterization(
     )  # fmt: skip
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {"shN": shN, "backgrounds": backgrounds})
-    warn_of_intrinsics("raw_rasterization", Ks)
+    check_intrinsics("raw_rasterization", Ks)
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     harmonics = [sh0] if shN is None else [sh0, shN]
@@ -165,9 +141,6 @@ def raw_rasterization(
     lazy = _lazy(optimizers)
     for optimizer in lazy:
         optimizer.catch_up(geometry)
-    hand_over = None
-    if direct_grad and torch.is_grad_enabled():
-        hand_over = _hand_over(lazy, (*geometry, *(harmonics if shaded else ())), sparse_grad)
     given = {**tensors, "viewmats": viewmats, "Ks": Ks, "shN": shN}
     if not shaded:
         del given["sh0"], given["shN"]
@@ -183,40 +156,12 @@ def raw_rasterization(
             optimizer.catch_up(harmonics, rows, count)
 
     groups = groups_of(gaussians, project)
-    tables = ShTables(harmonics if shaded else (), catch_up_sh, hand_over)
+    tables = ShTables(harmonics if shaded else (), catch_up_sh)
     if may_queue(groups):
         return render("raw_rasterization", gaussians, project, image, tables=tables, groups=groups)
-    # Several groups, no Gaussians, or another tile size.
-    ids, visible = _gather_visible(gaussians, groups, tables, sparse_grad)
-    renders, alphas, meta = render("raw_rasterization", visible, project, image._replace(sparse_grad=False))
-    assert isinstance(meta, LazyDict)
-    meta.change("gaussian_ids", lambda index_in_visible: ids.long()[index_in_visible])
-    return renders, alphas, meta
-
-
-def _gather_visible(
-    gaussians: Gaussians, groups: Sequence[Group], tables: ShTables, sparse_grad: bool
-) -> tuple[Tensor, Gaussians]:
-    """Return the Gaussians that a view of any group sees, int32 [U], and these Gaussians alone.
-
-    Args:
-        gaussians: all Gaussians, one scene.
-        groups: `groups_of` the Gaussians.
-        tables: the SH.
-        sparse_grad: whether the gradients of the parameters are sparse.
-    """
-    ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
-    tables.before(ids, None)
-    (scene,) = gaussians.scenes
-    read = (scene.means, scene.quats, scene.scales, scene.opacities, *tables.parts)
-    hand_over, ticket = tables.hand_over, None
-    if hand_over is not None:
-        read, ticket = tuple(table.detach() for table in read), hand_over.ticket
-    means, quats, scales, opacities, sh = _Visible.apply(  # type: ignore[no-untyped-call]
-        ids, sparse_grad, hand_over, ticket, *read
-    )
-    scene = Scene(means, quats, scales, opacities, sh, scene.viewmats, scene.Ks)
-    return ids, replace(gaussians, scenes=(scene,), colors=sh, opacities=opacities)
+    # Several groups, no Gaussians, or another tile size: gather the Gaussians that any group sees.
+    groups = gathered_groups(groups, tables)
+    return render("raw_rasterization", gaussians, project, image, groups=groups)
 
 
 def _check_leaves(params: Mapping[str, Tensor | None]) -> None:
@@ -230,7 +175,7 @@ def _check_leaves(params: Mapping[str, Tensor | None]) -> None:
 
 
 def _lazy(optimizers: Any) -> list[CatchesUp]:
-    """Return the optimisers that may have pending steps; those that step together are one."""
+    """Return the optimisers that may have pending steps, each once."""
     if isinstance(optimizers, torch.optim.Optimizer) or hasattr(optimizers, "catch_up"):
         optimizers = [optimizers]
     if not isinstance(optimizers, Iterable):
@@ -239,57 +184,7 @@ def _lazy(optimizers: Any) -> list[CatchesUp]:
             f"{type(optimizers).__name__}"
         )
     given = optimizers.values() if isinstance(optimizers, Mapping) else optimizers
-    found: list[CatchesUp] = []
-    for optimizer in given:
-        joint = getattr(optimizer, "joint", None)
-        # A mapping may have an optimiser under several names; it would take the gradients as often.
-        if joint in found or optimizer in found:
-            continue
-        if joint is not None and joint.follow():
-            found.append(joint)
-        elif hasattr(optimizer, "catch_up"):
-            found.append(optimizer)
-    return found
-
-
-def _hand_over(lazy: Sequence[Any], params: Sequence[Tensor], sparse_grad: bool) -> HandOver | None:
-    """Return what hands the gradients of means, quats, scales, opacities and SH to their optimisers.
-
-    None: no parameter requires a gradient.
-    """
-    if not sparse_grad:
-        raise ValueError("direct_grad=True needs sparse_grad=True; leave one of them out")
-    needed = [param.requires_grad for param in params]
-    wanted = set(map(id, itertools.compress(params, needed)))
-    owners: list[TakesGradients] = []
-    found: set[int] = set()
-    for optimizer in lazy:
-        if hasattr(optimizer, "param_ids") and (own := wanted & optimizer.param_ids()):
-            owners.append(optimizer)
-            found |= own
-    if found != wanted:
-        names = zip(("means", "quats", "scales", "opacities", "sh0", "shN"), params, strict=False)
-        missing = [name for name, param in names if id(param) in wanted - found]
-        raise ValueError(
-            f"direct_grad=True: no LazyAdam in `optimizers` has {', '.join(missing)}; pass the optimisers of "
-            "all parameters, call requires_grad_(False) for parameters that are not learned, or leave "
-            "direct_grad out"
-        )
-
-    def give(rows: Tensor, gradients: Sequence[Tensor | None]) -> None:
-        # As autograd does, leave out parameters that were frozen after the call.
-        given = {
-            param: gradient
-            for param, gradient in zip(params, gradients, strict=True)
-            if gradient is not None and param.requires_grad
-        }
-        if given:
-            for owner in owners:
-                owner.receive(rows, given)
-
-    if not wanted:
-        return None
-    return HandOver(torch.empty(0, device=params[0].device, requires_grad=True), needed, give)
+    return [optimizer for optimizer in dict.fromkeys(given) if hasattr(optimizer, "catch_up")]
 
 
 def _checked_degree(harmonics: list[Tensor], count: int, degree: int | None, shaded: bool) -> int:
@@ -306,45 +201,3 @@ def _checked_degree(harmonics: list[Tensor], count: int, degree: int | None, sha
     if shaded and (degree + 1) ** 2 > given:
         raise ValueError(f"sh_degree {degree} needs {(degree + 1) ** 2} SH coefficients, got {given}")
     return degree
-
-
-class _Visible(torch.autograd.Function):
-    """Gathers the rows `ids` of means, quats, scales and opacities, and of SH in any number of parts.
-
-    The result has the SH in one tensor, or None without parts. The gradients of the tables are sparse, or
-    dense if `sparse` is False, or go to `hand_over`.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        ids: Tensor,
-        sparse: bool,
-        hand_over: HandOver | None,
-        _ticket: Tensor | None,
-        *tables: Tensor,
-    ) -> tuple[Tensor | None, ...]:
-        ctx.save_for_backward(ids)
-        ctx.sparse, ctx.hand_over, ctx.shapes = sparse, hand_over, [table.shape for table in tables]
-        ctx.set_materialize_grads(False)
-        parts = tables[4:]
-        ctx.lengths = [part.shape[1] for part in parts]
-        rows = gather_rows(tables[:4], parts, ids)
-        return (*rows, *([] if parts else [None]))
-
-    @staticmethod
-    def backward(ctx: Any, *v_rows: Tensor | None) -> Any:
-        (ids,) = ctx.saved_tensors
-        *gradients, v_sh = v_rows
-        if len(ctx.lengths) == 1 or v_sh is None:
-            gradients += [v_sh] * len(ctx.lengths)
-        else:
-            gradients += split_rows(v_sh, ctx.lengths)
-        needed = ctx.needs_input_grad[4:] if ctx.hand_over is None else ctx.hand_over.needed
-        gradients = [gradient if need else None for gradient, need in zip(gradients, needed, strict=True)]
-        if ctx.hand_over is None:
-            gradients = full_gradients(ids, gradients, ctx.shapes, [ctx.sparse] * len(gradients))
-        else:
-            ctx.hand_over.give(ids.long(), gradients)
-            gradients = [None] * len(gradients)
-        return None, None, None, None, *gradients

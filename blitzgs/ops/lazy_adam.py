@@ -38,14 +38,43 @@ class AdamState(NamedTuple):
     last_step: Tensor
     moment_step: Tensor
 
+    @classmethod
+    def alone(cls, param: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, *steps: Tensor) -> AdamState:
+        """Return the state of a single parameter [N, ...]: it takes the place of SH, without other columns.
+
+        Its learning rates are those of SH: one for the first three values of a row, one for the rest.
+        """
+        none = [param.new_empty(len(param), 0)] * 4
+        return cls([*none, param], [*none, exp_avg], [*none, exp_avg_sq], *steps)
+
     @property
     def tensors(self) -> list[Tensor]:
         """The group `state` of the ops (`AdamTensors` of csrc/adam/lazy_adam_op.h)."""
         return [*self.params, *self.exp_avgs, *self.exp_avg_sqs, self.last_step, self.moment_step]
 
 
-class AdamSchedule:
-    """Adam's constants, its learning rates of every step, and the tables that the ops read instead.
+class AdamTables:
+    """Adam's constants and the tables of a schedule that the ops read, see csrc/adam/lazy_adam.h.
+
+    Attributes:
+        betas: decay rates of the moments.
+        eps: added to the root of the second moment.
+        explicit_steps: number of steps without a gradient for which a row still moves.
+        tables: the group `tables` of the ops.
+    """
+
+    betas: tuple[float, float]
+    eps: float
+    explicit_steps: int
+    tables: list[Tensor]
+
+    def constants(self, step: int) -> tuple[int, int, float, float, float]:
+        """Return the arguments of the ops from `step` to `eps` for a row of the tables."""
+        return (step, self.explicit_steps, *self.betas, self.eps)
+
+
+class AdamSchedule(AdamTables):
+    """The tables of a schedule whose learning rates are known in advance.
 
     The tables are made once, so that a step computes none of this again.
 
@@ -53,11 +82,9 @@ class AdamSchedule:
         lr_table: float32 [S + 1, 6], the learning rates of every step.
         table: float64 [S + 1, 30] on the device of `lr_table`: for each step, the sums that give a row's
             movement over the steps it misses after that one (csrc/adam/lazy_adam.h).
-        tables: the group `tables` of the ops: `table`, `lr_table`, and the rules for rows that are
-            `explicit_steps` or more steps behind. A rule applies all missed steps of a row; rules are indexed
-            by the row's last step: uint8 [max(0, S + 1 - explicit_steps), bytes], in a layout that only the
-            ops read.
-        decays: the group `decays` of the ops.
+        tables: `table`, `lr_table`, and the rules for rows that are `explicit_steps` or more steps behind. A
+            rule applies all missed steps of a row; rules are indexed by the row's last step: uint8
+            [max(0, S + 1 - explicit_steps), bytes], in a layout that only the ops read.
     """
 
     def __init__(
@@ -66,7 +93,6 @@ class AdamSchedule:
         beta1: float,
         beta2: float,
         eps: float,
-        sparse: bool = False,
         dtype: torch.dtype = torch.float32,
     ) -> None:
         """Make the tables.
@@ -76,28 +102,108 @@ class AdamSchedule:
                 for every step of the schedule (row 0 unused). It must not change afterwards.
             beta1: decay of the first moment, 0 <= beta1 < sqrt(beta2).
             beta2: decay of the second moment, in (0, 1).
-            eps: added to the root of the second moment.
-            sparse: plain sparse Adam: moments of unlisted rows keep their values and nothing drifts.
+            eps: as the attribute.
             dtype: of the parameters.
 
         Raises:
             ValueError: decay rates outside their range.
         """
-        self.lr_table, self.decays, self._sparse = lr_table, [beta1, beta2, eps], sparse
-        self.table = _make_table(lr_table, beta1, beta2)
-        self._explicit_steps = explicit_steps(beta1, beta2, dtype)
+        self.betas, self.eps = (beta1, beta2), eps
+        self.lr_table, self.table = lr_table, _make_table(lr_table, beta1, beta2)
+        self.explicit_steps = explicit_steps(beta1, beta2, dtype)
         rules = torch.ops.blitzgs.lazy_adam_final_rules(
-            self.table, lr_table.new_empty(0, dtype=dtype), self._explicit_steps, eps
+            self.table, lr_table.new_empty(0, dtype=dtype), self.explicit_steps, eps
         )
-        self.tables: list[Tensor] = [self.table, lr_table, rules]
+        self.tables = [self.table, lr_table, rules]
 
-    def steps(self, step: int) -> list[int]:
-        """Return the group `steps` of the ops for step number `step`."""
-        return [step, self._explicit_steps, int(self._sparse)]
+
+class GrowingSchedule(AdamTables):
+    """The tables of one parameter whose learning rates become known step by step.
+
+    A row without a gradient moves between step p and step s by a sum over the steps between them. Each new
+    step therefore adds its term to the table rows of earlier steps; those before the last `explicit_steps`
+    need no term, because moments of that age have decayed below rounding. The tables have a fixed length.
+    Their rows, and the optimiser's columns of steps, count from `begin`.
+
+    Attributes:
+        begin: number of steps taken before the tables begin, with which all rows must be up to date.
+        last: number of the last step in the tables.
+        current: the step with which the parameters of all rows are known to be up to date.
+    """
+
+    LENGTH = 4096  # steps in the tables
+
+    def __init__(
+        self, betas: tuple[float, float], eps: float, dtype: torch.dtype, device: torch.device, begin: int
+    ) -> None:
+        """Begin with empty tables; the arguments are the attributes, and dtype and device of the parameter.
+
+        Raises:
+            ValueError: decay rates outside their range.
+        """
+        self.betas, self.eps = betas, eps
+        self.explicit_steps = explicit_steps(*betas, dtype)
+        self.begin = self.last = self.current = begin
+        table = table_without_rates(self.LENGTH + 1, *betas, begin)
+        # The terms that a step with learning rate 1 adds to the rows of earlier steps, by order and group.
+        first, second = table[:, CORRECTION1], table[:, CORRECTION2]
+        shares = torch.stack([first * second ** (order - 1) for order in range(ORDERS)], dim=1)[..., None]
+        ratio, root = betas[0] / math.sqrt(betas[1]), math.sqrt(betas[1])
+        distances = np.arange(self.explicit_steps, 0, -1)[:, None]
+        decays = (ratio * root ** np.arange(ORDERS)) ** distances
+        self._shares, self._decays = shares.to(device), torch.from_numpy(decays[..., None]).to(device)
+        rates = torch.zeros(self.LENGTH + 1, GROUPS, dtype=torch.float32, device=device)
+        self._use([table.to(device), rates])
+
+    def _use(self, tables: list[Tensor]) -> None:
+        """Take the tables, and keep the views that `add` changes, to which it costs time to come again."""
+        self.tables = tables
+        # A parameter alone is in the column of SH, whose groups are the last two (`AdamState.alone`).
+        self._tails = tables[0].view(-1, ORDERS + 1, GROUPS)[:, :ORDERS, 4:]
+        self._rates = tables[1][:, 4:]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in ("_tails", "_rates")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._use(self.tables)  # a pickled view would no longer be one
+
+    @property
+    def row(self) -> int:
+        """The last step in the tables, counted from `begin`."""
+        return self.last - self.begin
+
+    def is_full(self) -> bool:
+        """Tell whether no further step fits."""
+        return self.row >= self.LENGTH
+
+    def add(self, rate: float, rest: float) -> None:
+        """Add a step, with learning rates of the first three values of a row and of the rest.
+
+        Nothing is copied to the device.
+        """
+        self.last += 1
+        row = self.row
+        reach = min(row, self.explicit_steps)
+        # narrow and select take less of the host's time than indexing.
+        tails, share = self._tails.narrow(0, row - reach, reach), self._shares.select(0, row)
+        decays = self._decays.narrow(0, self.explicit_steps - reach, reach)
+        rates = self._rates.select(0, row)
+        groups = ((0, 2, rate),) if rate == rest else ((0, 1, rate), (1, 1, rest))
+        for first, count, value in groups:
+            rounded = float(np.float32(value))  # as in the table of rates
+            tails.narrow(2, first, count).addcmul_(decays, share, value=rounded)
+            rates.narrow(0, first, count).fill_(rounded)
 
 
 def lazy_adam_step_(
-    state: AdamState, schedule: AdamSchedule, step: int, grads: Sequence[Tensor], ids: Tensor
+    state: AdamState,
+    schedule: AdamTables,
+    step: int,
+    grads: Sequence[Tensor],
+    ids: Tensor,
+    current: bool = False,
 ) -> None:
     """Take Adam step ``step`` for the rows `ids`, in place, after the zero-gradient steps they skipped.
 
@@ -111,19 +217,20 @@ def lazy_adam_step_(
         step: 1 <= step <= S.
         grads: gradients of the listed rows, shaped like the parameters with U rows.
         ids: int32 [U], the rows, each once.
+        current: the parameters of these rows are at ``step`` - 1, so that none has to catch up.
 
     Raises:
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
     with below_autograd():
         torch.ops.blitzgs.lazy_adam_step_(
-            state.tensors, schedule.tables, schedule.steps(step), schedule.decays, list(grads), ids
+            state.tensors, schedule.tables, *schedule.constants(step), list(grads), ids, current
         )
 
 
 def lazy_adam_catch_up_(
     state: AdamState,
-    schedule: AdamSchedule,
+    schedule: AdamTables,
     step: int,
     ids: Tensor | None = None,
     count: Tensor | None = None,
@@ -146,7 +253,7 @@ def lazy_adam_catch_up_(
     """
     with below_autograd():
         torch.ops.blitzgs.lazy_adam_catch_up_(
-            state.tensors, schedule.tables, schedule.steps(step), schedule.decays, ids, count
+            state.tensors, schedule.tables, *schedule.constants(step), ids, count
         )
 
 

@@ -1,36 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sparse gradients whose rows are unique, without torch's sort that would make sure of it."""
+"""Gradients of tables of which only some rows are not zero, as sparse tensors."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.multiprocessing.reductions import StorageWeakRef
-
-# Storages of the indices of the latest gradients. Autograd passes the indices tensor of a first gradient on
-# unchanged but loses the mark that it is coalesced (each index once). A sum of gradients has an indices
-# tensor of its own.
-_distinct: deque[StorageWeakRef] = deque(maxlen=32)
-
-
-class HandOver(NamedTuple):
-    """Takes the gradients of parameters in place of autograd, to which the parameters are constants.
-
-    Attributes:
-        ticket: [0], requires a gradient and gets none. It stands for the parameters in autograd's graph, on
-            their device: `backward` then lets the caller's stream wait for theirs, as it does for `.grad`.
-        needed: which of the parameters need a gradient.
-        give: called with rows, int64 [U], ascending, each once, and the gradients [U, ...] of all parameters,
-            None for those that need none.
-    """
-
-    ticket: Tensor
-    needed: Sequence[bool]
-    give: Callable[[Tensor, Sequence[Tensor | None]], object]
 
 
 def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
@@ -41,17 +17,7 @@ def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
         values: the rows, [U, ...].
         shape: shape of the table.
     """
-    return _sparse_table(_indices_of(ids.long()), values, shape)
-
-
-def _indices_of(ids: Tensor) -> Tensor:
-    """Return the indices of sparse gradients, int64 [1, U], and remember that each is there once."""
-    indices = ids[None]
-    _distinct.append(StorageWeakRef(indices.untyped_storage()))
-    return indices
-
-
-def _sparse_table(indices: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
+    indices = ids.long()[None]
     if indices.shape[1] == 0:
         # Torch adds to an empty gradient in place, and would change the indices of all that share them.
         indices = indices.clone()
@@ -75,29 +41,26 @@ def full_gradients(
         sparse: which of the results are sparse.
     """
     ids = ids.long()
-    # All gradients share their indices, by which an optimiser sees that their rows are the same.
-    indices = _indices_of(ids) if any(sparse) else ids
-    found: list[Tensor | None] = []
-    for gradient, shape, is_sparse in zip(gradients, shapes, sparse, strict=True):
-        if gradient is None:
-            found.append(None)
-        elif is_sparse:
-            found.append(_sparse_table(indices, gradient, shape))
-        else:
-            found.append(gradient.new_zeros(shape).index_copy_(0, ids, gradient))
-    return found
+    return [
+        None
+        if gradient is None
+        else sparse_rows(ids, gradient, shape)
+        if is_sparse
+        else gradient.new_zeros(shape).index_copy_(0, ids, gradient)
+        for gradient, shape, is_sparse in zip(gradients, shapes, sparse, strict=True)
+    ]
 
 
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the indices int64 [1, U] and values [U, ...] of a sparse tensor, each index once.
+    """Return the rows int64 [U], each once, and the values [U, ...] of a sparse tensor.
+
+    Autograd loses the mark that a gradient is coalesced. Rows that ascend are not sorted again: to look at
+    them costs far less, though on CUDA the host waits for it.
 
     Args:
         table: a tensor whose only sparse dimension is the first.
     """
-    if not table.is_coalesced():
-        indices = table._indices()
-        here = indices.untyped_storage()._cdata
-        if any(known.cdata == here and not known.expired() for known in reversed(_distinct)):
-            return indices, table._values()
+    rows = table._indices()[0]
+    if not table.is_coalesced() and not bool((rows[1:] > rows[:-1]).all()):
         table = table.coalesce()
-    return table.indices(), table.values()
+    return table._indices()[0], table._values()

@@ -2,6 +2,5 @@
 """Optimisers for Gaussians with the interface of `torch.optim`."""
 
 from blitzgs.optim.lazy_adam import LazyAdam
-from blitzgs.optim.together import step_together
 
-__all__ = ["LazyAdam", "step_together"]
+__all__ = ["LazyAdam"]

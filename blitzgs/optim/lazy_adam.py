@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
@@ -10,19 +11,27 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from blitzgs.ops.lazy_adam import AdamState, GrowingSchedule, lazy_adam_catch_up_, lazy_adam_step_
 from blitzgs.ops.sparse_rows import distinct_rows
-from blitzgs.optim.drift import Drift
-from blitzgs.optim.handed import Handed, move_to_grad
-from blitzgs.optim.joint import Joint, step_jointly
 from blitzgs.optim.lazy_adam_checks import (
+    MOMENTS,
     check_group,
     check_mask,
     check_new_rows,
     check_order,
+    check_param,
+    check_rows,
     check_saved,
     groups_by_name,
 )
-from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of, steps_of
+
+# Entries of a parameter's state: the step up to which each row's values, and its moments, are current,
+# counted from `GrowingSchedule.begin`. A state without them, as `torch.optim.Adam` has it, is up to date.
+_STEPS = ("last_step", "moment_step")
+# Entry of a group: the schedule of each parameter, by its index, because strategies replace parameters.
+_SCHEDULES = "schedules"
+
+Place = tuple[dict[str, Any], int, Tensor]  # a group, the index of a parameter in it, the parameter
 
 
 class LazyAdam(torch.optim.Optimizer):
@@ -35,8 +44,8 @@ class LazyAdam(torch.optim.Optimizer):
     zero. `step` does not touch them, so they fall behind. `catch_up` applies the steps that they missed, in
     closed form whatever their number, and gives them the values of `torch.optim.Adam` to rounding
     (csrc/adam/lazy_adam.h). Call it before the parameters are read: before a view is rendered and before
-    evaluation. Call `bring_up_to_date` before a strategy replaces parameters and their state. With a dense
-    gradient, `step` is a step of plain Adam.
+    evaluation. Call `catch_up(moments=True)` before code that knows only `torch.optim.Adam` replaces
+    parameters and their state. With a dense gradient, `step` is a step of plain Adam.
 
     Parameters are [N, ...], contiguous, float32, or float64 on the CPU. Learning rates are rounded to
     float32. A parameter of SH coefficients may give its first coefficient (three values a row) another
@@ -52,14 +61,6 @@ class LazyAdam(torch.optim.Optimizer):
         rasterization(means, ..., sparse_grad=True)[0].sum().backward()
         optimizer.step()
         new = optimizer.keep(mask)  # {"means": Parameter, "sh": Parameter}
-
-    Attributes:
-        drifts: tables of the steps that rows missed, by the indices of a parameter's group and of the
-            parameter in it, because strategies replace the parameters and their state. Parameters of
-            `joint` have none.
-        joint: the parameters that are stepped together, also those of other optimisers (`step_together`).
-        handed: gradients that are not in `.grad`, but count as if they were: those that backward passes of
-            `raw_rasterization(..., direct_grad=True)` handed over since the last `zero_grad`.
     """
 
     def __init__(
@@ -68,9 +69,15 @@ class LazyAdam(torch.optim.Optimizer):
         lr: float = 1e-3,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
+        weight_decay: float = 0.0,
+        amsgrad: bool = False,
         *,
         foreach: bool | None = None,
+        maximize: bool = False,
+        capturable: bool = False,
+        differentiable: bool = False,
         fused: bool | None = None,
+        decoupled_weight_decay: bool = False,
     ) -> None:
         """Take parameters, or groups of them, as any optimiser of torch.
 
@@ -78,54 +85,44 @@ class LazyAdam(torch.optim.Optimizer):
             params: parameters, or dicts of them with options of their own: those below, `lr_rest` (the
                 learning rate of all but the first three values of a row; None: as `lr`) and `name`.
             lr: learning rate; a scheduler may change it from step to step.
-            betas: decay rates of the moments, 0 <= beta1 < sqrt(beta2) < 1; fixed once a step was taken.
+            betas: decay rates of the moments, 0 <= beta1 < sqrt(beta2) < 1.
             eps: added to the root of the second moment.
             foreach: accepted and not needed: it selects how `torch.optim.Adam` computes, never the result.
             fused: accepted and not needed, as `foreach`: a step is always a fused kernel.
+            weight_decay: only 0 is supported, as `torch.optim.Adam` has it by default.
+            amsgrad: only False.
+            maximize: only False.
+            capturable: only False.
+            differentiable: only False.
+            decoupled_weight_decay: accepted, without effect if there is no weight decay.
 
         Raises:
-            ValueError: an option is outside its range.
+            ValueError: an option is outside its range, or not supported.
         """
-        self.drifts: dict[tuple[int, int], Drift] = {}
-        self.joint: Joint | None = None
-        self.handed: list[Handed] = []
-        self._drift_groups: list[dict[str, Any]] = []
-        super().__init__(params, {"lr": lr, "lr_rest": None, "betas": betas, "eps": eps})
+        defaults = {
+            "lr": lr, "lr_rest": None, "betas": betas, "eps": eps, "weight_decay": weight_decay,
+            "amsgrad": amsgrad, "foreach": foreach, "maximize": maximize, "capturable": capturable,
+            "differentiable": differentiable, "fused": fused,
+            "decoupled_weight_decay": decoupled_weight_decay,
+        }  # fmt: skip
+        super().__init__(params, defaults)
 
-    def __getstate__(self) -> dict[str, Any]:
-        self.leave_joint()  # its other members do not belong to a copy
-        self._follow_groups()
-        own = {"drifts": self.drifts, "joint": None, "handed": [], "_drift_groups": self._drift_groups}
-        return {**super().__getstate__(), **own}
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        for group in self.param_groups:
+            group.setdefault(_SCHEDULES, {})
+            for name, value in self.defaults.items():
+                group.setdefault(name, value)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add parameters with options of their own, see `__init__`."""
         super().add_param_group(param_group)
+        self.param_groups[-1][_SCHEDULES] = {}
         try:
             check_group(self.param_groups[-1])
         except ValueError:
             del self.param_groups[-1]
             raise
-
-    def param_ids(self) -> set[int]:
-        """Return the `id` of every parameter."""
-        return {id(param) for group in self.param_groups for param in group["params"]}
-
-    def receive(self, rows: Tensor, gradients: Mapping[Tensor, Tensor]) -> None:
-        """Take gradients that count as if they were added to `.grad`; see `Handed` for the arguments."""
-        self.handed.append(Handed(rows, gradients))
-
-    def move_handed(self) -> None:
-        """Add the gradients that were handed over to `.grad`."""
-        if self.handed:
-            move_to_grad(self.handed, [param for _, _, param in self._placed()])
-
-    def zero_grad(self, set_to_none: bool = True) -> None:
-        """Remove all gradients, also those that were handed over; see `torch.optim.Optimizer.zero_grad`."""
-        if set_to_none:
-            self.handed.clear()
-        self.move_handed()
-        super().zero_grad(set_to_none)
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -144,44 +141,44 @@ class LazyAdam(torch.optim.Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        if not step_jointly([self]):
-            self._step_alone()
+        for place in self._places():
+            if place[2].grad is not None:
+                self._step_alone(*place)
         return loss
 
-    def _step_alone(self) -> None:
-        """Take a step for each parameter by itself."""
-        self.leave_joint()
-        self.move_handed()
-        for place, group, param in self._placed():
-            if param.grad is None:
-                continue
-            state, table = self._table_of(place, group, param)
-            drift = table.drift
-            if drift.is_full(int(state["step"])):
-                table.restart(int(state["step"]))
-                drift.restart(int(state["step"]))
-            if param.grad.is_sparse:
-                if param.grad.sparse_dim() != 1:
-                    raise ValueError(
-                        "LazyAdam: a sparse gradient must have whole rows (one sparse dimension), got "
-                        f"{param.grad.sparse_dim()} of them"
-                    )
-                indices, values = distinct_rows(param.grad)
-            else:
-                indices, values = torch.arange(len(param), device=param.device), param.grad
-            if param.numel() == 0:
-                indices = indices[:0]
-            rates = (0.0,) * 4 + rates_of(group)
-            gradients = table.columns([values])
-            state["step"] += 1
-            drift.step(int(state["step"]), rates, table.eps, table.tensors, gradients, indices, [False])
+    def _step_alone(self, group: dict[str, Any], index: int, param: Tensor) -> None:
+        """Take the step of one parameter."""
+        gradient = param.grad
+        assert gradient is not None
+        if not gradient.is_sparse:
+            rows, values = torch.arange(len(param), device=param.device), gradient
+        elif gradient.sparse_dim() == 1:
+            rows, values = distinct_rows(gradient)
+        else:
+            raise ValueError(
+                "LazyAdam: a sparse gradient must have whole rows (one sparse dimension), got "
+                f"{gradient.sparse_dim()} of them"
+            )
+        state, schedule = self._tables_of(group, index, param)
+        rate, rest = group["lr"], group["lr_rest"]
+        is_current = schedule.current == schedule.last
+        schedule.add(float(rate), float(rate if rest is None else rest))
+        state["step"] += 1
+        if param.numel() > 0:
+            own = _alone(param, state)
+            gradients = [*own.params[:4], values]
+            lazy_adam_step_(own, schedule, schedule.row, gradients, rows.int(), is_current)
+        # A backward pass that has saved the parameter must fail, as it does after a step of torch's Adam.
+        torch.autograd.graph.increment_version(param)
 
     @torch.no_grad()
     def catch_up(
         self,
-        params: Iterable[Tensor] | None = None,
+        params: Tensor | Iterable[Tensor] | None = None,
         rows: Tensor | None = None,
         count: Tensor | None = None,
+        *,
+        moments: bool = False,
     ) -> None:
         """Apply the steps that rows missed, so that the parameters can be read.
 
@@ -193,57 +190,42 @@ class LazyAdam(torch.optim.Optimizer):
             rows: int32 [A], the rows to update, each once; None: all.
             count: int32 [1] on the device of the rows, how many of them are rows, the first ones; the host
                 does not wait for it. None, or on CUDA a number above A: all of them.
+            moments: whether the moments of all rows catch up too, which costs a pass over them; the state is
+                then that of `torch.optim.Adam`. Without it, the state has two more columns, `last_step` and
+                `moment_step`, which must stay beside the moments if rows change.
+
+        Raises:
+            ValueError: `moments` of some rows only.
         """
+        if moments and rows is not None:
+            raise ValueError("LazyAdam.catch_up: moments=True takes all rows; leave `rows` out")
         if isinstance(params, Tensor):
             params = [params]
-        chosen = None if params is None else {id(param) for param in params}
-        wanted = [entry for entry in self._behind() if chosen is None or id(entry[2]) in chosen]
-        if not wanted:
-            return
-        if self.joint is not None and self.joint.follow():
-            self.joint.catch_up([param for _, _, param in wanted], rows, count)
-            return
-        for place, group, param in wanted:
-            state, table = self._table_of(place, group, param)
-            table.catch_up(int(state["step"]), rows, count)
+        chosen = None if params is None else set(map(id, params))
+        for group, index, param in self._places():
+            if _STEPS[0] not in self.state.get(param, ()) or (chosen is not None and id(param) not in chosen):
+                continue
+            state, schedule = self._tables_of(group, index, param)
+            if moments:
+                _settle(param, state, schedule)
+            elif schedule.current < schedule.last and param.numel() > 0:
+                lazy_adam_catch_up_(_alone(param, state), schedule, schedule.row, rows, count)
+                if rows is None:
+                    schedule.current = schedule.last
 
-    @torch.no_grad()
     def bring_up_to_date(self) -> None:
-        """Bring all rows and their moments up to date; afterwards the state is that of `torch.optim.Adam`.
-
-        Call it before a density strategy that knows `torch.optim.Adam` replaces parameters and state. It also
-        brings up to date the optimisers that are stepped together with this one.
-        """
-        behind = self._behind()
-        if not behind:
-            return
-        if self.joint is not None and self.joint.follow():
-            self.joint.bring_up_to_date()
-            return
-        for place, group, param in behind:
-            state, table = self._table_of(place, group, param)
-            table.bring_up_to_date(int(state["step"]))
-            for name in STEPS:
-                del state[name]
-
-    def _behind(self) -> list[tuple[tuple[int, int], dict[str, Any], Tensor]]:
-        """Return the entries of `_placed` whose parameters may have rows or moments that are behind."""
-        return [entry for entry in self._placed() if STEPS[0] in self.state.get(entry[2], ())]
-
-    def leave_joint(self) -> None:
-        """Step each parameter by itself again, see `step_together`."""
-        if self.joint is not None:
-            self.joint.dissolve()
+        """Deprecated name of `catch_up(moments=True)`."""
+        warnings.warn(
+            "LazyAdam.bring_up_to_date() is now catch_up(moments=True)", FutureWarning, stacklevel=2
+        )
+        self.catch_up(moments=True)
 
     def state_dict(self) -> dict[str, Any]:
-        """Bring all rows up to date and return the state of `torch.optim.Adam`: step, exp_avg, exp_avg_sq."""
-        self.bring_up_to_date()
+        """Bring all rows up to date and return the state of `torch.optim.Adam`, which can load it."""
+        self.catch_up(moments=True)
         packed = super().state_dict()
-        # Optimisers that are stepped together share the number of steps.
-        packed["state"] = {
-            index: {**state, "step": state["step"].clone()} if state else state
-            for index, state in packed["state"].items()
-        }
+        for group in packed["param_groups"]:
+            del group[_SCHEDULES]
         return packed
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -252,15 +234,12 @@ class LazyAdam(torch.optim.Optimizer):
         The parameters must have the values that they had when the state was saved.
 
         Raises:
-            ValueError: the state does not fit, or is of another optimiser, or of an Adam with weight decay,
-                AMSGrad or maximize.
+            ValueError: the state does not fit, or is of another optimiser, or of an Adam with options that
+                this class does not support.
         """
-        check_saved(state_dict, [param for _, _, param in self._placed()])
-        self.leave_joint()
+        check_saved(state_dict, [param for _, _, param in self._places()])
         super().load_state_dict(state_dict)
-        self.drifts.clear()
-        for _, group, param in self._placed():
-            group.setdefault("lr_rest", None)
+        for _, _, param in self._places():
             state = self.state.get(param)
             if state:
                 state["step"] = torch.tensor(float(state["step"]), dtype=torch.float32, device="cpu")
@@ -321,90 +300,69 @@ class LazyAdam(torch.optim.Optimizer):
     @torch.no_grad()
     def _renew(
         self,
-        named: dict[str, dict[str, Any]],
+        named: Mapping[str, dict[str, Any]],
         of_param: Callable[[str, Tensor], Tensor],
         of_state: Callable[[Tensor], Tensor],
     ) -> dict[str, Parameter]:
         """Replace every parameter and its moments by what the functions make of them."""
-        self.bring_up_to_date()
+        self.catch_up(moments=True)
         renewed = {}
         for name, group in named.items():
             old = group["params"][0]
             new = Parameter(of_param(name, old.detach()), requires_grad=old.requires_grad)
-            state = self.state.pop(old, None)
-            if state:
-                for key in MOMENTS:
-                    state[key] = of_state(state[key])
-                self.state[new] = state
+            if state := self.state.pop(old, None):
+                self.state[new] = {**state, **{key: of_state(state[key]) for key in MOMENTS}}
             group["params"] = [new]
             renewed[name] = new
-        self.handed.clear()
         return renewed
 
-    def index_of(self, group: dict[str, Any]) -> int | None:
-        """Return the present index of a group; None: it was removed."""
-        self._follow_groups()
-        return next((index for index, own in enumerate(self.param_groups) if own is group), None)
+    def _places(self) -> Iterator[Place]:
+        """Iterate over all parameters."""
+        for group in self.param_groups:
+            for index, param in enumerate(group["params"]):
+                yield group, index, param
 
-    def _follow_groups(self) -> None:
-        """Move `drifts` to the present indices of their groups, because groups may have been removed."""
-        known, now = self._drift_groups, self.param_groups
-        if len(known) == len(now) and all(a is b for a, b in zip(known, now, strict=True)):
-            return
-        places = {id(group): index for index, group in enumerate(now)}
-        self.drifts = {
-            (places[id(known[g])], p): drift
-            for (g, p), drift in self.drifts.items()
-            if id(known[g]) in places
-        }
-        self._drift_groups = list(now)
-
-    def _placed(self) -> Iterator[tuple[tuple[int, int], dict[str, Any], Tensor]]:
-        """Iterate over all parameters with their indices (group, parameter) and their groups."""
-        self._follow_groups()
-        for g, group in enumerate(self.param_groups):
-            for p, param in enumerate(group["params"]):
-                yield (g, p), group, param
-
-    def _table_of(
-        self, place: tuple[int, int], group: dict[str, Any], param: Tensor
-    ) -> tuple[dict[str, Any], Table]:
-        """Return the state of a parameter, and the parameter as a table by itself."""
-        state = self.state_of(param)
-        betas = tuple(group["betas"])
-        drift = self.drifts.get(place)
-        if drift is None:
-            drift = self.drifts[place] = Drift(betas, param.dtype, param.device, int(state["step"]))
-        if drift.betas != betas:
-            raise ValueError(f"LazyAdam: betas cannot change from {drift.betas} to {betas} after a step")
-        if STEPS[0] not in state:
-            state.update({name: steps_of(param, int(state["step"]) - drift.begin) for name in STEPS})
-        return state, Table([param], [state], drift, 0, group["eps"])
-
-    def state_of(self, param: Tensor) -> dict[str, Any]:
-        """Return the state of a parameter; make it on first use, and correct a strategy's dtypes."""
+    def _tables_of(
+        self, group: dict[str, Any], index: int, param: Tensor
+    ) -> tuple[dict[str, Any], GrowingSchedule]:
+        """Return the state of a parameter and its schedule; make or correct them where needed."""
+        check_param(param)
         state: dict[str, Any] = self.state[param]
-        if param.dtype not in (torch.float32, torch.float64):
-            raise ValueError(
-                f"LazyAdam: parameters must be float32 or float64, one of shape {list(param.shape)} is "
-                f"{param.dtype}; convert it"
-            )
-        if not param.is_contiguous():
-            raise ValueError(
-                f"LazyAdam: a parameter of shape {list(param.shape)} is not contiguous; clone it"
-            )
         if not state:
             state["step"] = torch.tensor(0.0, dtype=torch.float32, device="cpu")
             state.update({name: torch.zeros_like(param) for name in MOMENTS})
-        columns = [name for name in STEPS if name in state]
-        for name in columns:
+        for name in _STEPS:
             # gsplat's strategies append float zeros. The value is right for rows whose moments are zero.
-            if state[name].dtype != torch.int32:
+            if name in state and state[name].dtype != torch.int32:
                 state[name] = state[name].int()
-        for name in (*MOMENTS, *columns):
-            if state[name].shape[0] != param.shape[0]:
-                raise ValueError(
-                    f"LazyAdam: a parameter has {len(param)} rows and its {name} {len(state[name])}; change "
-                    "both together (append, keep, permute)"
-                )
-        return state
+        check_rows(param, state)
+        step, betas = int(state["step"]), (float(group["betas"][0]), float(group["betas"][1]))
+        schedule: GrowingSchedule | None = group[_SCHEDULES].get(index)
+        if schedule is not None and (schedule.last != step or schedule.betas != betas or schedule.is_full()):
+            if _STEPS[0] in state:
+                _settle(param, state, schedule)
+            schedule = None
+        if schedule is None:
+            schedule = GrowingSchedule(betas, group["eps"], param.dtype, param.device, step)
+            group[_SCHEDULES][index] = schedule
+        schedule.eps = group["eps"]
+        if _STEPS[0] not in state:
+            place = torch.full((len(param),), schedule.row, dtype=torch.int32, device=param.device)
+            state.update({name: place.clone() for name in _STEPS})
+        return state, schedule
+
+
+def _alone(param: Tensor, state: Mapping[str, Any]) -> AdamState:
+    return AdamState.alone(param, *(state[name] for name in (*MOMENTS, *_STEPS)))
+
+
+def _settle(param: Tensor, state: dict[str, Any], schedule: GrowingSchedule) -> None:
+    """Bring all rows and their moments up to date, and leave the state of `torch.optim.Adam`."""
+    if param.numel() > 0:
+        lazy_adam_catch_up_(_alone(param, state), schedule, schedule.row)
+    schedule.current = schedule.last
+    behind = (schedule.row - state["moment_step"]).double()
+    for name, beta in zip(MOMENTS, schedule.betas, strict=True):
+        state[name] *= (beta**behind).to(param.dtype).view(-1, *(1,) * (param.dim() - 1))
+    for name in _STEPS:
+        del state[name]

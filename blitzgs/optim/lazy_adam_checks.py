@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blitzgs.optim.table import MOMENTS
+MOMENTS = ("exp_avg", "exp_avg_sq")
 
 Groups = Mapping[str, dict[str, Any]]  # parameter groups of one parameter each, by name
 
@@ -29,9 +29,38 @@ def check_group(group: dict[str, Any]) -> None:
     for name in ("lr", "lr_rest", "eps"):
         if group[name] is not None and not group[name] >= 0:
             raise ValueError(f"LazyAdam: {name} must be 0 or more, got {group[name]}")
-    for name in ("weight_decay", "amsgrad", "maximize"):
+    for name in ("weight_decay", "amsgrad", "maximize", "capturable", "differentiable"):
         if group.get(name):
             raise ValueError(f"LazyAdam: {name}={group[name]} is not supported; leave it out")
+
+
+def check_param(param: Tensor) -> None:
+    """Check that a parameter has a form that the op takes.
+
+    Raises:
+        ValueError: it has another dtype, or is not contiguous.
+    """
+    if param.dtype not in (torch.float32, torch.float64):
+        raise ValueError(
+            f"LazyAdam: parameters must be float32 or float64, one of shape {list(param.shape)} is "
+            f"{param.dtype}; convert it"
+        )
+    if not param.is_contiguous():
+        raise ValueError(f"LazyAdam: a parameter of shape {list(param.shape)} is not contiguous; clone it")
+
+
+def check_rows(param: Tensor, state: Mapping[str, Any]) -> None:
+    """Check that a parameter's state has as many rows as the parameter.
+
+    Raises:
+        ValueError: it has not.
+    """
+    for name, value in state.items():
+        if name != "step" and value.shape[0] != param.shape[0]:
+            raise ValueError(
+                f"LazyAdam: a parameter has {len(param)} rows and its {name} {len(value)}; change both "
+                "together (append, keep, permute), or call catch_up(moments=True) before"
+            )
 
 
 def check_saved(saved: Mapping[str, Any], params: Sequence[Tensor]) -> None:

@@ -97,7 +97,6 @@ struct AdamArgs {
   std::int32_t step;
   std::int32_t explicit_steps;
   double beta1, beta2, eps;
-  bool sparse;   // plain sparse Adam: no decay, no drift
   bool current;  // the parameters of the listed rows stand at target(), so that none has to catch up
 
   // Tests the SH column, because the other columns may be empty.

@@ -111,7 +111,7 @@ __device__ __forceinline__ void step_pack(const AdamArgs<float>& args, const Ada
   StepPack<Column, Width> own;
   own.load(column, row, pack);
   const auto g = *reinterpret_cast<const Pack<Width>*>(column.grad + list_row * column.width + pack * Width);
-  own.finish(column, step, make_decay(args, args.sparse ? 0 : args.target() - args.moment_step[row]), g);
+  own.finish(column, step, make_decay(args, args.target() - args.moment_step[row]), g);
 }
 
 // The Adam step with gradients, for rows that have caught up. One thread per pack. A block handles Rows rows
@@ -171,7 +171,7 @@ __global__ void __launch_bounds__(kListThreads)
   const AdamColumn<float>& column = args.columns[kAlone];
   for (std::int64_t e = first_element(); e < args.n * column.width; e += element_stride()) {
     const std::int64_t i = e / column.width, j = e % column.width, row = args.ids ? args.ids[i] : i;
-    const Decay decay = make_decay(args, args.sparse ? 0 : args.target() - args.moment_step[row]);
+    const Decay decay = make_decay(args, args.target() - args.moment_step[row]);
     const std::int64_t at = row * column.width + j;
     float p = column.param[at], m = column.exp_avg[at] * decay.first,
           v = column.exp_avg_sq[at] * decay.second;
@@ -276,7 +276,7 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
   AdamArgs<float> behind = args;
   behind.step = args.target();
   for (AdamColumn<float>& column : behind.columns) column.grad = nullptr;
-  if (!args.sparse && !args.current) catch_up(behind, workspace, stream);
+  if (!args.current) catch_up(behind, workspace, stream);
   if (!args.with_gradient()) return;
   if (is_alone(args)) {
     launch_early("lazy_adam step", step_alone_kernel, alone_size(args, stream), args);

@@ -21,7 +21,6 @@ struct AdamRow {
 template <class T>
 AdamRow<T> adam_row(const AdamArgs<T>& args, std::int64_t row) {
   const std::int32_t target = args.target();
-  if (args.sparse) return {target, T(1), T(1), T(1), T(1), false};
   const std::int32_t from = args.last_step[row], moment_step = args.moment_step[row];
   const double *to_params = args.table_row(from - moment_step),
                *to_target = args.table_row(target - moment_step);

@@ -4,17 +4,18 @@
 namespace blitzgs {
 namespace {
 
-void lazy_adam_step(const std::vector<Tensor>& state, const std::vector<Tensor>& tables,
-                    const std::vector<std::int64_t>& steps, const std::vector<double>& decays,
-                    const std::vector<Tensor>& grads, const Tensor& ids) {
-  AdamTensors("lazy_adam_step_", state, tables, steps, decays).step_rows(grads, ids);
+void lazy_adam_step(const std::vector<Tensor>& state, const std::vector<Tensor>& tables, std::int64_t step,
+                    std::int64_t explicit_steps, double beta1, double beta2, double eps,
+                    const std::vector<Tensor>& grads, const Tensor& ids, bool current) {
+  AdamTensors adam("lazy_adam_step_", state, tables, {step, explicit_steps, beta1, beta2, eps});
+  adam.step_rows(grads, ids, current);
 }
 
 void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<Tensor>& tables,
-                        const std::vector<std::int64_t>& steps, const std::vector<double>& decays,
-                        const std::optional<Tensor>& ids, const std::optional<Tensor>& count) {
+                        std::int64_t step, std::int64_t explicit_steps, double beta1, double beta2,
+                        double eps, const std::optional<Tensor>& ids, const std::optional<Tensor>& count) {
   constexpr const char* kOp = "lazy_adam_catch_up_";
-  AdamTensors state(kOp, state_in, tables, steps, decays);
+  AdamTensors state(kOp, state_in, tables, {step, explicit_steps, beta1, beta2, eps});
   const std::optional<Tensor> list = checked(kOp, "ids", ids, ScalarType::Int, {-1});
   const std::int64_t n = max_listed(kOp, count, list ? list->size(0) : state.rows());
   DeviceScope scope(state.like());

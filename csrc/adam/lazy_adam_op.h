@@ -16,29 +16,29 @@ inline constexpr const char* kAdamNames[kAdamColumns] = {"means", "quats", "scal
 // moment_step.
 inline constexpr std::size_t kAdamState = 3 * kAdamColumns + 2;
 
+// What the ops that move parameters take beside tensors.
+struct AdamConstants {
+  std::int64_t step, explicit_steps;
+  double beta1, beta2, eps;
+};
+
 // The optimiser's state of a table of Gaussians and its schedule. state: (params, exp_avgs, exp_avg_sqs,
 // last_step, moment_step), of which each of the first three is (means, quats, scales, opacities, sh); tables:
-// (table of lazy_adam.h, lr_table[, final_rules]); steps: (step, explicit_steps, sparse); decays: (beta1,
-// beta2, eps). blitzgs/ops/lazy_adam.py builds these groups.
+// (table of lazy_adam.h, lr_table[, final_rules]). blitzgs/ops/lazy_adam.py builds these groups.
 struct AdamTensors {
   const char* op;
   std::vector<Tensor> params, exp_avgs, exp_avg_sqs;
   Tensor last_step, moment_step, table, lr_table;
   std::optional<Tensor> final_rules;
-  std::int64_t step = 0, explicit_steps = 0;
-  double beta1 = 0, beta2 = 0, eps = 0;
-  bool sparse = false;
+  AdamConstants constants;
 
   AdamTensors(const char* op_name, const std::vector<Tensor>& state, const std::vector<Tensor>& tables,
-              const std::vector<std::int64_t>& steps, const std::vector<double>& decays)
-      : op(op_name) {
-    STD_TORCH_CHECK(state.size() == kAdamState && (tables.size() == 2 || tables.size() == 3) &&
-                        steps.size() == 3 && decays.size() == 3,
-                    "blitzgs::", op, ": expected state (params, exp_avgs and exp_avg_sqs of means, quats, ",
-                    "scales, opacities and sh, last_step, moment_step), tables (table, ",
-                    "lr_table[, final_rules]), steps (step, explicit_steps, sparse) and decays (beta1, ",
-                    "beta2, eps); got ", state.size(), ", ", tables.size(), ", ", steps.size(), " and ",
-                    decays.size(), " entries");
+              const AdamConstants& constants_in)
+      : op(op_name), constants(constants_in) {
+    STD_TORCH_CHECK(state.size() == kAdamState && (tables.size() == 2 || tables.size() == 3), "blitzgs::", op,
+                    ": expected state (params, exp_avgs and exp_avg_sqs of means, quats, scales, opacities ",
+                    "and sh, last_step, moment_step) and tables (table, lr_table[, final_rules]); got ",
+                    state.size(), " and ", tables.size(), " entries");
     auto next = state.begin();
     for (std::vector<Tensor>* columns : {&params, &exp_avgs, &exp_avg_sqs}) {
       columns->assign(next, next + kAdamColumns);
@@ -49,12 +49,6 @@ struct AdamTensors {
     table = tables[0];
     lr_table = tables[1];
     if (tables.size() == 3) final_rules = tables[2];
-    step = steps[0];
-    explicit_steps = steps[1];
-    sparse = steps[2] != 0;
-    beta1 = decays[0];
-    beta2 = decays[1];
-    eps = decays[2];
     check();
   }
 
@@ -78,25 +72,24 @@ struct AdamTensors {
     args.lr_table = data<float>(lr_table);
     if (final_rules) {
       check_in_place(op, "final_rules", *final_rules, ScalarType::Byte,
-                     {final_rules_of(table.size(0), explicit_steps),
+                     {final_rules_of(table.size(0), constants.explicit_steps),
                       static_cast<std::int64_t>(sizeof(PendingSteps<T>))});
       args.final_rules = static_cast<const PendingSteps<T>*>(final_rules->const_data_ptr());
     }
-    args.step = static_cast<std::int32_t>(step);
-    args.explicit_steps = static_cast<std::int32_t>(explicit_steps);
-    args.beta1 = beta1;
-    args.beta2 = beta2;
-    args.eps = eps;
-    args.sparse = sparse;
+    args.step = static_cast<std::int32_t>(constants.step);
+    args.explicit_steps = static_cast<std::int32_t>(constants.explicit_steps);
+    args.beta1 = constants.beta1;
+    args.beta2 = constants.beta2;
+    args.eps = constants.eps;
     return args;
   }
 
   // Takes the step for the rows `ids`, int32 [A], from a gradient [A, ...] for each column; those of empty
   // columns are not read. current: the parameters of the rows stand at step - 1.
-  void step_rows(const std::vector<Tensor>& grads, const Tensor& ids, bool current = false) {
+  void step_rows(const std::vector<Tensor>& grads, const Tensor& ids, bool current) {
     STD_TORCH_CHECK(grads.size() == kAdamColumns, "blitzgs::", op,
                     ": grads must hold means, quats, scales, opacities, sh; got ", grads.size(), " tensors");
-    STD_TORCH_CHECK(step >= 1, "blitzgs::", op, ": steps count from 1, got ", step);
+    check_takes_step();
     const Tensor list = checked(op, "ids", ids, ScalarType::Int, {-1});
     const std::int64_t n = list.size(0);
     std::vector<Tensor> held;
@@ -118,6 +111,10 @@ struct AdamTensors {
     });
   }
 
+  void check_takes_step() const {
+    STD_TORCH_CHECK(constants.step >= 1, "blitzgs::", op, ": steps count from 1, got ", constants.step);
+  }
+
   std::int64_t width(int column) const { return rows() ? params[column].numel() / rows() : 0; }
 
  private:
@@ -137,6 +134,7 @@ struct AdamTensors {
     check_in_place(op, "moment_step", moment_step, ScalarType::Int, {rows()});
     check_in_place(op, "table", table, ScalarType::Double, {-1, kAdamTable});
     check_in_place(op, "lr_table", lr_table, ScalarType::Float, {table.size(0), kAdamGroups});
+    const std::int64_t step = constants.step;
     STD_TORCH_CHECK(step >= 0 && step < table.size(0), "blitzgs::", op, ": step ", step,
                     " is outside the learning-rate table, which ends at step ", table.size(0) - 1);
   }

@@ -27,7 +27,7 @@ struct StepRows {
   __device__ Own begin(Shared& shared, const WarpRows& warp) const {
     if (threadIdx.x == kBackwardThreads - 1) shared.step = adam_step_scalars(adam);
     shared.ids[threadIdx.x] = warp.id;
-    return {adam.sparse || warp.id < 0 ? 0 : adam.step - 1 - adam.moment_step[warp.id]};
+    return {warp.id < 0 ? 0 : adam.step - 1 - adam.moment_step[warp.id]};
   }
 
   __device__ void take(Shared& shared, const Own& own, const WarpRows& warp, TripleStage& triple,

@@ -26,13 +26,12 @@ def test_every_call_is_measured(tmp_path, monkeypatch, capsys):
         steps[name] > 0 for name in parts
     )
     assert count.startswith("torch's operations") and steps[count] > 20
-    direct = {row["part"]: row["direct_grad, host us"] for row in written["steps"]}
-    assert direct.keys() == steps.keys() and 20 < direct[count] < steps[count] / 2
+    assert all(row["one optimiser, host us"] > 0 for row in written["steps"])
 
 
-@pytest.mark.parametrize("direct_grad", [False, True])
-def test_the_trainer_whose_steps_are_measured_learns(direct_grad):
-    trainer = bm_host.Trainer("cpu", direct_grad)
+@pytest.mark.parametrize("in_one", [False, True])
+def test_the_trainer_whose_steps_are_measured_learns(in_one):
+    trainer = bm_host.Trainer("cpu", in_one)
     before = {name: value.detach().clone() for name, value in trainer.params.items()}
     for _ in range(3):
         trainer.step()

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import blitzgs
-from blitzgs.optim import LazyAdam, step_together
+from blitzgs.optim import LazyAdam
 from tests.call.test_raw_rasterization import NAMES, activated, raw, raw_parameters
 from tests.helpers import random_scene, rasterize_scene, relative_error
 
@@ -20,8 +20,14 @@ RATES = dict(zip(NAMES, (2.0**-9, 2.0**-10, 2.0**-8, 2.0**-6, 2.0**-8, 2.0**-10)
 class Trainer:
     """The loop of gsplat's simple_trainer: its strategy, an optimiser for each parameter."""
 
-    def __init__(self, scene, strategy, lazy, packed, direct):
-        self.scene, self.strategy, self.lazy, self.packed, self.direct = scene, strategy, lazy, packed, direct
+    def __init__(self, scene, strategy, lazy, packed, moments):
+        self.scene, self.strategy, self.lazy, self.packed, self.moments = (
+            scene,
+            strategy,
+            lazy,
+            packed,
+            moments,
+        )
         self.splats = torch.nn.ParameterDict(
             {name: torch.nn.Parameter(p.detach()) for name, p in raw_parameters(scene).items()}
         )
@@ -40,21 +46,18 @@ class Trainer:
         one.viewmats, one.Ks = self.scene.viewmats[view, None], self.scene.Ks[view, None]
         p = {name: self.splats[name] for name in NAMES}
         if self.lazy:
-            return raw(p, one, optimizers=self.optimizers, direct_grad=self.direct)
+            return raw(p, one, optimizers=self.optimizers)
         return activated(p, one, packed=self.packed)
 
     def step(self, step, view, target):
         image, _, info = self.render(view)
         self.strategy.step_pre_backward(self.splats, self.optimizers, self.state, step, info)
         blitzgs.l1_ssim(image, target).backward()
-        if self.direct:
-            step_together(self.optimizers, set_to_none=True)
-        for optimizer in () if self.direct else self.optimizers.values():
+        for optimizer in self.optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
-        if self.lazy:
-            for optimizer in self.optimizers.values():
-                optimizer.catch_up()
+            if self.lazy:
+                optimizer.catch_up(moments=self.moments)
         packed = self.lazy or self.packed
         self.strategy.step_post_backward(self.splats, self.optimizers, self.state, step, info, packed=packed)
 

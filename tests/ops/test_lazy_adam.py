@@ -56,11 +56,11 @@ class State:
         ]  # fmt: skip
 
 
-def schedule_of(steps, dtype, device="cpu", sparse=False):
+def schedule_of(steps, dtype, device="cpu"):
     t = torch.arange(steps + 1) / steps
     base = torch.tensor([1.6e-3, 1e-3, 7e-3, 2e-2, 7.5e-3, 7.5e-3 / 20])
     rates = (base * (0.01**t)[:, None]).float().to(device)
-    return AdamSchedule(rates, BETA1, BETA2, EPS, sparse, dtype)
+    return AdamSchedule(rates, BETA1, BETA2, EPS, dtype)
 
 
 class DenseAdam:
@@ -281,7 +281,7 @@ def test_final_rules_replace_many_pending_steps(gap, dtype):
         end = begin + reach + gap
         state.catch_up(None, schedule, end)
         torch.ops.blitzgs.lazy_adam_catch_up_(
-            alone.tensors(), schedule.tables[:2], schedule.steps(end), schedule.decays, None
+            alone.tensors(), schedule.tables[:2], *schedule.constants(end), None
         )
         for with_rules, without in zip(state.params, alone.params, strict=True):
             assert torch.equal(with_rules, without)
@@ -295,7 +295,7 @@ def test_a_schedule_makes_its_tables_once(steps, dtype):
     assert [len(table) for table in schedule.tables] == [steps + 1, steps + 1, max(0, steps + 1 - reach)]
     assert schedule.tables[0] is schedule.table and schedule.tables[1] is schedule.lr_table
     assert schedule.tables[2].shape[1] == 28 * dtype.itemsize
-    assert schedule.steps(7) == [7, reach, 0]
+    assert schedule.constants(7) == (7, reach, BETA1, BETA2, EPS)
 
 
 def test_a_schedule_of_another_dtype_is_refused():
@@ -331,20 +331,6 @@ def test_order_of_the_list_does_not_matter():
         [*a.params, *a.exp_avgs, *a.exp_avg_sqs], [*b.params, *b.exp_avgs, *b.exp_avg_sqs], strict=True
     ):
         assert torch.equal(x, y)
-
-
-def test_sparse_skips_decay_and_drift():
-    state, _ = one_update()
-    before = [t.clone() for t in (*state.params, *state.exp_avgs, *state.exp_avg_sqs)]
-    grads = [torch.ones(s, dtype=torch.float64) for s in shapes(1)]
-    schedule = schedule_of(4000, torch.float64, sparse=True)
-    state.step(grads, torch.tensor([2], dtype=torch.int32), schedule, 500)
-    after = (*state.params, *state.exp_avgs, *state.exp_avg_sqs)
-    for a, b in zip(after, before, strict=True):
-        others = torch.arange(7) != 2
-        assert torch.equal(a[others], b[others])
-        assert not torch.equal(a[2], b[2])
-    torch.testing.assert_close(after[5][2], BETA1 * before[5][2] + (1 - BETA1))
 
 
 def test_empty_list_and_zero_gradient():
@@ -384,20 +370,20 @@ def test_errors_name_the_value():
 
 def test_opcheck():
     state, schedule = one_update(5, torch.float32)
-    tables, reach = schedule.tables, schedule.steps(0)[1]
+    tables, reach = schedule.tables, schedule.explicit_steps
     grads = [torch.randn(s) for s in shapes(2)]
     ids = torch.tensor([1, 3], dtype=torch.int32)
-    columns, decays = state.tensors(), [BETA1, BETA2, EPS]
+    columns = state.tensors()
     torch.library.opcheck(
-        torch.ops.blitzgs.lazy_adam_step_, (columns, tables, [2, reach, 0], decays, grads, ids)
+        torch.ops.blitzgs.lazy_adam_step_, (columns, tables, *schedule.constants(2), grads, ids)
     )
     torch.library.opcheck(
-        torch.ops.blitzgs.lazy_adam_catch_up_, (columns, tables, [9, reach, 0], decays, ids)
+        torch.ops.blitzgs.lazy_adam_catch_up_, (columns, tables, *schedule.constants(9), ids)
     )
     torch.library.opcheck(torch.ops.blitzgs.lazy_adam_final_rules, (tables[0], state.params[0], reach, EPS))
     bad = [*tables[:2], tables[2][1:]]
     with pytest.raises(RuntimeError, match=r"final_rules must have shape"):
-        torch.ops.blitzgs.lazy_adam_catch_up_(columns, bad, [9, reach, 0], decays, ids)
+        torch.ops.blitzgs.lazy_adam_catch_up_(columns, bad, *schedule.constants(9), ids)
 
 
 @pytest.mark.cuda

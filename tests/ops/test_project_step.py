@@ -67,26 +67,26 @@ class Scene:
     def views(self):
         return WeightedViews(self.viewmats, self.Ks, self.scale_reg, self.opacity_reg)
 
-    def schedule(self, sparse=False):
-        return AdamSchedule(self.lr_table, BETA1, BETA2, EPS, sparse, self.params[0].dtype)
+    def schedule(self):
+        return AdamSchedule(self.lr_table, BETA1, BETA2, EPS, self.params[0].dtype)
 
     def backward_arguments(self, need_viewmats=False):
         return (
-            self.params, list(self.views()), self.splat_ids(), self.options.ints, self.options.floats,
+            self.params, *self.views(), *self.splat_ids(), None, *self.options,
             list(self.v.parts), None, need_viewmats,
         )  # fmt: skip
 
     def backward(self, need_viewmats=False):
         return torch.ops.blitzgs.project_bwd(*self.backward_arguments(need_viewmats))
 
-    def one_after_the_other(self, sparse):
+    def one_after_the_other(self):
         r = self.splats
         *gradients, _ = self.backward()
-        lazy_adam_step_(self.state(), self.schedule(sparse), STEP, gradients, r.visible_ids)
+        lazy_adam_step_(self.state(), self.schedule(), STEP, gradients, r.visible_ids)
 
-    def at_once(self, sparse, means2d_sums=None):
+    def at_once(self, means2d_sums=None):
         project_bwd_step_(
-            self.state(), self.schedule(sparse), STEP, self.views(), self.splats, self.options, self.v,
+            self.state(), self.schedule(), STEP, self.views(), self.splats, self.options, self.v,
             means2d_sums=means2d_sums,
         )  # fmt: skip
 
@@ -129,7 +129,6 @@ def compare(a, b, exact):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("sparse", [False, True])
 @pytest.mark.parametrize(
     "n,k,degree,views",
     [
@@ -137,15 +136,15 @@ def compare(a, b, exact):
         (333, 25, 3, 1),
     ],
 )  # fmt: skip
-def test_equals_backward_and_step(device, sparse, n, k, degree, views):
+def test_equals_backward_and_step(device, n, k, degree, views):
     antialiased = views == 3
     scenes = [Scene(n, k, views, device, torch.float32) for _ in range(2)]
     for scene in scenes:
         scene.degree = degree
         scene.render(antialiased)
     before = [p.clone() for p in scenes[0].params]
-    scenes[0].one_after_the_other(sparse)
-    scenes[1].at_once(sparse)
+    scenes[0].one_after_the_other()
+    scenes[1].at_once()
     compare(*scenes, exact=device == "cpu")
     visible = scenes[0].splats.visible_ids.long()
     assert len(visible) and bool((scenes[1].moment_step[visible] == STEP).all())
@@ -200,8 +199,8 @@ def agree(plain, other, exact, means2d_sums=None):
         for x, y in zip(plain.backward(True), other.backward(True), strict=True):
             assert len(x) and (torch.equal(x, y) or not exact)
             torch.testing.assert_close(x, y, rtol=1e-5, atol=2e-6 * float(x.abs().max()))
-    plain.at_once(False)
-    other.at_once(False, means2d_sums)
+    plain.at_once()
+    other.at_once(means2d_sums)
     compare(plain, other, exact)
 
 
@@ -210,7 +209,7 @@ def test_repeats_bit_for_bit(device):
     scenes = [Scene(5000, 16, 2, device, torch.float32) for _ in range(2)]
     for scene in scenes:
         scene.render(False)
-        scene.at_once(False)
+        scene.at_once()
     compare(*scenes, exact=True)
 
 
@@ -218,14 +217,14 @@ def test_float64_and_nothing_visible():
     scenes = [Scene(200, 16, 1, "cpu", torch.float64) for _ in range(2)]
     for scene in scenes:
         scene.render(False)
-    scenes[0].one_after_the_other(False)
-    scenes[1].at_once(False)
+    scenes[0].one_after_the_other()
+    scenes[1].at_once()
     compare(*scenes, exact=True)
     scene = scenes[1]
     scene.viewmats[:, 2, 3] = -100  # all behind the camera
     scene.render(False)
     before = [p.clone() for p in scene.params]
-    scene.at_once(False)
+    scene.at_once()
     assert len(scene.splats.visible_ids) == 0
     assert all(torch.equal(x, y) for x, y in zip(before, scene.params, strict=True))
 
@@ -235,11 +234,11 @@ def test_errors_name_the_value():
     scene.render(False)
     scene.v.parts[1] = scene.v.parts[1][:, :2]
     with pytest.raises(RuntimeError, match=r"project_bwd_step_: v_conics must have shape \[\d+, 3\]"):
-        scene.at_once(False)
+        scene.at_once()
     scene.render(False)
     scene.exp_avgs[4] = scene.exp_avgs[4][:, :4].contiguous()
     with pytest.raises(RuntimeError, match=r"the moments of sh must have its shape \[20, 16, 3\]"):
-        scene.at_once(False)
+        scene.at_once()
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -272,7 +271,7 @@ def test_errors_name_what_is_wrong_with_weights():
     with pytest.raises(
         RuntimeError, match=r"project_bwd_step_: opacity_reg must have shape \[2\], got \[1\]"
     ):
-        scene.at_once(False)
+        scene.at_once()
 
 
 def test_errors_name_what_is_wrong_with_tables():
@@ -280,14 +279,14 @@ def test_errors_name_what_is_wrong_with_tables():
     scene.render(False)
     scene.spread()
     with pytest.raises(RuntimeError, match="project_bwd_step_: tables of gradients need CUDA"):
-        scene.at_once(False)
+        scene.at_once()
     scene.render(False)
     del scene.v.parts[1:3]
     with pytest.raises(RuntimeError, match="v_splats must be v_means2d, .* or one table, got 2 tensors"):
         scene.backward()
     scene.render(False)
     with pytest.raises(RuntimeError, match="means2d_sums needs gradients at ranks"):
-        scene.at_once(False, torch.zeros_like(scene.splats.means2d))
+        scene.at_once(torch.zeros_like(scene.splats.means2d))
 
 
 @pytest.mark.cuda
@@ -306,7 +305,7 @@ def test_errors_name_what_does_not_fit():
     ):
         scene.v = whole._replace(**change)
         with pytest.raises(RuntimeError, match=text):
-            scene.at_once(False)
+            scene.at_once()
 
 
 def test_opcheck():
@@ -315,7 +314,7 @@ def test_opcheck():
     state, schedule = scene.state(), scene.schedule()
     torch.library.opcheck(
         torch.ops.blitzgs.project_bwd_step_,
-        (state.tensors, schedule.tables[:2], schedule.steps(STEP), schedule.decays, list(scene.views()),
-         scene.splat_ids(), scene.options.ints, scene.options.floats, list(scene.v.parts)),
+        (state.tensors, schedule.tables[:2], *schedule.constants(STEP), *scene.views(),
+         *scene.splat_ids(), None, *scene.options, list(scene.v.parts)),
     )  # fmt: skip
     torch.library.opcheck(torch.ops.blitzgs.project_bwd, scene.backward_arguments(True))
