@@ -247,6 +247,7 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
     for text in (
         f"pictures: {folder / run_files.EVALUATION}",
         "next:",
+        f"  blitzgs view {name}                       the model in the browser",
         f"  blitzgs render {name} --out PICTURES      the held-out views as pictures",
         f"  blitzgs export {name} --ply MODEL.ply     the model for viewers",
         f"  blitzgs train --out {name} --extend 1.5   train half as long again",

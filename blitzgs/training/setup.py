@@ -289,6 +289,6 @@ def first_gaussians(
         level_count=levels.count,
         peak_gaussians=len(first),
         seconds=0.0,
-        milestones={"initial": len(first), "found": first.found},
+        milestones={"initial": len(first)} | ({"found": first.found} if first.found > len(first) else {}),
         reference_distance=levels.reference_distance,
     )

@@ -298,9 +298,9 @@ class Trainer:
             f"{views['train']} training views, {views['test']} held out; "
             f"{images:,} images, {images / views['train']:,.0f} per view"
         )
-        found = state.progress.milestones.get("found", 0)
-        if state.progress.step == 0 and found > (kept := state.progress.milestones["initial"]):
-            text += f"; thinned from {found:,} to population.max_gaussians={kept}"
+        if state.progress.step == 0 and (found := state.progress.milestones.get("found", 0)):
+            most = state.config.population.max_gaussians
+            text += f"; thinned from {found:,} to population.max_gaussians={most}"
         if state.config.data.downscale > 1:
             factor = f"data.downscale={state.config.data.downscale:g}"
             text += f"; images of {largest_size(state.capture)} ({factor})"
