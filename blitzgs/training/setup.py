@@ -33,6 +33,8 @@ from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
+from blitzgs.training.curve import Curve
+from blitzgs.training.exposure import Exposures
 from blitzgs.training.extension import extended
 from blitzgs.training.inputs import check_alike, check_capture
 from blitzgs.training.loss import weighted
@@ -111,6 +113,14 @@ def set_up(
     sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed)
     if config.memory.resident_gb > 0:
         table = HostTable(table.release(), pinned=ranks.device.type == "cuda")
+    stepper = _stepper(
+        config, table, optimiser, owners, space.extent, UpcomingCameras(sampler, capture.train, views)
+    )
+    if config.model.exposure:
+        stepper.exposures = Exposures(capture.train, ranks)
+        # As with the tiles, rows are those of the same training views.
+        if restored is not None and restored.progress.train_views in ("", progress.train_views):
+            stepper.exposures.restore(restored.shared)
     return TrainingState(
         config=config,
         capture=capture,
@@ -124,9 +134,7 @@ def set_up(
         views=views,
         sampler=sampler,
         optimiser=optimiser,
-        stepper=_stepper(
-            config, table, optimiser, owners, space.extent, UpcomingCameras(sampler, capture.train, views)
-        ),
+        stepper=stepper,
         owners=owners,
         lpips=lpips,
         run_id=run_id,
@@ -134,6 +142,7 @@ def set_up(
         save_clock=SaveClock(config.log.checkpoint_seconds),
         veto=veto,
         lineage=_start_lineage(config, capture, folder, table, progress, ranks),
+        curve=Curve.of(progress.curve),
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )
 
@@ -156,9 +165,10 @@ def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
 def _resolved(config: Config, capture: Capture, restored: run_files.Restored | None) -> Config:
     """Return `config` with the values that depend on the training views and on what the run has measured.
 
-    The number of views decides the length of the run (`schedule.images_per_view`) and the opacity term
-    (`loss.opacity_total`). A run that is resumed with fewer or more photographs (`data.allow_missing`) keeps
-    the values that it began with. `run_files.with_pace_of` says what a run measures.
+    The depths of what the views see decide on the near plane (`model.near`). The number of views decides the
+    length of the run (`schedule.images_per_view`) and the opacity term (`loss.opacity_total`). A run that is
+    resumed with fewer or more photographs (`data.allow_missing`) keeps the values that it began with.
+    `run_files.with_pace_of` says what a run measures.
     """
     schedule, loss = config.schedule, config.loss
     if restored is not None:
@@ -168,8 +178,13 @@ def _resolved(config: Config, capture: Capture, restored: run_files.Restored | N
                 schedule = replace(schedule, scale=own.schedule.scale, images_per_view=0.0)
             if loss.opacity_total > 0:
                 loss = replace(loss, opacity=own.loss.opacity, opacity_total=0.0)
+    model = config.model
+    if model.near == 0:
+        # Relative to the extent of this capture: a photograph that is lost later does not move the plane.
+        near = capture.near / capture.extent if restored is None else restored.config.model.near
+        model = replace(model, near=near)
     views = len(capture.train)
-    config = replace(config, schedule=stretched(schedule, views), loss=weighted(loss, views))
+    config = replace(config, model=model, schedule=stretched(schedule, views), loss=weighted(loss, views))
     return run_files.with_pace_of(config, None if restored is None else restored.config)
 
 
@@ -189,7 +204,7 @@ def _continued(config: Config, restored: run_files.Restored, extend: float | Non
 def _tile_owners(ranks: Ranks, progress: Progress, restored: run_files.Restored | None) -> TileOwners:
     """Return the division of tiles, with the costs that the checkpoint has if they can be used."""
     owners = TileOwners(ranks)
-    if restored is None or not restored.shared or ranks.world_size == 1:
+    if restored is None or "bounds" not in restored.shared or ranks.world_size == 1:
         return owners
     # Tile costs and plans are stored by view index. With other views, they would belong to other images.
     if restored.progress.train_views in ("", progress.train_views):
@@ -256,7 +271,9 @@ def first_gaussians(
     """Make the first Gaussians from the capture's points; each rank keeps its share of them at `home`."""
     lod, device = config.lod, ranks.device
     points = torch.from_numpy(capture.points) / space.unit
-    centres = trained_centres([capture.cameras[i] for i in capture.train], space).to(device)
+    # Cameras that are far from the others would stretch the octree over distances that no photograph covers.
+    together = [i for i in capture.train if i not in capture.apart] or capture.train
+    centres = trained_centres([capture.cameras[i] for i in together], space).to(device)
     levels = measure_levels(points.to(device), centres, lod.fork)
     colors, most = torch.from_numpy(capture.colors), config.population.max_gaussians
     first = octree_gaussians(
