@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs.lod import scene_gate
 from blitzgs.runs.watch import Watcher, Wish
-from blitzgs.table.pool import Residence
+from blitzgs.table.pool import Pool
 from blitzgs.training.events import save
 from blitzgs.training.state import TrainingState
 from blitzgs.view.draw import Drawer, Subject
@@ -85,7 +85,7 @@ class Watching:
     def _drawn(self, look: Look) -> Picture | None:
         state = self._state
         scene = state.stepper.scene
-        if isinstance(scene, Residence):
+        if isinstance(scene, Pool):
             # The pool is filled for the view, and written back with nothing pending.
             state.catch_up()
         lod = scene_gate(state.config, state.progress, state.table, state.ranks)
