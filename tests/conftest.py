@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from blitzgs.cli import main
-from tests.training.tiny import OVERRIDES, write_tiny_capture
+from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
 
 # Folders of tests with tiny trainings.
 _TRAININGS = ("config", "runs", "spawn", "training")
@@ -39,7 +39,7 @@ def trained(tmp_path_factory):
     """A capture and a short run of it, made by the command line."""
     data, folder = tmp_path_factory.mktemp("capture"), tmp_path_factory.mktemp("runs") / "run"
     write_tiny_capture(data)
-    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES)]
+    flags = as_flags("config=defaults", *OVERRIDES)
     assert main(["train", "--data", str(data), "--out", str(folder), "--schedule.scale=0.4", *flags]) == 0
     return data, folder
 
@@ -49,6 +49,6 @@ def lineage_run(tmp_path_factory):
     """A folder with a capture and a run of it that has lineage."""
     folder = tmp_path_factory.mktemp("gate")
     write_tiny_capture(folder / "capture")
-    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, *LINEAGE)]
+    flags = as_flags("config=defaults", *OVERRIDES, *LINEAGE)
     assert main(["train", "--data", str(folder / "capture"), "--out", str(folder / "run"), *flags]) == 0
     return folder

@@ -21,6 +21,7 @@ from blitzgs.call.arguments import (
 from blitzgs.call.images import ImageOptions, render
 from blitzgs.call.ranks import gather_views
 from blitzgs.ops.projection_types import ProjectionOptions
+from blitzgs.util.memory import explaining_memory
 
 
 def rasterization(
@@ -125,6 +126,7 @@ def rasterization(
         ValueError: an argument is not supported, has a wrong shape or value, or another dtype or device than
             the others; the message names it.
         RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
+        NotEnoughMemoryError: the images or what they need do not fit into memory.
     """
     check_further("rasterization", further)
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
@@ -168,7 +170,9 @@ def rasterization(
         _check_distributed(gaussians, absgrad)
         channels = None if gaussians.colors is None else gaussians.colors.shape[-1]
         gaussians, job = gather_views(gaussians, (width, height, tile_size, render_mode, channels))
-    return render("rasterization", gaussians, project, image, job=job)
+    views = gaussians.views * len(gaussians.scenes)
+    with explaining_memory(views, width, height, means.shape[-2], means.device):
+        return render("rasterization", gaussians, project, image, job=job)
 
 
 def _check_distributed(gaussians: Gaussians, absgrad: bool) -> None:

@@ -32,6 +32,7 @@ from blitzgs.capture.layouts import SourcePoints, SourceView, read_layout
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.splits import split_views
 from blitzgs.capture.undistort import Rectification, rectify
+from blitzgs.util.arguments import check_number
 
 # In pixels. SSIM compares windows of 11 pixels, and a much smaller image shows too little to train on.
 _LEAST_SIDE = 8
@@ -109,6 +110,7 @@ def load_capture(
         ValueError: a file is damaged, or sizes, poses or options are invalid.
     """
     root = Path(path)
+    check_number("downscale", downscale)
     if not downscale >= 1:  # NaN too
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     for option, value, allowed in (

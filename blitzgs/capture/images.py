@@ -187,6 +187,8 @@ class ImageStore:
             shared: memory for `decoded_shapes` of the capture that other processes use too. All images stay
                 decoded there, and none is kept in this process. None: they are kept in this process.
         """
+        if not hasattr(capture, "cameras"):
+            raise TypeError(f"capture must be a Capture, as load_capture returns it, got {capture!r}")
         self.capture, self._shared = capture, shared
         self._background = background if capture.has_alpha else None
         self.compressed: BoundedCache[Path | int, bytes] = BoundedCache(budget_bytes)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from blitzgs.util.arguments import check_tensor
 from blitzgs.util.output import write_file
 
 UInt8 = npt.NDArray[np.uint8]
@@ -37,8 +38,14 @@ def save_image(path: Path | str, image: Tensor) -> None:
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: the format is not known, or the image has another shape.
+        TypeError: the image is not a tensor.
+        ValueError: the format is not known, or the image has another shape or values that are NaN.
     """
+    check_tensor("image", image)
+    if bool(image.isnan().any()):
+        raise ValueError(
+            f"image has NaN in {int(image.isnan().sum()):,} of {image.numel():,} values: black in a file"
+        )
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, encode_image(image, path.suffix), sync=False)

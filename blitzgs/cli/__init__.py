@@ -1,30 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `blitzgs train | eval | render | export | gate | synth`, one file per command."""
+"""The command line: `blitzgs train | eval | render | export | gate | synth`, one file per command.
+
+A command's file is imported when the command is used: `blitzgs --help` needs no torch.
+"""
 
 from __future__ import annotations
 
 import argparse
-import difflib
-import io
-import re
+import os
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
-
-from rich.console import Console
+from types import FrameType
+from typing import cast
 
 from blitzgs import __version__
-from blitzgs.capture.images import PhotographError
-from blitzgs.cli import evaluate, export, gate, render, train
-from blitzgs.cli.arguments import add_command
-from blitzgs.distributed.group import MismatchError
-from blitzgs.runs.checkpoint import CheckpointError
-from blitzgs.runs.folder_checks import FolderError
-from blitzgs.runs.guard import ModelLostError, NonFiniteError
-from blitzgs.table.host_table import HostMemoryError
-from blitzgs.table.pool import ResidenceError
-from blitzgs_synth import command as synth
+from blitzgs.cli.flags import Parser, check_given_once, flag_meant, split_fields
+from blitzgs.util.terminal import Output, printable, surviving_output
 
 HELP = """\
 Train 3D Gaussian Splatting models of photographs with known cameras: models of a desk, or of a whole city.
@@ -33,66 +30,145 @@ These commands lead from a capture (a COLMAP model and its photographs) to pictu
   blitzgs train --data CAPTURE --out RUN
   blitzgs render RUN --out PICTURES
   blitzgs export RUN --ply MODEL.ply
+
+blitzgs train --help explains the training; blitzgs train --help FIELD explains a field of its configuration.
 """
 
+# For each command the module that has it, and what it does.
+COMMANDS = {
+    "train": ("blitzgs.cli.train", "train a model of photographs with known cameras"),
+    "eval": ("blitzgs.cli.evaluate", "measure PSNR and SSIM of a run's held-out views"),
+    "render": ("blitzgs.cli.render", "render the views of a run to files (needs no photographs)"),
+    "export": ("blitzgs.cli.export", "write the model of a run as a PLY file for viewers"),
+    "gate": ("blitzgs.cli.gate", "fit and evaluate spawn gates, which make smaller models"),
+    "synth": (
+        "blitzgs.cli.synth",
+        "make a synthetic city: photographs, cameras and points to train on",
+    ),
+}
+
 # Errors that a user can cause and correct: they are reported as a message. Any other error is a fault of the
-# program and keeps its traceback.
-USER_ERRORS = (
-    ValueError,
-    OSError,
-    ImportError,
-    CheckpointError,
-    FolderError,
-    HostMemoryError,
-    MismatchError,
-    ModelLostError,
-    NonFiniteError,
-    PhotographError,
-    ResidenceError,
+# program and keeps its traceback. The second part is imported only when an error is to be judged.
+_USER_ERRORS: tuple[type[BaseException], ...] = (ValueError, OSError, ImportError, MemoryError)
+_NAMED_ERRORS = (
+    "blitzgs.capture.images.PhotographError",
+    "blitzgs.distributed.group.MismatchError",
+    "blitzgs.runs.checkpoint.CheckpointError",
+    "blitzgs.runs.folder_checks.FolderError",
+    "blitzgs.runs.guard.ModelLostError",
+    "blitzgs.runs.guard.NonFiniteError",
+    "blitzgs.table.host_table.HostMemoryError",
+    "blitzgs.table.pool.ResidenceError",
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status (1: failed, 2: wrong usage, 130: Ctrl-C)."""
-    # File names may contain bytes that are not UTF-8; print them escaped.
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
-    parser = _parser()
-    args, rest = parser.parse_known_args(arguments)
-    trains = args.command == "train"
-    unknown = [text for text in rest if not (trains and text.startswith("--") and "=" in text)]
-    if unknown:
-        hint = " (configuration fields are written --section.field=value)" if trains else ""
-        if meant := _flag_meant(args.parser, unknown[0]):
-            hint = f"; did you mean {meant}?"
-        args.parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
-    args.overrides = rest
+    """Run the command line; returns the exit status (1: failed, 2: wrong usage, 130: Ctrl-C).
+
+    A terminal or pipe that closes ends no command: what cannot be printed is lost, and the work goes on.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    with surviving_output() as outputs:
+        status = _run(given)
+        return _report_lost(given, outputs) or status
+
+
+def _run(given: list[str]) -> int:
+    chosen = next((text for text in given if not text.startswith("-")), "")
+    name = f"blitzgs {chosen}" if chosen in COMMANDS else "blitzgs"
     # Our warnings are about the user's data, so they are shown without the line of code that raised them.
-    warnings.formatwarning = lambda message, *_, **__: f"blitzgs {args.command}: warning: {message}\n"
+    warnings.formatwarning = lambda message, *_, **__: printable(f"{name}: warning: {message}\n")
     try:
-        status: int = args.run(args)
-    except USER_ERRORS as error:
-        Console(stderr=True, highlight=False, emoji=False).print(
-            f"blitzgs {args.command}: {_message(error)}", style="red", markup=False, soft_wrap=True
-        )
-        return 1
+        with _quiet_interrupt(name):
+            parser, command = _parser(chosen)
+        if not given:
+            parser.print_help(sys.stderr)
+            return 2
+        args = _arguments(parser, command, chosen, given)
+        return cast(Callable[[argparse.Namespace], int], args.run)(args)
     except KeyboardInterrupt:
-        print(f"blitzgs {args.command}: interrupted", file=sys.stderr)
+        print(f"{name}: interrupted", file=sys.stderr)
         return 130
-    return status
+    except Exception as error:
+        if not isinstance(error, _user_errors()):
+            raise
+        _print_error(f"{name}: {printable(_message(error))}")
+        return 1
 
 
-def _flag_meant(parser: argparse.ArgumentParser, text: str) -> str | None:
-    """Return the command's flag that an unknown one resembles; None for a field and if no flag is like it."""
-    name = text.partition("=")[0]
-    flags = re.findall(r"--[\w-]+", parser.format_usage())
-    if not name.startswith("--") or "." in name:
-        return None
-    return next(iter(difflib.get_close_matches(name, flags, n=1, cutoff=0.75)), None)
+def _arguments(parser: Parser, command: Parser | None, chosen: str, given: list[str]) -> argparse.Namespace:
+    """Parse the command line; exit with status 2 if it is wrong."""
+    at = given.index(chosen) + 1 if command is not None else len(given)
+    own = given[at:]
+    fields: list[str] = []
+    if command is not None and chosen == "train":
+        own, fields = split_fields(command, own)
+    args, unknown = parser.parse_known_args([*given[:at], *own])
+    parser_of = getattr(args, "parser", parser)
+    if unknown:
+        meant = flag_meant(parser_of, unknown[0])
+        hint = f"; did you mean {meant}?" if meant else ""
+        if chosen == "train" and not meant:
+            hint = " (configuration fields are written --section.field=value)"
+        parser_of.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+    check_given_once(parser_of, [*own, *fields])
+    args.overrides = fields
+    return args
 
 
-def _message(error: Exception) -> str:
+def _parser(chosen: str) -> tuple[Parser, Parser | None]:
+    """Return the parser of all commands, and that of the chosen one, whose module alone is imported."""
+    parser = Parser(prog="blitzgs", description=HELP, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--version", action="version", version=f"blitzgs {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, (module, summary) in COMMANDS.items():
+        if name == chosen:
+            import_module(module).add_to(commands, summary)
+        else:
+            commands.add_parser(name, help=summary)
+    return parser, commands.choices[chosen] if chosen in COMMANDS else None
+
+
+@contextmanager
+def _quiet_interrupt(name: str) -> Iterator[None]:
+    """End the process at once on Ctrl-C while modules are imported, which may not be interrupted halfway."""
+    usual = threading.current_thread() is threading.main_thread() and (
+        signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    )
+
+    def end(number: int, frame: FrameType | None) -> None:
+        os.write(2, f"{name}: interrupted\n".encode())
+        os._exit(130)
+
+    if usual:
+        signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    finally:
+        if usual:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _user_errors() -> tuple[type[BaseException], ...]:
+    """Return the errors that are reported as a message."""
+    named = (path.rpartition(".") for path in _NAMED_ERRORS)
+    return (*_USER_ERRORS, *(getattr(import_module(module), name) for module, _, name in named))
+
+
+def _print_error(text: str) -> None:
+    from rich.console import Console
+
+    console = Console(stderr=True, highlight=False, emoji=False)
+    console.print(text, style="red", markup=False, soft_wrap=True)
+
+
+def _message(error: BaseException) -> str:
     """Return the error's text; for an error of the operating system, the file and the reason."""
+    if isinstance(error, MemoryError):
+        return (
+            str(error)
+            or "the memory is not sufficient: use smaller images (--data.downscale) or a larger machine"
+        )
     if not isinstance(error, OSError) or error.filename is None or error.strerror is None:
         return str(error)
     if isinstance(error, (FileExistsError, NotADirectoryError)):
@@ -102,16 +178,24 @@ def _message(error: Exception) -> str:
     return f"{error.filename}: {error.strerror}"
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="blitzgs", description=HELP, formatter_class=argparse.RawDescriptionHelpFormatter
+# Commands whose result is what they print.
+_PRINTING = ("eval", "--show-config", "--help", "--help-fields", "-h", "--version")
+
+
+def _report_lost(given: list[str], outputs: dict[str, Output]) -> int:
+    """Say that a part of the output was lost; return 1 if it was the result of the command, else 0.
+
+    A reader that closes its end, as `head` does, wants no more: this is no failure.
+    """
+    for name in outputs:
+        getattr(sys, name).flush()
+    lost = [output for output in outputs.values() if output.lost and not output.closed]
+    for output in lost:
+        print(
+            f"blitzgs: {output.name} cannot be written ({output.lost}): what was printed there is "
+            "incomplete; files are complete",
+            file=sys.stderr,
+        )
+    return int(
+        any(output.name == "standard output" for output in lost) and any(text in _PRINTING for text in given)
     )
-    parser.add_argument("--version", action="version", version=f"blitzgs {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for command in (train, evaluate, render, export, gate):
-        command.add_to(commands)
-    city = add_command(
-        commands, "synth", synth.run, "make a synthetic city: photographs, cameras and points to train on"
-    )
-    synth.add_arguments(city)
-    return parser

@@ -21,13 +21,18 @@ def add_command(
     function: Callable[[argparse.Namespace], int],
     summary: str,
     description: str | None = None,
+    add_help: bool = True,
 ) -> argparse.ArgumentParser:
-    """Add a command that calls `function` with its arguments and exits with what it returns."""
+    """Add a command that calls `function` with its arguments and exits with what it returns.
+
+    Without `add_help`, the caller adds the flag --help.
+    """
     parser = commands.add_parser(
         name,
         help=summary,
         description=description or summary[0].upper() + summary[1:] + ".",
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        add_help=add_help,
     )
     parser.set_defaults(run=function, parser=parser)
     return parser

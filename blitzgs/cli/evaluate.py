@@ -23,10 +23,11 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import input_files
-from blitzgs.runs.evaluation import evaluate, load_lpips
+from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
 from blitzgs.runs.lod import lod_gate, scene_gate
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.util.progress import image_progress
+from blitzgs.util.terminal import printable
 from blitzgs.view.views import ViewSet, render_options
 
 HELP = """\
@@ -37,9 +38,9 @@ photograph.
 """
 
 
-def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "eval", run, "measure PSNR and SSIM of a run's held-out views", HELP)
+    parser = add_command(commands, "eval", run, summary, HELP)
     add_run(parser)
     add_capture(parser)
     add_device(parser, shares_gpus=True)
@@ -101,5 +102,7 @@ def run(args: argparse.Namespace) -> int:
         if ranks.rank == 0:
             print(json.dumps({name: value for name, value in result.items() if name != "views"}, indent=1))
             # Standard output has nothing but the JSON.
+            for view, psnr in worst_views(result["views"]):
+                print(printable(f"among the worst views: {view} {psnr:.2f} dB"), file=sys.stderr)
             print(f"{folder}: metrics.json and pictures", file=sys.stderr)
     return 0

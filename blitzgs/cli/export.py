@@ -10,9 +10,9 @@ from pathlib import Path
 
 from blitzgs.cli.arguments import Commands, add_command, add_device, add_run, named_path
 from blitzgs.distributed.group import Ranks
+from blitzgs.formats.ply import check_replaces_ply
 from blitzgs.runs.export import COORDINATES, Exported, export_ply, without_antialiasing
 from blitzgs.runs.folder import open_run
-from blitzgs.util.output import check_replaceable
 
 HELP = """\
 Write the model of a run as a PLY file in INRIA's layout, which most viewers read.
@@ -31,9 +31,8 @@ of the training views; at other distances it is an approximation.
 """
 
 
-def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    summary = "write the model of a run as a PLY file for viewers"
     parser = add_command(commands, "export", run, summary, HELP)
     add_run(parser)
     add_device(parser)
@@ -79,12 +78,8 @@ def _check_format(path: Path) -> None:
         FileExistsError: the file is not empty and no PLY.
         OSError: it is no regular file.
     """
-    check_replaceable(path)
-    if path.exists():
-        with open(path, "rb") as file:
-            start = file.read(3)
-        if start not in (b"", b"ply"):
-            raise FileExistsError(f"{path} exists and is not a PLY file: choose another --ply")
+    if path.exists() or path.is_symlink():
+        check_replaces_ply(path)
     if path.suffix.lower() != ".ply":
         raise ValueError(
             f"{path}: the file will be a PLY, whatever its name: choose a --ply that ends in .ply"

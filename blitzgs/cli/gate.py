@@ -39,11 +39,9 @@ all births and deaths of Gaussians. The repository's docs/guide/fewer-gaussians.
 """
 
 
-def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(
-        commands, "gate", lambda _: 2, "fit and evaluate spawn gates, which make smaller models", HELP
-    )
+    parser = add_command(commands, "gate", lambda _: 2, summary, HELP)
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     fit = add_command(actions, "fit", run_fit, "fit a gate on the lineage of runs")
     fit.add_argument(

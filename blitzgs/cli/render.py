@@ -34,9 +34,9 @@ from blitzgs.view.views import CameraLike, ViewSet, render_options
 from blitzgs.view.visible import VisibleFinder
 
 
-def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "render", run, "render the views of a run to files (needs no photographs)")
+    parser = add_command(commands, "render", run, summary)
     add_run(parser)
     parser.add_argument(
         "--data", type=named_path, metavar="DIR", help="take the cameras from this capture, not from the run"

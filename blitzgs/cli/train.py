@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
 import os
 import shlex
 import sys
@@ -17,14 +18,17 @@ from rich.console import Console
 from rich.table import Table
 
 from blitzgs.cli.arguments import Commands, add_command, add_device, named_path
+from blitzgs.config.describe import describe, describe_all
 from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, load_config, to_dict
 from blitzgs.config.recipes import default_recipe, recipe_path
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.folder_checks import locked
+from blitzgs.training.extension import LEAST_IMAGES
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
+from blitzgs.util.terminal import printable
 
 HELP = """\
 Train a model of a capture, which is a folder DIR with photographs and their cameras: a COLMAP model
@@ -35,9 +39,9 @@ own split: the model is not trained on these views, and its quality is measured 
 
 A GPU trains with the recipe aerial, a CPU with aerial_cpu. --config takes another recipe (compact: fewer
 Gaussians; smoke: a first model in minutes; city: thousands of photographs; paper: the paper's values), a YAML
-file of yours, or "defaults" (the defaults of all fields; blitzgs/config/fields.py describes them). Every
-field is also a flag, for example --data.downscale=2 --population.max_gaussians=2000000. --show-config prints
-the resulting configuration and stops.
+file of yours, or "defaults" (the defaults of all fields). Every field is also a flag, for example
+--data.downscale=2 --population.max_gaussians=2000000; --help FIELD explains one, --help-fields all of them.
+--show-config prints the resulting configuration and stops.
 
 Times in the configuration count the images that were trained on. --schedule.scale=0.5 makes the whole
 schedule half as long; with --minutes=M the run measures its speed and chooses this factor itself.
@@ -46,16 +50,27 @@ RUN gets config.yaml, cameras.json, log.jsonl, checkpoints/, evaluation/, summar
 tensorboard/ if TensorBoard is installed. A checkpoint is written every 10 minutes (log.checkpoint_seconds)
 and when the run is interrupted (Ctrl-C, SIGTERM or SIGHUP). The same command with --resume continues from the
 newest checkpoint; without any checkpoint it starts a new run and says so. With --resume and without --config,
-the run's own configuration is used.
+the run's own configuration is used. --extend trains a finished run longer.
 
 To share the work among M processes, run torchrun --nproc-per-node=M -m blitzgs train with the same flags.
 With torchrun's --max-restarts=K and --resume, a job that loses a process continues from its last checkpoint.
 """
 
 
-def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "train", run, "train a model of photographs with known cameras", HELP)
+    parser = add_command(commands, "train", run, summary, HELP, add_help=False)
+    parser.add_argument(
+        "-h",
+        "--help",
+        nargs="?",
+        metavar="FIELD",
+        action=_Help,
+        help="show this help, or explain a field or section of the configuration, and stop",
+    )
+    parser.add_argument(
+        "--help-fields", nargs=0, action=_Help, help="explain all fields of the configuration and stop"
+    )
     parser.add_argument(
         "--config",
         metavar="RECIPE",
@@ -65,6 +80,13 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--out", type=named_path, metavar="RUN", help="folder for the results")
     parser.add_argument(
         "--resume", action="store_true", help="continue from the newest checkpoint in RUN, if any"
+    )
+    parser.add_argument(
+        "--extend",
+        type=_extension,
+        metavar="IMAGES|FACTOR",
+        help="train the finished run in RUN longer: by a number of images (100 or more), or to a multiple of "
+        "its length (--extend=1.5)",
     )
     parser.add_argument(
         "--minutes",
@@ -78,8 +100,45 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     add_device(parser)
 
 
+class _Help(argparse.Action):
+    """Prints the help of the command, of a field, or of all fields, and stops."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        """Print the help; exit with status 2 if there is no such field."""
+        if option_string == "--help-fields":
+            print(printable(describe_all()))
+        elif isinstance(values, str):
+            try:
+                print(printable(describe(values)))
+            except ConfigError as error:
+                parser.error(str(error))
+        else:
+            parser.print_help()
+        parser.exit()
+
+
+def _extension(text: str) -> float:
+    """Return what --extend says; see `blitzgs.training.extension.extended`."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (1 < value < math.inf and (value < LEAST_IMAGES or value.is_integer())):
+        raise argparse.ArgumentTypeError(
+            f"must be a number of images from {LEAST_IMAGES} on, or a factor above 1, got {text}"
+        )
+    return value
+
+
 def run(args: argparse.Namespace) -> int:
     """Train; returns the exit status."""
+    args.resume = args.resume or args.extend is not None
     if args.out is None and not args.show_config:
         needed = "--out" if args.data or args.config else "--data, --out"
         args.parser.error(f"the following arguments are required: {needed}")
@@ -103,7 +162,7 @@ def run(args: argparse.Namespace) -> int:
         # A capture that cannot be read leaves no empty folder behind.
         capture, images = open_capture(config, ranks)
         with locked(args.out, ranks):
-            summary = Trainer(config, capture, images, args.out, ranks, args.resume).train()
+            summary = Trainer(config, capture, images, args.out, ranks, args.resume, args.extend).train()
         if summary is not None and ranks.rank == 0:
             _print_summary(summary, args.out)
     return 0
@@ -140,7 +199,7 @@ def _config(args: argparse.Namespace) -> Config:
 def _print_summary(summary: dict[str, object], folder: Path) -> None:
     console, table = Console(emoji=False), Table(show_header=False)
     # Print the path verbatim: rich must not interpret brackets and colons in it.
-    console.print(str(folder), markup=False, highlight=False, soft_wrap=True)
+    console.print(printable(str(folder)), markup=False, highlight=False, soft_wrap=True)
     if summary.get("split") == "train":
         console.print("no view is held out: the figures are those of the training views", style="yellow")
     for name, value in summary.items():
@@ -151,6 +210,9 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
     name = shlex.quote(str(folder))
     for text in (
         f"pictures: {folder / run_files.EVALUATION}",
-        f"for viewers: blitzgs export {name} --ply FILE.ply",
+        "next:",
+        f"  blitzgs render {name} --out PICTURES      the held-out views as pictures",
+        f"  blitzgs export {name} --ply MODEL.ply     the model for viewers",
+        f"  blitzgs train --out {name} --extend 1.5   train half as long again",
     ):
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        console.print(printable(text), markup=False, highlight=False, soft_wrap=True)

@@ -17,13 +17,11 @@ from typing import Any
 
 import yaml
 
+from blitzgs.config.errors import ConfigError as ConfigError
 from blitzgs.config.fields import Config
 from blitzgs.config.ranges import problems
+from blitzgs.config.recipes import base_file
 from blitzgs.util.output import write_file
-
-
-class ConfigError(ValueError):
-    """A configuration that cannot be used; the message names the field, the value and the remedy."""
 
 
 class Ignored:
@@ -61,7 +59,7 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
 
     Args:
         path: YAML file with sections as in `Config`, or None. A file may name another one under `base`
-            (relative to itself); it then changes the values of that file.
+            (relative to itself, or the name of a recipe); it then changes the values of that file.
         overrides: "section.field=value" with a YAML value; leading dashes are allowed.
 
     Raises:
@@ -159,8 +157,8 @@ def _read(path: Path, seen: set[Path]) -> dict[str, Any]:
     if base is None:
         return values
     if not isinstance(base, str):
-        raise ConfigError(f"{path}: base must be a file name, got {base!r}")
-    merged = _read(path.parent / base, seen | {path})
+        raise ConfigError(f"{path}: base must be a file name or the name of a recipe, got {base!r}")
+    merged = _read(base_file(base, path), seen | {path})
     _merge(merged, values, str(path))
     return merged
 

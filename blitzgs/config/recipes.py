@@ -6,7 +6,7 @@ from __future__ import annotations
 import difflib
 from pathlib import Path
 
-from blitzgs.config.files import ConfigError
+from blitzgs.config.errors import ConfigError
 
 # The name that stands for the default of every field, without a file.
 DEFAULTS = "defaults"
@@ -36,13 +36,44 @@ def recipe_path(given: str) -> Path | None:
         return Path(given)
     if given == DEFAULTS:
         return None
-    for folder in _FOLDERS:
-        if (folder / f"{given}.yaml").is_file():
-            return folder / f"{given}.yaml"
+    if (found := _recipe(given)) is not None:
+        return found
+    raise ConfigError(f"{given}: no such file or recipe; {_known(given)}")
+
+
+def base_file(given: str, file: Path) -> Path:
+    """Return the file that `base` names in a configuration file.
+
+    Args:
+        given: path relative to `file`, or a name of `recipe_names`, with or without ".yaml": a copy of a
+            recipe's file names its base so.
+        file: the configuration file.
+
+    Raises:
+        ConfigError: there is neither such a file nor such a recipe.
+    """
+    beside = file.parent / given
+    if beside.is_file():
+        return beside
+    if (found := _recipe(given.removesuffix(".yaml"))) is not None:
+        return found
+    raise ConfigError(
+        f"{file}: base: {given}: no such file in {file.parent} and no such recipe; {_known(given)}"
+    )
+
+
+def _recipe(name: str) -> Path | None:
+    """Return the file of a recipe; None if there is none of this name."""
+    files = (folder / f"{name}.yaml" for folder in _FOLDERS if "/" not in name)
+    return next((file for file in files if file.is_file()), None)
+
+
+def _known(given: str) -> str:
+    """Return which recipes there are, and which of them may have been meant."""
     known = [*recipe_names(), DEFAULTS]
     close = difflib.get_close_matches(Path(given).stem, known, n=1)
     hint = f"did you mean '{close[0]}'? " if close else ""
-    raise ConfigError(f"{given}: no such file or recipe; {hint}recipes are {', '.join(known)}")
+    return f"{hint}recipes are {', '.join(known)}"
 
 
 def default_recipe(on_gpu: bool) -> str:

@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.formats.native import native_io
-from blitzgs.util.output import new_file
+from blitzgs.util.arguments import check_tensor
+from blitzgs.util.output import check_replaceable, new_file
 
 LEVEL = "level"
 _REST_TO_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
@@ -115,7 +116,7 @@ def write_ply(
     """Write Gaussians in the INRIA layout; the file appears under its name only when it is complete.
 
     Args:
-        path: file to write; its folder is created.
+        path: file to write, in a folder that exists. Only an empty file or a PLY is replaced.
         means: [N, 3].
         quats: [N, 4] w, x, y, z.
         scales: [N, 3] logarithms.
@@ -127,12 +128,22 @@ def write_ply(
         levels: [N] octree levels; None: the file has none.
 
     Raises:
-        ValueError: shapes disagree.
+        TypeError: an argument is not a tensor.
+        ValueError: shapes disagree, or a value is NaN (or a mean infinite).
+        FileExistsError: there is a file of another format.
+        FileNotFoundError: there is no such folder.
         OSError: the file cannot be written, or `path` is no regular file; an existing file is unchanged.
     """
+    path = Path(path)
+    check_replaces_ply(path)
+    tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+    optional = {"normals": normals, "levels": levels}
+    for name, tensor in (tensors | {name: t for name, t in optional.items() if t is not None}).items():
+        check_tensor(name, tensor)
+        _check_values(name, tensor)
     n, k = len(means), sh.shape[1] if sh.ndim == 3 else 0
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}
-    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+    given = dict(tensors)
     if levels is not None:
         shapes["levels"], given["levels"] = (n,), levels
     if k not in _REST_TO_COEFFICIENTS.values():
@@ -156,8 +167,6 @@ def write_ply(
     rows[:, end - 4 : end] = _array(quats)
     if levels is not None:
         rows[:, end] = _array(levels)
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     properties = [(name, "f4") for name in names]
     with new_file(path) as partial:
         try:
@@ -165,6 +174,36 @@ def write_ply(
         except OSError as error:
             reason = str(error).rpartition(": ")[2]
             raise OSError(f"{path} cannot be written: {reason}") from error
+
+
+def check_replaces_ply(path: Path) -> None:
+    """Check that writing a PLY file replaces no file of another format, and that its folder exists.
+
+    Raises:
+        FileExistsError: there is a file that is not empty and no PLY.
+        FileNotFoundError: there is no such folder.
+        OSError: `path` is no regular file.
+    """
+    check_replaceable(path)
+    if path.exists():
+        with open(path, "rb") as file:
+            start = file.read(3)
+        if start not in (b"", b"ply"):
+            raise FileExistsError(f"{path} exists and is not a PLY file: choose another name")
+    elif not path.parent.is_dir():
+        raise FileNotFoundError(f"{path.parent} is not a folder: make it first, or choose another one")
+
+
+def _check_values(name: str, tensor: Tensor) -> None:
+    """Refuse values that no viewer can show: NaN, and positions at infinity."""
+    bad = ~tensor.isfinite() if name == "means" else tensor.isnan()
+    if bool(bad.any()):
+        rows = bad.flatten(1).any(dim=1) if bad.dim() > 1 else bad
+        first = int(rows.nonzero()[0])
+        raise ValueError(
+            f"{name} has NaN or infinite values in {int(rows.sum()):,} Gaussians, the first is number "
+            f"{first}: leave these Gaussians out"
+        )
 
 
 def _array(tensor: Tensor) -> npt.NDArray[np.float32]:

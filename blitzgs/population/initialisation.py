@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.voxel_keys import voxel_keys
 from blitzgs.table.table import GaussianTable, opacity_logit
@@ -34,12 +35,14 @@ class FirstGaussians:
         log_scales: float32 [C], the same on all axes.
         colors: float32 [C, 3], their SH coefficients of degree 0.
         levels: uint8 [C], octree levels.
+        found: number of Gaussians before they were thinned to a limit.
     """
 
     means: Tensor
     log_scales: Tensor
     colors: Tensor
     levels: Tensor
+    found: int
 
     def __len__(self) -> int:
         return len(self.means)
@@ -76,7 +79,13 @@ class FirstGaussians:
 
 
 def octree_gaussians(
-    points: Tensor, colors: Tensor, centres: Tensor, levels: Levels, visible_threshold: float
+    points: Tensor,
+    colors: Tensor,
+    centres: Tensor,
+    levels: Levels,
+    visible_threshold: float,
+    most: int = 0,
+    seed: int = 0,
 ) -> FirstGaussians:
     """Find one Gaussian per occupied voxel of every level that enough cameras can resolve.
 
@@ -93,6 +102,9 @@ def octree_gaussians(
         levels: from `measure_levels` on the same points and cameras.
         visible_threshold: a voxel is kept when its level is resolvable in more than this share of the
             cameras.
+        most: largest number of Gaussians. Whole levels are kept, from the coarsest on, and of the first level
+            that does not fit a random part. 0: no limit.
+        seed: seed of the draw.
 
     Raises:
         ValueError: no voxel is left.
@@ -110,10 +122,22 @@ def octree_gaussians(
         raise ValueError(
             f"the octree kept no voxel of {len(points)} points at lod.visible_threshold {visible_threshold}"
         )
+    found = len(means)
+    if 0 < most < found:
+        rows = _thinned(level_of, most, seed)
+        means, mean_colors, level_of = means[rows], mean_colors[rows], level_of[rows]
     spacing = _spacing(means).clamp(min=SMALLEST_SPACING * levels.voxel_size)
     return FirstGaussians(
-        means.float(), spacing.log().float(), ((mean_colors / 255.0 - 0.5) / SH_C0).float(), level_of
+        means.float(), spacing.log().float(), ((mean_colors / 255.0 - 0.5) / SH_C0).float(), level_of, found
     )
+
+
+def _thinned(levels: Tensor, most: int, seed: int) -> Tensor:
+    """Return `most` rows, in order: those of the coarsest levels, and a random part of the next level."""
+    draws = uniform(torch.arange(len(levels)), seed, 0, 0)
+    order = torch.argsort(draws, stable=True)
+    order = order[torch.argsort(levels[order].long(), stable=True)]
+    return order[:most].sort().values
 
 
 def _grid_origin(points: Tensor, levels: Levels) -> Tensor:

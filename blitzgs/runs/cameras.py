@@ -40,7 +40,7 @@ class RunCamera:
     world_to_camera: npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RunCameras:
     """All cameras of a run.
 
@@ -56,6 +56,11 @@ class RunCameras:
     test: list[int]
     inputs: list[Path]
 
+    def __repr__(self) -> str:
+        return (
+            f"RunCameras({len(self.cameras):,} cameras: {len(self.train):,} train, {len(self.test):,} test)"
+        )
+
 
 def checked_camera(
     name: str, width: int, height: int, K: npt.ArrayLike, world_to_camera: npt.ArrayLike
@@ -63,9 +68,13 @@ def checked_camera(
     """Return a camera with these values, in arrays of its own.
 
     Raises:
+        TypeError: a size is no number, or a matrix not made of numbers; the message names it.
         ValueError: a value is impossible; the message names it.
     """
-    intrinsics, pose = np.array(K, dtype=np.float64), np.array(world_to_camera, dtype=np.float64)
+    for argument, size in (("width", width), ("height", height)):
+        if isinstance(size, bool) or not isinstance(size, (int, float, np.integer, np.floating)):
+            raise TypeError(f"{argument} must be an integer, got {size!r} ({type(size).__name__})")
+    intrinsics, pose = _matrix("K", K), _matrix("world_to_camera", world_to_camera)
     for argument, matrix, shape in (("K", intrinsics, (3, 3)), ("world_to_camera", pose, (4, 4))):
         if matrix.shape != shape or not np.isfinite(matrix).all():
             raise ValueError(f"{argument} must be a finite matrix {shape}, got {matrix.tolist()}")
@@ -80,8 +89,18 @@ def checked_camera(
     return RunCamera(name, int(width), int(height), intrinsics, pose)
 
 
-def save_cameras(folder: Path, capture: Capture) -> None:
-    """Write the cameras of a capture into the folder of a run."""
+def _matrix(argument: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return a copy of a matrix as float64."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"{argument} must be a matrix of numbers, got {type(value).__name__} ({error})"
+        ) from error
+
+
+def save_cameras(folder: Path, capture: Capture, run_id: str = "") -> None:
+    """Write the cameras of a capture into the folder of a run; `run_id` tells its checkpoints from others."""
     views = [
         {
             "name": camera.name,
@@ -94,6 +113,7 @@ def save_cameras(folder: Path, capture: Capture) -> None:
     ]
     content = {
         "version": _VERSION,
+        "run": run_id,
         "train": list(capture.train),
         "test": list(capture.test),
         "inputs": [str(path.absolute()) for path in input_files(capture)],

@@ -9,7 +9,6 @@ compares the files with the digests. The folder must be on a file system that ev
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
@@ -28,18 +27,27 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.sharding import global_positions
+from blitzgs.runs.disk_space import check_space, explain
 from blitzgs.runs.shard_file import file_digest, header_of, write_shard
-from blitzgs.util.output import sync_to_disk
+from blitzgs.util.output import is_lack_of_space, sync_to_disk
 
 FORMAT = 2
 MANIFEST = "manifest.json"
 SHARED = "shared.safetensors"
-_NAME = re.compile(r"checkpoint_(\d{6})")
+_NAME = re.compile(r"checkpoint_(\d{6,})")
 _UNFINISHED = ".unfinished_"
 
 
 class CheckpointError(RuntimeError):
-    """A checkpoint could not be written or read; the message names the checkpoint and the reason."""
+    """A checkpoint could not be written or read; the message names the checkpoint and the reason.
+
+    Attributes:
+        lacks_space: whether it could be written if there were more space on the disk.
+    """
+
+    def __init__(self, message: str, lacks_space: bool = False) -> None:
+        super().__init__(message)
+        self.lacks_space = lacks_space
 
 
 @dataclass
@@ -74,7 +82,7 @@ def save(
             of crashes stop the process there.
 
     Returns:
-        The folder of the new checkpoint, `directory/checkpoint_NNNNNN`.
+        The folder of the new checkpoint, `directory/checkpoint_NNNNNN`; later numbers may have more digits.
 
     Raises:
         CheckpointError: on every rank, if any rank could not write; earlier checkpoints are unchanged.
@@ -94,12 +102,13 @@ def save(
     name, problem = ranks.broadcast_object((name, problem))
     if problem:
         raise CheckpointError(problem)
+    lacks_space = True
     unfinished = directory / (_UNFINISHED + name)
     mine, common = None, None
     try:
         reached("begin")
         unfinished.mkdir(parents=True, exist_ok=True)
-        _check_space(unfinished, columns)
+        check_space(unfinished, columns)
         reached("folder made")
         file = f"shard_{ranks.rank:04d}_of_{ranks.world_size:04d}.safetensors"
         with ranks.watchdog.working("writing a checkpoint"):
@@ -108,23 +117,27 @@ def save(
         if shared and ranks.rank == 0:
             common = Shard(SHARED, 0, *write_shard(unfinished / SHARED, shared, lambda point: None))
     except OSError as error:
-        problem = f"rank {ranks.rank} could not write: {_explain(error)}"
-    results = ranks.all_gather_object((mine, problem))
-    problems = [text for _, text in results if text]
+        problem = f"rank {ranks.rank} could not write: {explain(error)}"
+        lacks_space = is_lack_of_space(error)
+    results = ranks.all_gather_object((mine, problem, lacks_space))
+    problems = [text for _, text, _ in results if text]
+    lacks_space = all(lacks for _, _, lacks in results)
     if not problems and ranks.rank == 0:
         try:
             with ranks.watchdog.working("finishing a checkpoint"):
-                shards = [shard for shard, _ in results if shard]
+                shards = [shard for shard, _, _ in results if shard]
                 _finish(directory, name, shards, common, state, ranks.world_size, reached)
         except OSError as error:
-            problems.append(f"rank 0 could not write: {_explain(error)}")
-    problems = ranks.broadcast_object(problems)
+            problems.append(f"rank 0 could not write: {explain(error)}")
+            lacks_space = is_lack_of_space(error)
+    problems, lacks_space = ranks.broadcast_object((problems, lacks_space))
     if problems:
         if ranks.rank == 0:
             shutil.rmtree(unfinished, ignore_errors=True)
         raise CheckpointError(
             f"checkpoint {directory / name} was not saved: {'; '.join(problems)}. "
-            "Earlier checkpoints are untouched."
+            "Earlier checkpoints are untouched.",
+            lacks_space,
         )
     if ranks.rank == 0:
         try:
@@ -364,12 +377,17 @@ def _delete_unfinished(directory: Path) -> None:
 def _names(directory: Path) -> list[str]:
     if not directory.is_dir():
         return []
-    return sorted(entry.name for entry in directory.iterdir() if _NAME.fullmatch(entry.name))
+    names = (entry.name for entry in directory.iterdir() if _NAME.fullmatch(entry.name))
+    return sorted(names, key=lambda name: (_number(name), name))
+
+
+def _number(name: str) -> int:
+    return int(name.rpartition("_")[2])
 
 
 def _next_name(directory: Path) -> str:
     names = _names(directory)
-    return f"checkpoint_{int(names[-1].rsplit('_', 1)[1]) + 1 if names else 0:06d}"
+    return f"checkpoint_{_number(names[-1]) + 1 if names else 0:06d}"
 
 
 def _common_length(columns: Mapping[str, Tensor]) -> int:
@@ -377,18 +395,3 @@ def _common_length(columns: Mapping[str, Tensor]) -> int:
     if len(set(lengths.values())) != 1:
         raise ValueError(f"checkpoint: the columns must be given and of one length, got {lengths}")
     return next(iter(lengths.values()))
-
-
-def _check_space(folder: Path, columns: Mapping[str, Tensor]) -> None:
-    needed = sum(column.numel() * column.element_size() for column in columns.values())
-    free = shutil.disk_usage(folder).free
-    if free < needed:
-        raise OSError(
-            errno.ENOSPC, f"{needed / 1e9:.2f} GB are needed and {free / 1e9:.2f} GB are free", str(folder)
-        )
-
-
-def _explain(error: OSError) -> str:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return f"the disk is full ({error}); free some space or lower the number of checkpoints kept"
-    return str(error)

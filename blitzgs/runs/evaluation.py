@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.pixels import collect_images
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.ops.photometric import ssim
+from blitzgs.util.memory import explaining_memory
 from blitzgs.util.output import OutputFolder
 from blitzgs.util.progress import Report
 from blitzgs.view.gate import SceneGate
@@ -121,10 +122,11 @@ def render_view(
     """
     picked, ranks = views.pick([index]), owners.ranks
     table, active, _ = finder.find(*picked.as_arguments(), options.limits)
-    if ranks.world_size == 1:
-        return pipeline.forward(table, picked, options, active).renders[0]
-    ranges = owners.divide([index], picked.width, picked.height, options.tile_size)
-    frame = pipeline.forward(table, picked, options, active, TileAssignment(ranks, ranges))
+    with explaining_memory(1, picked.width, picked.height, len(table), ranks.device):
+        if ranks.world_size == 1:
+            return pipeline.forward(table, picked, options, active).renders[0]
+        ranges = owners.divide([index], picked.width, picked.height, options.tile_size)
+        frame = pipeline.forward(table, picked, options, active, TileAssignment(ranks, ranges))
     owners.record([index], frame.tile_work, ranges)
     collect_images(frame.renders, ranges, ranks, destination)
     return frame.renders[0] if ranks.rank == destination else None
@@ -257,6 +259,12 @@ def _over_all_ranks(
             result[metric] = sum(values) / len(values)
     result["views"] = views
     return result
+
+
+def worst_views(views: Mapping[str, Mapping[str, float]], count: int = 3) -> list[tuple[str, float]]:
+    """Return names and PSNR of the views of lowest PSNR, the worst first; none of a single view."""
+    ordered = sorted((view["psnr"], name) for name, view in views.items())
+    return [(name, psnr) for psnr, name in ordered[:count]] if len(ordered) > 1 else []
 
 
 class _Files:

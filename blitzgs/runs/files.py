@@ -23,6 +23,7 @@ from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.guard import bad_column, check_before_saving
+from blitzgs.runs.identity import check_own
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Residence
 from blitzgs.table.table import GaussianTable
@@ -184,12 +185,14 @@ def restore(folder: Path, ranks: Ranks, device: torch.device | None = None) -> R
         device: device of the Gaussians; None: the ranks' device.
 
     Raises:
-        CheckpointError: there are checkpoints, but all are damaged, or the newest is of another version.
+        CheckpointError: there are checkpoints, but all are damaged, or the newest is of another version or
+            of another run.
     """
     loaded = checkpoint.load_latest(folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns)
     if loaded is None:
         return None
     state = loaded.state
+    check_own(folder, folder / CHECKPOINTS / loaded.name, str(state.get("run", "")), ranks)
     why = "the newest sound one" if loaded.refused else "the newest"
     skipped = f"; {len(loaded.refused)} newer refused" if loaded.refused else ""
     try:
@@ -286,10 +289,12 @@ def check_resumable(saved: Config, wanted: Config) -> None:
         # The number of minutes may change: the rest of the run is then fitted into the rest of the new time.
         is_budget = name == "schedule.minutes" and old > 0 and new > 0
         if not (_is_free(name) or is_budget):
+            longer = name in ("schedule.scale", "schedule.iterations", "schedule.minutes")
+            remedy = ", or train a finished run longer with --extend" if longer else ""
             raise ConfigError(
                 f"{name}: the checkpoint was trained with {old!r}, now {new!r}; "
                 "leave out --config and the fields to resume with the run's own configuration, or start "
-                "another run"
+                f"another run{remedy}"
             )
 
 

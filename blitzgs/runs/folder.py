@@ -49,6 +49,7 @@ class Model:
         sh_degree: spherical-harmonics degree to evaluate.
         config: configuration of the run.
         images_seen: number of images that the model was trained on.
+        run: the run, whose cameras `render` takes by their indices; None: it takes only cameras.
     """
 
     means: Tensor
@@ -62,6 +63,7 @@ class Model:
     sh_degree: int
     config: Config
     images_seen: int
+    run: RunFolder | None = None
 
     def __len__(self) -> int:
         return len(self.means)
@@ -73,12 +75,13 @@ class Model:
         )
 
     @torch.no_grad()
-    def render(self, camera: CameraLike, render_mode: str = "RGB", alpha: bool = False) -> Tensor:
+    def render(self, camera: CameraLike | int, render_mode: str = "RGB", alpha: bool = False) -> Tensor:
         """Render a view as the run's own evaluation does.
 
         Args:
             camera: any pinhole camera with a pose in the re-centred world, for example from
-                `RunFolder.cameras` or `camera`.
+                `RunFolder.cameras` or `camera`; or the index of a camera of the run, for example from
+                `RunFolder.cameras().test`.
             render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED", as for `blitzgs.rasterization`; depths are in
                 the capture's unit.
             alpha: whether the opacity of each pixel follows as the last channel.
@@ -87,14 +90,34 @@ class Model:
             float32 [H, W, channels] on the model's device: colours (not clamped), depth, alpha.
 
         Raises:
+            TypeError: `camera` is no camera.
+            IndexError: the run has no camera of this index.
             ValueError: there is no such mode.
+            NotEnoughMemoryError: the image does not fit into memory.
         """
+        camera = self._camera(camera)
         images, alphas, _ = self._kept(camera).splat(
             [camera], antialiased=self.config.model.antialiased, render_mode=render_mode
         )
         if "D" in render_mode:
             images[..., -1] *= self.space.unit
         return torch.cat([images[0], alphas[0]], dim=-1) if alpha else images[0]
+
+    def _camera(self, camera: CameraLike | int) -> CameraLike:
+        """Return a camera, or that of the run with an index."""
+        if isinstance(camera, (int, np.integer)) and not isinstance(camera, bool) and self.run is not None:
+            cameras = self.run.cameras().cameras
+            if not 0 <= camera < len(cameras):
+                raise IndexError(f"camera {camera}: the run has the cameras 0 to {len(cameras) - 1}")
+            return cameras[camera]
+        if isinstance(camera, (int, np.integer)) or not all(
+            hasattr(camera, name) for name in ("width", "height", "K", "world_to_camera")
+        ):
+            raise TypeError(
+                "camera must be a camera, such as run.cameras().cameras[0] or model.camera(...), got "
+                f"{camera!r} ({type(camera).__name__})"
+            )
+        return camera
 
     def _kept(self, camera: CameraLike) -> Model:
         """Return the Gaussians that the LOD gate keeps for a view, faded if levels are smooth."""
@@ -224,6 +247,7 @@ class RunFolder:
             sh_degree=found.progress.sh_degree,
             config=found.config,
             images_seen=found.progress.step * found.config.schedule.batch_size,
+            run=self,
         )
 
     @staticmethod

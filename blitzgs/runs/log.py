@@ -22,6 +22,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import Report
+from blitzgs.util.terminal import printable
 
 LOG = "log.jsonl"
 BOARD = "tensorboard"
@@ -32,12 +33,16 @@ _MOST_WAITING = 10_000
 _BAR_SECONDS = 0.5
 _LINE_SECONDS = 30.0
 
+# The loss and the PSNR that are shown are means over this number of records; the file has each record's own.
+_MEAN_RECORDS = 20
+
 # Events after the last image, which a run that is resumed there logs again.
-_AT_THE_END = ("population", "image_memory", "evaluation")
+_AT_THE_END = ("population", "image_memory", "evaluation", "worst views")
 
 _SHOWN: dict[str, Callable[[float], str]] = {
     "loss": lambda value: f"loss {value:.4f}",
-    "psnr": lambda value: f"{value:.2f} dB",
+    "psnr": lambda value: f"train {value:.2f} dB",
+    "held_out": lambda value: f"held-out {value:.2f} dB",
     "gaussians": lambda value: f"{_count(value)} Gaussians",
     "images_per_second": lambda value: f"{value:.1f} images/s",
 }
@@ -72,6 +77,8 @@ class RunLog:
         self._progress: Progress | None = None
         self._task = TaskID(0)
         self._moved = 0.0
+        self._recent: dict[str, deque[float]] = {}
+        self._held_out: float | None = None
         self._run_id = run_id
         self._first, self._started = done, time.monotonic()
         self.total = total
@@ -137,7 +144,7 @@ class RunLog:
         self._write(t, values)
         if self._board is not None:
             self._board.add(t, values)
-        text = "  ".join(_SHOWN[name](value) for name, value in values.items() if name in _SHOWN)
+        text = self._shown(values)
         if self._progress is not None:
             self._progress.update(self._task, completed=t, total=self.total, description=text)
         elif self._file is not None:
@@ -145,9 +152,24 @@ class RunLog:
             left = timedelta(seconds=round(rate * (self.total - t)))
             self._print(f"{t:>7,}/{self.total:,} images  {text}  ETA {left}")
 
+    def _shown(self, values: Mapping[str, float]) -> str:
+        """Return the text of a record: running means, because a record is that of a few views."""
+        shown = dict(values)
+        for name in ("loss", "psnr"):
+            if name in values:
+                recent = self._recent.setdefault(name, deque(maxlen=_MEAN_RECORDS))
+                recent.append(values[name])
+                shown[name] = sum(recent) / len(recent)
+        if self._held_out is not None:
+            shown["held_out"] = self._held_out
+        return "  ".join(show(shown[name]) for name, show in _SHOWN.items() if name in shown)
+
     def event(self, t: int, kind: str, values: Mapping[str, Any], text: str | None = None) -> None:
         """Record something that happened at time `t`; print `text` if given."""
         self._write(t, {"event": kind, **values})
+        is_held_out = kind == "glance" or (kind == "evaluation" and values.get("split") == "test")
+        if is_held_out and "psnr" in values:
+            self._held_out = values["psnr"]
         if self._board is not None:
             numbers = {name: value for name, value in values.items() if isinstance(value, (int, float))}
             self._board.add(t, {f"{kind}/{name}": value for name, value in numbers.items()})
@@ -171,7 +193,7 @@ class RunLog:
 
     def _print(self, text: str) -> None:
         with self._failures.tolerated("terminal"):
-            self.console.print(text, soft_wrap=True, markup=False, emoji=False)
+            self.console.print(printable(text), soft_wrap=True, markup=False, emoji=False)
 
 
 class _JsonLines:

@@ -165,10 +165,13 @@ class Lineage:
             OSError: on every rank, when one could not write a part; a later call tries that part again.
         """
         self.flush(step)
-        found = self._ranks.all_gather_object((self._writer.finish(), self._parts))
-        problems = [text for part, _ in found for text in part]
+        failed = [(error.errno, str(error)) for error in self._writer.finish()]
+        found = self._ranks.all_gather_object((failed, self._parts))
+        problems = [problem for part, _ in found for problem in part]
         if problems:
-            raise OSError(f"the lineage could not be written: {problems[0]}")
+            error = OSError(f"the lineage could not be written: {problems[0][1]}")
+            error.errno = problems[0][0]
+            raise error
         self._parts = max(parts for _, parts in found)
         device = self._id_sum.device
         counts = torch.tensor([self._births, self._deaths, len(ids)], device=device)

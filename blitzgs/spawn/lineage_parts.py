@@ -72,7 +72,7 @@ class PartWriter:
             ready.record(current_stream(groups[0].device))
         self._copying.append(self._copier.submit(self._copy, name, table, groups, ready))
 
-    def finish(self) -> list[str]:
+    def finish(self) -> list[OSError]:
         """Wait until all parts are written, and try those again that could not be; return what went wrong."""
         for copying in self._copying:
             copying.result().result()
@@ -80,7 +80,7 @@ class PartWriter:
         failed, self._failed = self._failed, []
         for name, columns, _ in failed:
             self._write(name, columns)
-        return [str(error) for _, _, error in self._failed]
+        return [error for _, _, error in self._failed]
 
     def close(self) -> None:
         """Finish the part that is being written, and drop those behind it."""

@@ -33,6 +33,7 @@ from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Residence
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
+from blitzgs.training.extension import extended
 from blitzgs.training.inputs import check_alike, check_capture
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
@@ -46,7 +47,13 @@ from blitzgs.view.views import Space, ViewSet, trained_centres
 
 
 def set_up(
-    config: Config, capture: Capture, images: Images, folder: Path, ranks: Ranks, resume: bool
+    config: Config,
+    capture: Capture,
+    images: Images,
+    folder: Path,
+    ranks: Ranks,
+    resume: bool,
+    extend: float | None = None,
 ) -> TrainingState:
     """Make the state of a new run, or restore the state of the run in `folder`.
 
@@ -57,6 +64,7 @@ def set_up(
         folder: folder of the run, for configuration, log, checkpoints, evaluation and summary.
         ranks: the job.
         resume: continue from the newest checkpoint in `folder`, if there is one.
+        extend: with `resume`, train a finished run longer, see `extension.extended`.
 
     Raises:
         FileExistsError: the folder holds a trained run and `resume` is not set, or files of another program.
@@ -75,12 +83,15 @@ def set_up(
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
     restored = run_files.restore(folder, ranks, home) if resume else None
     config = _resolved(config, capture, restored)
+    if restored is not None:
+        config = _continued(config, restored, extend)
+    elif extend is not None:
+        raise FileNotFoundError(f"{folder} has no checkpoint: there is no finished run to extend")
     schedule = Schedule(config.schedule)
     if restored is None:
         table, progress = first_gaussians(config, capture, space, ranks, home)
     else:
         table, progress = restored.table, restored.progress
-        run_files.check_resumable(restored.config, config)
         check_capture(restored.space, capture, folder)
     # The views and the spawn gate are compared with those of the checkpoint.
     progress = keep_to_views(table, progress, capture, ranks)
@@ -88,11 +99,11 @@ def set_up(
     progress = replace(progress, gate=spawn_gate_digest)
     check_room(folder, table, ranks, config.population.max_gaussians)
 
+    run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
     if ranks.rank == 0:
         save_config(config, folder / run_files.CONFIG)
         if restored is None or not (folder / CAMERAS).exists():
-            save_cameras(folder, capture)
-    run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
+            save_cameras(folder, capture, run_id)
     optimiser = TableAdam(config.optimiser, schedule, space.extent, ranks.device)
     owners = _tile_owners(ranks, progress, restored)
     views = ViewSet(list(capture.cameras), space, ranks.device)
@@ -119,7 +130,7 @@ def set_up(
         owners=owners,
         lpips=lpips,
         run_id=run_id,
-        origin=_origin(restored, resume, folder),
+        origin=_origin(restored, resume, folder, schedule.iterations),
         save_clock=SaveClock(config.log.checkpoint_seconds),
         veto=veto,
         lineage=_start_lineage(config, capture, folder, table, progress, ranks),
@@ -160,6 +171,19 @@ def _resolved(config: Config, capture: Capture, restored: run_files.Restored | N
     views = len(capture.train)
     config = replace(config, schedule=stretched(schedule, views), loss=weighted(loss, views))
     return run_files.with_pace_of(config, None if restored is None else restored.config)
+
+
+def _continued(config: Config, restored: run_files.Restored, extend: float | None) -> Config:
+    """Return the configuration to continue a run with: `config`, or one with a longer schedule.
+
+    Raises:
+        ConfigError: it differs from that of the run, or the run to extend is not finished.
+    """
+    if extend is not None:
+        # An interrupted extension may have left its schedule in the folder's configuration.
+        config = replace(config, schedule=restored.config.schedule)
+    run_files.check_resumable(restored.config, config)
+    return config if extend is None else extended(config, restored.progress.step, extend)
 
 
 def _tile_owners(ranks: Ranks, progress: Progress, restored: run_files.Restored | None) -> TileOwners:
@@ -217,10 +241,12 @@ def _start_lineage(
     return lineage
 
 
-def _origin(restored: run_files.Restored | None, resume: bool, folder: Path) -> str:
+def _origin(restored: run_files.Restored | None, resume: bool, folder: Path, iterations: int) -> str:
     """Describe where the run begins, for the log."""
     if restored is not None:
-        return f"resumed from {restored.source} after {restored.progress.step:,} steps"
+        longer = Schedule(restored.config.schedule).iterations != iterations
+        extended_to = f", extended to {iterations:,} images" if longer else ""
+        return f"resumed from {restored.source} after {restored.progress.step:,} steps{extended_to}"
     return f"nothing to resume in {folder}: starting anew" if resume else "new run"
 
 
@@ -232,7 +258,10 @@ def first_gaussians(
     points = torch.from_numpy(capture.points) / space.unit
     centres = trained_centres([capture.cameras[i] for i in capture.train], space).to(device)
     levels = measure_levels(points.to(device), centres, lod.fork)
-    first = octree_gaussians(points, torch.from_numpy(capture.colors), centres, levels, lod.visible_threshold)
+    colors, most = torch.from_numpy(capture.colors), config.population.max_gaussians
+    first = octree_gaussians(
+        points, colors, centres, levels, lod.visible_threshold, most=most, seed=config.seed
+    )
     # A row of the table has some 750 bytes, so each rank makes only its own rows, on its device.
     share = slice(ranks.rank, None, ranks.world_size)
     table = first.table(config.model.sh_degree, INITIAL_OPACITY, home, share)
@@ -243,6 +272,6 @@ def first_gaussians(
         level_count=levels.count,
         peak_gaussians=len(first),
         seconds=0.0,
-        milestones={"initial": len(first)},
+        milestones={"initial": len(first), "found": first.found},
         reference_distance=levels.reference_distance,
     )

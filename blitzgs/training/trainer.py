@@ -33,16 +33,14 @@ from blitzgs.training.agreement import MOST_STEPS, Agreement, StopRequest
 from blitzgs.training.batches import MOST_MASKED, BatchLoader
 from blitzgs.training.budget import Budget
 from blitzgs.training.events import evaluate, events_left, handle_all, save
-from blitzgs.training.inputs import sharing_hint
+from blitzgs.training.glances import Glances
+from blitzgs.training.hints import hints_of, largest_size
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
 from blitzgs.training.setup import set_up
-from blitzgs.training.state import TrainingState, never
+from blitzgs.training.state import never
 from blitzgs.training.step_report import StepRecord, log_step, measure_step
 from blitzgs.util.output import write_file
 from blitzgs.view.views import render_options
-
-# With fewer views for each rank, a step takes a rank's host longer than its GPU (docs/city.md).
-VIEWS_PER_RANK = 4
 
 
 class Trainer:
@@ -62,9 +60,11 @@ class Trainer:
         folder: Path,
         ranks: Ranks,
         resume: bool = False,
+        extend: float | None = None,
     ) -> None:
         """Set up the run; arguments and errors are those of `blitzgs.training.setup.set_up`."""
-        self.state = state = set_up(config, capture, images, folder, ranks, resume)
+        self.state = state = set_up(config, capture, images, folder, ranks, resume, extend)
+        self._saves_first = extend is not None
         self.loader = BatchLoader(
             images,
             state.views,
@@ -107,7 +107,9 @@ class Trainer:
                 agreement = Agreement(state.ranks, stop, state.save_clock)
                 state.stops = lambda: agreement.now(state.progress.step).signal is not None
                 self._announce()
-                budget = Budget(state)
+                if self._saves_first:  # so that --resume knows the longer schedule
+                    save.run(state)
+                budget, glances = Budget(state), Glances(state)
                 if not handle_all(state, events_left(state.progress)):
                     self._stop(_stopped_by(agreement.now(done).signal))
                     return None
@@ -124,6 +126,7 @@ class Trainer:
                         self._stop(_stopped_by(agreement.now(step).signal))
                         return None
                     budget.after(step)
+                    glances.after((step - 1) * size, step * size)
                     if step == state.schedule.steps:
                         break
                     decision = agreement.after(step, self.loader.lost is not None)
@@ -273,9 +276,12 @@ class Trainer:
             f"{views['train']} training views, {views['test']} held out; "
             f"{images:,} images, {images / views['train']:,.0f} per view"
         )
+        found = state.progress.milestones.get("found", 0)
+        if state.progress.step == 0 and found > (kept := state.progress.milestones["initial"]):
+            text += f"; thinned from {found:,} to population.max_gaussians={kept}"
         if state.config.data.downscale > 1:
             factor = f"data.downscale={state.config.data.downscale:g}"
-            text += f"; images of {_largest_size(state)} ({factor})"
+            text += f"; images of {largest_size(state.capture)} ({factor})"
         if ranks.world_size > 1:
             text += f"; {ranks.world_size} ranks, transport {ranks.transport}"
         if state.config.schedule.minutes > 0:
@@ -284,12 +290,8 @@ class Trainer:
         state.log.event(
             state.images_seen, "start", {"origin": state.origin} | values, f"{state.origin}; {text}"
         )
-        hints = [sharing_hint(state.capture, state.config.data.cache_bytes, ranks.local_world_size)]
-        if state.progress.step == 0:  # a resumed run keeps its batches
-            hints.append(small_batch_hint(state.schedule.batch_size, ranks.world_size))
-        for hint in hints:
-            if hint is not None:
-                state.log.event(state.images_seen, "hint", {"hint": hint}, hint)
+        for hint in hints_of(state):
+            state.log.event(state.images_seen, "hint", {"hint": hint}, hint)
 
     def finish(self, agreement: Agreement) -> dict[str, Any] | None:
         """Save and evaluate the trained model; return and write the summary.
@@ -345,25 +347,6 @@ class Trainer:
                 "scale": state.images_seen / state.config.schedule.iterations,
             }
         return figures
-
-
-def small_batch_hint(batch_size: int, world_size: int) -> str | None:
-    """Return what to do if a step has too few views for several ranks; None if it has enough."""
-    enough = VIEWS_PER_RANK * world_size
-    if world_size == 1 or batch_size >= enough:
-        return None
-    return (
-        f"a step of {batch_size} views may be no faster on {world_size} ranks than on one: try "
-        f"--schedule.batch_size={enough}, which also scales the learning rates"
-    )
-
-
-def _largest_size(state: TrainingState) -> str:
-    """Return the size of the training images, of the largest if they differ, as text."""
-    cameras = [state.capture.cameras[index] for index in state.capture.train]
-    sizes = {(camera.width, camera.height) for camera in cameras}
-    width, height = max(sizes, key=lambda size: size[0] * size[1])
-    return f"{'at most ' if len(sizes) > 1 else ''}{width} x {height}"
 
 
 def _stopped_by(signal: str | None) -> str:

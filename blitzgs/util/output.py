@@ -7,6 +7,7 @@ equal when their suffix is replaced. `OutputFolder` makes paths of them for whic
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
@@ -224,6 +225,11 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return found.st_dev, found.st_ino
+
+
+def is_lack_of_space(error: OSError) -> bool:
+    """Tell whether an error would not have happened with more space on the disk."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def sync_to_disk(path: Path) -> None:

@@ -8,14 +8,29 @@ from blitzgs.capture.pictures import comparison, error_map, save_image, strip, t
 
 
 def test_saved_pictures_are_rgb_rounded_and_clamped(tmp_path):
-    image = torch.tensor([[[1.5, 0.5, -1.0], [float("nan"), 0.0, 1.0]]])
-    assert to_uint8(image).tolist() == [[[255, 128, 0], [0, 0, 255]]]
+    image = torch.tensor([[[1.5, 0.5, -1.0], [float("inf"), 0.0, 1.0]]])
+    assert to_uint8(image).tolist() == [[[255, 128, 0], [255, 0, 255]]]
     save_image(tmp_path / "new" / "a.png", image)
     found = cv2.imread(str(tmp_path / "new" / "a.png"))[..., ::-1]
     np.testing.assert_array_equal(found, to_uint8(image))
     whole = torch.randint(0, 256, (4, 5, 3), dtype=torch.uint8)
     save_image(tmp_path / "b.png", whole)
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "b.png"))[..., ::-1], whole)
+
+
+@pytest.mark.parametrize(
+    ("image", "error", "message"),
+    [
+        (torch.full((2, 2, 3), float("nan")), ValueError, "image has NaN in 12 of 12 values"),
+        (np.zeros((2, 2, 3)), TypeError, "image must be a torch.Tensor, got ndarray: convert it with"),
+        ("a.jpg", TypeError, "image must be a torch.Tensor, got str"),
+        (None, TypeError, "image must be a torch.Tensor, got NoneType"),
+    ],
+)
+def test_what_is_no_picture_is_refused(tmp_path, image, error, message):
+    with pytest.raises(error, match=message):
+        save_image(tmp_path / "a.png", image)
+    assert not (tmp_path / "a.png").exists()
 
 
 def test_unwritable_pictures_are_named(tmp_path):

@@ -19,7 +19,7 @@ from blitzgs.distributed.group import Ranks
 from tests.helpers import needs_cuda
 
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["torch", "torch.distributed", "blitzgs.cli"])
+CONTEXT.set_forkserver_preload(["torch", "torch.distributed", "blitzgs.cli.train"])
 
 
 def _child(function, rank, world_size, port, timeout_seconds, join, device, transport, arguments, pipe):

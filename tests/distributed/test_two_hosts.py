@@ -13,7 +13,7 @@ import pytest
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
-from tests.training.tiny import OVERRIDES, write_tiny_capture
+from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = (
@@ -57,7 +57,7 @@ def test_a_host_is_lost_and_both_resume(tmp_path):
     data, out = tmp_path / "data", tmp_path / "run"
     write_tiny_capture(data)
     arguments = ["--data", str(data), "--out", str(out), "--resume", "--device", "cpu"]
-    arguments += [f"--{text}" for text in ("config=defaults", *SETTINGS)]
+    arguments += as_flags("config=defaults", *SETTINGS)
     hosts = []
     try:
         # The first agent serves the rendezvous, so the second one is killed.

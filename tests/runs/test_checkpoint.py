@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import errno
 import json
 import os
 import resource
@@ -157,7 +158,7 @@ def test_kill_at_any_point_of_a_save(tmp_path, point):
 
 
 def _save_on_a_full_disk(directory, limit):
-    # Past the limit every write fails, as on a full disk; Python ignores the signal that comes with it.
+    # Past the limit every write fails; Python ignores the signal that comes with it.
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
     try:
         checkpoint.save(directory, table(5000, 1), {"iteration": 1}, ALONE)
@@ -171,13 +172,44 @@ def test_full_disk(tmp_path, monkeypatch):
     process.start()
     process.join(60)
     message = (tmp_path / "message").read_text()
-    assert "checkpoint_000001 was not saved: rank 0 could not write: the disk is full" in message
+    assert "checkpoint_000001 was not saved: rank 0 could not write: a file is larger than" in message
     assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint_000000", "message"]
     usage = type("Usage", (), {"free": 10})
     monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda path: usage)
-    with pytest.raises(checkpoint.CheckpointError, match="GB are needed and 0.00 GB are free"):
+    with pytest.raises(checkpoint.CheckpointError, match="GB are needed and 0.00 GB are free") as failure:
         checkpoint.save(tmp_path, table(64), {}, ALONE)
+    assert failure.value.lacks_space
     assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 0}
+
+
+@pytest.mark.parametrize(
+    ("error", "waits", "text"),
+    [
+        (errno.ENOSPC, True, "the disk is full"),
+        (errno.EDQUOT, True, "the disk is full"),
+        (errno.EFBIG, False, "a file is larger than is allowed"),
+        (errno.EACCES, False, "Permission denied"),
+        (errno.EIO, False, "Input/output error"),
+        (errno.EROFS, False, "Read-only file system"),
+    ],
+)
+def test_an_error_tells_whether_space_would_help(tmp_path, monkeypatch, error, waits, text):
+    def write_shard(*_):
+        raise OSError(error, os.strerror(error))
+
+    monkeypatch.setattr(checkpoint, "write_shard", write_shard)
+    with pytest.raises(checkpoint.CheckpointError, match=text) as failure:
+        checkpoint.save(tmp_path, table(4), {}, ALONE)
+    assert failure.value.lacks_space == waits
+
+
+def test_numbers_may_have_more_than_six_digits(tmp_path):
+    (tmp_path / "checkpoint_999999").mkdir()
+    for number in range(1_000_000, 1_000_003):
+        path = checkpoint.save(tmp_path, table(4), {"iteration": number}, ALONE, keep=2)
+        assert path.name == f"checkpoint_{number}"
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["checkpoint_1000001", "checkpoint_1000002"]
+    assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 1_000_002}
 
 
 def _refuse(monkeypatch, method, folder):
@@ -256,7 +288,7 @@ def test_save_at_four_ranks_load_at_any_number(tmp_path):
     with pytest.raises(RankError) as failure:
         run_ranks(_save_with_one_full_disk, 2, tmp_path, [50, 50])
     for message in failure.value.messages.values():
-        assert "checkpoint_000001 was not saved: rank 1 could not write: the disk is full" in message
+        assert "checkpoint_000001 was not saved: rank 1 could not write: a file is larger than" in message
     assert [p.name for p in tmp_path.iterdir()] == ["checkpoint_000000"]
 
 

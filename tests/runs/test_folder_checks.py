@@ -12,7 +12,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs.folder_checks import FolderError, check_room, check_writable, locked
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import RankError, run_ranks
-from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene, write_tiny_capture
 
 ROOT = Path(__file__).parents[2]
 
@@ -65,7 +65,7 @@ def test_folders_are_checked_on_every_rank(tmp_path):
 
 
 def test_a_capture_that_cannot_be_read_leaves_no_folder(tmp_path):
-    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, "schedule.iterations=2")]
+    flags = as_flags("config=defaults", *OVERRIDES, "schedule.iterations=2")
     command = ["train", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run"), *flags]
     assert main(command) == 1 and not (tmp_path / "run").exists()
     write_tiny_capture(tmp_path / "data")
@@ -86,7 +86,7 @@ def test_one_run_at_a_time(tmp_path, monkeypatch, capsys):
     holder = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, cwd=ROOT)
     try:
         assert holder.stdout.readline() == "in\n"
-        flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, "schedule.iterations=2")]
+        flags = as_flags("config=defaults", *OVERRIDES, "schedule.iterations=2")
         command = ["train", "--data", str(tmp_path / "data"), "--out", str(out), *flags]
         assert main(command) == 1
         assert f"in use by another run (process {holder.pid} on " in capsys.readouterr().err

@@ -23,7 +23,7 @@ from blitzgs.runs import checkpoint
 from blitzgs.runs import files as run_files
 from blitzgs.runs.export import export_ply, without_antialiasing
 from blitzgs.training.trainer import Trainer
-from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene
+from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene
 
 
 @pytest.fixture
@@ -350,7 +350,7 @@ def test_export_replaces_no_file_of_another_format(trained, tmp_path, capsys):
     path = tmp_path / "notes.txt"
     path.write_text("precious")
     assert main(["export", str(trained[1]), "--ply", str(path)]) == 1
-    assert "notes.txt exists and is not a PLY file: choose another --ply" in capsys.readouterr().err
+    assert "notes.txt exists and is not a PLY file: choose another name" in capsys.readouterr().err
     assert path.read_text() == "precious"
 
 
@@ -370,7 +370,7 @@ def test_export_refuses_a_name_that_promises_another_format(trained, tmp_path, c
 def test_any_path_works(trained, tmp_path, capfd, name):
     data, out = tmp_path / f"data {name}", tmp_path / f"run {name}"
     shutil.copytree(trained[0], data)
-    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, "schedule.scale=0.02")]
+    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.02")
     assert main(["train", "--data", str(data), "--out", str(out), *flags]) == 0
     printed = capfd.readouterr().out
     assert "psnr" in printed

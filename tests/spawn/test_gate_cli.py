@@ -16,7 +16,7 @@ from blitzgs.spawn.fit import read_spawns
 from blitzgs.spawn.samples import read_sample
 from tests.conftest import LINEAGE
 from tests.spawn.test_spawn_gate import spawns
-from tests.training.tiny import OVERRIDES
+from tests.training.tiny import OVERRIDES, as_flags
 from tests.training.tiny_runs import events_of
 
 pyarrow = pytest.importorskip("pyarrow")
@@ -142,7 +142,7 @@ def test_names_need_not_be_utf_8(lineage_run, tmp_path):
     model.images.names[0] = "\udcfe.png"
     write_model(sparse, model)
     (root / "\udcff" / "images" / "00.png").rename(root / "\udcff" / "images" / "\udcfe.png")
-    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, *LINEAGE)]
+    flags = as_flags("config=defaults", *OVERRIDES, *LINEAGE)
     run, gate, sample = str(root / "run"), str(root / "gate.json"), str(root / "sample.parquet")
     assert main(["train", "--data", str(root / "\udcff"), "--out", run, *flags]) == 0
     assert main(["gate", "sample", run, "--out", sample]) == 0

@@ -25,7 +25,7 @@ from blitzgs.training.trainer import Trainer
 from tests.conftest import LINEAGE
 from tests.distributed.rank_harness import run_ranks
 from tests.spawn.test_spawn_gate import candidates
-from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, tiny_config
+from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, as_flags, tiny_config
 from tests.training.tiny_runs import at_step, events_of
 
 pytest.importorskip("pyarrow")
@@ -38,7 +38,7 @@ def test_a_replay_that_repeats_the_reference_matches_it_though_the_population_is
     """Candidates that the limit held back are candidates of both continuations."""
     capture, gate = str(lineage_run / "capture"), str(tmp_path / "g.json")
     limited, out = str(tmp_path / "run"), tmp_path / "replay"
-    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, *LINEAGE)]
+    flags = as_flags("config=defaults", *OVERRIDES, *LINEAGE)
     flags.append("--population.max_gaussians=420")
     assert main(["gate", "fit", str(lineage_run / "run"), "--out", gate]) == 0
     assert main(["train", "--data", capture, "--out", limited, *flags]) == 0

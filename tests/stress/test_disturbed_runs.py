@@ -18,7 +18,7 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from tests.distributed.rank_harness import CONTEXT
-from tests.training.tiny import OVERRIDES, write_tiny_capture
+from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
 from tests.training.tiny_runs import steps_of
 
 TRIALS = int(os.environ.get("BLITZGS_TRIALS", "20"))
@@ -50,7 +50,7 @@ def _train(arguments):
 
 
 def start(data, out, *flags):
-    settings = [f"--{text}" for text in ("config=defaults", *SETTINGS)]
+    settings = as_flags("config=defaults", *SETTINGS)
     process = CONTEXT.Process(
         target=_train, args=(["train", "--data", str(data), "--out", str(out), *settings, *flags],)
     )

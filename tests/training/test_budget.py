@@ -24,7 +24,7 @@ from blitzgs.training.budget import Budget
 from blitzgs.training.replay import replay
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
-from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene, write_tiny_capture
 from tests.training.tiny_runs import events_of
 
 SECONDS = 2.4
@@ -235,7 +235,7 @@ def test_ranks_whose_clocks_differ_take_the_same_steps(tmp_path):
 
 def test_the_command_takes_minutes(tmp_path, capsys):
     write_tiny_capture(tmp_path / "data")
-    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, "log.pictures=0")]
+    flags = as_flags("config=defaults", *OVERRIDES, "log.pictures=0")
     command = ["train", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run"), *flags]
     assert main([*command, "--minutes=0.02"]) == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())

@@ -26,7 +26,7 @@ from blitzgs.training.trainer import Trainer
 from blitzgs.view.gate import centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training import tiny_runs
-from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene, write_tiny_capture
 from tests.training.tiny_runs import assert_same_table, events_of, steps_of, stop_at
 
 # The passes follow the density event at 40 and come at 70; the window ends at 60; the mask is cleared at 85.
@@ -167,7 +167,7 @@ def test_a_run_on_two_ranks_opens_the_gate_and_clears_the_mask(whole_run, tmp_pa
 
 def test_render_honours_the_gate(tmp_path):
     write_tiny_capture(tmp_path / "capture")
-    out, flags = tmp_path / "run", [f"--{flag}" for flag in ("config=defaults", *OVERRIDES, *FLAGS)]
+    out, flags = tmp_path / "run", as_flags("config=defaults", *OVERRIDES, *FLAGS)
     data = ["--data", str(tmp_path / "capture"), "--out", str(out)]
     assert main(["train", *data, "--schedule.scale=0.8", *flags]) == 0
     arguments = ["--out", str(tmp_path / "images"), "--raw", "--device", "cpu"]

@@ -75,6 +75,12 @@ class Images:
         return ImageMemory(0, 0, 0, 0, 0)
 
 
+def as_flags(*overrides: str) -> list[str]:
+    """Return overrides as flags of a command, which takes none twice: of equal fields the last one counts."""
+    fields = dict(text.split("=", 1) for text in overrides)
+    return [f"--{name}={value}" for name, value in fields.items()]
+
+
 def tiny_config(*overrides: str) -> Config:
     return load_config(None, [*OVERRIDES, *overrides])
 

@@ -10,7 +10,7 @@ from typing import Any
 from blitzgs.config.schedule import Event
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import files as run_files
-from blitzgs.runs.evaluation import EvaluationStoppedError, evaluate
+from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, worst_views
 from blitzgs.runs.lod import scene_gate
 from blitzgs.training.state import TrainingState
 
@@ -26,7 +26,7 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
         folder = state.folder / run_files.EVALUATION / f"{state.images_seen:06d}"
         capture = state.capture
         try:
-            metrics = measure(state, capture.test or capture.train, folder)
+            metrics = measure(state, capture.test or capture.train, folder, state.lpips)
         except EvaluationStoppedError:
             text = "evaluation given up: the run has to stop"
             state.log.event(state.images_seen, "evaluation stopped", {}, text)
@@ -36,17 +36,24 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
         figures = "  ".join(f"{name} {value:.4f}" for name, value in means.items())
         text = f"{what}: {figures or 'all pixels are masked'}"
         means["split"] = "test" if capture.test else "train"
-        state.log.event(state.images_seen, "evaluation", means, text)
+        worst = worst_views(metrics["views"])
+        state.log.event(state.images_seen, "evaluation", means | {"worst": dict(worst)}, text)
+        if event is None and worst:  # at the end
+            names = ", ".join(f"{name} {psnr:.2f} dB" for name, psnr in worst)
+            state.log.event(state.images_seen, "worst views", {"worst": dict(worst)}, f"worst views: {names}")
     return means
 
 
-def measure(state: TrainingState, indices: Sequence[int], folder: Path | None) -> dict[str, Any]:
+def measure(
+    state: TrainingState, indices: Sequence[int], folder: Path | None, lpips: Lpips | None = None
+) -> dict[str, Any]:
     """Compare the model with the photographs of some cameras; see `blitzgs.runs.evaluation.evaluate`.
 
     Args:
         state: state of the run; every rank calls this.
         indices: cameras of the capture.
         folder: folder for the metrics and the pictures; None: nothing is written.
+        lpips: the perceptual metric, or None.
     """
     state.catch_up()
     with state.log.work("views measured") as report:
@@ -60,7 +67,7 @@ def measure(state: TrainingState, indices: Sequence[int], folder: Path | None) -
             folder,
             TileOwners(state.ranks),
             pictures=state.config.log.pictures,
-            lpips=state.lpips,
+            lpips=lpips,
             report=report,
             optional_files=True,
             lod=scene_gate(state.config, state.progress, state.table, state.ranks),

@@ -3,22 +3,28 @@
 
 from __future__ import annotations
 
+import contextlib
+import shlex
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
+from blitzgs.config.files import save_config
 from blitzgs.config.schedule import Event
 from blitzgs.runs import files as run_files
+from blitzgs.runs.cameras import save_cameras
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.spawn.lineage import ledger_state
 from blitzgs.training.state import TrainingState
+from blitzgs.util.output import is_lack_of_space
 
 # If a checkpoint cannot be written, training continues and tries again after this time.
 RETRY_SECONDS = 60.0
 # If the last checkpoint of a run cannot be written, the run waits this long, then twice as long each time.
 FIRST_WAIT_SECONDS = 1.0
 LONGEST_WAIT_SECONDS = 20.0
-# The run waits up to a day, so that its user can see the message and free some space.
+# For lack of space the run waits up to a day, so that its user can see the message and free some space.
 PATIENCE_SECONDS = 24 * 3600.0
 # A run that was told to stop waits less: torchrun kills a process 30 seconds after SIGTERM.
 STOPPING_PATIENCE_SECONDS = 15.0
@@ -40,7 +46,9 @@ def run(state: TrainingState, event: Event | None = None) -> None:
 
 
 def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[], bool]) -> None:
-    """Write the checkpoint at the end of a run; if it cannot be written, wait and try again.
+    """Write the checkpoint at the end of a run; if there is no space for it, wait and try again.
+
+    If it cannot be written for another reason, which waiting does not change, the model is saved elsewhere.
 
     Args:
         state: state of the run.
@@ -49,7 +57,8 @@ def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[
 
     Raises:
         NonFiniteError: as for `run`.
-        CheckpointError: it could not be written in time.
+        CheckpointError: it could not be written in time, or not at all; the message says whether and where
+            the model was saved instead.
     """
     waited, pause = 0.0, FIRST_WAIT_SECONDS
     while True:
@@ -57,6 +66,8 @@ def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[
             _write(state)
             return
         except CheckpointError as error:
+            if not error.lacks_space:
+                raise CheckpointError(f"{error} {_rescue(state)}") from error
             if waited >= patience_seconds or gives_up():
                 raise
             left = f"{max(1, round((patience_seconds - waited) / 60)):,} minutes"
@@ -70,6 +81,22 @@ def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[
         waited, pause = waited + pause, min(2 * pause, LONGEST_WAIT_SECONDS)
 
 
+def _rescue(state: TrainingState) -> str:
+    """Save the model in another folder than the run's; return where it is, and how to continue, as text."""
+    run, name = state.folder.resolve(), f"rescued_{state.run_id}"
+    for folder in (run / name, run.with_name(f"{run.name}_{name}")):
+        try:
+            _save(state, folder)
+        except (CheckpointError, OSError):
+            continue
+        if state.ranks.rank == 0:
+            with contextlib.suppress(OSError):
+                save_config(state.config, folder / run_files.CONFIG)
+                save_cameras(folder, state.capture, state.run_id)
+        return f"The model is saved in {folder}: continue with --resume --out {shlex.quote(str(folder))}"
+    return f"The model could not be saved elsewhere ({run / name} and beside {run}): it is lost"
+
+
 def _write(state: TrainingState) -> None:
     """Write a checkpoint, after the lineage has been written and found to add up."""
     state.stepper.write_back()
@@ -77,12 +104,20 @@ def _write(state: TrainingState) -> None:
         try:
             ledger = state.lineage.flush_and_check(state.table["id"], state.progress.step)
         except OSError as error:
-            raise CheckpointError(f"no checkpoint was written, because {error}.") from error
+            raise CheckpointError(
+                f"no checkpoint was written, because {error}.", is_lack_of_space(error)
+            ) from error
         state.progress = replace(state.progress, ledger=ledger_state(ledger))
+    _save(state, state.folder)
+    state.save_clock.restart()
+
+
+def _save(state: TrainingState, folder: Path) -> None:
+    """Write a checkpoint into the folder of a run."""
     # The division of tiles decides the order of sums, and therefore their last bits.
     shared = state.owners.columns() if state.ranks.world_size > 1 else None
     run_files.save(
-        state.folder,
+        folder,
         state.table,
         state.progress,
         state.space,
@@ -91,7 +126,6 @@ def _write(state: TrainingState) -> None:
         state.run_id,
         shared,
     )
-    state.save_clock.restart()
 
 
 def _report(state: TrainingState, error: CheckpointError, what_next: str) -> None:

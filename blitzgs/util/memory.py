@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Turns the errors of failed allocations into a sentence about memory."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterator
+
+import psutil
+import torch
+
+# What torch says when memory is missing; kernels only learn that the call of an allocation failed.
+_MESSAGES = re.compile(
+    r"can't allocate memory|not enough memory|out of memory|aoti_torch_empty\w*\(.*API call failed", re.DOTALL
+)
+
+
+class NotEnoughMemoryError(MemoryError, RuntimeError):
+    """There is too little memory; the message says for what, how much that takes and how much is free."""
+
+
+def is_lack_of_memory(error: BaseException) -> bool:
+    """Tell whether an error is that of a failed allocation."""
+    if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
+        return True
+    return isinstance(error, RuntimeError) and _MESSAGES.search(str(error)) is not None
+
+
+@contextlib.contextmanager
+def explaining_memory(
+    views: int, width: int, height: int, gaussians: int, device: torch.device
+) -> Iterator[None]:
+    """Explain failed allocations while images are rendered.
+
+    Raises:
+        NotEnoughMemoryError: instead of the error of an allocation that failed inside the context.
+    """
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if isinstance(error, NotEnoughMemoryError) or not is_lack_of_memory(error):
+            raise
+        # A pixel has three colours, an opacity and the number of its last splat.
+        needed = views * width * height * 5 * 4
+        count = "1 view" if views == 1 else f"{views:,} views"
+        raise NotEnoughMemoryError(
+            f"not enough memory to render {count} of {width:,} x {height:,} pixels with {gaussians:,} "
+            f"Gaussians: the pixels alone take {needed / 1e9:,.2f} GB, and {_free(device) / 1e9:,.2f} GB are "
+            f"free on {device}. Render smaller views, or fewer at once"
+        ) from error
+
+
+def _free(device: torch.device) -> int:
+    """Return the bytes that are free on a device."""
+    if device.type == "cuda":
+        return int(torch.cuda.mem_get_info(device)[0])
+    return int(psutil.virtual_memory().available)

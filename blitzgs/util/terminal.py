@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What commands print: it survives a closed terminal, and contains nothing that controls the terminal."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import os
+import re
+import sys
+from collections.abc import Iterator
+from typing import Any, TextIO, cast
+
+# Control characters except line feed and tab, and the marks that change the direction of text.
+_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+
+
+def printable(text: str) -> str:
+    """Return text for a terminal: control characters, as in names of files, are written as escapes."""
+    return _CONTROLS.sub(lambda match: ascii(match[0])[1:-1], text)
+
+
+class Output:
+    """One of the process's output streams, which keeps the program running when it cannot be written.
+
+    Attributes:
+        name: "standard output" or "standard error".
+        lost: why text was lost; None: all was written.
+        closed: whether the reader has gone (a pipe that `head` closed, a terminal that hung up).
+    """
+
+    def __init__(self, name: str, descriptor: int) -> None:
+        self.name = name
+        self.lost: str | None = None
+        self.closed = False
+        self._descriptor = descriptor
+
+    def write(self, data: bytes) -> None:
+        """Write all of the data; after the first error, to nowhere."""
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[os.write(self._descriptor, view) :]
+        except OSError as error:
+            self.lost = error.strerror or str(error)
+            self.closed = error.errno in (errno.EPIPE, errno.EIO, errno.EBADF)
+            # So that later text of this process, and of its libraries and children, goes nowhere as well.
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self._descriptor)
+            os.close(nowhere)
+
+
+class _Raw(io.RawIOBase):
+    """The bytes of an `Output` as a file of Python."""
+
+    def __init__(self, output: Output, descriptor: int) -> None:
+        self._output, self._descriptor = output, descriptor
+
+    def writable(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return self._descriptor
+
+    def isatty(self) -> bool:
+        return os.isatty(self._descriptor)
+
+    def write(self, data: bytes) -> int:  # type: ignore[override]
+        self._output.write(data)
+        return len(data)
+
+
+@contextlib.contextmanager
+def surviving_output() -> Iterator[dict[str, Output]]:
+    """Let `sys.stdout` and `sys.stderr` survive errors while the context lasts: text is lost, nothing else.
+
+    Names that are not valid UTF-8 are printed with escapes. A stream that is no file of the process, as in
+    tests and notebooks, stays as it is.
+
+    Yields:
+        The streams by the names "stdout" and "stderr", those that were replaced.
+    """
+    outputs: dict[str, Output] = {}
+    previous: dict[str, TextIO | None] = {}
+    for name, title in (("stdout", "standard output"), ("stderr", "standard error")):
+        stream = getattr(sys, name)
+        if stream is None:  # the process was started without it
+            previous[name] = None
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+            continue
+        buffer = getattr(stream, "buffer", None)
+        raw = getattr(buffer, "raw", buffer)  # python -u has no buffer
+        if type(stream) is not io.TextIOWrapper or not isinstance(raw, io.FileIO):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")
+            continue
+        with contextlib.suppress(OSError):
+            stream.flush()
+        previous[name] = stream
+        outputs[name] = Output(title, stream.fileno())
+        setattr(sys, name, _text(outputs[name], stream, name == "stderr"))
+    try:
+        yield outputs
+    finally:
+        for name, stream in previous.items():
+            getattr(sys, name).flush()
+            setattr(sys, name, stream)
+
+
+def _text(output: Output, stream: io.TextIOWrapper, is_error: bool) -> io.TextIOWrapper:
+    buffer = io.BufferedWriter(cast(Any, _Raw(output, stream.fileno())))
+    by_line = is_error or stream.line_buffering
+    return io.TextIOWrapper(
+        buffer,
+        stream.encoding,
+        "backslashreplace",
+        line_buffering=by_line,
+        write_through=stream.write_through,
+    )
