@@ -4,10 +4,8 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
 from numbers import Integral, Real
 from typing import Any, NamedTuple
 
@@ -251,21 +249,6 @@ def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]
             raise ValueError(f"{name} is on {value.device} and {first} on {device}; move one")
         if value.dtype != dtype:
             raise ValueError(f"{name} is {value.dtype} and {first} {dtype}; convert {name} to {dtype}")
-
-
-def warn_of_intrinsics(function: str, Ks: Tensor) -> None:
-    """Warn once if the caller expects a gradient of the intrinsics, of which there is none, as in gsplat."""
-    if Ks.requires_grad and torch.is_grad_enabled() and not torch.compiler.is_compiling():
-        _warn_of_intrinsics(function)
-
-
-@cache
-def _warn_of_intrinsics(function: str) -> None:
-    warnings.warn(
-        f"blitzgs.{function}: Ks requires a gradient and gets none, as in gsplat; pass Ks.detach()",
-        RuntimeWarning,
-        stacklevel=4,
-    )
 
 
 def gaussians_of(

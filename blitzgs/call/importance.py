@@ -9,6 +9,7 @@ from torch import Tensor
 from blitzgs.call.arguments import check_options, check_tensors, gaussians_of
 from blitzgs.call.finite import warn_of_non_finite
 from blitzgs.call.images import CUDA_TILE_SIZE
+from blitzgs.call.intrinsics import check_intrinsics
 from blitzgs.ops.importance import UNITS, splat_contributions
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
@@ -77,6 +78,7 @@ def contributions(
     )
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {})
+    check_intrinsics("contributions", Ks)
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     gaussians = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, "D")

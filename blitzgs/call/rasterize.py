@@ -15,10 +15,10 @@ from blitzgs.call.arguments import (
     check_options,
     check_tensors,
     gaussians_of,
-    warn_of_intrinsics,
     with_covariances,
 )
 from blitzgs.call.images import ImageOptions, render
+from blitzgs.call.intrinsics import check_intrinsics
 from blitzgs.call.ranks import gather_views
 from blitzgs.ops.projection_types import ProjectionOptions
 from blitzgs.util.memory import explaining_memory
@@ -73,7 +73,8 @@ def rasterization(
             slower; otherwise values of 1 to 4096 channels (a rendered depth counts), [..., N, D] or per view
             [..., C, N, D]. May be None for the render modes D and ED.
         viewmats: [..., C, 4, 4] world to camera, a rotation and a translation.
-        Ks: [..., C, 3, 3] intrinsics in px, without skew. They get no gradient.
+        Ks: [..., C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1, which is
+            checked on the CPU. They get no gradient.
         width: image width in px.
         height: image height in px.
         near_plane: Gaussians have z > near_plane, world units; less than far_plane.
@@ -138,7 +139,7 @@ def rasterization(
     if covars is None:
         required |= {"quats": quats, "scales": scales}
     check_tensors(required, {"colors": colors, "backgrounds": backgrounds, "covars": covars})
-    warn_of_intrinsics("rasterization", Ks)
+    check_intrinsics("rasterization", Ks)
     if covars is not None:
         # Placeholders, which the decomposition of the covariances replaces.
         quats, scales = (means.new_zeros(()).expand(*means.shape[:-1], length) for length in (4, 3))

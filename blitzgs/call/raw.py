@@ -22,10 +22,10 @@ from blitzgs.call.arguments import (
     check_options,
     check_tensors,
     gaussians_of,
-    warn_of_intrinsics,
 )
 from blitzgs.call.groups import Group, groups_of
 from blitzgs.call.images import ImageOptions, may_queue, render
+from blitzgs.call.intrinsics import check_intrinsics
 from blitzgs.call.lazy_dict import LazyDict
 from blitzgs.ops.gather_rows import gather_rows, split_rows
 from blitzgs.ops.project import project_splats
@@ -86,7 +86,8 @@ def raw_rasterization(
         sh0: [N, 1, 3], the first SH coefficient; or all of them, [N, K, 3], with shN None.
         shN: [N, K - 1, 3], the other SH coefficients.
         viewmats: [C, 4, 4] world to camera, a rotation and a translation.
-        Ks: [C, 3, 3] intrinsics in px, without skew. They get no gradient.
+        Ks: [C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1, which is
+            checked on the CPU. They get no gradient.
         width: image width in px.
         height: image height in px.
         near_plane: Gaussians have z > near_plane, world units; less than far_plane.
@@ -128,7 +129,7 @@ def raw_rasterization(
     )  # fmt: skip
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {"shN": shN, "backgrounds": backgrounds})
-    warn_of_intrinsics("raw_rasterization", Ks)
+    check_intrinsics("raw_rasterization", Ks)
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     harmonics = [sh0] if shN is None else [sh0, shN]

@@ -57,12 +57,3 @@ def downscaled_size(width: int, height: int, factor: float) -> tuple[int, int]:
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Tell whether two sizes (width, height) have the same ratio of sides, to rounding by two pixels."""
     return abs(size[0] * other[1] - size[1] * other[0]) <= 2 * max(*size, *other)
-
-
-def sees_any(camera: Camera, points: Float64) -> bool:
-    """Tell whether any of the re-centred points [M, 3] is in front of a camera and within its image."""
-    x, y, depth = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
-    front = depth > 0
-    u = camera.K[0, 0] * x[front] / depth[front] + camera.K[0, 2]
-    v = camera.K[1, 1] * y[front] / depth[front] + camera.K[1, 2]
-    return bool(((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)).any())

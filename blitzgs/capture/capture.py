@@ -24,26 +24,27 @@ from blitzgs.capture.cameras import (
     downscaled_size,
     same_shape,
     scaled_matrix,
-    sees_any,
 )
 from blitzgs.capture.files import find_mask
 from blitzgs.capture.image_files import ImageHeader, read_header
-from blitzgs.capture.layouts import SourcePoints, SourceView, read_layout
+from blitzgs.capture.layouts import Source, SourceView, read_layout
+from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_extent
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.splits import split_views
+from blitzgs.capture.splits import split_capture, without_unused
 from blitzgs.capture.undistort import Rectification, rectify
+from blitzgs.capture.usable import (
+    check_lenses,
+    finite_points,
+    points_at_random,
+    with_finite_poses,
+    without_strays,
+)
 from blitzgs.util.arguments import check_number
 
 # In pixels. SSIM compares windows of 11 pixels, and a much smaller image shows too little to train on.
 _LEAST_SIDE = 8
 _HEADER_THREADS = 16
-_SAMPLED_POINTS = 2000
 _MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp")
-# Cameras whose distance is below this share of the points' distance count as being in one place: the parallax
-# between them is far below a pixel.
-_LEAST_SPREAD = 1e-6
-# Coordinates from here on are damage; the squares of smaller ones are finite.
-_FARTHEST = 1e100
 
 
 @dataclass(eq=False)
@@ -66,9 +67,35 @@ class Capture:
     train: list[int]
     test: list[int]
     extent: float
-    """INRIA's: 1.1 x the largest distance of a training camera from their mean centre, in world units."""
+    """INRIA's: 1.1 x the largest distance of a training camera from their mean centre, in world units;
+    without the cameras of `apart`."""
     has_alpha: bool
     """Whether some image has an alpha channel; `ImageStore` composites it over its background."""
+    near: float
+    """Near plane by the depths of the points that training views see (`Sight.near`), in world units."""
+    apart: list[int]
+    """Cameras that are so far from the others that no length is measured by them."""
+    about: About
+    """What was read and what was left out."""
+
+
+@dataclass(frozen=True)
+class About:
+    """What `load_capture` decided, for messages."""
+
+    source: Source
+    split: str
+    """What decided on the held-out views."""
+    strays: list[StrayCamera]
+    """The cameras whose pose is wrong; they are left out unless `stray_cameras` keeps them."""
+    unused: int
+    """Number of frames that are in no list of the file's own split."""
+    missing: int
+    """Number of views whose image is not on disk."""
+    blind: int
+    """Number of views that see none of the points."""
+    random_points: bool
+    """Whether the capture has no points, so that training starts from random ones."""
 
 
 class MissingImagesError(FileNotFoundError):
@@ -85,6 +112,8 @@ def load_capture(
     undistort: str = "crop",
     exif: str = "auto",
     allow_missing: bool = False,
+    sparse: str = "largest",
+    stray_cameras: str = "drop",
 ) -> Capture:
     """Load a capture without decoding its images.
 
@@ -104,6 +133,10 @@ def load_capture(
             and its turned size does (COLMAP itself ignores the tag); "apply" always turns it, "ignore" never.
         allow_missing: drop views whose image is not on disk, with a warning, instead of failing. The world's
             origin, the extent and the split are still computed from all views with a pose.
+        sparse: which of several COLMAP models is read: the "largest", "all" of them, which must have the same
+            world coordinates, or a folder such as "sparse/1", relative to `path`.
+        stray_cameras: "drop" the cameras that lie apart from all others and hardly show a point, or "keep"
+            them; no length is measured by them either way.
 
     Raises:
         FileNotFoundError: the folder has no capture, or images are missing on disk (`MissingImagesError`).
@@ -116,22 +149,32 @@ def load_capture(
     for option, value, allowed in (
         ("exif", exif, ("auto", "apply", "ignore")),
         ("undistort", undistort, ("crop", "mask")),
+        ("stray_cameras", stray_cameras, ("drop", "keep")),
     ):
         if value not in allowed:
             raise ValueError(f"{option} must be one of {', '.join(allowed)}, got {value!r}")
-    views, points = read_layout(root, images, downscale)
+    views, points, source = read_layout(root, images, downscale, sparse)
     if not views:
         raise ValueError(f"{root}: its COLMAP model or transforms.json lists no images")
-    views = sorted(_with_finite_poses(views), key=lambda view: view.name)
+    listed = len(views)
+    views = without_unused(views, split)
+    unused = listed - len(views)
+    check_lenses(views)
+    views = sorted(with_finite_poses(views), key=lambda view: view.name)
+    points = finite_points(points)
     # Use all views, so that a photograph that is lost later changes neither the origin nor the split.
+    train, test, why = split_capture(views, root, split)
+    apart, strays = find_apart(views, points.positions)
     centres = camera_centres(np.stack([view.world_to_camera for view in views]))
-    offset = centres.mean(axis=0)
-    train, test = _split(views, root, split)
-    train_centres = centres[train] - offset
+    offset = centres[~apart].mean(axis=0)
+    train_centres = centres[[i for i in train if not apart[i]] or train] - offset
     kept = _existing(views, root, images, allow_missing)
+    missing = len(views) - len(kept)
+    kept = without_strays(views, kept, strays, keep=stray_cameras == "keep")
     place = {index: position for position, index in enumerate(kept)}
     views = [views[index] for index in kept]
     train, test = ([place[index] for index in part if index in place] for part in (train, test))
+    apart_left = [place[index] for index in kept if apart[index]]
     if not train:
         raise MissingImagesError(f"{root}: no image of a training view is on disk")
     with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # the files may be on a slow network disk
@@ -145,11 +188,14 @@ def load_capture(
         for view, header in zip(views, headers, strict=True)
     ]
     _check_masks(cameras, mask_folder)
-    points = _finite_points(points)
-    if len(points.positions) == 0:
-        points = _random_points(root, cameras, offset)
+    has_points = len(points.positions) > 0
+    if not has_points:
+        points = points_at_random(root, [c for i, c in enumerate(cameras) if i not in apart_left], offset)
     points.positions = points.positions - offset
-    _warn_of_blind_views(cameras, points.positions)
+    extent = measured_extent(train_centres, points.positions)
+    sight = Sight.of(cameras, points.positions)
+    blind = sight.blind(cameras, points.positions)
+    near = sight.near([i for i in train if i not in apart_left] if has_points else [], extent)
     return Capture(
         root=root,
         cameras=cameras,
@@ -160,39 +206,12 @@ def load_capture(
         offset=offset,
         train=train,
         test=test,
-        extent=_extent(train_centres, points.positions),
+        extent=extent,
         has_alpha=any(header.has_alpha for header in headers),
+        near=near,
+        apart=apart_left,
+        about=About(source, why, strays, unused, missing, blind, not has_points),
     )
-
-
-def _warn_of_blind_views(cameras: list[Camera], points: Float64) -> None:
-    """Warn if most views see no point: poses and points may have different worlds or axis conventions."""
-    sample = points[:: max(1, len(points) // _SAMPLED_POINTS)]
-    blind = [camera.name for camera in cameras if not sees_any(camera, sample)]
-    if 2 * len(blind) > len(cameras):
-        warnings.warn(
-            f"{len(blind)} of {len(cameras)} views (first: {blind[0]}) see none of the points: do the poses "
-            "and the points belong together, and do the cameras look along +z?",
-            stacklevel=3,
-        )
-
-
-def _is_usable(coordinates: Float64) -> npt.NDArray[np.bool_]:
-    return np.asarray(np.abs(coordinates) < _FARTHEST)  # false for NaN
-
-
-def _with_finite_poses(views: list[SourceView]) -> list[SourceView]:
-    finite = [view for view in views if _is_usable(view.world_to_camera).all()]
-    if not finite:
-        raise ValueError(f"none of the {len(views)} views has a pose (a finite rotation and translation)")
-    if len(finite) < len(views):
-        first = next(v.name for v in views if not _is_usable(v.world_to_camera).all())
-        warnings.warn(
-            f"{len(views) - len(finite)} of {len(views)} views have no finite pose and were dropped "
-            f"(first: {first})",
-            stacklevel=3,
-        )
-    return finite
 
 
 def _existing(views: list[SourceView], root: Path, images: str, allow_missing: bool) -> list[int]:
@@ -325,69 +344,3 @@ def _orientation(view: SourceView, header: ImageHeader, exif: str) -> int:
     swaps = header.orientation >= 5 and view.lens.width != view.lens.height
     turned = (view.lens.width > view.lens.height) != (header.width > header.height)
     return header.orientation if swaps and turned else 1
-
-
-def _split(views: Sequence[SourceView], root: Path, spec: int | str | Path) -> tuple[list[int], list[int]]:
-    if spec == "auto" and any(view.is_test is not None for view in views):
-        test = [i for i, view in enumerate(views) if view.is_test]
-        train = [i for i, view in enumerate(views) if not view.is_test]
-        if not train:
-            raise ValueError(f"{root}: the files hold out every view: no training view is left")
-        return train, test
-    return split_views([v.name for v in views], [v.path for v in views], root, spec)
-
-
-def _finite_points(points: SourcePoints) -> SourcePoints:
-    finite: npt.NDArray[np.bool_] = np.asarray(_is_usable(points.positions).all(axis=1))
-    if finite.all():
-        return points
-    warnings.warn(
-        f"{int((~finite).sum())} of {finite.size} points are not finite and were dropped", stacklevel=3
-    )
-    return SourcePoints(
-        points.positions[finite],
-        points.colors[finite],
-        points.track_lengths[finite] if points.track_lengths is not None else None,
-        points.errors[finite] if points.errors is not None else None,
-    )
-
-
-def _random_points(
-    root: Path, cameras: Sequence[Camera], offset: Float64, count: int = 100_000
-) -> SourcePoints:
-    """Return uniform points of random colours in the region that the cameras look at."""
-    warnings.warn(
-        f"{root}: the capture has no points; {count:,} random ones take their place. Points of the "
-        "reconstruction give a better start",
-        stacklevel=3,
-    )
-    poses = np.stack([camera.world_to_camera for camera in cameras])
-    centres, axes = camera_centres(poses), poses[:, 2, :3]
-    # The point nearest to all optical axes by least squares; the tiny term keeps parallel axes solvable.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    target = np.linalg.solve(
-        across.sum(axis=0) + 1e-6 * np.eye(3),
-        np.einsum("nij,nj->i", across, centres) + 1e-6 * centres.mean(axis=0),
-    )
-    half = 0.35 * float(np.linalg.norm(centres - target, axis=1).mean())
-    if half <= _LEAST_SPREAD * (1 + float(np.abs(offset).max())):
-        raise ValueError(
-            f"{root}: the capture has no points and all its cameras are in one place, so the position of the "
-            "scene is unknown: add points to the capture"
-        )
-    random = np.random.default_rng(0)
-    positions = target + offset + random.uniform(-half, half, (count, 3))
-    return SourcePoints(positions, random.integers(0, 256, (count, 3), dtype=np.uint8))
-
-
-def _extent(centres: Float64, points: Float64) -> float:
-    extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-    distance = float(np.median(np.linalg.norm(points - centres[0], axis=1)))
-    if extent > _LEAST_SPREAD * distance:
-        return extent
-    extent = distance
-    warnings.warn(
-        f"all training cameras are in one place: extent is the points' median distance, {extent:g}",
-        stacklevel=3,
-    )
-    return extent or 1.0

@@ -97,21 +97,54 @@ def camera_models() -> dict[str, list[str]]:
 
 
 def find_model(path: Path) -> Path | None:
-    """Return the folder of a sparse model below `path` (sparse/0, sparse, `path`, colmap/...), or None."""
-    return _find(path, all)
+    """Return the folder of a sparse model below `path` (sparse/0, sparse, `path`, colmap/...), or None.
+
+    Of several numbered models, which COLMAP makes of parts that it could not join, it is the largest.
+    """
+    models = find_models(path)
+    return models[0][0] if models else None
+
+
+def find_models(path: Path) -> list[tuple[Path, int]]:
+    """Return the folders of the sparse models below `path` in one place, with their numbers of images.
+
+    The largest comes first. The number is 0 if there is only one model, which nobody compares.
+    """
+    for folder in ("sparse", ".", "colmap/sparse"):
+        numbered = _numbered(path / folder) if folder != "." else []
+        if len(numbered) > 1:
+            counted = [(model, count_images(model)) for model in numbered]
+            return sorted(counted, key=lambda model: -model[1])  # stable: of equal ones, the first
+        if numbered or _has(path / folder, all):
+            return [(numbered[0] if numbered else path / folder, 0)]
+    return []
 
 
 def find_incomplete_model(path: Path) -> Path | None:
     """Return the folder that `find_model` would return if none of its files were missing, or None."""
-    return _find(path, any)
+    folders = ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap/sparse")
+    return next((path / folder for folder in folders if _has(path / folder, any)), None)
 
 
-def _find(path: Path, enough: Callable[[Iterable[bool]], bool]) -> Path | None:
-    for folder in ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap/sparse"):
-        for suffix in _SUFFIXES:
-            if enough((path / folder / (name + suffix)).is_file() for name in FILES):
-                return path / folder
-    return None
+def _numbered(folder: Path) -> list[Path]:
+    """Return the complete models in the folders 0, 1, ... of a folder, in the order of their numbers."""
+    found = [model for model in folder.glob("[0-9]*") if model.name.isdecimal() and _has(model, all)]
+    return sorted(found, key=lambda model: int(model.name))
+
+
+def _has(folder: Path, enough: Callable[[Iterable[bool]], bool]) -> bool:
+    return any(enough((folder / (name + suffix)).is_file() for name in FILES) for suffix in _SUFFIXES)
+
+
+def count_images(folder: Path) -> int:
+    """Return the number of images of a model; 0 if its file is damaged, so that an undamaged one is used."""
+    path = folder / "images.bin"
+    if not all((folder / f"{name}.bin").is_file() for name in FILES):
+        path = folder / "images.txt"
+    try:
+        return len(native_io().read_images(os.fsencode(path), False)["ids"])
+    except ValueError:
+        return 0
 
 
 def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = False) -> ColmapModel:

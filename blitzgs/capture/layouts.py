@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import re
+import warnings
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,8 @@ from blitzgs.capture.lens import Lens
 from blitzgs.formats.ply import read_points
 
 _PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+# What programs write beside the images of a synthetic capture.
+_BY_PRODUCT = re.compile(r"(?i)(depth|normal|disp|mask|alpha|segmentation)s?(_?\d+)?$")
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +33,8 @@ class SourceView:
     mask_path: Path | None
     lens: Lens
     world_to_camera: Float64
-    is_test: bool | None = None
+    part: str | None = None
+    """See `transforms.Frame.part`."""
 
 
 @dataclass(eq=False)
@@ -41,13 +47,30 @@ class SourcePoints:
     errors: Float64 | None = None
 
 
-def read_layout(root: Path, images: str, downscale: float) -> tuple[list[SourceView], SourcePoints]:
+@dataclass(frozen=True)
+class Source:
+    """Which files were read, and what of them was not."""
+
+    cameras: str
+    """The model or files that the poses are from, relative to the capture."""
+    split: str = ""
+    """What in the files decides on the split."""
+    notes: tuple[str, ...] = ()
+    """What the reader decided between fields or files, and what has no effect."""
+    without_camera: int = 0
+    """Photographs beside those of the views that have no camera."""
+
+
+def read_layout(
+    root: Path, images: str, downscale: float, sparse: str = "largest"
+) -> tuple[list[SourceView], SourcePoints, Source]:
     """Read the views and points of a folder in any of the layouts of docs/captures.md.
 
     Args:
         root: folder of the capture.
         images: folder of the images, relative to `root`.
         downscale: see `load_capture`; decides which folder of images is used.
+        sparse: see `load_capture`.
 
     Raises:
         FileNotFoundError: the folder has no capture.
@@ -57,21 +80,32 @@ def read_layout(root: Path, images: str, downscale: float) -> tuple[list[SourceV
         raise FileNotFoundError(
             f"{root} is not a folder: name the folder of the capture (images and a COLMAP model) with --data"
         )
-    folder = colmap.find_model(root)
+    models, notes = _models(root, sparse)
+    folder = models[0] if models else None
     parts = [part for part in ("train", "val") if colmap.find_model(root / part)]
-    if transforms.find_transforms(root) and (folder is None or "colmap" in folder.relative_to(root).parts):
-        return _read_transforms(root)
-    if folder is not None:
-        return _read_colmap(root, folder, images, downscale)
-    if "train" in parts:
+    by_default = sparse in ("largest", "all")
+    has_transforms = by_default and bool(transforms.find_transforms(root))
+    if has_transforms and (folder is None or "colmap" in folder.relative_to(root).parts):
+        views, points, source = _read_transforms(root)
+    elif folder is not None:
+        read = [_read_colmap(root, model, images, downscale) for model in models]
+        views, points = read[0] if len(read) == 1 else _joined(root, read)
+        shown = " and ".join(str(model.relative_to(root)) for model in models if model != root)
+        source = Source(shown or "cameras, images and points3D", "", tuple(notes))
+    elif "train" in parts:
         found = [_read_colmap(root / p, _model_in(root / p), images, downscale, part=p) for p in parts]
-        return [view for views, _ in found for view in views], found[0][1]
-    incomplete = colmap.find_incomplete_model(root)
-    if incomplete is not None:
-        return _read_colmap(
-            root, incomplete, images, downscale
-        )  # raises an error that names the missing file
-    raise FileNotFoundError(
+        views, points = [view for views, _ in found for view in views], found[0][1]
+        source = Source(" and ".join(str(_model_in(root / p).relative_to(root)) for p in parts))
+    else:
+        incomplete = colmap.find_incomplete_model(root)
+        if incomplete is not None:
+            _read_colmap(root, incomplete, images, downscale)  # raises an error that names the missing file
+        raise _no_capture(root)
+    return views, points, _with_photographs(root, source, views)
+
+
+def _no_capture(root: Path) -> FileNotFoundError:
+    return FileNotFoundError(
         f"{root} holds no capture: expected a COLMAP model (sparse/0 with cameras, images and points3D as "
         f".bin or .txt), or transforms.json{_hint(root)}"
     )
@@ -99,14 +133,93 @@ def _model_in(root: Path) -> Path:
     return folder
 
 
-def _read_transforms(root: Path) -> tuple[list[SourceView], SourcePoints]:
+def _models(root: Path, sparse: str) -> tuple[list[Path], list[str]]:
+    """Return the COLMAP models to read, the largest first, and a line if others are left out.
+
+    Raises:
+        FileNotFoundError: the folder that `sparse` names has no model.
+    """
+    if sparse not in ("largest", "all"):
+        named = root / sparse
+        if colmap.find_models(named) and (model := _model_in(named)).is_relative_to(root):
+            return [model], []
+        raise FileNotFoundError(
+            f"data.sparse: {named} has no complete COLMAP model (cameras, images and points3D); name its "
+            "folder relative to the capture, or use 'largest' or 'all'"
+        )
+    models = colmap.find_models(root)
+    if len(models) < 2:
+        return [model for model, _ in models], []
+    counts = ", ".join(f"{model.relative_to(root)} {count} images" for model, count in models)
+    if sparse == "all":
+        return [model for model, _ in models], [f"{len(models)} COLMAP models are read as one: {counts}"]
+    note = (
+        f"of {len(models)} COLMAP models, the largest is used: {counts} (others with --data.sparse=FOLDER; "
+        "--data.sparse=all reads all, if they have the same world coordinates)"
+    )
+    warnings.warn(note, stacklevel=4)
+    return [models[0][0]], [note]
+
+
+def _joined(
+    root: Path, parts: list[tuple[list[SourceView], SourcePoints]]
+) -> tuple[list[SourceView], SourcePoints]:
+    """Return the views and points of several models; of an image in two of them, the first counts."""
+    views = {view.name: view for found, _ in reversed(parts) for view in found}
+    points = [points for _, points in parts]
+    tracks = [p.track_lengths for p in points if p.track_lengths is not None]
+    errors = [p.errors for p in points if p.errors is not None]
+    joined = SourcePoints(
+        np.concatenate([p.positions for p in points]),
+        np.concatenate([p.colors for p in points]),
+        np.concatenate(tracks) if len(tracks) == len(points) else None,
+        np.concatenate(errors) if len(errors) == len(points) else None,
+    )
+    return list(views.values()), joined
+
+
+def _with_photographs(root: Path, source: Source, views: Sequence[SourceView]) -> Source:
+    """Add the number of photographs that have no camera, and say it.
+
+    They are searched in the folders of those that have one, so that folders of masks or of smaller copies do
+    not count; only files with the suffixes of photographs in use count, and no depths or normals beside them.
+    """
+    used = {view.path for view in views}
+    suffixes = {path.suffix.lower() for path in used} & set(_PHOTOGRAPH_SUFFIXES)
+    folders = {path.parent for path in used}
+    masks = {view.mask_path for view in views}
+    without = sorted(
+        file
+        for folder in folders
+        for file in (folder.iterdir() if folder.is_dir() else ())
+        if file.suffix.lower() in suffixes and file not in used | masks and not _BY_PRODUCT.search(file.stem)
+    )
+    if without:
+        warnings.warn(
+            f"{len(without)} of {len(without) + len(used)} photographs have no camera in {source.cameras} "
+            f"and are not used (first: {without[0].name})",
+            stacklevel=4,
+        )
+    return replace(source, without_camera=len(without))
+
+
+def _read_transforms(root: Path) -> tuple[list[SourceView], SourcePoints, Source]:
     content = transforms.read_transforms(root)
     views = [
-        SourceView(f.name, f.path, f.mask_path, f.lens, f.world_to_camera, f.is_test) for f in content.frames
+        SourceView(f.name, f.path, f.mask_path, f.lens, f.world_to_camera, f.part) for f in content.frames
     ]
+    notes = list(content.notes)
+    if content.files[0].name == "transforms.json":
+        others = [f"transforms_{part}.json" for part in ("train", "val", "test")]
+        if beside := [name for name in others if (root / name).is_file()]:
+            notes.append(f"transforms.json is read, and {', '.join(beside)} beside it not")
+    for note in notes:
+        if not note.startswith("fields without effect"):
+            warnings.warn(f"{content.files[0]}: {note}", stacklevel=4)
+    source = Source(" and ".join(path.name for path in content.files), content.split, tuple(notes))
     if content.points_path is None:
-        return views, SourcePoints(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
-    return views, SourcePoints(*read_points(content.points_path))
+        return views, SourcePoints(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)), source
+    return views, SourcePoints(*read_points(content.points_path)), source
 
 
 def _read_colmap(

@@ -104,6 +104,33 @@ class Lens:
         return fx * u + cx, fy * v + cy
 
 
+def check_lens(lens: Lens) -> str:
+    """Return what is unusual about a lens, or an empty text.
+
+    The limits are far from what is built: from a fisheye of 250 degrees to a telescope, pixels four times as
+    long as wide (anamorphic lenses have two), and a tile cut from a picture ten times as long.
+
+    Raises:
+        ValueError: no camera has such a lens; names the values.
+    """
+    fx, fy, cx, cy = lens.intrinsics
+    side = max(lens.width, lens.height)
+    where = f"for an image of {lens.width} x {lens.height} pixels"
+    if not 0.25 <= fx / fy <= 4:
+        raise ValueError(
+            f"the focal lengths {fx:g} and {fy:g} differ by more than a factor of 4: check fx and fy"
+        )
+    if not 0.02 * side <= max(fx, fy) <= 1000 * side:
+        raise ValueError(f"the focal lengths {fx:g} and {fy:g} pixels are no camera's {where}")
+    if not (abs(cx - lens.width / 2) <= 10 * side and abs(cy - lens.height / 2) <= 10 * side):
+        raise ValueError(f"the principal point {cx:g}, {cy:g} is far outside the image, {where}")
+    if not 1 / 1.5 <= fx / fy <= 1.5:
+        return f"focal lengths {fx:g} and {fy:g} {where}"
+    if not (0 <= cx <= lens.width and 0 <= cy <= lens.height):
+        return f"principal point {cx:g}, {cy:g} outside an image of {lens.width} x {lens.height} pixels"
+    return ""
+
+
 def _polynomial(r2: Array, coefficients: Sequence[float]) -> Array:
     """Return 1 + c0 r2 + c1 r2^2 + ..."""
     value = np.zeros_like(r2)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePath
 
 from blitzgs.capture.files import read_lines
+from blitzgs.capture.layouts import SourceView
 
 DEFAULT_EVERY = 8
 
@@ -91,3 +92,39 @@ def split_views(
     if not train:
         raise ValueError(f"split '{spec}' leaves no training view of {len(names)}")
     return train, test
+
+
+def without_unused(views: list[SourceView], spec: int | str | Path) -> list[SourceView]:
+    """Return the views without those that the capture's own lists leave out, if these decide.
+
+    Raises:
+        ValueError: a view is in the list of training views and in one of held-out views.
+    """
+    if spec != "auto":
+        return views
+    both = [view.name for view in views if view.part == "both"]
+    if both:
+        raise ValueError(
+            f"{len(both)} views are in train_filenames and also in val_filenames or test_filenames (first: "
+            f"{both[0]}): a view that is trained on cannot measure the result; remove them from one of the "
+            "lists, or choose the held-out views with --data.split"
+        )
+    return [view for view in views if view.part != "unused"]
+
+
+def split_capture(
+    views: Sequence[SourceView], root: Path, spec: int | str | Path
+) -> tuple[list[int], list[int], str]:
+    """Return train and test views, both ascending, and what decided on them; see `split_views`."""
+    if spec == "auto" and any(view.part is not None for view in views):
+        test = [i for i, view in enumerate(views) if view.part == "test"]
+        train = [i for i, view in enumerate(views) if view.part != "test"]
+        if not train:
+            raise ValueError(f"{root}: the files hold out every view: no training view is left")
+        return train, test, "the capture's own split"
+    names, paths = [view.name for view in views], [view.path for view in views]
+    train, test = split_views(names, paths, root, spec)
+    if spec != "auto":
+        return train, test, f"data.split={spec}"
+    in_val = bool(test) and is_val(names[test[0]], paths[test[0]], root)
+    return train, test, "the images in val/" if in_val else f"every {DEFAULT_EVERY}th view by name"

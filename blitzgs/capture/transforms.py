@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
@@ -17,17 +17,21 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.cameras import Float64
-from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
+from blitzgs.capture.transforms_lens import FIELDS, read_lens
 
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
-_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "OPENCV": ("FULL_OPENCV", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
-    "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
-    "PINHOLE": ("PINHOLE", ()),
-    "SIMPLE_PINHOLE": ("PINHOLE", ()),
-}
-_COEFFICIENTS = _MODELS["OPENCV"][1]
+_PARTS = ("train", "val", "test")
+# Fields that are read, or that have no meaning for a view; all others are named in `Transforms.notes`.
+_KNOWN = FIELDS | {
+    "frames", "file_path", "mask_path", "transform_matrix", "ply_file_path", "train_filenames",
+    "val_filenames", "test_filenames", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2",
+}  # fmt: skip
+# Fields of nerfstudio, instant-ngp and Blender that concern their own programs.
+_OF_OTHERS = {
+    "aabb_scale", "scale", "offset", "from_na", "applied_transform", "applied_scale", "orientation_override",
+    "sharpness", "colmap_im_id", "colmap_image_id", "depth_file_path", "rotation", "time", "n_frames",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -39,8 +43,9 @@ class Frame:
     mask_path: Path | None
     lens: Lens
     world_to_camera: Float64
-    is_test: bool | None
-    """Whether the files hold it out; None when they do not say."""
+    part: str | None
+    """"train" or "test" (held out) by the files, "unused" if it is in none of their lists, "both" if it is in
+    two that exclude each other; None if they do not say."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +54,18 @@ class Transforms:
 
     frames: list[Frame]
     points_path: Path | None
+    files: list[Path]
+    split: str
+    """What in the files decides on the split, as text; empty if nothing does."""
+    notes: list[str]
+    """What was decided between fields, and which fields have no effect."""
 
 
 def find_transforms(root: Path) -> list[Path]:
-    """Return the files to read: transforms.json, else the files of Blender's train and test split, if any."""
+    """Return the files to read: transforms.json, else those of Blender's split into parts, if any."""
     if (root / "transforms.json").is_file():
         return [root / "transforms.json"]
-    files = [root / f"transforms_{part}.json" for part in ("train", "test")]
+    files = [root / f"transforms_{part}.json" for part in _PARTS]
     return [path for path in files if path.is_file()]
 
 
@@ -68,52 +78,104 @@ def read_transforms(root: Path) -> Transforms:
     frames: list[Frame] = []
     points_path = None
     files = find_transforms(root)
+    notes: dict[str, None] = {}
+    ignored: dict[str, None] = {}
+    split: list[str] = []
     for path in files:
-        try:
-            content = json.loads(path.read_text(encoding="utf-8-sig"))
-            entries = content["frames"]
-            if not isinstance(entries, list):
-                raise TypeError("'frames' is not a list")
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise ValueError(f"{path}: not a transforms file with a list of frames ({error})") from error
+        content, entries = _read_file(path)
         if "ply_file_path" in content:
             if not isinstance(content["ply_file_path"], str):
                 raise ValueError(f"{path}: ply_file_path must be text, got {content['ply_file_path']!r}")
             points_path = root / content["ply_file_path"]
-        held_out = _held_out(path, content)
+        lists = _lists(path, content)
+        split += [f"{key}_filenames" for key in lists] if path.name == "transforms.json" else [path.name]
+        own: list[Frame] = []
         for index, entry in enumerate(entries):
             try:
-                frames.append(_read_frame(root, content, entry, held_out))
+                if not isinstance(entry, dict):
+                    raise TypeError(
+                        f"must be an object with file_path and transform_matrix, got {entry!r:.40}"
+                    )
+                own.append(_read_frame(root, path, content, entry, lists, notes))
             except (KeyError, TypeError, ValueError, ArithmeticError) as error:
                 reason = f"the field {error} is missing" if isinstance(error, KeyError) else str(error)
                 raise ValueError(f"{path}: frame {index}: {reason}") from error
-        if isinstance(held_out, set) and (lost := held_out - {frame.name for frame in frames}):
-            raise ValueError(
-                f"{path}: test_filenames or val_filenames name {len(lost)} images that are no frames "
-                f"(first: {min(lost)})"
-            )
+            ignored |= dict.fromkeys(key for key in entry if key not in _KNOWN | _OF_OTHERS)
+        ignored |= dict.fromkeys(key for key in content if key not in _KNOWN | _OF_OTHERS)
+        _check_lists(path, lists, own)
+        frames += own
+    if ignored:
+        shown = ", ".join(f"{key:.40}" for key in list(ignored)[:8]) + (", ..." if len(ignored) > 8 else "")
+        notes[f"fields without effect: {shown}"] = None
     counts = Counter(frame.path for frame in frames)
     if twice := sorted({frame.name for frame in frames if counts[frame.path] > 1}):
         shown = ", ".join(twice[:5]) + (", ..." if len(twice) > 5 else "")
         raise ValueError(
             f"{' and '.join(map(str, files))}: images of more than one frame: {shown}; keep one frame of each"
         )
-    return Transforms(frames, points_path)
+    return Transforms(frames, points_path, files, " and ".join(split), list(notes))
 
 
-def _held_out(file: Path, content: Mapping[str, Any]) -> set[str] | bool | None:
-    """Return the names of the frames that a file holds out, or whether it holds out all; None: not said."""
+def _read_file(path: Path) -> tuple[dict[str, Any], list[Any]]:
+    """Return the root of a file and its frames."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not a transforms file: no JSON ({error}); export it again") from error
+    if not isinstance(content, dict):
+        kind = "null" if content is None else "a list" if isinstance(content, list) else f"{content!r:.40}"
+        raise ValueError(f"{path}: not a transforms file with a list of frames: its content is {kind}")
+    if not isinstance(content.get("frames"), list):
+        what = "there are none" if "frames" not in content else f"they are {content['frames']!r:.40}"
+        raise ValueError(f"{path}: not a transforms file with a list of frames: {what}")
+    return content, content["frames"]
+
+
+def _lists(file: Path, content: Mapping[str, Any]) -> dict[str, set[str]]:
+    """Return the names in the lists of a file's split, as far as it has them."""
     if file.name != "transforms.json":
-        return file.name == "transforms_test.json"
-    lists = {key: content[key] for key in ("test_filenames", "val_filenames") if key in content}
-    for key, names in lists.items():
+        return {}
+    lists = {}
+    for part in _PARTS:
+        key = f"{part}_filenames"
+        if key not in content:
+            continue
+        names = content[key]
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"{file}: {key} must be a list of the file_path of frames")
-    return {str(Path(name)) for names in lists.values() for name in names} if lists else None
+        lists[part] = {str(Path(name)) for name in names}
+    return lists
+
+
+def _check_lists(file: Path, lists: Mapping[str, set[str]], frames: Sequence[Frame]) -> None:
+    names = {frame.name for frame in frames}
+    lost = set().union(*lists.values()) - names
+    if lost:
+        keys = " or ".join(f"{part}_filenames" for part in lists)
+        raise ValueError(f"{file}: {keys} name {len(lost)} images that are no frames (first: {min(lost)})")
+
+
+def _part(file: Path, lists: Mapping[str, set[str]], name: str) -> str | None:
+    """Return the part of a frame, see `Frame.part`."""
+    if file.name != "transforms.json":
+        return "train" if file.name == "transforms_train.json" else "test"
+    if not lists:
+        return None
+    held_out = any(name in lists.get(part, ()) for part in ("val", "test"))
+    if "train" not in lists:
+        return "test" if held_out else "train"
+    if name in lists["train"]:
+        return "both" if held_out else "train"
+    return "test" if held_out else "unused"
 
 
 def _read_frame(
-    root: Path, content: Mapping[str, Any], entry: Mapping[str, Any], held_out: set[str] | bool | None
+    root: Path,
+    file: Path,
+    content: Mapping[str, Any],
+    entry: Mapping[str, Any],
+    lists: Mapping[str, set[str]],
+    notes: dict[str, None],
 ) -> Frame:
     relative = entry["file_path"]
     if not isinstance(relative, str) or not PurePath(relative).name:
@@ -127,21 +189,35 @@ def _read_frame(
         name=name,
         path=path,
         mask_path=None if mask is None else root / mask,
-        lens=_read_lens({**content, **entry}, path),
+        lens=read_lens(content, entry, path, notes),
         world_to_camera=_read_pose(entry["transform_matrix"]),
-        is_test=name in held_out if isinstance(held_out, set) else held_out,
+        part=_part(file, lists, name),
     )
 
 
 def _read_pose(matrix: object) -> Float64:
-    camera_to_world = np.asarray(matrix, dtype=np.float64)
+    try:
+        camera_to_world = np.asarray(matrix, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError("transform_matrix must be 4 x 4 numbers") from error
     if camera_to_world.shape not in ((3, 4), (4, 4)):
         raise ValueError(f"transform_matrix must be 4 x 4, got the shape {camera_to_world.shape}")
     pose = np.eye(4)
     rotation = camera_to_world[:3, :3] * np.array([1.0, -1.0, -1.0])
-    # Some exporters do not remove the scale of the rig.
-    rotation = rotation / np.linalg.norm(rotation, axis=0)
-    if np.isfinite(rotation).all():
+    if np.isfinite(camera_to_world).all():  # views whose pose is not finite are dropped later
+        last = camera_to_world[3:].ravel()
+        if last.size and not np.allclose(last, [0, 0, 0, 1], atol=1e-6):
+            raise ValueError(f"the last row of transform_matrix must be 0, 0, 0, 1, got {last.tolist()}")
+        lengths = np.linalg.norm(rotation, axis=0)
+        if lengths.max() == 0:
+            raise ValueError("transform_matrix has a rotation of zeros only: leave out frames without a pose")
+        # Some exporters do not remove the scale of the rig, which is the same along all axes.
+        if lengths.min() < 0.999 * lengths.max():
+            raise ValueError(
+                "transform_matrix is not a rotation and a translation: its axes have the lengths "
+                f"{', '.join(f'{length:.6g}' for length in lengths)}"
+            )
+        rotation = rotation / lengths
         if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3):
             raise ValueError("transform_matrix is not a rotation and a translation")
         if np.linalg.det(rotation) < 0:
@@ -149,59 +225,3 @@ def _read_pose(matrix: object) -> Float64:
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -rotation.T @ camera_to_world[:3, 3]
     return pose
-
-
-def _read_lens(fields: Mapping[str, Any], path: Path) -> Lens:
-    if "w" in fields and "h" in fields:
-        width, height = int(fields["w"]), int(fields["h"])
-    elif not path.is_file():
-        raise ValueError(f"the image {path} does not exist, and its size is not given by w and h")
-    else:
-        header = read_header(path)
-        width, height = header.width, header.height
-    if min(width, height) < 1:
-        raise ValueError(f"the image's size must be at least 1 x 1, got {width} x {height}")
-    if "fl_x" in fields:
-        fx = float(fields["fl_x"])
-        fy = float(fields.get("fl_y", fx))
-    elif "camera_angle_x" in fields:
-        fx = 0.5 * width / float(np.tan(0.5 * float(fields["camera_angle_x"])))
-        fy = (
-            0.5 * height / float(np.tan(0.5 * float(fields["camera_angle_y"])))
-            if "camera_angle_y" in fields
-            else fx
-        )
-    else:
-        raise ValueError("neither fl_x nor camera_angle_x is given")
-    model = _camera_model(fields)
-    name, distortion = _MODELS[model]
-    params = [fx, fy, float(fields.get("cx", width / 2)), float(fields.get("cy", height / 2))]
-    params += [float(fields.get(key, 0.0)) for key in distortion]
-    return Lens(name, width, height, tuple(params))
-
-
-def _camera_model(fields: Mapping[str, Any]) -> str:
-    """Return the camera model; refuse coefficients that it would not apply as their writer meant them."""
-    is_fisheye = fields.get("is_fisheye", False)
-    if not isinstance(is_fisheye, bool):
-        raise ValueError(f"is_fisheye must be true or false, got {is_fisheye!r}")
-    # instant-ngp names no model.
-    model = str(fields.get("camera_model", "OPENCV_FISHEYE" if is_fisheye else "OPENCV"))
-    if model not in _MODELS:
-        raise ValueError(f"camera_model {model} is not supported; known: {', '.join(_MODELS)}")
-    if is_fisheye and model != "OPENCV_FISHEYE":
-        raise ValueError(f"is_fisheye is true but camera_model is {model}: remove the one that is wrong")
-    given = {key: value for key in _COEFFICIENTS if (value := float(fields.get(key, 0.0))) != 0}
-    if model == "OPENCV" and "k4" in given and not {"k5", "k6"} & fields.keys():
-        # nerfstudio multiplies by 1 + k1 r + k2 r^2 + k3 r^3 + k4 r^4 with r = x^2 + y^2.
-        raise ValueError(
-            f"k4 is {given['k4']:g}, without k5 and k6: a polynomial of four coefficients, as nerfstudio's, "
-            "is no lens of this package; fit the lens again without k4 or undistort the images, or write k5 "
-            "and k6 if k4 is of OpenCV's rational model"
-        )
-    if model == "OPENCV_FISHEYE" and (lost := sorted(given.keys() - set(_MODELS[model][1]))):
-        values = ", ".join(f"{key} = {given[key]:g}" for key in lost)
-        raise ValueError(
-            f"{values}: a fisheye lens has only k1 to k4; set the others to 0, or name another camera_model"
-        )
-    return model

@@ -58,7 +58,7 @@ _NAMED_ERRORS = (
     "blitzgs.runs.guard.ModelLostError",
     "blitzgs.runs.guard.NonFiniteError",
     "blitzgs.table.host_table.HostMemoryError",
-    "blitzgs.table.pool.ResidenceError",
+    "blitzgs.table.pool.PoolError",
 )
 
 

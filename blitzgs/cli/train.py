@@ -28,6 +28,7 @@ from blitzgs.runs.folder_checks import locked
 from blitzgs.training.extension import LEAST_IMAGES
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
+from blitzgs.training.understood import check_worlds, estimate, understood
 from blitzgs.util.terminal import printable
 
 HELP = """\
@@ -41,7 +42,8 @@ A GPU trains with the recipe aerial, a CPU with aerial_cpu. --config takes anoth
 Gaussians; smoke: a first model in minutes; city: thousands of photographs; paper: the paper's values), a YAML
 file of yours, or "defaults" (the defaults of all fields). Every field is also a flag, for example
 --data.downscale=2 --population.max_gaussians=2000000; --help FIELD explains one, --help-fields all of them.
---show-config prints the resulting configuration and stops.
+--show-config prints the resulting configuration and stops; --check prints what was understood of the capture
+and stops.
 
 Times in the configuration count the images that were trained on. --schedule.scale=0.5 makes the whole
 schedule half as long; with --minutes=M the run measures its speed and chooses this factor itself.
@@ -97,6 +99,12 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser.add_argument(
         "--show-config", action="store_true", help="print the resulting configuration and stop"
     )
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help="read the capture, print what was understood and roughly what the training will take, and stop; "
+        "needs no GPU and no --out",
+    )
     add_device(parser)
 
 
@@ -139,7 +147,7 @@ def _extension(text: str) -> float:
 def run(args: argparse.Namespace) -> int:
     """Train; returns the exit status."""
     args.resume = args.resume or args.extend is not None
-    if args.out is None and not args.show_config:
+    if args.out is None and not args.show_config and not args.check:
         needed = "--out" if args.data or args.config else "--data, --out"
         args.parser.error(f"the following arguments are required: {needed}")
     config = _config(args)
@@ -151,6 +159,8 @@ def run(args: argparse.Namespace) -> int:
             f"{args.out} holds no run to continue (it has no config.yaml): check --out, or name the capture "
             "of a new run with --data"
         )
+    if args.check:
+        return _check(args, config)
     job = config.ranks
     with Ranks.from_environment(
         args.device,
@@ -161,11 +171,29 @@ def run(args: argparse.Namespace) -> int:
     ) as ranks:
         # A capture that cannot be read leaves no empty folder behind.
         capture, images = open_capture(config, ranks)
+        check_worlds(capture)
+        if ranks.rank == 0:
+            _print_block(understood(config, capture, images))
         with locked(args.out, ranks):
             summary = Trainer(config, capture, images, args.out, ranks, args.resume, args.extend).train()
         if summary is not None and ranks.rank == 0:
             _print_summary(summary, args.out)
     return 0
+
+
+def _check(args: argparse.Namespace, config: Config) -> int:
+    """Print what is understood of the capture, and what a training will take."""
+    capture, images = open_capture(config, Ranks())
+    check_worlds(capture)
+    lines = understood(config, capture, images)
+    images.close()
+    on_gpu = args.device.startswith("cuda") or (args.device == "auto" and torch.cuda.is_available())
+    _print_block([*lines, f"{'training:':15}{estimate(config, capture, on_gpu, torch.get_num_threads())}"])
+    return 0
+
+
+def _print_block(lines: list[str]) -> None:
+    print("\n".join(lines), flush=True)
 
 
 def _config(args: argparse.Namespace) -> Config:

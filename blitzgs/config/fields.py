@@ -33,6 +33,10 @@ class DataConfig:
         exif: "auto" turns an image by its EXIF tag if only the turned image fits its camera; "apply" always
             turns it, "ignore" never.
         allow_missing: drop views whose image is missing instead of failing.
+        sparse: which of several COLMAP models (sparse/0, sparse/1, ...) is read: the "largest", "all" of
+            them, which must have the same world coordinates, or a folder inside the capture.
+        stray_cameras: "drop" leaves out cameras that lie far apart from all others and hardly show a point,
+            "keep" trains on them. The scene's lengths are measured without them either way.
         cache_bytes: memory for compressed images, of all ranks of a host together, at most half of the host's
             memory; decoded images take what these leave, and up to a quarter of it in addition. If all
             decoded images fit into half of it, the ranks of a host share them.
@@ -49,6 +53,8 @@ class DataConfig:
     undistort: str = "crop"
     exif: str = "auto"
     allow_missing: bool = False
+    sparse: str = "largest"
+    stray_cameras: str = "drop"
     cache_bytes: int = 8_000_000_000
     threads: int = 0
     prefetch: int = 3
@@ -63,7 +69,8 @@ class ModelConfig:
         background: colour behind everything, RGB in [0, 1].
         antialiased: scale opacities to compensate the screen-space blur (Mip-Splatting's 2D filter); false:
             classic 3DGS.
-        near: near plane, relative to extent.
+        near: near plane, relative to extent. 0: a quarter of the depth of the nearest points that training
+            views see, 0.01 at most; the run's own configuration has the result.
         deterministic: make a run repeat bit for bit on CUDA too, at some cost in time (the CPU always does).
         exposure: if photographs differ in exposure, each training photograph has a gain and a bias of its
             channels: gains are estimated from the points' tracks, where there are tracks, and both are
@@ -75,7 +82,7 @@ class ModelConfig:
     sh_degree: int = 3
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     antialiased: bool = False
-    near: float = 0.01
+    near: float = 0.0
     deterministic: bool = False
     exposure: bool = False
 

@@ -51,7 +51,7 @@ RANGES: Mapping[str, Range] = {
     "data.prefetch": Range(0, 1000),
     "model.sh_degree": Range(0, 3),
     "model.background": Range(0, 1),
-    "model.near": Range(1e-9, 1e6),
+    "model.near": Range(0, 1e6),
     "lod.fork": Range(1.01, 100),
     "lod.visible_threshold": Range(0, 1, high_open=True),
     "schedule.iterations": Range(1, 1e9),

@@ -80,9 +80,16 @@ def checked_camera(
             raise ValueError(f"{argument} must be a finite matrix {shape}, got {matrix.tolist()}")
     if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
         raise ValueError(f"K must have positive focal lengths, got {intrinsics.tolist()}")
+    if not np.allclose(intrinsics[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1], atol=1e-9):
+        raise ValueError(
+            "K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (a skew has no effect; divide K by K[2, 2]), "
+            f"got {intrinsics.tolist()}"
+        )
     rotation = pose[:3, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
         raise ValueError(f"world_to_camera[:3, :3] must be a rotation, got {rotation.tolist()}")
+    if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-9):
+        raise ValueError(f"the last row of world_to_camera must be 0, 0, 0, 1, got {pose[3].tolist()}")
     for argument, size in (("width", width), ("height", height)):
         if not 1 <= size <= MOST_SIDE or size != int(size):
             raise ValueError(f"{argument} must be an integer from 1 to {MOST_SIDE:,}, got {size}")

@@ -25,7 +25,7 @@ from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.guard import bad_column, check_before_saving
 from blitzgs.runs.identity import check_own
 from blitzgs.table.host_table import HostTable
-from blitzgs.table.pool import Residence
+from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.views import Space
 from blitzgs.view.visible import Scene
@@ -118,12 +118,12 @@ class TrainedModel:
         With a pool, the first call moves the table into memory that the pool can reach.
 
         Raises:
-            ResidenceError: the pool has room for fewer than two blocks.
+            PoolError: the pool has room for fewer than two blocks.
         """
         if self.pool_bytes == 0:
             return self.table
         self.table = HostTable(self.table.release(), pinned=device.type == "cuda")
-        return Residence(self.table, device, self.pool_bytes, None)
+        return Pool(self.table, device, self.pool_bytes, None)
 
 
 def save(

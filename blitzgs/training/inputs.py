@@ -57,6 +57,8 @@ def open_capture(
             undistort=data.undistort,
             exif=data.exif,
             allow_missing=data.allow_missing,
+            sparse=data.sparse,
+            stray_cameras=data.stray_cameras,
         )
     except MissingImagesError as error:
         raise MissingImagesError(f"{error} ({remedy})") from error

@@ -31,7 +31,7 @@ from blitzgs.spawn.lineage import Lineage, initial_births, ledger_of
 from blitzgs.spawn.rules import lineage_subject, open_spawn_gate
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.host_table import HostTable
-from blitzgs.table.pool import Residence
+from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.curve import Curve
@@ -164,9 +164,10 @@ def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
 def _resolved(config: Config, capture: Capture, restored: run_files.Restored | None) -> Config:
     """Return `config` with the values that depend on the training views and on what the run has measured.
 
-    The number of views decides the length of the run (`schedule.images_per_view`) and the opacity term
-    (`loss.opacity_total`). A run that is resumed with fewer or more photographs (`data.allow_missing`) keeps
-    the values that it began with. `run_files.with_pace_of` says what a run measures.
+    The depths of what the views see decide on the near plane (`model.near`). The number of views decides the
+    length of the run (`schedule.images_per_view`) and the opacity term (`loss.opacity_total`). A run that is
+    resumed with fewer or more photographs (`data.allow_missing`) keeps the values that it began with.
+    `run_files.with_pace_of` says what a run measures.
     """
     schedule, loss = config.schedule, config.loss
     if restored is not None:
@@ -176,8 +177,13 @@ def _resolved(config: Config, capture: Capture, restored: run_files.Restored | N
                 schedule = replace(schedule, scale=own.schedule.scale, images_per_view=0.0)
             if loss.opacity_total > 0:
                 loss = replace(loss, opacity=own.loss.opacity, opacity_total=0.0)
+    model = config.model
+    if model.near == 0:
+        # Relative to the extent of this capture: a photograph that is lost later does not move the plane.
+        near = capture.near / capture.extent if restored is None else restored.config.model.near
+        model = replace(model, near=near)
     views = len(capture.train)
-    config = replace(config, schedule=stretched(schedule, views), loss=weighted(loss, views))
+    config = replace(config, model=model, schedule=stretched(schedule, views), loss=weighted(loss, views))
     return run_files.with_pace_of(config, None if restored is None else restored.config)
 
 
@@ -247,8 +253,8 @@ def _stepper(
     if not isinstance(table, HostTable):
         return Stepper(table, *shared)
     budget = int(config.memory.resident_gb * 1e9)
-    residence = Residence(table, owners.ranks.device, budget, optimiser.pending_table)
-    return OffloadingStepper(residence, upcoming, *shared)
+    pool = Pool(table, owners.ranks.device, budget, optimiser.pending_table)
+    return OffloadingStepper(pool, upcoming, *shared)
 
 
 def _position_noise(config: Config, extent: float) -> PositionNoise | None:
@@ -287,7 +293,9 @@ def first_gaussians(
     """Make the first Gaussians from the capture's points; each rank keeps its share of them at `home`."""
     lod, device = config.lod, ranks.device
     points = torch.from_numpy(capture.points) / space.unit
-    centres = trained_centres([capture.cameras[i] for i in capture.train], space).to(device)
+    # Cameras that are far from the others would stretch the octree over distances that no photograph covers.
+    together = [i for i in capture.train if i not in capture.apart] or capture.train
+    centres = trained_centres([capture.cameras[i] for i in together], space).to(device)
     levels = measure_levels(points.to(device), centres, lod.fork)
     colors, most = torch.from_numpy(capture.colors), config.population.max_gaussians
     first = octree_gaussians(

@@ -27,7 +27,7 @@ from blitzgs.runs.guard import LossGuard, ModelLostError
 from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.log import RunLog
 from blitzgs.spawn.rules import lineage_subject
-from blitzgs.table.pool import ResidenceError
+from blitzgs.table.pool import PoolError
 from blitzgs.training import view_level
 from blitzgs.training.agreement import MOST_STEPS, Agreement, StopRequest
 from blitzgs.training.batches import MOST_MASKED, BatchLoader
@@ -93,7 +93,7 @@ class Trainer:
             NonFiniteError: a loss or a parameter is not finite.
             PhotographError: a photograph cannot be read; the steps before it are saved.
             ModelLostError: no Gaussian is left.
-            ResidenceError: the Gaussians that a step or an event needs do not fit into the pool of
+            PoolError: the Gaussians that a step or an event needs do not fit into the pool of
                 `memory.resident_gb`; with one rank, the steps before it are saved.
             CheckpointError: the model could not be saved, although the run waited for disk space.
         """
@@ -160,11 +160,11 @@ class Trainer:
         state = self.state
         try:
             yield
-        except ResidenceError as error:
+        except PoolError as error:
             if is_saved or state.ranks.world_size > 1:
                 raise  # with several ranks, the others are in the middle of the step or event
             self._stop(f"saved after {state.images_seen:,} images, before {what} that lacks room")
-            raise ResidenceError(
+            raise PoolError(
                 f"{error}. The model so far is saved: continue with --resume and a larger memory.resident_gb"
             ) from error
 

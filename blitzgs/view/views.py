@@ -147,6 +147,8 @@ class ViewSet:
 
 # The far plane, relative to the scene's extent: nothing is cut off.
 FAR = 1e6
+# The near plane of a configuration that leaves it to the capture, where no capture has decided on it.
+_NEAR = 0.01
 
 
 def render_options(config: Config, space: Space, sh_degree: int, lod: LodGate | None = None) -> RenderOptions:
@@ -154,7 +156,7 @@ def render_options(config: Config, space: Space, sh_degree: int, lod: LodGate | 
     model = config.model
     return RenderOptions(
         sh_degree=sh_degree,
-        near_plane=model.near * space.extent,
+        near_plane=(model.near or _NEAR) * space.extent,
         far_plane=FAR * space.extent,
         antialiased=model.antialiased,
         background=model.background,

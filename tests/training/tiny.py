@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from blitzgs.capture.images import ImageMemory
+from blitzgs.capture.lengths import Sight
 from blitzgs.config.fields import Config
 from blitzgs.config.files import load_config
 from blitzgs.frame import frame as pipeline
@@ -57,6 +58,11 @@ class Capture:
     extent: float
     offset: np.ndarray = field(default_factory=lambda: np.array([10.0, 20.0, 30.0]))
     root: Path = Path("/nowhere")
+    apart: list[int] = field(default_factory=list)
+
+    @property
+    def near(self) -> float:
+        return Sight.of(self.cameras, self.points).near(self.train, self.extent)
 
 
 class Images:

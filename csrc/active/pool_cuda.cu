@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 
-#include "active/residence.h"
+#include "active/pool.h"
 #include "common/cuda.cuh"
 #include "exchange/copy_to_host.h"
 
@@ -15,7 +15,7 @@ constexpr int kThreads = 256, kWarps = kThreads / 32;
 // training step run at the same time.
 constexpr int kWords = 4, kUnit = 32 * kWords, kBlocks = 96;
 
-// seen [n] (residence.h), one thread per block of the table.
+// seen [n] (pool.h), one thread per block of the table.
 __global__ void __launch_bounds__(kThreads) see_blocks(const SeenBlocks args) {
   __shared__ Frustum planes[kMaxViews];
   if (threadIdx.x < args.views) planes[threadIdx.x] = frustum_of(args, threadIdx.x);
@@ -44,7 +44,7 @@ __device__ __forceinline__ void move(uint4* slot, uint4* leaving, const uint4* c
   }
 }
 
-// Moves the blocks of `swap` (residence.h). The units of all columns of all moves are numbered; a warp moves
+// Moves the blocks of `swap` (pool.h). The units of all columns of all moves are numbered; a warp moves
 // one unit at a time, in a loop. units: the number of units in a move.
 __global__ void __launch_bounds__(kThreads) move_blocks(const SwapBlocks swap, int units) {
   const int lane = threadIdx.x % 32;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "active/residence.h"
+#include "active/pool.h"
 
 #include <vector>
 
@@ -8,7 +8,7 @@
 
 using namespace blitzgs;
 
-TEST_CASE("blocks leave and come at once", "[residence]") {
+TEST_CASE("blocks leave and come at once", "[pool]") {
   // A slot and three blocks of 256 rows of one int16.
   constexpr std::int64_t kRows = 256;
   std::vector<std::int16_t> pool(2 * kRows), table(3 * kRows), kept(3 * kRows, 7), pool_kept(2 * kRows, 8);
@@ -31,7 +31,7 @@ TEST_CASE("blocks leave and come at once", "[residence]") {
   }
 }
 
-TEST_CASE("views of their own sizes see blocks", "[residence]") {
+TEST_CASE("views of their own sizes see blocks", "[pool]") {
   const std::vector<float> identity{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
   const std::vector<float> K{100, 0, 50, 0, 100, 40, 0, 0, 1};
   std::vector<float> viewmats, Ks;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "active/residence.h"
+#include "active/pool.h"
 
 #include <cstring>
 

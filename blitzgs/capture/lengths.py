@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The lengths of a capture, measured so that one wrong camera or point does not decide on them.
+
+Every comparison is between lengths of the capture, and every share is of a rank, so a capture scaled by a
+power of two has the same lengths, scaled exactly.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.capture.cameras import Camera, Float64, camera_centres
+from blitzgs.capture.lens import Lens
+
+# Cameras whose distance is below this share of the points' distance count as being in one place: the parallax
+# between them is far below a pixel.
+_LEAST_SPREAD = 1e-6
+# A camera is apart from the others if it is so many times farther from their middle than the farthest of
+# them, and than the points are. Without points, nothing tells an overview from a pose that is wrong.
+_GAP, _GAP_WITHOUT_POINTS = 5.0, 20.0
+# A camera that is apart and shows the points on less than this share of its image's sides has a wrong pose:
+# its photograph would teach the model nothing but the colour of a few pixels.
+_LEAST_SHOWN = 0.05
+# An overview from afar is no wrong pose, but does not decide on lengths where it is one of few.
+_MOST_APART = 0.1
+# A fraction of the depth of the nearest points that views see. Gaussians grow between the points and the
+# cameras, and what is so near to a camera is a defect of the model.
+_NEAR_OF_DEPTH = 0.25
+# The near plane is at most this share of the extent, as with model.near = 0.01.
+NEAR_OF_EXTENT = 0.01
+# The points in front of a view that are skipped, and the views, as shares: some points are wrong.
+_SKIPPED_POINTS, _SKIPPED_VIEWS = 0.02, 0.01
+# Pairs of a view and a point that are projected, and the least number of points.
+_PAIRS, _LEAST_POINTS = 10_000_000, 2000
+
+
+class PosedView(Protocol):
+    """What the search for stray cameras reads of a view."""
+
+    @property
+    def name(self) -> str:
+        """Name of the image."""
+
+    @property
+    def lens(self) -> Lens:
+        """Lens at the size that the capture's file states."""
+
+    @property
+    def world_to_camera(self) -> Float64:
+        """Pose, [4, 4]."""
+
+
+@dataclass(frozen=True)
+class StrayCamera:
+    """A camera that lies apart from all others and hardly shows a point: its pose is wrong."""
+
+    name: str
+    distance: float
+    """From the middle of all cameras, in world units."""
+    others: float
+    """Largest such distance of the cameras that are together."""
+
+
+def sampled(points: Float64, views: int) -> Float64:
+    """Return so many of the points, evenly chosen, that all views can be compared with them quickly."""
+    count = max(_LEAST_POINTS, _PAIRS // max(1, views))
+    return points[:: max(1, -(-len(points) // count))]
+
+
+def find_apart(
+    views: Sequence[PosedView], points: Float64
+) -> tuple[npt.NDArray[np.bool_], list[StrayCamera]]:
+    """Find the cameras that must not decide on lengths, and those of them whose pose is wrong.
+
+    Args:
+        views: all views, with finite poses.
+        points: [M, 3] in the same world; may be empty.
+
+    Returns:
+        Whether each view must not decide on lengths [V], and the cameras whose pose is wrong.
+    """
+    centres = camera_centres(np.stack([view.world_to_camera for view in views]))
+    middle = np.median(centres, axis=0)
+    distances = np.linalg.norm(centres - middle, axis=1)
+    sample = sampled(points, len(views))
+    scene = float(np.median(np.linalg.norm(sample - middle, axis=1))) if len(sample) else 0.0
+    order = np.argsort(distances, kind="stable")
+    ranked = distances[order]
+    begin = (len(views) + 1) // 2  # at least half of the cameras are together
+    before = np.maximum(ranked[begin - 1 : -1], scene)
+    gap = _GAP if len(sample) else _GAP_WITHOUT_POINTS
+    gaps = np.flatnonzero((ranked[begin:] > gap * before) & (before > 0))
+    apart = np.zeros(len(views), dtype=bool)
+    if len(gaps) == 0:
+        return apart, []
+    first = begin + int(gaps[0])
+    strays = [
+        StrayCamera(views[i].name, float(distances[i]), float(ranked[first - 1]))
+        for i in sorted(order[first:].tolist())
+        if len(sample) == 0 or _shown(views[i], sample) < _LEAST_SHOWN
+    ]
+    names = {stray.name for stray in strays}
+    apart[[i for i in order[first:] if views[i].name in names]] = True
+    overviews = [i for i in order[first:] if views[i].name not in names]
+    if len(overviews) <= _MOST_APART * len(views):
+        apart[overviews] = True
+    return apart, strays
+
+
+def _shown(view: PosedView, points: Float64) -> float:
+    """Return the share of an image's sides on which a view shows the inner 90 % of what it sees."""
+    x, y, depth = view.world_to_camera[:3, :3] @ points.T + view.world_to_camera[:3, 3:]
+    front = depth > 0
+    u, v = view.lens.project(x[front] / depth[front], y[front] / depth[front])
+    with np.errstate(invalid="ignore"):
+        inside = (u >= 0) & (u < view.lens.width) & (v >= 0) & (v < view.lens.height)
+    if inside.sum() < 2:
+        return 0.0
+    spans = (
+        float(np.subtract(*np.quantile(pixels[inside], [0.95, 0.05]))) / side
+        for pixels, side in ((u, view.lens.width), (v, view.lens.height))
+    )
+    return max(spans)
+
+
+def depths_seen(camera: Camera, points: Float64) -> Float64:
+    """Return the depths of the re-centred points [M, 3] that a camera sees, occluded ones too, unordered."""
+    x, y, depth = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
+    front = depth > 0
+    x, y, depth = x[front], y[front], depth[front]
+    u = camera.K[0, 0] * x / depth + camera.K[0, 2]
+    v = camera.K[1, 1] * y / depth + camera.K[1, 2]
+    return np.asarray(depth[(u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)])
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the views see of the points, by a sample of them."""
+
+    nearest: Float64
+    """[V] depth of the nearest points that each view sees, without the nearest 2 % of them; infinite for a
+    view that sees none."""
+    names: list[str]
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera], points: Float64) -> Sight:
+        """Measure the views of cameras; `points` [M, 3] are re-centred."""
+        sample = sampled(points, len(cameras))
+        nearest = np.full(len(cameras), np.inf)
+        for index, camera in enumerate(cameras):
+            depths = depths_seen(camera, sample)
+            if len(depths):
+                # At least one point is skipped where there are several.
+                rank = min(len(depths) - 1, max(1, int(_SKIPPED_POINTS * len(depths))))
+                nearest[index] = np.partition(depths, rank)[rank]
+        return cls(nearest, [camera.name for camera in cameras])
+
+    def blind(self, cameras: Sequence[Camera], points: Float64) -> int:
+        """Return how many views see none of the points; warn if most do, and name the first."""
+        blind = [name for name, depth in zip(self.names, self.nearest, strict=True) if np.isinf(depth)]
+        if 2 * len(blind) > len(self.names):
+            warnings.warn(
+                f"{len(blind)} of {len(self.names)} views (first: {blind[0]}) see none of the points: do the "
+                "poses and the points belong together, and do the cameras look along +z?",
+                stacklevel=3,
+            )
+        if len(blind) == len(self.names):  # a view may see points that are not in the sample
+            some = cameras[:: max(1, len(cameras) // 64)]
+            return len(blind) - sum(len(depths_seen(camera, points)) > 0 for camera in some)
+        return len(blind)
+
+    def near(self, views: Sequence[int], extent: float) -> float:
+        """Return the near plane: less than the depth of what the views see, and at most 0.01 x the extent.
+
+        Args:
+            views: the views that decide.
+            extent: of the scene.
+        """
+        most = NEAR_OF_EXTENT * extent
+        depths = np.sort(self.nearest[list(views)])
+        depths = depths[np.isfinite(depths)]
+        if len(depths) == 0:
+            return most
+        near = min(most, _NEAR_OF_DEPTH * float(depths[int(_SKIPPED_VIEWS * len(depths))]))
+        lost = int((depths <= most).sum())
+        if 2 * lost > len(depths):
+            # The cameras are spread over far more than they are away from what they show, as along a street.
+            warnings.warn(
+                f"{lost} of {len(depths)} views begin to see points at less than {NEAR_OF_EXTENT:g} x the "
+                f"extent ({most:.4g}), so the near plane is at {near:.4g}; model.near sets another",
+                stacklevel=3,
+            )
+        return near
+
+
+def measured_extent(centres: Float64, points: Float64) -> float:
+    """Return the extent of a scene: see `Capture.extent`.
+
+    Args:
+        centres: of the training cameras that decide on lengths, [V, 3].
+        points: [M, 3] in the same world.
+    """
+    extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    distance = float(np.median(np.linalg.norm(points - centres[0], axis=1)))
+    if extent > _LEAST_SPREAD * distance:
+        return extent
+    extent = distance
+    warnings.warn(
+        f"all training cameras are in one place: extent is the points' median distance, {extent:g}",
+        stacklevel=4,
+    )
+    return extent or 1.0
+
+
+def random_points(
+    cameras: Sequence[Camera], offset: Float64, count: int
+) -> tuple[Float64, npt.NDArray[np.uint8]]:
+    """Return uniform points of random colours in the region that cameras look at, in the capture's own world.
+
+    Raises:
+        ValueError: all cameras are in one place.
+    """
+    poses = np.stack([camera.world_to_camera for camera in cameras])
+    centres, axes = camera_centres(poses), poses[:, 2, :3]
+    # The point nearest to all optical axes by least squares; the tiny term keeps parallel axes solvable.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    target = np.linalg.solve(
+        across.sum(axis=0) + 1e-6 * np.eye(3),
+        np.einsum("nij,nj->i", across, centres) + 1e-6 * centres.mean(axis=0),
+    )
+    half = 0.35 * float(np.linalg.norm(centres - target, axis=1).mean())
+    if half <= _LEAST_SPREAD * (1 + float(np.abs(offset).max())):
+        raise ValueError(
+            "the capture has no points and all its cameras are in one place, so the position of the "
+            "scene is unknown: add points to the capture"
+        )
+    random = np.random.default_rng(0)
+    positions = target + offset + random.uniform(-half, half, (count, 3))
+    return np.asarray(positions), random.integers(0, 256, (count, 3), dtype=np.uint8)

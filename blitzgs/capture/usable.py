@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What of a capture's views and points can be used: what cannot is refused, or left out with a message."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.capture.cameras import Camera, Float64
+from blitzgs.capture.layouts import SourcePoints, SourceView
+from blitzgs.capture.lengths import StrayCamera, random_points
+from blitzgs.capture.lens import Lens, check_lens
+
+# Coordinates from here on are damage; the squares of smaller ones are finite.
+_FARTHEST = 1e100
+# As many as give a start where the capture has no points.
+_RANDOM_POINTS = 100_000
+
+
+def _is_usable(coordinates: Float64) -> npt.NDArray[np.bool_]:
+    return np.asarray(np.abs(coordinates) < _FARTHEST)  # false for NaN
+
+
+def with_finite_poses(views: list[SourceView]) -> list[SourceView]:
+    """Return the views whose pose is finite; warn of the others.
+
+    Raises:
+        ValueError: there is none.
+    """
+    finite = [view for view in views if _is_usable(view.world_to_camera).all()]
+    if not finite:
+        raise ValueError(f"none of the {len(views)} views has a pose (a finite rotation and translation)")
+    if len(finite) < len(views):
+        first = next(v.name for v in views if not _is_usable(v.world_to_camera).all())
+        warnings.warn(
+            f"{len(views) - len(finite)} of {len(views)} views have no finite pose and were dropped "
+            f"(first: {first})",
+            stacklevel=3,
+        )
+    return finite
+
+
+def check_lenses(views: list[SourceView]) -> None:
+    """Refuse lenses that no camera has, and name those that are unusual."""
+    unusual: dict[Lens, str] = {}
+    checked: set[Lens] = set()
+    for view in views:
+        if view.lens in checked:
+            continue
+        checked.add(view.lens)
+        try:
+            doubt = check_lens(view.lens)
+        except ValueError as error:
+            raise ValueError(f"the camera of {view.name}: {error}") from error
+        if doubt:
+            unusual[view.lens] = f"{view.name}: {doubt}"
+    if unusual:
+        warnings.warn(
+            f"{len(unusual)} of {len(checked)} cameras are unusual (first: {next(iter(unusual.values()))})",
+            stacklevel=3,
+        )
+
+
+def without_strays(
+    views: list[SourceView], kept: list[int], strays: list[StrayCamera], keep: bool
+) -> list[int]:
+    """Return the views without those whose pose is wrong, unless the user keeps them, and name them."""
+    if not strays:
+        return kept
+    shown = ", ".join(f"{s.name} at {s.distance:.6g}" for s in strays[:5]) + ", ..." * (len(strays) > 5)
+    done = "kept" if keep else "left out; --data.stray_cameras=keep trains on them"
+    warnings.warn(
+        f"{len(strays)} of {len(views)} cameras lie far from the others, which are within "
+        f"{strays[0].others:.6g} of their middle, and show hardly a point: {shown} ({done})",
+        stacklevel=3,
+    )
+    names = {stray.name for stray in strays}
+    return kept if keep else [index for index in kept if views[index].name not in names]
+
+
+def finite_points(points: SourcePoints) -> SourcePoints:
+    """Return the points whose position is finite; warn of the others."""
+    finite: npt.NDArray[np.bool_] = np.asarray(_is_usable(points.positions).all(axis=1))
+    if finite.all():
+        return points
+    warnings.warn(
+        f"{int((~finite).sum())} of {finite.size} points are not finite and were dropped", stacklevel=3
+    )
+    return SourcePoints(
+        points.positions[finite],
+        points.colors[finite],
+        points.track_lengths[finite] if points.track_lengths is not None else None,
+        points.errors[finite] if points.errors is not None else None,
+    )
+
+
+def points_at_random(root: Path, cameras: Sequence[Camera], offset: Float64) -> SourcePoints:
+    """Return uniform points of random colours in the region that the cameras look at."""
+    warnings.warn(
+        f"{root}: the capture has no points; {_RANDOM_POINTS:,} random ones take their place. Points of the "
+        "reconstruction give a better start",
+        stacklevel=3,
+    )
+    try:
+        return SourcePoints(*random_points(cameras, offset, _RANDOM_POINTS))
+    except ValueError as error:
+        raise ValueError(f"{root}: {error}") from error

@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a training has understood of its capture, as a block of lines, and what in it predicts a bad model."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from blitzgs.capture.capture import Capture
+from blitzgs.capture.images import Images
+from blitzgs.capture.lengths import NEAR_OF_EXTENT, depths_seen, sampled
+from blitzgs.config.fields import Config
+from blitzgs.config.schedule import Schedule, stretched
+from blitzgs.population.growth import growth_limit
+from blitzgs.util.terminal import printable
+
+# Photographs that are decoded before the training, and views that are compared with the points.
+_DECODED, _PROJECTED = 16, 100
+# Means of a photograph or of all points' colours, of 255, from which it is black or saturated.
+_BLACK, _SATURATED = 4.0, 251.0
+# What a Gaussian needs in bytes: its row with the optimiser's state, and the scratch memory of a step.
+_ROW_BYTES, _SCRATCH_BYTES = 750, 500
+_PROGRAM_BYTES = 400_000_000
+# Rough speeds of one CPU core and of one data-centre GPU: seconds of a step, for each megapixel and million
+# Gaussians of the model, as measured with one view a step.
+_CPU_SECONDS, _GPU_SECONDS = (0.0, 0.3, 0.6), (0.003, 0.004, 0.004)
+
+
+class HopelessCaptureError(ValueError):
+    """Poses and points of a capture do not belong together, so that there is nothing to train."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Figures of some photographs.
+
+    Attributes:
+        means: mean of each, over the pixels that count, 0 to 255.
+        masked: share of each that its mask excludes, of those with a mask.
+        unread: what is wrong with those that could not be decoded.
+    """
+
+    means: list[float]
+    masked: list[float]
+    unread: list[str]
+
+
+def check_worlds(capture: Capture) -> None:
+    """Refuse a capture of which no view sees a point.
+
+    Raises:
+        HopelessCaptureError: see above.
+    """
+    views = len(capture.cameras)
+    if capture.about.blind == views:
+        raise HopelessCaptureError(
+            f"{views} of {views} views see none of the {len(capture.points):,} points, so there is nothing "
+            f"to train: the cameras of {capture.about.source.cameras} and the points have different worlds "
+            "(give points that were reconstructed with these cameras, in the same coordinates), or the "
+            "cameras look along another axis than +z (COLMAP) or -z (transforms.json)"
+        )
+
+
+def understood(config: Config, capture: Capture, images: Images) -> list[str]:
+    """Return the lines of the block, and warn of what predicts a bad model."""
+    pictures = _look(capture, images)
+    near = config.model.near * capture.extent or capture.near
+    _warn_of_pictures(capture, pictures, near)
+    lines = [
+        ("capture", f"{capture.root}, cameras of {capture.about.source.cameras}"),
+        ("photographs", _photographs(capture)),
+        ("held out", _held_out(capture)),
+        ("stray cameras", _strays(capture)),
+        ("sizes", _sizes(capture, config.data.downscale)),
+        ("masks", _masks(capture, pictures)),
+        ("alpha", _alpha(capture, config)),
+        ("points", _points(capture)),
+        ("exposure", _exposure(pictures)),
+        ("extent", f"{capture.extent:.6g}; near plane {near:.4g} ({_why_near(config, capture)})"),
+        *(("note", note) for note in capture.about.source.notes),
+    ]
+    # A name may have characters that a terminal would obey.
+    return [f"{name + ':':15}{printable(text)}" for name, text in lines]
+
+
+def estimate(config: Config, capture: Capture, on_gpu: bool, cores: int) -> str:
+    """Return roughly how much memory and time a training will take."""
+    sizes = [capture.cameras[i].width * capture.cameras[i].height for i in capture.train]
+    population = config.population
+    limit = growth_limit(
+        population.max_gaussians,
+        sum(sizes),
+        population.pixels_per_gaussian,
+        len(capture.points),
+        population.gaussians_per_point,
+        None,
+    )
+    # The octree begins with more Gaussians than points, whatever limits its growth.
+    count = max(int(1.3 * len(capture.points)), limit.count if limit is not None else 5 * len(capture.points))
+    schedule = Schedule(stretched(config.schedule, len(capture.train)))
+    pixels = float(np.mean(sizes))
+    fixed, per_megapixel, per_million = _GPU_SECONDS if on_gpu else _CPU_SECONDS
+    step = fixed + (per_megapixel * pixels + per_million * count) / 1e6
+    minutes = schedule.iterations * step / (1 if on_gpu else max(1, cores)) / 60
+    if config.schedule.minutes > 0:
+        minutes = config.schedule.minutes
+    memory = _PROGRAM_BYTES + count * (_ROW_BYTES + _SCRATCH_BYTES) + 100 * max(sizes)
+    device = "a data-centre GPU" if on_gpu else f"{cores} CPU cores"
+    return (
+        f"about {_rounded(count):,} Gaussians at most, {memory / 1e9:.1f} GB and {max(1, round(minutes)):,} "
+        f"minutes on {device} for {schedule.iterations:,} images (rough: within a factor of 3)"
+    )
+
+
+def _rounded(count: int) -> int:
+    digits = max(0, len(str(count)) - 2)
+    return round(count / 10**digits) * 10**digits
+
+
+def _look(capture: Capture, images: Images) -> Pictures:
+    """Decode some photographs, evenly chosen; a damaged one is left to the reader that needs it."""
+    some = capture.train[:: -(-len(capture.train) // _DECODED)]
+    images.prefetch(some)
+    pictures = Pictures([], [], [])
+    for index in some:
+        try:
+            image, mask = images.get(index).numpy(), images.mask(index)
+        except (OSError, ValueError) as error:
+            pictures.unread.append(str(error))
+            continue
+        step = max(1, min(image.shape[:2]) // 256)
+        pixels = image[::step, ::step]
+        if mask is None:
+            pictures.means.append(float(pixels.mean()))
+            continue
+        counts = mask.numpy()[::step, ::step] > 0
+        pictures.masked.append(1 - float(counts.mean()))
+        if counts.any():
+            pictures.means.append(float(pixels[counts].mean()))
+    return pictures
+
+
+def _warn_of_pictures(capture: Capture, pictures: Pictures, near: float) -> None:
+    """Warn if most photographs, the colours of the points, or most views give a black or white picture."""
+    means = np.array(pictures.means)
+    for what, hit, cause in (
+        ("black", means < _BLACK, "is their alpha 0 everywhere, or is their range below 8 bits?"),
+        ("saturated", means > _SATURATED, "are they overexposed, or is model.background white behind alpha?"),
+    ):
+        if 2 * hit.sum() > len(means):
+            warnings.warn(
+                f"{int(hit.sum())} of {len(means)} photographs that were looked at are {what}, and so will "
+                f"the model be: {cause}",
+                stacklevel=3,
+            )
+    if len(means) and not capture.about.random_points and _BLACK <= float(np.median(means)) <= _SATURATED:
+        mean = float(capture.colors.mean())
+        if not _BLACK <= mean <= _SATURATED:
+            what = "black" if mean < _BLACK else "saturated"
+            warnings.warn(
+                f"the points' colours are {what} (mean {mean:.0f} of 255), and the photographs are not: "
+                "the model starts with a wrong picture; are the colours read from the right fields?",
+                stacklevel=3,
+            )
+    views = capture.train[:_PROJECTED]
+    points = sampled(capture.points, len(views))
+    depths = [depths_seen(capture.cameras[i], points) for i in views]
+    cut = sum(len(d) > 0 and bool(d.max() <= near) for d in depths)
+    if 2 * cut > len(views):
+        warnings.warn(
+            f"{cut} of the first {len(views)} training views have all their points in front of the near "
+            f"plane ({near:.4g}) and will be black: lower model.near, or set it to 0 for a plane by depths",
+            stacklevel=3,
+        )
+
+
+def _photographs(capture: Capture) -> str:
+    about = capture.about
+    parts = [f"{len(capture.cameras)} used: {len(capture.train)} to train, {len(capture.test)} held out"]
+    for count, text in (
+        (about.source.without_camera, "without a camera"),
+        (about.unused, "in no list of the capture's split"),
+        (about.missing, "not on disk"),
+    ):
+        if count:
+            parts.append(f"{count} {text}")
+    return "; ".join(parts)
+
+
+def _held_out(capture: Capture) -> str:
+    if not capture.test:
+        return f"none ({_why_split(capture)})"
+    names = ", ".join(capture.cameras[i].name for i in capture.test[:4])
+    return f"{_why_split(capture)}: {names}{', ...' if len(capture.test) > 4 else ''}"
+
+
+def _why_split(capture: Capture) -> str:
+    source = capture.about.source.split
+    own = capture.about.split == "the capture's own split"
+    return f"{capture.about.split}, {source}" if own and source else capture.about.split
+
+
+def _strays(capture: Capture) -> str:
+    strays = capture.about.strays
+    if not strays:
+        return "none"
+    names = {camera.name for camera in capture.cameras}
+    shown = ", ".join(f"{stray.name} at {stray.distance:.6g}" for stray in strays[:4])
+    state = "kept" if any(stray.name in names for stray in strays) else "left out"
+    return (
+        f"{len(strays)} {state}: {shown}{', ...' if len(strays) > 4 else ''} (the others are within "
+        f"{strays[0].others:.6g})"
+    )
+
+
+def _sizes(capture: Capture, downscale: float) -> str:
+    sizes = sorted({(camera.width, camera.height) for camera in capture.cameras})
+    shown = " to ".join(f"{w} x {h}" for w, h in (sizes if len(sizes) < 2 else (sizes[0], sizes[-1])))
+    more = f" (data.downscale={downscale:g})" if downscale > 1 else ""
+    return f"{shown} pixels{more}" + (f", {len(sizes)} sizes" if len(sizes) > 1 else "")
+
+
+def _masks(capture: Capture, pictures: Pictures) -> str:
+    files = sum(camera.mask_path is not None for camera in capture.cameras)
+    borders = sum(camera.rectification.has_invalid for camera in capture.cameras)
+    if not files and not borders:
+        return "none"
+    parts = [f"{files} of {len(capture.cameras)} photographs have one"] if files else []
+    parts += [f"{borders} have masked borders (data.undistort=mask)"] if borders else []
+    if pictures.masked:
+        parts.append(
+            f"mean share excluded {np.mean(pictures.masked):.1%} of {len(pictures.masked)} looked at"
+        )
+    return "; ".join(parts)
+
+
+def _alpha(capture: Capture, config: Config) -> str:
+    if not capture.has_alpha:
+        return "none"
+    colour = ", ".join(f"{value:g}" for value in config.model.background)
+    return f"some photographs have it; composited over model.background ({colour})"
+
+
+def _points(capture: Capture) -> str:
+    if capture.about.random_points:
+        return f"none; {len(capture.points):,} random ones"
+    colours = capture.colors
+    grey = bool((colours == colours[:1]).all())
+    shown = (
+        f"all of colour {tuple(colours[0].tolist())}" if grey else f"mean colour {colours.mean():.0f} of 255"
+    )
+    blind = f"; {capture.about.blind} views see none" if capture.about.blind else ""
+    return f"{len(capture.points):,}, {shown}{blind}"
+
+
+def _exposure(pictures: Pictures) -> str:
+    if not pictures.means:
+        return f"unknown: {pictures.unread[0]}" if pictures.unread else "unknown: all pixels are masked"
+    means = np.array(pictures.means)
+    stops = float(np.log2(max(means.max(), 1.0) / max(means.min(), 1.0))) * 2.2  # of linear light, by sRGB
+    text = (
+        f"means of {len(means)} photographs {means.min():.0f} to {means.max():.0f} of 255 ({stops:.1f} stops)"
+    )
+    return text + (
+        f"; {len(pictures.unread)} cannot be read: {pictures.unread[0]}" if pictures.unread else ""
+    )
+
+
+def _why_near(config: Config, capture: Capture) -> str:
+    if config.model.near:
+        return f"model.near={config.model.near:g} x extent"
+    if capture.near == NEAR_OF_EXTENT * capture.extent:
+        return f"{NEAR_OF_EXTENT:g} x extent, well before the points"
+    return "a quarter of the depth of the nearest points"
