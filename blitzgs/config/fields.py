@@ -74,8 +74,11 @@ class ModelConfig:
         near: near plane, relative to extent. 0: a quarter of the depth of the nearest points that training
             views see, 0.01 at most; the run's own configuration has the result.
         deterministic: make a run repeat bit for bit on CUDA too, at some cost in time (the CPU always does).
-        exposure: each training photograph has a gain and a bias of its channels, if the photographs differ;
-            the model has the mean exposure.
+        exposure: if photographs differ in exposure, each training photograph has a gain and a bias of its
+            channels: gains are estimated from the points' tracks, where there are tracks, and both are
+            refined in training. Views are rendered with the mean exposure (`blitzgs render --exposure`:
+            with the photograph's), so held-out photographs are farther from them: `psnr_corrected` compares
+            without exposure.
     """
 
     sh_degree: int = 3
