@@ -39,9 +39,7 @@ def call(name, Ks, dtype=torch.float32):  # noqa: N803
 def test_a_renderer_refuses_them(name, row, column, value):
     Ks = torch.from_numpy(np.stack([np.array(GOOD), wrong(row, column, value)])).float()  # noqa: N806
     call(name, Ks[:1])
-    with pytest.raises(
-        ValueError, match=r"Ks\[1\] must be \[\[fx, 0, cx\], \[0, fy, cy\], \[0, 0, 1\]\], got"
-    ):
+    with pytest.raises(ValueError, match=r"Ks\[1\] must be \[\[fx, 0, cx\], .* got"):
         call(name, Ks)
 
 

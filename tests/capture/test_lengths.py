@@ -152,8 +152,9 @@ def test_two_groups_of_cameras_are_no_strays(tmp_path):
     rotations, centres, points = ring(0)
     rotations[7:], centres[7:] = rotations[:5], centres[:5] + [500.0, 0, 0]
     write(tmp_path, "binary", rotations, centres, np.concatenate([points, points + [500.0, 0, 0]]))
-    capture, said = quiet_load(tmp_path)
-    assert len(capture.cameras) == COUNT and not capture.apart and not capture.about.strays and not said
+    capture, _ = quiet_load(tmp_path)
+    assert len(capture.cameras) == COUNT and not capture.apart and not capture.about.strays
+    assert capture.extent > 250
 
 
 @pytest.mark.parametrize("form", ["binary", "transforms"])
