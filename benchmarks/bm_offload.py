@@ -34,7 +34,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.host_table import HostTable
-from blitzgs.table.pool import Residence, ResidenceError
+from blitzgs.table.pool import Pool, PoolError
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batch import Batch
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
@@ -148,22 +148,22 @@ def measure_pool(
     """Measure steps with a pool; `at` is the first step."""
     results = []
     budget = int(table_bytes(table) / ratio)
-    residence = Residence(table, over.ranks.device, budget, over.optimiser.pending_table)
+    pool = Pool(table, over.ranks.device, budget, over.optimiser.pending_table)
     for name in orders:
         order = over.orders[name]
         upcoming = UpcomingCameras(order, list(range(LINES * VIEWS_A_LINE)), over.views)
-        stepper = OffloadingStepper(residence, upcoming, over.optimiser, TileOwners(over.ranks), LOSS, 1.0)
+        stepper = OffloadingStepper(pool, upcoming, over.optimiser, TileOwners(over.ranks), LOSS, 1.0)
         result: dict[str, Any] = {"arm": f"{ratio:g}x", "order": name, "pool_gb": budget / 1e9}
         results.append(result)
         try:
             over.steps(stepper, order, at, steps)
-        except ResidenceError as error:
+        except PoolError as error:
             result["failed"] = str(error)
             at += 2 * steps
             continue
-        before = residence.moved
+        before = pool.moved
         seconds = over.steps(stepper, order, at + steps, steps)
-        moved = residence.moved.since(before)
+        moved = pool.moved.since(before)
         at += 2 * steps
         result |= {"step_ms": 1e3 * seconds} | moved.values()
         result |= {

@@ -18,6 +18,9 @@ gsplat-default-reset (with the resets of opacities that 1.5.3 skips by mistake) 
     recipes: {aerial: configs/aerial.yaml, mcmc: gsplat-mcmc --cap_max=2000000}
     seeds: [0, 1, 2]
 
+--stress YAML runs the stress grid of a configuration (`benchmarks/quality_stress.py`) instead of recipes, and
+writes stress.md; --part 2/8 runs an eighth of it.
+
 Every run is a process. By default, each GPU has one run at a time. With more (--per-gpu) the models are as
 good, but times no longer compare, and the table says so. When a run ends, it writes a JSON file into
 RESULTS/runs. The same command then skips the runs that are finished and repeats those that failed.
@@ -42,6 +45,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import quality_report
+import quality_stress
 import torch
 from harness import commit
 from quality_plan import RunSpec, parse_named, read_plan, runs_of
@@ -218,6 +222,10 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--recipe", action="append", default=[], metavar='"NAME=SOURCE [--FIELD=VALUE]"')
     parser.add_argument("--seeds", type=int, nargs="+", help="of the trainings (default: the plan's, or 0)")
     parser.add_argument("--plan", type=Path, metavar="YAML", help="captures, recipes and seeds")
+    parser.add_argument("--stress", metavar="YAML", help="run the stress grid of this configuration")
+    parser.add_argument(
+        "--part", type=quality_stress.parse_part, metavar="K/N", help="with --stress: this part of the grid"
+    )
     parser.add_argument(
         "--evaluate-at",
         type=positive,
@@ -257,18 +265,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         plan = {"captures": {}, "recipes": {}} if args.plan is None else read_plan(args.plan)
         captures = plan["captures"] | dict(map(parse_named, args.capture))
         recipes = plan["recipes"] | dict(map(parse_named, args.recipe))
+        seeds = args.seeds or plan.get("seeds") or [0]
+        evaluate_at = args.evaluate_at
+        if args.stress is not None:
+            recipes |= quality_stress.part_of(quality_stress.recipes(args.stress), args.part or (1, 1))
+            seeds, evaluate_at = args.seeds or quality_stress.SEEDS, []
         quality_report.collect(args.out, args.collect or [])
         specs = []
         if captures or recipes or args.collect is None:
             device = "cuda" if args.gpus > 0 else "cpu"
-            seeds = args.seeds or plan.get("seeds") or [0]
-            specs = runs_of(captures, recipes, seeds, args.evaluate_at, args.lpips, device, args.ranks)
+            specs = runs_of(captures, recipes, seeds, evaluate_at, args.lpips, device, args.ranks)
             if args.ranks > 1 and (args.per_gpu > 1 or 0 < args.gpus < args.ranks):
                 raise ValueError(f"--ranks {args.ranks} needs as many --gpus, and --per-gpu 1")
     except (ValueError, OSError) as error:
         parser.error(str(error))
     work(specs, Pool(args.out, args.gpus, args.per_gpu, args.ranks), args.minutes)
     print(quality_report.report(args.out))
+    if args.stress is not None:
+        table = quality_stress.markdown(quality_report.read_runs(args.out / quality_report.RUNS))
+        (args.out / "stress.md").write_text(table)
+        print(table)
     wanted = {spec.name for spec in specs}
     failed = [r for r in quality_report.read_runs(args.out / quality_report.RUNS) if r["status"] != "done"]
     return int(any(run["name"] in wanted for run in failed))

@@ -159,8 +159,10 @@ def train_ours(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:
         trainer.recorder = recorder
         if trainer.train() is None:
             raise InterruptedError("stopped by a signal")
-    found = figures(recorder, trainer.state.progress.peak_gaussians) | {"population": trainer.population}
-    return found
+    return figures(recorder, trainer.state.progress.peak_gaussians) | {
+        "population": trainer.population,
+        "largest_fall": trainer.state.curve.fall,
+    }
 
 
 def train_opponent(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:

@@ -206,8 +206,8 @@ def arm_lines(file: Json, arms: dict[str, Json], columns: Iterable[str]) -> list
 
 
 def compact_lines(compact: Json) -> list[str]:
-    """Tabulate configs/compact.yaml against the whole model level and against none of it, with times."""
-    arms = {"half": {"title": "compact.yaml"}, "full": {"title": "full"}, "all_off": {"title": "all off"}}
+    """Tabulate configs/density.yaml against the whole model level and against none of it, with times."""
+    arms = {"half": {"title": "density.yaml"}, "full": {"title": "full"}, "all_off": {"title": "all off"}}
     return arm_lines(compact, arms, (*ABLATION_COLUMNS, "seconds"))
 
 

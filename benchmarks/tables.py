@@ -3,7 +3,7 @@ r"""The paper's tables on any scenes: runs what is missing, and writes Markdown 
 
     python benchmarks/tables.py ablation --out TABLES --seeds 0 1 2 --gpus 4 \
         --scenes town=DATA/town "park=DATA/park --data.downscale=2" \
-        --config configs/compact.yaml --gate gates/mine.json
+        --config configs/density.yaml --gate gates/mine.json
     python benchmarks/tables.py scaling --out TABLES --scenes city=DATA/city --gpus 4 --ranks 1 2 4
     python benchmarks/tables.py cost --out TABLES --scenes city=DATA/city --gpus 4 --ranks 1 2 4
     python benchmarks/tables.py oracle --out TABLES --runs town=RUNS/town --gate gates/mine.json --gpus 1
@@ -209,7 +209,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--scenes", nargs="+", default=[], metavar='"NAME=DIR [--data.FIELD=VALUE]"')
     parser.add_argument("--runs", nargs="+", default=[], metavar="NAME=RUN", help="for oracle and popping")
     parser.add_argument(
-        "--config", default="configs/compact.yaml", metavar="YAML", help="of all arms (%(default)s)"
+        "--config", default="configs/density.yaml", metavar="YAML", help="of all arms (%(default)s)"
     )
     parser.add_argument("--flags", default="", metavar='"--FIELD=VALUE ..."', help="for all arms")
     parser.add_argument("--arms", nargs="+", metavar="ARM", help="only these, by their names in the plan")

@@ -17,6 +17,8 @@ def build_city(plan: Plan) -> Mesh:
     b = MeshBuilder()
     far = max(20 * plan.options.extent, 6000.0)
     b.top(-far, -far, far, far, 0.0, Look(GROUND, (1, 1, 1)))
+    if not plan.options.built:
+        return b.build(plan)
     for i, j in np.ndindex(*plan.kinds.shape):
         _fill_block(b, plan, int(i), int(j), np.random.default_rng([plan.options.seed, 2, int(i), int(j)]))
     rng = np.random.default_rng([plan.options.seed, 3])

@@ -21,6 +21,9 @@ _HELP = {
     "points_per_view": "number of feature points to search for in each image",
     "oblique": "fraction of oblique views, 0 to 1",
     "seed": "seed of all random choices",
+    "built": "a city; --no-built: flat farmland",
+    "grain": "noise of the photographs, in steps of 8-bit values",
+    "exposure": "standard deviation of the logarithm of the photographs' gains",
 }
 
 
@@ -45,8 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"city that the other flags change (default: %(default)s): {_sizes()}",
     )
     for field in fields(CityOptions):
+        flag = f"--{field.name.replace('_', '-')}"
+        if isinstance(field.default, bool):
+            parser.add_argument(flag, action=argparse.BooleanOptionalAction, help=_HELP[field.name])
+            continue
         parser.add_argument(
-            f"--{field.name.replace('_', '-')}",
+            flag,
             type=type(field.default),
             metavar="N" if isinstance(field.default, int) else "X",
             help=_HELP[field.name],

@@ -38,6 +38,9 @@ def generate_city(
     points_per_view: int = CityOptions.points_per_view,
     oblique: float = CityOptions.oblique,
     seed: int = CityOptions.seed,
+    built: bool = CityOptions.built,
+    grain: float = CityOptions.grain,
+    exposure: float = CityOptions.exposure,
     processes: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -59,6 +62,9 @@ def generate_city(
         points_per_view: feature points looked for per image.
         oblique: fraction of oblique views, 0 to 1.
         seed: seed of all random numbers.
+        built: whether there is a city; false: flat farmland.
+        grain: standard deviation of the photographs' noise, in steps of 8-bit values.
+        exposure: standard deviation of the logarithm of the photographs' gains.
         processes: number of processes that render; None: one for each core that this process may use.
         overwrite: replace a city with other parameters instead of raising.
         progress: called after each image.
@@ -72,7 +78,9 @@ def generate_city(
         BrokenProcessPool: the system ended one of the processes, for example because memory ran out.
         ModuleNotFoundError: `embreex` is not installed.
     """
-    options = CityOptions(extent, views, width, height, points_per_view, oblique, seed)
+    options = CityOptions(
+        extent, views, width, height, points_per_view, oblique, seed, built, grain, exposure
+    )
     out = Path(out)
     if out.name in ("", ".."):
         raise ValueError(f"synthetic city: the folder must be given by its name, got '{out}'")

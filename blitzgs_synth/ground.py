@@ -7,17 +7,20 @@ from typing import Final
 
 import numpy as np
 
-from blitzgs_synth.arrays import Bools, Floats, Ints
+from blitzgs_synth.arrays import Bools, Doubles, Floats, Ints
 from blitzgs_synth.materials import mix, rgb
 from blitzgs_synth.noise import Noise, cell_random, inside, resolved, stripes
 from blitzgs_synth.plan import HOUSES, PARK, PLAZA, RETAIL, SIDEWALK, TOWERS, Plan, Streets
 
+_SWAY: Final = 0.12  # standard deviation of the movement of crops, metres
 _WHITE: Final = (0.74, 0.74, 0.70)
 
 
-def ground_color(plan: Plan, noise: Noise, position: Floats, footprint: Floats) -> Floats:
-    """Return linear RGB [3, R] of ground points at world positions [3, R]."""
+def ground_color(plan: Plan, noise: Noise, position: Floats, footprint: Floats, centre: Doubles) -> Floats:
+    """Return linear RGB [3, R] of ground points at world positions [3, R], seen from `centre` [3]."""
     x, y = plan.unbend(position[0], position[1])
+    if not plan.options.built:
+        return _crops(noise, x, y, footprint, centre)
     color = np.empty((3, len(x)), np.float32)
     dx, i = plan.along_y.nearest(x)
     dy, j = plan.along_x.nearest(y)
@@ -249,3 +252,20 @@ def _fields(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
     color = color * (1 + furrows + tone)
     border = np.abs(v / 62 - np.round(v / 62)) < 0.03
     return mix(color, _grass(noise, x, y, footprint, 0.0), border * np.float32(1))
+
+
+def _crops(noise: Noise, x: Floats, y: Floats, footprint: Floats, centre: Doubles) -> Floats:
+    """Return fields whose crops have as fine a texture as photographs can show: rows, leaves and soil.
+
+    Crops sway in the wind, so no two photographs show quite the same.
+    """
+    color = _fields(noise, x, y, footprint)
+    gust = centre.astype(np.float32)
+    sway_x = np.float32(_SWAY) * noise(x / 3 + gust[0], y / 3 + gust[1])
+    sway_y = np.float32(_SWAY) * noise(x / 3 - gust[1], y / 3 + gust[0])
+    x, y = x + sway_x, y + sway_y
+    rows = (stripes(x + 0.4 * y, 0.75, 0.0, 0.55, footprint) - 0.55) * 0.35
+    leaves = noise.layers(x, y, footprint, (1.4, 0.16), (0.7, 0.22), (0.36, 0.30), (0.2, 0.30))
+    shade: Floats = np.clip(1 + rows + leaves, 0.15, 2.2)
+    soil = np.clip(noise(x / 0.8 + 13, y / 0.8) - 0.4, 0, 1) * resolved(0.8, footprint)
+    return mix(color * shade, (0.21, 0.155, 0.105), 0.7 * soil)

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 
 # Raised whenever the same parameters would give other files, so that cached cities are made anew.
 FORMAT_VERSION = 3
+# Fields that the first cities of this version did not have.
+_LATER = ("built", "grain", "exposure")
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,9 @@ class CityOptions:
         points_per_view: feature points looked for in each image; the cloud has somewhat fewer in total.
         oblique: fraction of the views flown obliquely (45°, four headings); the others look straight down.
         seed: of the layout, the buildings, the flight and the noise.
+        built: whether there is a city; false: flat farmland of finely textured crops.
+        grain: standard deviation of the noise of the photographs, in steps of 8-bit values.
+        exposure: standard deviation of the logarithm of the photographs' gains.
     """
 
     extent: float = 150.0
@@ -30,6 +35,9 @@ class CityOptions:
     points_per_view: int = 500
     oblique: float = 0.6
     seed: int = 0
+    built: bool = True
+    grain: float = 0.0
+    exposure: float = 0.0
 
     def __post_init__(self) -> None:
         limits = {
@@ -40,6 +48,9 @@ class CityOptions:
             "points_per_view": (1, 100_000),
             "oblique": (0.0, 1.0),
             "seed": (0, 2**63 - 1),
+            "built": (False, True),
+            "grain": (0.0, 64.0),
+            "exposure": (0.0, 1.0),
         }
         for name, (low, high) in limits.items():
             value = getattr(self, name)
@@ -47,8 +58,17 @@ class CityOptions:
                 raise ValueError(f"synthetic city: {name} must be between {low} and {high}, got {value}")
 
     def manifest(self) -> dict[str, float | int]:
-        """Return the parameters that decide the files' content, for a city's manifest."""
-        return {"format_version": FORMAT_VERSION, **asdict(self)}
+        """Return the parameters that decide the files' content, for a city's manifest.
+
+        Those added later are left out where they change nothing, so that older cities need not be made anew.
+        """
+        values = asdict(self)
+        same = [
+            field.name
+            for field in fields(self)
+            if field.name in _LATER and values[field.name] == field.default
+        ]
+        return {"format_version": FORMAT_VERSION, **{k: v for k, v in values.items() if k not in same}}
 
 
 PRESETS = {
@@ -58,4 +78,16 @@ PRESETS = {
     "town": CityOptions(extent=500.0, views=400, width=1368, height=912, points_per_view=1000),
     # More than two square kilometres, with the views and the image size of the usual large captures.
     "city": CityOptions(extent=1600.0, views=2048, width=1368, height=912, points_per_view=1200),
+    # Flat crops from straight above, with grain: a capture on which training can lose what it has learnt
+    # (docs/decisions/recipe.md).
+    "farmland": CityOptions(
+        extent=240.0,
+        views=166,
+        width=800,
+        height=600,
+        points_per_view=1200,
+        oblique=0.0,
+        built=False,
+        grain=5.0,
+    ),
 }

@@ -15,6 +15,7 @@ import numpy as np
 from blitzgs.util.output import write_file
 from blitzgs_synth.arrays import Bytes
 from blitzgs_synth.flight import View
+from blitzgs_synth.options import CityOptions
 from blitzgs_synth.processes import each
 from blitzgs_synth.render import City
 from blitzgs_synth.tracks import Corners, find_corners
@@ -52,7 +53,7 @@ def take_photographs(
         record = folder / CORNERS / f"{index:05d}.npz"
         corners = _finished(path, record)
         if corners is None:
-            image = city.render(view)
+            image = _exposed(city.render(view), index, options)
             corners = find_corners(city, view, image, options.points_per_view, options.seed)
             encoded = _encode_jpeg(path, image)
             # Checksums find files that a power failure tore, so the files are not synced to disk.
@@ -66,6 +67,19 @@ def take_photographs(
         if progress:
             progress(len(found), len(views))
     return found
+
+
+def _exposed(image: Bytes, index: int, options: CityOptions) -> Bytes:
+    """Return a photograph, RGB [H, W, 3], with the gain and the grain of the camera."""
+    if options.grain == 0 and options.exposure == 0:
+        return image
+    rng = np.random.default_rng([options.seed, 6, index])
+    # Channels differ by less than photographs do.
+    gains = np.exp(options.exposure * (rng.standard_normal() + 0.25 * rng.standard_normal(3)))
+    values = image.astype(np.float32) * gains.astype(np.float32)
+    values += np.float32(options.grain) * rng.standard_normal(image.shape, np.float32)
+    exposed: Bytes = np.clip(values + 0.5, 0, 255).astype(np.uint8)
+    return exposed
 
 
 def _finished(image: Path, record: Path) -> Corners | None:

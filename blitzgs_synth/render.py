@@ -154,7 +154,7 @@ class City:
         # On a slanted surface the footprint is longer one way, taken as the mean of both axes.
         footprint = pixel / np.sqrt(np.maximum(np.abs(slant), 0.15))
 
-        albedo = self._albedo(surface, parts, position, normal, footprint)
+        albedo = self._albedo(view, surface, parts, position, normal, footprint)
         sunny = self._sunny(samples, group, count, normal, material)
         lit = self._light(position, normal, sunny)
         lit *= albedo
@@ -178,7 +178,13 @@ class City:
         return np.stack(turns)
 
     def _albedo(
-        self, surface: Ints, parts: list[slice], position: Floats, normal: Floats, footprint: Floats
+        self,
+        view: View,
+        surface: Ints,
+        parts: list[slice],
+        position: Floats,
+        normal: Floats,
+        footprint: Floats,
     ) -> Floats:
         albedo = np.empty((3, len(surface)), np.float32)
         for kind, part in enumerate(parts):
@@ -186,7 +192,8 @@ class City:
             if len(s) == 0:
                 continue
             if kind == mesh.GROUND:
-                albedo[:, part] = ground_color(self.plan, self.noise, position[:, part], footprint[part])
+                where = position[:, part]
+                albedo[:, part] = ground_color(self.plan, self.noise, where, footprint[part], view.centre)
                 continue
             offset = position[:, part] - self.mesh.origin.take(s, 1)
             points = Points(

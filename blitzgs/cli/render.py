@@ -46,6 +46,11 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     add_split(parser, "render")
     parser.add_argument("--out", type=named_path, required=True, metavar="DIR", help="folder for the images")
     parser.add_argument(
+        "--exposure",
+        action="store_true",
+        help="show training views with the exposure of their photographs (model.exposure), not with the mean",
+    )
+    parser.add_argument(
         "--raw",
         action="store_true",
         help="write float32 arrays [H, W, 3] as .npy, not clamped, instead of PNG",
@@ -59,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
         stored = _cameras(args, model, ranks)
         cameras: Sequence[CameraLike] = stored.cameras
         indices = chosen_views(args, stored)
+        exposures = _exposures(model, stored) if args.exposure else {}
         views = ViewSet(list(cameras), model.space, ranks.device)
         gate = lod_gate(model.config, model.progress)
         options = render_options(model.config, model.space, model.progress.sh_degree, gate)
@@ -76,10 +82,28 @@ def run(args: argparse.Namespace) -> int:
                 report(position + 1, len(indices))
                 if render is None:
                     continue
+                if index in exposures:
+                    gain, bias = exposures[index].to(render.device)
+                    render = render * gain + bias
                 output.write(paths[index], _npy(render) if args.raw else encode_image(render, ".png"))
         if ranks.rank == 0:
             print(f"{args.out}: {len(indices)} images")
     return 0
+
+
+def _exposures(model: run_files.TrainedModel, stored: RunCameras) -> dict[int, Tensor]:
+    """Return gain and bias, float32 [2, 3], of each training view, by its index among the cameras.
+
+    Raises:
+        ValueError: the run has no exposures, or those of other cameras.
+    """
+    if model.exposures is None:
+        raise ValueError("--exposure: the run was trained without model.exposure")
+    if len(model.exposures) != len(stored.train):
+        raise ValueError(
+            f"--exposure: the run has {len(model.exposures)} photographs, not {len(stored.train)}"
+        )
+    return dict(zip(stored.train, model.exposures.float(), strict=True))
 
 
 def _cameras(args: argparse.Namespace, model: run_files.TrainedModel, ranks: Ranks) -> RunCameras:

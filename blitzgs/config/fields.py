@@ -72,6 +72,8 @@ class ModelConfig:
         near: near plane, relative to extent. 0: a quarter of the depth of the nearest points that training
             views see, 0.01 at most; the run's own configuration has the result.
         deterministic: make a run repeat bit for bit on CUDA too, at some cost in time (the CPU always does).
+        exposure: each training photograph has a gain and a bias of its channels, if the photographs differ;
+            the model has the mean exposure.
     """
 
     sh_degree: int = 3
@@ -79,6 +81,7 @@ class ModelConfig:
     antialiased: bool = False
     near: float = 0.0
     deterministic: bool = False
+    exposure: bool = False
 
 
 @dataclass(frozen=True)
@@ -206,8 +209,8 @@ class PopulationConfig:
 
     Some fields have no effect on some runs. With "relocation": `grad_threshold`, `clone_scale`,
     `min_observations` and `phi`. With "density": `growth`. Without
-    `importance`: `score`, `pass1_keep`, `pass2_mass`, `pass2_keep` and `phi`. Without `gate`: `gate_rate` and
-    `gate_rule`. With the gate "random": `gate_rule`.
+    `importance`: `score`, `pass1_keep`, `pass2_mass`, `pass2_keep`, `pass2_views` and `phi`. Without `gate`:
+    `gate_rate` and `gate_rule`. With the gate "random": `gate_rule`.
 
     Attributes:
         strategy: what a density event does: "density" (clone and split by gradients, prune) or "relocation"
@@ -240,10 +243,12 @@ class PopulationConfig:
         pass2_keep: largest share of the Gaussians that the second pass keeps, those of the highest scores,
             without those below `min_opacity`; 1: no such limit. If `pass2_mass` and `pass2_keep` are both 1,
             the pass keeps all Gaussians and only computes phi and the cull matrix.
+        pass2_views: with fewer training views the second pass keeps all Gaussians, because scores add up what
+            the views show, and say little about places that few of them see.
         phi: from the first pass on, density control multiplies the gradients that it sums with phi: among the
             views that see a Gaussian, the share of those in which it counts.
         gate: model file of a spawn gate (`blitzgs gate fit`), or "default" for the one that comes with
-            BlitzGS, for configs/compact.yaml with schedule.t1=8999, pass1_keep=0.85 and score=weight; or
+            BlitzGS, for configs/density.yaml with schedule.t1=8999, pass1_keep=0.85 and score=weight; or
             "random" to withhold as many at random, which a gate has to surpass; null: none.
         gate_rate: share of the candidates, clones and splits apart, that the gate withholds at each density
             event from `schedule.gate_from` on.
@@ -274,6 +279,7 @@ class PopulationConfig:
     pass1_keep: float = 0.7
     pass2_mass: float = 0.99
     pass2_keep: float = 1.0
+    pass2_views: int = 0
     phi: bool = True
     gate: str | None = None
     gate_rate: float = 0.6

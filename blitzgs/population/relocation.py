@@ -50,7 +50,8 @@ def relocate(
     the share `growth` of the population. Live Gaussians are drawn for copying in proportion to their opacity
     (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", section 3.4). A Gaussian and
     its copies have one position, and share opacity and size such that together they look like the Gaussian
-    before (`shared`). All of them get moments of zero. Copies have the level, phi and cull row of the
+    before (`shared`). The copied Gaussian keeps its moments, scaled as its gradients are (`_keep_moments`),
+    and the copies begin with moments of zero. Copies have the level, phi and cull row of the
     Gaussian that they copy, and no statistics. Draws and ids depend only on (seed, time, id), so the result
     depends neither on the order of the rows nor on the number of ranks.
 
@@ -163,13 +164,38 @@ def draw(weights: Tensor, count: int, ids: Tensor, seed: int, time: int, ranks: 
 
 
 def _set_shares(table: GaussianTable, sources: Tensor, copies: Tensor, min_opacity: float) -> None:
-    """Set opacities and scales of the rows `sources` to their shares, and their moments to zero."""
-    opacities, scales = shared(table["opacities"][sources], table["scales"][sources], copies)
+    """Set opacities and scales of the rows `sources` to their shares, and scale their moments."""
+    before = table["opacities"][sources]
+    opacities, scales = shared(before, table["scales"][sources], copies)
     # Sharing must not reduce the opacity below the limit, or the Gaussian would count as dead.
     table["opacities"][sources] = opacities.clamp(min=opacity_logit(min_opacity)).float()
     table["scales"][sources] = scales.float()
-    for name in (*EXP_AVGS, *EXP_AVG_SQS):
-        table[name][sources] = 0
+    _keep_moments(table, sources, copies, before)
+
+
+def _keep_moments(table: GaussianTable, sources: Tensor, copies: Tensor, before: Tensor) -> None:
+    """Scale the moments of the rows `sources`, of which there are now `copies` each, as their gradients are.
+
+    Each of N Gaussians in one place has 1/N of the gradient of the Gaussian before. That of the logit l of
+    its opacity o changes by the factor o' / o, since (1 - o')^N = 1 - o.
+
+    With moments of zero instead, a row would move by several times its learning rate in its next steps, as
+    Adam's bias correction is that of the run and not of the row. In each event the most opaque Gaussians are
+    copied, and such steps of all of them undo what a run has learnt (docs/decisions/recipe.md).
+
+    Args:
+        table: changed in place.
+        sources: int64 [M].
+        copies: N, int64 [M].
+        before: logits of the opacities before they were shared, [M].
+    """
+    share = 1.0 / copies.double()
+    dimmed = table["opacities"][sources].double().sigmoid() / before.double().sigmoid()
+    for names, power in ((EXP_AVGS, 1), (EXP_AVG_SQS, 2)):
+        for name, parameter in zip(names, PARAMETERS, strict=True):
+            factor = ((dimmed if parameter == "opacities" else share) ** power).float()
+            column = table[name]
+            column[sources] *= factor.view(-1, *[1] * (column.dim() - 1))
 
 
 def _copies(table: GaussianTable, rows: Tensor, counts: Tensor, time: int, step: int) -> dict[str, Tensor]:

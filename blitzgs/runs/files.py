@@ -20,12 +20,12 @@ from blitzgs.config.files import ConfigError, from_dict, load_config, to_dict
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs import checkpoint
+from blitzgs.runs import checkpoint, exposure
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.guard import bad_column, check_before_saving
 from blitzgs.runs.identity import check_own
 from blitzgs.table.host_table import HostTable
-from blitzgs.table.pool import Residence
+from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.views import Space
 from blitzgs.view.visible import Scene
@@ -70,6 +70,7 @@ class Progress:
         least_kept: the smallest share of the Gaussians that a training view keeps with the LOD gate; 0
             without a gate, and in old checkpoints.
         train_views: digest of the names of the training views, in their order; empty in old checkpoints.
+        curve: result of `blitzgs.training.curve.Curve.saved`; empty in old checkpoints.
         gate: digest of the spawn gate's files; empty without a gate, and in old checkpoints.
         events_left: (time, order, kind) of the events of the last step that a signal kept from running.
     """
@@ -86,6 +87,7 @@ class Progress:
     gated_views: str = ""
     least_kept: float = 0.0
     train_views: str = ""
+    curve: dict[str, Any] = dataclasses.field(default_factory=dict)
     gate: str = ""
     events_left: list[tuple[Any, ...]] = dataclasses.field(default_factory=list)
 
@@ -99,6 +101,7 @@ class TrainedModel:
         progress: progress of the run at the checkpoint.
         space: maps between the trained world and the capture's world.
         table: this rank's Gaussians.
+        exposures: gain and bias of each training photograph, [T, 2, 3]; None if the run has none.
         pool_bytes: bytes of a device that the Gaussians may take, if the run trained with a pool; else 0.
     """
 
@@ -107,6 +110,7 @@ class TrainedModel:
     space: Space
     table: GaussianTable
     pool_bytes: int = 0
+    exposures: torch.Tensor | None = None
 
     def scene(self, device: torch.device) -> Scene:
         """Return the scene that views are rendered from on a device.
@@ -114,12 +118,12 @@ class TrainedModel:
         With a pool, the first call moves the table into memory that the pool can reach.
 
         Raises:
-            ResidenceError: the pool has room for fewer than two blocks.
+            PoolError: the pool has room for fewer than two blocks.
         """
         if self.pool_bytes == 0:
             return self.table
         self.table = HostTable(self.table.release(), pinned=device.type == "cuda")
-        return Residence(self.table, device, self.pool_bytes, None)
+        return Pool(self.table, device, self.pool_bytes, None)
 
 
 def save(
@@ -164,7 +168,7 @@ class Restored:
         config: configuration of the run.
         run_id: identifies the run in its log.
         source: name of the checkpoint and why it was chosen, as text.
-        shared: tensors that are the same on all ranks: `TileOwners.columns`.
+        shared: tensors that are the same on all ranks: `TileOwners.columns`, and those of the exposures.
     """
 
     table: GaussianTable
@@ -176,19 +180,24 @@ class Restored:
     shared: dict[str, torch.Tensor]
 
 
-def restore(folder: Path, ranks: Ranks, device: torch.device | None = None) -> Restored | None:
+def restore(
+    folder: Path, ranks: Ranks, device: torch.device | None = None, only: str | None = None
+) -> Restored | None:
     """Read the newest undamaged checkpoint of a run; return None if the run has no checkpoint.
 
     Args:
         folder: folder of the run.
         ranks: the job.
         device: device of the Gaussians; None: the ranks' device.
+        only: name of the one checkpoint to read; None: the newest.
 
     Raises:
         CheckpointError: there are checkpoints, but all are damaged, or the newest is of another version or
             of another run.
     """
-    loaded = checkpoint.load_latest(folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns)
+    loaded = checkpoint.load_latest(
+        folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns, only
+    )
     if loaded is None:
         return None
     state = loaded.state
@@ -230,7 +239,11 @@ def check_is_run(folder: Path) -> None:
 
 
 def open_model(
-    folder: Path, ranks: Ranks, data: Path | None = None, resident_gb: float | None = None
+    folder: Path,
+    ranks: Ranks,
+    data: Path | None = None,
+    resident_gb: float | None = None,
+    only: str | None = None,
 ) -> TrainedModel:
     """Open the newest model of a run for rendering, with the configuration that was saved with it.
 
@@ -239,6 +252,7 @@ def open_model(
         ranks: the job.
         data: present folder of the capture; None: unchanged.
         resident_gb: gigabytes of each device for Gaussians; 0: no limit; None: as the run.
+        only: name of the one checkpoint to open; None: the newest.
 
     Raises:
         FileNotFoundError: the folder is not a run, or holds no checkpoint.
@@ -246,7 +260,7 @@ def open_model(
     check_is_run(folder)
     pool_bytes = int((_resident_gb(folder / CONFIG) if resident_gb is None else resident_gb) * 1e9)
     home = torch.device("cpu") if pool_bytes > 0 else ranks.device
-    restored = restore(folder, ranks, home)
+    restored = restore(folder, ranks, home, only)
     if restored is None:
         raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
     config, progress, table = restored.config, restored.progress, restored.table
@@ -256,7 +270,7 @@ def open_model(
         config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
     optimiser = TableAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
     optimiser.catch_up(table, None, progress.step)
-    return TrainedModel(config, progress, restored.space, table, pool_bytes)
+    return TrainedModel(config, progress, restored.space, table, pool_bytes, exposure.stored(restored.shared))
 
 
 def _resident_gb(path: Path) -> float:

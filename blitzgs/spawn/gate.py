@@ -29,7 +29,7 @@ from blitzgs.spawn.candidates import FEATURES, Candidates
 from blitzgs.util.output import check_replaceable, write_file
 
 FORMAT = 1
-# Name of the gate that is included in BlitzGS, for configs/compact.yaml.
+# Name of the gate that is included in BlitzGS, for configs/density.yaml.
 DEFAULT = "default"
 # Takes the place of a gate's name: vetoes at random, which a gate has to surpass.
 RANDOM = "random"

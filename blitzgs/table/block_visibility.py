@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.cull_mask import WORD_BITS
+from blitzgs.ops.pool import seen_blocks
 from blitzgs.ops.projection_types import MOST_VIEWS
-from blitzgs.ops.residence import seen_blocks
 
 _MOST_WORDS = 1 << 26  # words of a mask that are processed together
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training beyond the memory of a GPU: keeps the blocks that views need in a pool on the device.
 
-The whole table is in host memory. A `Residence` has a pool on the device: a smaller table with the same
+The whole table is in host memory. A `Pool` holds blocks of it on the device: a smaller table with the same
 columns, whose slots hold blocks of 256 rows of the host's table for a while. No result depends on a row's
 position, so the ops work on the pool as they would on the table.
 
@@ -25,7 +25,7 @@ from torch import Tensor
 
 from blitzgs.ops.blocks import BLOCK_ROWS
 from blitzgs.ops.host import to_device
-from blitzgs.ops.residence import swap_blocks_
+from blitzgs.ops.pool import swap_blocks_
 from blitzgs.table.block_visibility import BlockVisibility, Cameras, culled_blocks
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.host_table import HostTable
@@ -39,7 +39,7 @@ _SETTING = "memory.resident_gb (eval, render: --resident-gb)"
 _FREE = -1
 
 
-class ResidenceError(RuntimeError):
+class PoolError(RuntimeError):
     """The blocks that views see do not fit into the pool; the message names the sizes and a remedy."""
 
 
@@ -72,7 +72,7 @@ class Moved(NamedTuple):
         }
 
 
-class Residence:
+class Pool:
     """A pool on the device for blocks of a table in host memory.
 
     Between `load_for_step` and `write_back` the table on the host is out of date; `write_back` copies all
@@ -80,7 +80,7 @@ class Residence:
 
     Attributes:
         table: the table on the host.
-        pool: the table on the device; rows outside the blocks of `load_for_step`'s index are undefined.
+        held: the table on the device; rows outside the blocks of `load_for_step`'s index are undefined.
         moved: counts since the beginning.
     """
 
@@ -96,14 +96,14 @@ class Residence:
             pending_table: as for `BlockIndex`, on the device.
 
         Raises:
-            ResidenceError: the budget is less than two blocks.
+            PoolError: the budget is less than two blocks.
         """
         self.table, self._device, self._budget = table, device, budget_bytes
         self.moved = Moved()
         # High priority: its kernels need few multiprocessors, and the next step waits for them.
         self._stream = torch.cuda.Stream(device, priority=-1) if device.type == "cuda" else None
         self._storage: dict[str, Tensor] = {}
-        self.pool = self._pool_of({name: column[:0] for name, column in table.columns.items()}, 0)
+        self.held = self._held_of({name: column[:0] for name, column in table.columns.items()}, 0)
         self._is_open = self._rest_changed = False
         self.reindex(pending_table)
 
@@ -136,7 +136,7 @@ class Residence:
         has_rest = self._rest > 0
         slots = min(self._blocks, self._budget // self._bytes_in - has_rest)
         if slots < min(1, self._blocks):
-            raise ResidenceError(
+            raise PoolError(
                 f"{_SETTING}: {self._budget / 1e9:g} GB are less than two blocks of 256 Gaussians, "
                 f"which take {2 * self._bytes_in / 1e9:.4f} GB"
             )
@@ -144,13 +144,13 @@ class Residence:
         allocated_rows = (slots + has_rest) * BLOCK_ROWS
         if any(not _fits(self._storage.get(name), table.columns[name], allocated_rows) for name in names):
             # Free the old pool before allocating the new one.
-            self.pool.columns.clear()
+            self.held.columns.clear()
             self._storage.clear()
             self._storage = {
                 name: torch.zeros((allocated_rows, *row.shape), dtype=row.dtype, device=self._device)
                 for name, row in ((name, table.row_of(name)) for name in names)
             }
-        self.pool = self._pool_of({name: self._storage[name] for name in names}, rows)
+        self.held = self._held_of({name: self._storage[name] for name in names}, rows)
         self._block_in = np.full(slots, _FREE, dtype=np.int64)
         self._slot_of = np.full(self._blocks, _FREE, dtype=np.int64)
         self._is_changed = np.zeros(slots, dtype=bool)
@@ -159,17 +159,17 @@ class Residence:
         self._ready_for: int | None = None
 
     @staticmethod
-    def _pool_of(columns: Mapping[str, Tensor], rows: int) -> GaussianTable:
+    def _held_of(columns: Mapping[str, Tensor], rows: int) -> GaussianTable:
         """Return a table of the first `rows` rows of columns in their stored form."""
-        pool = GaussianTable({name: column[:rows] for name, column in columns.items() if name != CULL})
+        held = GaussianTable({name: column[:rows] for name, column in columns.items() if name != CULL})
         if CULL in columns:
-            pool.columns[CULL] = columns[CULL][: -(-rows // BLOCK_ROWS) * BLOCK_ROWS]
-        return pool
+            held.columns[CULL] = columns[CULL][: -(-rows // BLOCK_ROWS) * BLOCK_ROWS]
+        return held
 
     def _open(self) -> None:
         """Begin to use the pool: load the last, partial block, which stays."""
         if not self._is_open and self._rest:
-            for name, column in self.pool.columns.items():
+            for name, column in self.held.columns.items():
                 # The mask of the last block has the length of a full block.
                 count = BLOCK_ROWS if name == CULL else self._rest
                 column[-count:].copy_(self.table.columns[name][-count:])
@@ -182,7 +182,7 @@ class Residence:
         slots = (self._block_in >= 0).nonzero()[0]
         self._move(slots, np.full(len(slots), _FREE), self._mark())
         for name in _WRITTEN if self._rest_changed else ():
-            self.table[name][-self._rest :].copy_(self.pool[name][-self._rest :])
+            self.table[name][-self._rest :].copy_(self.held[name][-self._rest :])
         if self._stream is not None:
             self._stream.synchronize()
         self._is_open, self._rest_changed, self._ready_for = False, False, None
@@ -200,7 +200,7 @@ class Residence:
             coming = np.arange(begin, min(begin + slots, self._blocks))
             self._move(np.arange(len(coming)), coming, self._mark())
             self._wait()
-            function(self.pool)
+            function(self.held)
             self._is_changed[:] = True
             self._rest_changed = self._rest > 0
         self.write_back()
@@ -219,7 +219,7 @@ class Residence:
             The index of the pool's blocks. The step updates its bounds; pass it to `store_bounds` afterwards.
 
         Raises:
-            ResidenceError: the blocks do not fit into the pool.
+            PoolError: the blocks do not fit into the pool.
         """
         self._open()
         self._begun = self._mark()
@@ -306,7 +306,7 @@ class Residence:
 
     def _refuse(self, needed: int) -> None:
         slots = len(self._block_in)
-        raise ResidenceError(
+        raise PoolError(
             f"views that are rendered together see {needed:,} blocks of 256 Gaussians, "
             f"{needed * self._bytes_in / 1e9:.3f} GB, and the pool has room for {slots:,}, "
             f"{slots * self._bytes_in / 1e9:.3f} GB: raise {_SETTING}, or train with a lower "
@@ -334,7 +334,7 @@ class Residence:
         old, is_changed = self._block_in[slots], self._is_changed[slots]
         leaving = np.where(is_changed, old, _FREE)
         lists = torch.from_numpy(np.stack((slots, leaving, coming)).astype(np.int32))
-        columns = list(self.pool.columns.values()), [self.table.columns[name] for name in self.pool]
+        columns = list(self.held.columns.values()), [self.table.columns[name] for name in self.held]
         if self._stream is None:
             swap_blocks_(*columns, len(_WRITTEN), *lists)
         else:

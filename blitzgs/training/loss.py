@@ -53,7 +53,9 @@ def weighted(config: LossConfig, views: int) -> LossConfig:
     return replace(config, opacity=opacity, opacity_total=0.0)
 
 
-def loss_terms(frame: Frame, batch: Batch, config: LossConfig, extent: float) -> LossTerms:
+def loss_terms(
+    frame: Frame, batch: Batch, config: LossConfig, extent: float, shown: Tensor | None = None
+) -> LossTerms:
     """Compare rendered views with their photographs.
 
     On several ranks each compares its own tiles.
@@ -63,6 +65,8 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, extent: float) ->
         batch: their photographs.
         config: weights.
         extent: size of the scene in the unit of the means; L_scale is relative to it.
+        shown: the images to compare, [B, H, W, 3], instead of the frame's; `v_renders` is then their
+            gradient.
 
     Raises:
         ValueError: a rank has not composited all pixels that its loss reads.
@@ -71,7 +75,7 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, extent: float) ->
     if assignment is not None and assignment.ranges.halo < LOSS_HALO:
         raise ValueError(f"the loss reads {LOSS_HALO} px beyond a rank's tiles: divide them with that halo")
     parts, v_renders, scale_reg, opacity_reg = photometric_fwd_bwd(
-        frame.renders,
+        frame.renders if shown is None else shown,
         batch.targets,
         batch.masks,
         *_weights(config.ssim, count, batch.samples.device),

@@ -19,7 +19,7 @@ from blitzgs.ops.projection_types import MOST_VIEWS
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.position_noise import PositionNoise
 from blitzgs.table.block_visibility import Cameras
-from blitzgs.table.pool import Residence
+from blitzgs.table.pool import Pool
 from blitzgs.training.batch import Batch
 from blitzgs.training.loss import LossTerms
 from blitzgs.training.sampler import BatchSampler
@@ -63,15 +63,15 @@ class UpcomingCameras:
 class OffloadingStepper(Stepper):
     """Takes the same steps as `Stepper` with a table in host memory.
 
-    For a step, the pool of `Residence` is the table. The blocks of the next step are loaded while the step
-    runs.
+    For a step, the rows that the pool holds are the table. The blocks of the next step are loaded while the
+    step runs.
     """
 
-    scene: Residence
+    scene: Pool
 
     def __init__(
         self,
-        residence: Residence,
+        pool: Pool,
         upcoming: UpcomingCameras,
         optimiser: TableAdam,
         owners: TileOwners,
@@ -82,7 +82,7 @@ class OffloadingStepper(Stepper):
         """Prepare to step.
 
         Args:
-            residence: this rank's Gaussians and their pool.
+            pool: this rank's Gaussians, some of which it holds on the device.
             upcoming: the cameras of the next steps.
             optimiser: as for `Stepper`, like the following arguments.
             owners: records what the tiles cost.
@@ -90,34 +90,34 @@ class OffloadingStepper(Stepper):
             extent: size of the scene in the unit of the means.
             noise: noise on the means after each step; None: none.
         """
-        self._residence, self._upcoming = residence, upcoming
-        self._reported = residence.moved
+        self._pool, self._upcoming = pool, upcoming
+        self._reported = pool.moved
         self._up_to_date_at: int | None = None
-        super().__init__(residence.pool, optimiser, owners, loss, extent, noise)
-        self.scene = residence
+        super().__init__(pool.held, optimiser, owners, loss, extent, noise)
+        self.scene = pool
 
     def reindex(self) -> None:
         """See `Stepper.reindex`."""
-        self._residence.reindex(self._optimiser.pending_table)
-        self.table = self._residence.pool
+        self._pool.reindex(self._optimiser.pending_table)
+        self.table = self._pool.held
 
     def catch_up(self, step: int) -> None:
         """See `Stepper.catch_up`; afterwards the table on the host is up to date."""
         self.write_back()
         if self._up_to_date_at != step:
-            self._residence.catch_up(lambda pool: self._optimiser.catch_up(pool, None, step))
+            self._pool.catch_up(lambda held: self._optimiser.catch_up(held, None, step))
             self._up_to_date_at = step
 
     def write_back(self) -> None:
         """See `Stepper.write_back`: write changes back to the host, and empty the pool."""
-        self._residence.write_back()
+        self._pool.write_back()
 
     def report(self, whole: bool = False) -> dict[str, float]:
         """See `Stepper.report`: the share of blocks that were on the device, and megabytes moved per step."""
         if whole:
-            return self._residence.moved.values()
-        moved = self._residence.moved.since(self._reported)
-        self._reported = self._residence.moved
+            return self._pool.moved.values()
+        moved = self._pool.moved.since(self._reported)
+        self._reported = self._pool.moved
         return moved.values()
 
     def forward(
@@ -133,10 +133,10 @@ class OffloadingStepper(Stepper):
         cameras = self._upcoming.cameras(step, options.limits)
         if view_gate is None or not view_gate.columns:
             cameras = cameras._replace(columns=None)
-        self._blocks = self._residence.load_for_step(step, cameras, self._upcoming.batch_size)
+        self._blocks = self._pool.load_for_step(step, cameras, self._upcoming.batch_size)
         mark("other")
         rendered = super().forward(step, options, batch, mark, view_gate)
-        self._residence.prefetch(step + 1)
+        self._pool.prefetch(step + 1)
         return rendered
 
     def backward(
@@ -149,5 +149,5 @@ class OffloadingStepper(Stepper):
     ) -> Tensor | None:
         """See `Stepper.backward`."""
         v_means2d = super().backward(step, frame, terms, mark, keep_means2d)
-        self._residence.store_bounds(self._blocks)
+        self._pool.store_bounds(self._blocks)
         return v_means2d

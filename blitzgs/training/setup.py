@@ -30,9 +30,11 @@ from blitzgs.spawn.lineage import Lineage, initial_births, ledger_of
 from blitzgs.spawn.rules import lineage_subject, open_spawn_gate
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.host_table import HostTable
-from blitzgs.table.pool import Residence
+from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
+from blitzgs.training.curve import Curve
+from blitzgs.training.exposure import Exposures
 from blitzgs.training.extension import extended
 from blitzgs.training.inputs import check_alike, check_capture
 from blitzgs.training.loss import weighted
@@ -111,6 +113,14 @@ def set_up(
     sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed)
     if config.memory.resident_gb > 0:
         table = HostTable(table.release(), pinned=ranks.device.type == "cuda")
+    stepper = _stepper(
+        config, table, optimiser, owners, space.extent, UpcomingCameras(sampler, capture.train, views)
+    )
+    if config.model.exposure:
+        stepper.exposures = Exposures(capture.train, ranks)
+        # As with the tiles, rows are those of the same training views.
+        if restored is not None and restored.progress.train_views in ("", progress.train_views):
+            stepper.exposures.restore(restored.shared)
     return TrainingState(
         config=config,
         capture=capture,
@@ -124,9 +134,7 @@ def set_up(
         views=views,
         sampler=sampler,
         optimiser=optimiser,
-        stepper=_stepper(
-            config, table, optimiser, owners, space.extent, UpcomingCameras(sampler, capture.train, views)
-        ),
+        stepper=stepper,
         owners=owners,
         lpips=lpips,
         run_id=run_id,
@@ -134,6 +142,7 @@ def set_up(
         save_clock=SaveClock(config.log.checkpoint_seconds),
         veto=veto,
         lineage=_start_lineage(config, capture, folder, table, progress, ranks),
+        curve=Curve.of(progress.curve),
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )
 
@@ -195,7 +204,7 @@ def _continued(config: Config, restored: run_files.Restored, extend: float | Non
 def _tile_owners(ranks: Ranks, progress: Progress, restored: run_files.Restored | None) -> TileOwners:
     """Return the division of tiles, with the costs that the checkpoint has if they can be used."""
     owners = TileOwners(ranks)
-    if restored is None or not restored.shared or ranks.world_size == 1:
+    if restored is None or "bounds" not in restored.shared or ranks.world_size == 1:
         return owners
     # Tile costs and plans are stored by view index. With other views, they would belong to other images.
     if restored.progress.train_views in ("", progress.train_views):
@@ -222,8 +231,8 @@ def _stepper(
     if not isinstance(table, HostTable):
         return Stepper(table, *shared)
     budget = int(config.memory.resident_gb * 1e9)
-    residence = Residence(table, owners.ranks.device, budget, optimiser.pending_table)
-    return OffloadingStepper(residence, upcoming, *shared)
+    pool = Pool(table, owners.ranks.device, budget, optimiser.pending_table)
+    return OffloadingStepper(pool, upcoming, *shared)
 
 
 def _position_noise(config: Config, extent: float) -> PositionNoise | None:

@@ -29,6 +29,7 @@ from blitzgs.spawn.lineage import Lineage
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
+from blitzgs.training.curve import Curve
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
 from blitzgs.view.views import Space, ViewSet, render_options
@@ -68,6 +69,7 @@ class TrainingState:
         log: log of the run; it does nothing until the loop opens the run's log.
         stops: returns whether the run has to stop soon, the same on every rank; long events call it every few
             seconds. The loop sets it.
+        curve: training PSNR of the run.
         clock: returns monotonic seconds, by which training time is measured.
     """
 
@@ -93,6 +95,7 @@ class TrainingState:
     lineage: Lineage | None
     log: RunLog
     growth_was_limited: bool = False
+    curve: Curve = field(default_factory=Curve)
     stops: Callable[[], bool] = never
     clock: Callable[[], float] = time.monotonic
     _started: float = field(default_factory=time.monotonic)

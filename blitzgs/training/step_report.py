@@ -80,3 +80,6 @@ def log_step(state: TrainingState, record: StepRecord) -> None:
     if loss.scale > 0:
         values["l_scale"] = scale
     state.log.scalars(state.images_seen, values)
+    warning = None if math.isnan(psnr) else state.curve.add(state.images_seen, psnr)
+    if warning is not None:
+        state.log.event(state.images_seen, "warning", {"warning": warning}, f"warning: {warning}")

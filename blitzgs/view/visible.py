@@ -13,12 +13,12 @@ from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.view_gate import gate_views_
 from blitzgs.table.block_visibility import Cameras
 from blitzgs.table.blocks import BlockIndex
-from blitzgs.table.pool import Residence
+from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import SceneGate
 
 # The Gaussians that views are rendered from: a table on the device, or a table on the host with its pool.
-Scene = GaussianTable | Residence
+Scene = GaussianTable | Pool
 
 
 class VisibleScene(NamedTuple):
@@ -37,7 +37,7 @@ class VisibleScene(NamedTuple):
 
 def table_of(scene: Scene) -> GaussianTable:
     """Return the table of all of this rank's Gaussians in a scene."""
-    return scene.table if isinstance(scene, Residence) else scene
+    return scene.table if isinstance(scene, Pool) else scene
 
 
 class VisibleFinder:
@@ -54,7 +54,7 @@ class VisibleFinder:
             lod: leaves out rows whose octree level is too fine for their distance; None: no gate.
         """
         self._scene, self._lod = scene, lod
-        self._index = None if isinstance(scene, Residence) else BlockIndex(scene)
+        self._index = None if isinstance(scene, Pool) else BlockIndex(scene)
 
     def find(
         self, viewmats: Tensor, Ks: Tensor, width: int, height: int, limits: tuple[float, float, float]
@@ -69,13 +69,13 @@ class VisibleFinder:
             limits: near plane, far plane and eps2d.
 
         Raises:
-            ResidenceError: the pool is too small for the views.
+            PoolError: the pool is too small for the views.
         """
         scene, index = self._scene, self._index
-        if isinstance(scene, Residence):
+        if isinstance(scene, Pool):
             sizes = torch.tensor([[width, height]] * len(viewmats), dtype=torch.int32).to(viewmats.device)
             index = scene.load_for_views(Cameras(viewmats, Ks, sizes, limits))
-            table, rows_of = scene.pool, scene.rows_of
+            table, rows_of = scene.held, scene.rows_of
         else:
             table, rows_of = scene, _same_rows
         assert index is not None

@@ -39,7 +39,7 @@ def finished(recipe, seed, psnr, capture="town", **more):
     } | more  # fmt: skip
 
 
-@pytest.mark.parametrize("config", ["configs/compact.yaml", "configs/paper.yaml"])
+@pytest.mark.parametrize("config", ["configs/density.yaml", "configs/paper.yaml"])
 @pytest.mark.parametrize("table", tables.TRAINED)
 def test_every_arm_has_a_distinct_configuration(capture, monkeypatch, table, config):
     monkeypatch.chdir(ROOT)

@@ -122,9 +122,13 @@ def test_matches_row_by_row(growth, cap):
                 expected["scales"] = old["scales"] + math.log(factor)
             for name in (*PARAMETERS, "parent", "birth", "level", "last_step"):
                 np.testing.assert_allclose(row[name], expected[name], rtol=2e-6, atol=1e-6, err_msg=name)
+            opaque = old["opacities"].double().sigmoid()
             for name in table:
                 if name.startswith("exp_avg"):
-                    assert torch.equal(row[name], old[name] if n == 1 else torch.zeros_like(old[name]))
+                    share = row["opacities"].double().sigmoid() / opaque if "opacities" in name else 1 / n
+                    share = 0 if is_copy else share ** (2 if "_sq" in name else 1)
+                    wanted = old[name] if n == 1 else (old[name] * share).float()
+                    np.testing.assert_allclose(row[name], wanted, rtol=2e-6, err_msg=name)
     assert not born
 
 

@@ -142,7 +142,7 @@ def test_vetoes_do_not_depend_on_the_world_size(gate):
 
 def test_a_sampled_veto_keeps_candidates_in_proportion_to_their_odds(gate):
     """The share of kept candidates per score, against numpy's draws without replacement by the same odds."""
-    known, some, events = SpawnGate(gate[0]), candidates(60), 3000
+    known, some, events = SpawnGate(gate[0]), candidates(60), 1000
     odds = np.exp(known.scores(some.features).numpy() * 2.0**-32)
     kept = np.zeros(60)
     for event in range(events):

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from blitzgs.ops.blocks import BLOCK_ROWS
-from blitzgs.ops.residence import seen_blocks
+from blitzgs.ops.pool import seen_blocks
 from blitzgs.table import host_table
 from blitzgs.table.block_visibility import BlockVisibility, Cameras, culled_blocks
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.host_table import HostMemoryError, HostTable
-from blitzgs.table.pool import Moved, Residence, ResidenceError
+from blitzgs.table.pool import Moved, Pool, PoolError
 from blitzgs.table.table import GaussianTable
 from tests.helpers import DEVICES
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
@@ -27,10 +27,10 @@ def host_copy(table, device="cpu"):
     return HostTable({name: table[name].clone() for name in table}, pinned=device == "cuda")
 
 
-def make_residence(n=20_000, slots=30, device="cpu", seed=0):
+def make_pool(n=20_000, slots=30, device="cpu", seed=0):
     table = make_table(n, seed=seed)
     table["means"].nan_to_num_(0, 0, 0)  # so that tables can be compared
-    return table, Residence(host_copy(table, device), torch.device(device), (slots + 1) * BLOCK_BYTES, None)
+    return table, Pool(host_copy(table, device), torch.device(device), (slots + 1) * BLOCK_BYTES, None)
 
 
 def cameras(views, device="cpu", seed=1):
@@ -61,57 +61,57 @@ def active_rows(index, table, camera):
 @pytest.mark.parametrize("slots", [40, 50, 65])
 def test_steps_change_the_rows_that_they_would_change_in_the_whole_table(device, slots):
     """Steps that move all rows of their views, through a pool and in the table itself."""
-    table, residence = make_residence(slots=slots, device=device)
+    table, pool = make_pool(slots=slots, device=device)
     table = GaussianTable({name: table[name].to(device) for name in table})
     views, steps = cameras(16, device), 12
     whole = BlockIndex(table)
     for step in range(steps):
-        index = residence.load_for_step(step, first(views, step), 1)
-        rows = active_rows(index, residence.pool, first(views, step))
+        index = pool.load_for_step(step, first(views, step), 1)
+        rows = active_rows(index, pool.held, first(views, step))
         expected = active_rows(whole, table, first(views, step))
-        assert torch.equal(residence.rows_of(rows).sort().values, expected)
+        assert torch.equal(pool.rows_of(rows).sort().values, expected)
         assert len(expected) > 0
-        residence.prefetch(step + 1)
-        for at, side, view in ((rows, residence.pool, index), (expected, table, whole)):
+        pool.prefetch(step + 1)
+        for at, side, view in ((rows, pool.held, index), (expected, table, whole)):
             side["means"][at.long(), 0] += 0.5
             side["grad_count"][at.long()] += 1
             view.update(side, at)
-        residence.store_bounds(index)
-    residence.write_back()
-    assert_same(residence.table, table)
-    moved = residence.moved
+        pool.store_bounds(index)
+    pool.write_back()
+    assert_same(pool.table, table)
+    moved = pool.moved
     assert moved.steps == steps and 0 < moved.loaded <= moved.needed
-    residence.write_back()  # nothing is left to write back
-    assert residence.moved == moved
+    pool.write_back()  # nothing is left to write back
+    assert pool.moved == moved
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [20_000, 20_480, 100])
 def test_all_rows_pass_through_the_pool(device, n):
-    table, residence = make_residence(n, slots=9, device=device)
+    table, pool = make_pool(n, slots=9, device=device)
 
     def set_step(pool):
         pool["last_step"].fill_(7)
 
-    residence.catch_up(set_step)
-    assert (residence.table["last_step"] == 7).all() and len(residence.table) == n
+    pool.catch_up(set_step)
+    assert (pool.table["last_step"] == 7).all() and len(pool.table) == n
     table["last_step"].fill_(7)
-    assert_same(residence.table, table)
+    assert_same(pool.table, table)
 
 
 def test_the_blocks_that_are_needed_last_go_first():
-    _, residence = make_residence(slots=40)
+    _, pool = make_pool(slots=40)
     views = cameras(8)
-    seen = [set(np.flatnonzero(_blocks(residence, views, view))) for view in range(8)]
-    residence.load_for_step(0, views, 1)
-    residence.prefetch(1)
-    residence.load_for_step(1, first(views, 1), 1)
-    residence.prefetch(2)
-    loaded = residence.moved.loaded
-    residence.load_for_step(2, first(views, 2), 1)
-    assert residence.moved.loaded == loaded  # all of them were loaded ahead
-    slots = torch.arange(0, len(residence.pool), BLOCK_ROWS, dtype=torch.int32)
-    here = set((residence.rows_of(slots) // BLOCK_ROWS).tolist()) & set(range(78))  # the full blocks
+    seen = [set(np.flatnonzero(_blocks(pool, views, view))) for view in range(8)]
+    pool.load_for_step(0, views, 1)
+    pool.prefetch(1)
+    pool.load_for_step(1, first(views, 1), 1)
+    pool.prefetch(2)
+    loaded = pool.moved.loaded
+    pool.load_for_step(2, first(views, 2), 1)
+    assert pool.moved.loaded == loaded  # all of them were loaded ahead
+    slots = torch.arange(0, len(pool.held), BLOCK_ROWS, dtype=torch.int32)
+    here = set((pool.rows_of(slots) // BLOCK_ROWS).tolist()) & set(range(78))  # the full blocks
     assert seen[1] | seen[2] <= here
     gone = seen[0] - here
     # Blocks that were replaced are not needed sooner than idle blocks that stayed.
@@ -122,80 +122,80 @@ def test_the_blocks_that_are_needed_last_go_first():
         assert min(next_use[b] for b in gone) >= max(next_use[b] for b in idle)
 
 
-def _blocks(residence, views, view):
+def _blocks(pool, views, view):
     """Return the views, as bits, that see each full block of the table."""
-    one, full = first(views, view, 1), len(residence.table) // BLOCK_ROWS
-    return seen_blocks(BlockIndex(residence.table).bounds[:full], *one[:3], *LIMITS).numpy()
+    one, full = first(views, view, 1), len(pool.table) // BLOCK_ROWS
+    return seen_blocks(BlockIndex(pool.table).bounds[:full], *one[:3], *LIMITS).numpy()
 
 
 def test_a_step_waits_for_blocks_that_were_not_prefetched():
     """The pool fits one step at a time; blocks of the next step do not replace blocks of the present one."""
-    _, residence = make_residence(slots=60)
+    _, pool = make_pool(slots=60)
     views = cameras(4)
-    counts = [int((_blocks(residence, views, v) != 0).sum()) for v in range(4)]
-    _, residence = make_residence(slots=max(counts))
+    counts = [int((_blocks(pool, views, v) != 0).sum()) for v in range(4)]
+    _, pool = make_pool(slots=max(counts))
     for step in range(4):
-        index = residence.load_for_step(step, first(views, step), 1)
-        assert len(active_rows(index, residence.pool, first(views, step))) > 0
-        residence.prefetch(step + 1)
-    _, residence = make_residence(slots=max(counts) - 1)
+        index = pool.load_for_step(step, first(views, step), 1)
+        assert len(active_rows(index, pool.held, first(views, step))) > 0
+        pool.prefetch(step + 1)
+    _, pool = make_pool(slots=max(counts) - 1)
     with pytest.raises(
-        ResidenceError,
+        PoolError,
         match=rf"see {max(counts)} blocks .* room for {max(counts) - 1},.*raise memory.*--resident-gb",
     ):
         for step in range(4):
-            residence.load_for_step(step, first(views, step), 1)
-            residence.prefetch(step + 1)
+            pool.load_for_step(step, first(views, step), 1)
+            pool.prefetch(step + 1)
 
 
 def test_large_batches_do_without_a_look_ahead():
-    _, residence = make_residence(60_000, slots=233)
+    _, pool = make_pool(60_000, slots=233)
     views = cameras(40)
     views.Ks[:, :2, :2] *= 8
     for step in range(2):
-        index = residence.load_for_step(step, first(views, 20 * step, 20), 20)
-        found = index.active(residence.pool, *first(views, 20 * step, 20)[:2], WIDTH, HEIGHT, *LIMITS)
+        index = pool.load_for_step(step, first(views, 20 * step, 20), 20)
+        found = index.active(pool.held, *first(views, 20 * step, 20)[:2], WIDTH, HEIGHT, *LIMITS)
         assert int(found.length) > 0
-        residence.prefetch(step + 1)
-    assert residence.moved.needed > residence.moved.loaded
+        pool.prefetch(step + 1)
+    assert pool.moved.needed > pool.moved.loaded
 
 
 def test_a_budget_below_two_blocks_is_refused():
-    with pytest.raises(ResidenceError, match="less than two blocks"):
-        make_residence(slots=0)
+    with pytest.raises(PoolError, match="less than two blocks"):
+        make_pool(slots=0)
 
 
 def test_a_table_that_fits_is_loaded_once():
-    table, residence = make_residence(5000, slots=100)
+    table, pool = make_pool(5000, slots=100)
     views = cameras(12)
     for step in range(12):
-        residence.load_for_step(step, first(views, step), 1)
-        residence.prefetch(step + 1)
-    assert residence.moved.loaded <= 5000 // BLOCK_ROWS
-    assert residence.moved.bytes_out == 0
-    assert len(residence.pool) == 5000
+        pool.load_for_step(step, first(views, step), 1)
+        pool.prefetch(step + 1)
+    assert pool.moved.loaded <= 5000 // BLOCK_ROWS
+    assert pool.moved.bytes_out == 0
+    assert len(pool.held) == 5000
 
 
 def test_changes_of_the_table_reach_the_pool():
-    table, residence = make_residence(slots=40)
+    table, pool = make_pool(slots=40)
     views = cameras(2)
-    residence.load_for_step(0, views, 1)
-    residence.prefetch(1)
-    residence.write_back()
+    pool.load_for_step(0, views, 1)
+    pool.prefetch(1)
+    pool.write_back()
     kept = torch.arange(len(table)) % 3 > 0
-    residence.table.keep(kept)
-    residence.table["phi"] = torch.rand(len(residence.table))
-    residence.reindex(None)
-    index = residence.load_for_views(first(views, 0, 1))
-    rows = active_rows(index, residence.pool, views).long()
-    places = residence.rows_of(rows).long()
+    pool.table.keep(kept)
+    pool.table["phi"] = torch.rand(len(pool.table))
+    pool.reindex(None)
+    index = pool.load_for_views(first(views, 0, 1))
+    rows = active_rows(index, pool.held, views).long()
+    places = pool.rows_of(rows).long()
     assert len(rows) > 0
-    for name in residence.pool:
-        assert torch.equal(residence.pool[name][rows], residence.table[name][places]), name
+    for name in pool.held:
+        assert torch.equal(pool.held[name][rows], pool.table[name][places]), name
     table.keep(kept)
-    residence.write_back()
+    pool.write_back()
     for name in table:
-        assert torch.equal(residence.table[name], table[name])
+        assert torch.equal(pool.table[name], table[name])
 
 
 def test_traffic_between_two_counts():

@@ -9,7 +9,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import files as run_files
 from blitzgs.runs.evaluation import render_view
 from blitzgs.runs.lod import scene_gate
-from blitzgs.table.pool import Residence, ResidenceError
+from blitzgs.table.pool import Pool, PoolError
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.visible import VisibleFinder
@@ -147,7 +147,7 @@ def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypat
     whole = GaussianTable({name: table[name].clone() for name in table})
     scene = model.scene(ranks.device)
     finder = VisibleFinder(scene, lod)
-    assert isinstance(scene, Residence) and len(scene.pool) < 0.42 * len(whole)
+    assert isinstance(scene, Pool) and len(scene.held) < 0.42 * len(whole)
     for i, image in zip((0, 5), expected, strict=True):
         assert torch.equal(render_view(finder, views, i, options, owners), image)
         assert image.std() > 0.01
@@ -157,7 +157,7 @@ def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypat
 
 
 def test_a_batch_that_does_not_fit_is_named(tmp_path):
-    with pytest.raises(ResidenceError, match=r"see \d+ blocks of 256 Gaussians, .* lower schedule"):
+    with pytest.raises(PoolError, match=r"see \d+ blocks of 256 Gaussians, .* lower schedule"):
         train(tmp_path, "memory.resident_gb=0.002")
     assert not list((tmp_path / run_files.CHECKPOINTS).iterdir())
 
@@ -165,9 +165,9 @@ def test_a_batch_that_does_not_fit_is_named(tmp_path):
 def test_a_model_that_outgrows_its_pool_is_saved_and_goes_on_with_a_larger_one(tmp_path):
     growing = ("population.grad_threshold=1e-6", "schedule.densify_until=60")
     whole, _ = train(tmp_path / "whole", *growing)
-    with pytest.raises(ResidenceError, match=r"The model so far is saved: continue with --resume"):
+    with pytest.raises(PoolError, match=r"The model so far is saved: continue with --resume"):
         train(tmp_path / "pooled", *growing, "memory.resident_gb=0.0048")
-    with pytest.raises(ResidenceError, match=r"lower schedule.batch_size$"):  # nothing new to save
+    with pytest.raises(PoolError, match=r"lower schedule.batch_size$"):  # nothing new to save
         train(tmp_path / "pooled", *growing, "memory.resident_gb=0.0048", resume=True)
     larger, _ = train(tmp_path / "pooled", *growing, "memory.resident_gb=0.1", resume=True)
     assert larger.state.origin.startswith("resumed") and "after 0 steps" not in larger.state.origin
@@ -178,7 +178,7 @@ def test_a_pass_that_does_not_fit_costs_nothing_and_happens_with_a_larger_pool(t
     # The first step fits into the pool, and the pass behind it surveys views that see more blocks.
     options = ("schedule.iterations=20", "population.importance=true", "schedule.t1=1", "schedule.t2=0")
     whole, _ = train(tmp_path / "whole", *options)
-    with pytest.raises(ResidenceError, match=r"The model so far is saved: continue with --resume"):
+    with pytest.raises(PoolError, match=r"The model so far is saved: continue with --resume"):
         train(tmp_path / "pooled", *options, "memory.resident_gb=0.0048")
     larger, _ = train(tmp_path / "pooled", *options, "memory.resident_gb=0.1", resume=True)
     assert "after 2 steps" in larger.state.origin

@@ -13,7 +13,7 @@ from dataclasses import astuple, replace
 from blitzgs.config.schedule import Event, EventKind
 from blitzgs.population.importance import SweepStoppedError
 from blitzgs.runs.files import Progress
-from blitzgs.table.pool import ResidenceError
+from blitzgs.table.pool import PoolError
 from blitzgs.training.events import clear_cull, densify, evaluate, importance, reset_opacities, save
 from blitzgs.training.state import TrainingState
 
@@ -40,7 +40,7 @@ def handle_all(state: TrainingState, events: Sequence[Event]) -> bool:
         others, and the resumed run begins with them (`events_left`).
 
     Raises:
-        ResidenceError: the Gaussians that an event needs do not fit into the pool; `progress.events_left`
+        PoolError: the Gaussians that an event needs do not fit into the pool; `progress.events_left`
             holds it and the events after it.
     """
     state.progress = replace(state.progress, events_left=[])
@@ -48,9 +48,9 @@ def handle_all(state: TrainingState, events: Sequence[Event]) -> bool:
     for done, event in enumerate(ordered):
         try:
             HANDLERS[event.kind](state, event)
-        except (SweepStoppedError, ResidenceError) as error:
+        except (SweepStoppedError, PoolError) as error:
             state.progress = replace(state.progress, events_left=[astuple(other) for other in ordered[done:]])
-            if isinstance(error, ResidenceError):
+            if isinstance(error, PoolError):
                 raise
             return False
     return True

@@ -120,6 +120,8 @@ def causes_of_death(state: TrainingState, event: Event, found: Importance) -> Te
             )
             causes[~kept] = Cause.PASS_1
         return causes
+    if len(state.capture.train) < population.pass2_views:
+        return causes
     # If no Gaussian contributes to any view, the total is zero and no share of it can be kept.
     total = state.ranks.all_reduce(found.score.double().sum())
     if min(population.pass2_mass, population.pass2_keep) < 1 and total.item() > 0:

@@ -16,4 +16,5 @@ def run(state: TrainingState, event: Event) -> None:
     """
     state.catch_up()
     cap_opacities(state.table, state.config.population.reset_opacity)
+    state.curve.restart()
     state.log.event(event.time, "reset_opacities", {"opacity": state.config.population.reset_opacity})

@@ -114,8 +114,11 @@ def _write(state: TrainingState) -> None:
 
 def _save(state: TrainingState, folder: Path) -> None:
     """Write a checkpoint into the folder of a run."""
+    state.progress = replace(state.progress, curve=state.curve.saved())
     # The division of tiles decides the order of sums, and therefore their last bits.
-    shared = state.owners.columns() if state.ranks.world_size > 1 else None
+    shared = state.owners.columns() if state.ranks.world_size > 1 else {}
+    if state.stepper.exposures is not None:
+        shared |= state.stepper.exposures.columns()
     run_files.save(
         folder,
         state.table,

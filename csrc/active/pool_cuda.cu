@@ -1,0 +1,104 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+
+#include "active/pool.h"
+#include "common/cuda.cuh"
+#include "exchange/copy_to_host.h"
+
+namespace blitzgs::cuda {
+
+namespace {
+
+constexpr int kThreads = 256, kWarps = kThreads / 32;
+// A lane moves kWords words of 16 bytes at a time, so that enough of them are in flight; a unit is what a
+// warp moves at a time. The grid is small because the kernel is bound by the bus, and the kernels of a
+// training step run at the same time.
+constexpr int kWords = 4, kUnit = 32 * kWords, kBlocks = 96;
+
+// seen [n] (pool.h), one thread per block of the table.
+__global__ void __launch_bounds__(kThreads) see_blocks(const SeenBlocks args) {
+  __shared__ Frustum planes[kMaxViews];
+  if (threadIdx.x < args.views) planes[threadIdx.x] = frustum_of(args, threadIdx.x);
+  __syncthreads();
+  const std::int64_t block = blockIdx.x * std::int64_t{kThreads} + threadIdx.x;
+  if (block < args.n) args.seen[block] = views_that_see(args, planes, block);
+}
+
+// A warp moves up to kUnit words, of which `count` exist: from the slot to the leaving block, and from the
+// coming block to the slot. leaving, coming: null if there is none.
+__device__ __forceinline__ void move(uint4* slot, uint4* leaving, const uint4* coming, int lane, int count) {
+  uint4 old[kWords], fresh[kWords];
+#pragma unroll
+  for (int k = 0; k < kWords; ++k) {
+    const int at = lane + 32 * k;
+    if (at >= count) break;
+    if (coming) fresh[k] = coming[at];
+    if (leaving) old[k] = slot[at];
+  }
+#pragma unroll
+  for (int k = 0; k < kWords; ++k) {
+    const int at = lane + 32 * k;
+    if (at >= count) break;
+    if (leaving) leaving[at] = old[k];
+    if (coming) slot[at] = fresh[k];
+  }
+}
+
+// Moves the blocks of `swap` (pool.h). The units of all columns of all moves are numbered; a warp moves
+// one unit at a time, in a loop. units: the number of units in a move.
+__global__ void __launch_bounds__(kThreads) move_blocks(const SwapBlocks swap, int units) {
+  const int lane = threadIdx.x % 32;
+  const std::int64_t warps = std::int64_t{gridDim.x} * kWarps;
+  for (std::int64_t i = blockIdx.x * std::int64_t{kWarps} + threadIdx.x / 32; i < swap.n * units;
+       i += warps) {
+    const std::int64_t move_index = i / units;
+    int unit = static_cast<int>(i - move_index * units), c = 0;
+    int words = static_cast<int>(swap.columns[0].bytes / sizeof(uint4));
+    while (unit * kUnit >= words) {
+      unit -= (words + kUnit - 1) / kUnit;
+      words = static_cast<int>(swap.columns[++c].bytes / sizeof(uint4));
+    }
+    const SwapColumn& column = swap.columns[c];
+    const std::int32_t leaving = swap.leaving[move_index], coming = swap.coming[move_index];
+    const std::int64_t first = std::int64_t{unit} * kUnit;
+    const auto at = [&](std::byte* base, std::int64_t block) {
+      return reinterpret_cast<uint4*>(base) + block * words + first;
+    };
+    move(at(column.pool, swap.slots[move_index]),
+         leaving >= 0 && column.is_written ? at(column.table, leaving) : nullptr,
+         coming >= 0 ? at(column.table, coming) : nullptr, lane, words - static_cast<int>(first));
+  }
+}
+
+}  // namespace
+
+void seen_blocks(const SeenBlocks& args, Workspace&, CudaStream stream) {
+  if (args.n == 0) return;
+  see_blocks<<<blocks_for(args.n, kThreads), kThreads, 0, stream>>>(args);
+  check_launch("seen_blocks");
+}
+
+void swap_blocks(const SwapBlocks& given, Workspace&, CudaStream stream) {
+  if (given.n == 0 || given.n_columns == 0) return;
+  SwapBlocks swap = given;
+  std::int64_t units = 0;
+  for (int c = 0; c < swap.n_columns; ++c) {
+    SwapColumn& column = swap.columns[c];
+    column.table =
+        reinterpret_cast<std::byte*>(device_address(reinterpret_cast<std::int64_t*>(column.table)));
+    const auto places =
+        reinterpret_cast<std::uintptr_t>(column.pool) | reinterpret_cast<std::uintptr_t>(column.table);
+    if (places % sizeof(uint4) != 0) {
+      throw std::runtime_error(
+          "blitzgs: columns that blocks move between must begin at multiples of 16 bytes");
+    }
+    const std::int64_t words = column.bytes / static_cast<std::int64_t>(sizeof(uint4));
+    units += (words + kUnit - 1) / kUnit;
+  }
+  const std::int64_t wanted = (swap.n * units + kWarps - 1) / kWarps;
+  move_blocks<<<static_cast<unsigned>(std::min<std::int64_t>(wanted, kBlocks)), kThreads, 0, stream>>>(
+      swap, static_cast<int>(units));
+  check_launch("swap_blocks");
+}
+
+}  // namespace blitzgs::cuda
