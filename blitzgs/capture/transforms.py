@@ -257,12 +257,12 @@ def _read_pose(matrix: object) -> Float64:
     pose = np.eye(4)
     rotation = camera_to_world[:3, :3] * np.array([1.0, -1.0, -1.0])
     if np.isfinite(camera_to_world).all():  # views whose pose is not finite are dropped later
-        last = camera_to_world[3:].ravel()
-        if last.size and not np.allclose(last, [0, 0, 0, 1], atol=1e-6):
-            raise ValueError(f"the last row of transform_matrix must be 0, 0, 0, 1, got {last.tolist()}")
         lengths = np.linalg.norm(rotation, axis=0)
         if lengths.max() == 0:
             raise ValueError("transform_matrix has a rotation of zeros only: leave out frames without a pose")
+        last = camera_to_world[3:].ravel()
+        if last.size and not np.allclose(last, [0, 0, 0, 1], atol=1e-6):
+            raise ValueError(f"the last row of transform_matrix must be 0, 0, 0, 1, got {last.tolist()}")
         # Some exporters do not remove the scale of the rig, which is the same along all axes.
         if lengths.min() < 0.999 * lengths.max():
             raise ValueError(

@@ -42,9 +42,12 @@ def samples():
     plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")], text=True).write(folder / "cloud.ply")
     (folder / "QOI").write_bytes(native_io().encode_qoi(smooth_image(48, 64)))
     frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "mask_path": "b.png"}
-    lens = {"w": 64, "h": 48, "fl_x": 60.0, "k1": 0.1, "ply_file_path": "p.ply"}
+    frame |= {"camera_angle_x": 1.0, "camera_angle_y": 0.8, "cx": 31.5, "is_fisheye": False}
+    lens = {"w": 64, "h": 48, "fl_x": 60.0, "k1": 0.1, "ply_file_path": "p.ply", "camera_model": "RADIAL"}
+    lens |= {"fl_y": 61.0, "cy": 24.0, "p1": 0.001, "distortion_params": [0.1, 0, 0, 0, 0.001, 0]}
     lens |= {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 0.5}
-    (folder / "transforms.json").write_text(json.dumps(lens | {"frames": [frame], "test_filenames": []}))
+    lists = {"train_filenames": ["a.png"], "val_filenames": [], "test_filenames": []}
+    (folder / "transforms.json").write_text(json.dumps(lens | lists | {"frames": [frame]}))
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
