@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from blitzgs._torch import func_transforms_are_active
 from blitzgs.call.covariances import Decomposed, decompose
 from blitzgs.capture.cameras import MOST_SIDE
 
@@ -230,7 +231,7 @@ def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]
         ValueError: an argument has another dtype, or is on another device, whose memory the kernels could not
             read.
     """
-    if torch._C._are_functorch_transforms_active():
+    if func_transforms_are_active():
         raise RuntimeError(
             "blitzgs does not support the transforms of torch.func (grad, vjp, jvp, jacrev, vmap, ...): use "
             "torch.autograd or backward(), and batch dimensions of the arguments in place of vmap"

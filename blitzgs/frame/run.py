@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from blitzgs._library import below_autograd
-from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.protocol import Exchange, ExchangeResult, Mark, Transport, unmarked
 from blitzgs.ops.projection_types import ProjectionInputs, Sizes
+
+if TYPE_CHECKING:
+    from blitzgs.frame.tiles import TileAssignment
 
 # A failed attempt reports the sizes that it needs, and the next attempt uses them. More attempts than this
 # mean that the inputs change or that the program is wrong.

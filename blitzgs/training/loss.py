@@ -5,17 +5,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from blitzgs.config.fields import LEAST_OPACITY, MOST_OPACITY, LossConfig
-from blitzgs.frame.frame import Frame
 from blitzgs.frame.tiles import LOSS_HALO
 from blitzgs.ops.photometric import photometric_fwd_bwd
-from blitzgs.table.table import GaussianTable
-from blitzgs.training.batch import Batch
+
+if TYPE_CHECKING:
+    from blitzgs.frame.frame import Frame
+    from blitzgs.table.table import GaussianTable
+    from blitzgs.training.batch import Batch
 
 
 class LossTerms(NamedTuple):

@@ -8,7 +8,7 @@ import pickle
 import pytest
 from torch.utils._pytree import tree_map
 
-from blitzgs.call.lazy_dict import LateMapping, Later, LazyDict
+from blitzgs.call.meta import LateMapping, Later, LazyDict
 
 PLAIN = {"image": 1, "ids": [2, 3], "mask": None}
 READERS = {
