@@ -160,8 +160,10 @@ class Trainer:
                 return self.finish(agreement)
         except PhotographError as error:  # on every rank
             self._stop(f"saved after {state.images_seen:,} images, before a photograph that cannot be read")
+            what = "mask" if "the mask " in str(error) else "photograph"
             raise PhotographError(
-                f"{error}. The model so far is saved: put the photograph back and continue with --resume"
+                f"{error}. The model so far is saved: put the {what} back and continue with --resume, or "
+                "leave damaged ones out with --data.allow_missing=true"
             ) from error
         finally:
             state.stops = never

@@ -19,6 +19,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.view_gate import gate_views_
+from blitzgs.table.layouts import CULL, sectors_in
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.levels import farthest
 
@@ -97,7 +98,9 @@ class ViewGate:
 
     def rules(self, table: GaussianTable) -> GateRules:
         """Return the rules for a table, as the ops take them."""
-        return GateRules(table["level"], list(self.reach), self.lod_views, table.cull, list(self.columns))
+        mask = table.columns.get(CULL)
+        sectors = None if mask is None else sectors_in(mask)
+        return GateRules(table["level"], list(self.reach), self.lod_views, sectors, list(self.columns))
 
 
 class SceneGate:

@@ -26,7 +26,7 @@ from blitzgs.spawn.gate import GateError, GateInfo, RandomVeto, SampledVeto, inf
 from blitzgs.spawn.lineage import ABOUT, Cause
 from blitzgs.spawn.lineage_parts import read_lineage
 from blitzgs.spawn.rules import life_fields, reasons_against
-from blitzgs.table.table import CULL
+from blitzgs.table.layouts import CULL
 from blitzgs.training.events import importance
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import on_each_device, run_ranks
