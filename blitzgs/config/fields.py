@@ -32,7 +32,8 @@ class DataConfig:
             cuts it off, "mask" masks it.
         exif: "auto" turns an image by its EXIF tag if only the turned image fits its camera; "apply" always
             turns it, "ignore" never.
-        allow_missing: drop views whose image is missing instead of failing.
+        allow_missing: drop views whose image is missing or damaged instead of failing.
+        inside_only: refuse captures with names that lead outside their folder.
         sparse: which of several COLMAP models (sparse/0, sparse/1, ...) is read: the "largest", "all" of
             them, which must have the same world coordinates, or a folder inside the capture.
         stray_cameras: "drop" leaves out cameras that lie far apart from all others and hardly show a point,
@@ -53,6 +54,7 @@ class DataConfig:
     undistort: str = "crop"
     exif: str = "auto"
     allow_missing: bool = False
+    inside_only: bool = False
     sparse: str = "largest"
     stray_cameras: str = "drop"
     cache_bytes: int = 8_000_000_000
@@ -72,8 +74,11 @@ class ModelConfig:
         near: near plane, relative to extent. 0: a quarter of the depth of the nearest points that training
             views see, 0.01 at most; the run's own configuration has the result.
         deterministic: make a run repeat bit for bit on CUDA too, at some cost in time (the CPU always does).
-        exposure: each training photograph has a gain and a bias of its channels, if the photographs differ;
-            the model has the mean exposure.
+        exposure: if photographs differ in exposure, each training photograph has a gain and a bias of its
+            channels: gains are estimated from the points' tracks, where there are tracks, and both are
+            refined in training. Views are rendered with the mean exposure (`blitzgs render --exposure`:
+            with the photograph's), so held-out photographs are farther from them: `psnr_corrected` compares
+            without exposure.
     """
 
     sh_degree: int = 3

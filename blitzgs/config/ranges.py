@@ -116,6 +116,7 @@ RANGES: Mapping[str, Range] = {
 CHOICES: Mapping[str, tuple[str, ...]] = {
     "data.undistort": ("crop", "mask"),
     "data.exif": ("auto", "apply", "ignore"),
+    "data.stray_cameras": ("drop", "keep"),
     "ranks.transport": get_args(Transport),
     "population.strategy": ("density", "relocation"),
     "population.score": get_args(ScoreRule),

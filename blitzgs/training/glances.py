@@ -58,7 +58,7 @@ class Glances:
         self._spent += seconds
         self._cost = max(self._cost, seconds / count)
         if "psnr" in metrics:
-            values = {"psnr": metrics["psnr"], "views": count}
+            values = {"psnr": metrics["psnr"], "views": count, "seconds": seconds}
             text = f"held-out views: {metrics['psnr']:.2f} dB ({count} of {len(self._order)})"
             state.log.event(state.images_seen, "glance", values, text)
 

@@ -160,8 +160,10 @@ class Trainer:
                 return self.finish(agreement)
         except PhotographError as error:  # on every rank
             self._stop(f"saved after {state.images_seen:,} images, before a photograph that cannot be read")
+            what = "mask" if "the mask " in str(error) else "photograph"
             raise PhotographError(
-                f"{error}. The model so far is saved: put the photograph back and continue with --resume"
+                f"{error}. The model so far is saved: put the {what} back and continue with --resume, or "
+                "leave damaged ones out with --data.allow_missing=true"
             ) from error
         finally:
             state.stops = never
@@ -296,9 +298,9 @@ class Trainer:
             f"{views['train']} training views, {views['test']} held out; "
             f"{images:,} images, {images / views['train']:,.0f} per view"
         )
-        found = state.progress.milestones.get("found", 0)
-        if state.progress.step == 0 and found > (kept := state.progress.milestones["initial"]):
-            text += f"; thinned from {found:,} to population.max_gaussians={kept}"
+        if state.progress.step == 0 and (found := state.progress.milestones.get("found", 0)):
+            most = state.config.population.max_gaussians
+            text += f"; thinned from {found:,} to population.max_gaussians={most}"
         if state.config.data.downscale > 1:
             factor = f"data.downscale={state.config.data.downscale:g}"
             text += f"; images of {largest_size(state.capture)} ({factor})"

@@ -10,9 +10,9 @@ from PIL import Image
 from blitzgs.capture import colmap
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.capture import load_capture
-from blitzgs.capture.files import find_mask
 from blitzgs.capture.image_files import ImageHeader, apply_orientation, read_header
 from blitzgs.capture.images import ImageStore
+from blitzgs.capture.masks import find_masks
 from tests.capture.helpers import edit_model, shared_data, smooth_image, write_capture, write_image
 
 pytestmark = [
@@ -406,10 +406,11 @@ def test_a_photograph_is_not_taken_for_its_own_mask(tmp_path):
     (tmp_path / "capture" / "masks").mkdir(parents=True)
     write_image(tmp_path / "photos" / "a.png", smooth_image(64, 48))
     photo = str(tmp_path / "photos" / "a.png")
-    assert find_mask(tmp_path / "capture" / "masks", photo) is None
-    assert find_mask(tmp_path / "capture" / "masks", "../../photos/a.png") is None
+    for name in (photo, "../../photos/a.png"):
+        assert find_masks(tmp_path / "capture", None, [name], [None]) == [None]
     cv2.imwrite(str(tmp_path / "capture" / "masks" / "a.png"), np.ones((4, 4), dtype=np.uint8))
-    assert find_mask(tmp_path / "capture" / "masks", photo) == tmp_path / "capture" / "masks" / "a.png"
+    found = find_masks(tmp_path / "capture", None, [photo], [None])
+    assert found == [tmp_path / "capture" / "masks" / "a.png"]
 
 
 def test_a_list_file_may_begin_with_a_byte_order_mark(tmp_path):
