@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from blitzgs.util.output import write_file
-from blitzgs_synth.arrays import Bytes, Floats
+from blitzgs_synth.arrays import Bytes
 from blitzgs_synth.flight import View
 from blitzgs_synth.options import CityOptions
 from blitzgs_synth.processes import each
