@@ -10,7 +10,7 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu' 'examples/*.cpp')
 DEMO ?= runs/demo
 
-.PHONY: venv venv-test build io demo test test-python test-cxx test-cuda test-slow sanitize fuzz lint format clean
+.PHONY: venv venv-test build io demo test browser test-python test-cxx test-cuda test-slow sanitize fuzz lint format clean
 
 venv: $(VENV)/.installed
 venv-test: $(VENV)/.installed-test
@@ -57,7 +57,14 @@ demo: venv build
 	@echo "The model, for any 3DGS viewer:    $(DEMO)/city.ply"
 	@echo "Another run from the start:        make demo DEMO=runs/another"
 
-test: venv-test lint test-cxx test-python
+test: venv-test lint test-cxx browser test-python
+
+# The tests of pages drive a headless browser.
+browser:
+	@command -v chromium chromium-browser google-chrome >/dev/null \
+	  || apt-get install -y -qq chromium >/dev/null 2>&1 \
+	  || { apt-get update -qq && apt-get install -y -qq chromium; } >/dev/null 2>&1 \
+	  || { echo "Chromium is missing: install it (Debian: apt-get install chromium)"; exit 1; }
 
 # Two processes, because many tests wait for processes of their own.
 TEST_JOBS ?= 2

@@ -29,6 +29,7 @@ from blitzgs import rasterization
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import Mark, RenderOptions, Views, unmarked
 from blitzgs.frame.transport import LocalTransport
+from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.table.table import GaussianTable
 
 try:
@@ -82,7 +83,7 @@ class OurRender:
         del self.frame, splats
         inputs = pipeline.inputs_of(self.table, self.views, OPTIONS)
         ops.project_bwd(
-            list(inputs.gaussians), list(inputs.cameras), columns, inputs.options.ints, inputs.options.floats,
+            list(inputs.gaussians), *WeightedViews(*inputs.cameras), *columns, None, *inputs.options,
             v_splats, None, False,
         )  # fmt: skip
         mark("project back")

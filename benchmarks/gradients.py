@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.frame import frame as pipeline
+from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.ops.splat_gradients import SplatGradients
 from blitzgs.table.table import GaussianTable
 
@@ -38,8 +39,8 @@ def parameter_gradients(
     if gradients.places is not None:
         parts = [sum_of_ranks(gradients, len(projected.means2d))]
     *parameters, _ = torch.ops.blitzgs.project_bwd(
-        list(table.parameters), [frame.views.viewmats, frame.views.Ks, *weights],
-        [projected.camera_ids, projected.visible_ids, projected.splat_offsets], options.ints, options.floats,
+        list(table.parameters), *WeightedViews(frame.views.viewmats, frame.views.Ks, *weights),
+        projected.camera_ids, projected.visible_ids, projected.splat_offsets, None, *options,
         list(parts), None, False,
     )  # fmt: skip
     return parameters

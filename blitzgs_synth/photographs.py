@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from blitzgs.util.output import write_file
-from blitzgs_synth.arrays import Bytes, Floats
+from blitzgs_synth.arrays import Bytes
 from blitzgs_synth.flight import View
 from blitzgs_synth.options import CityOptions
 from blitzgs_synth.processes import each
@@ -76,7 +76,7 @@ def _exposed(image: Bytes, index: int, options: CityOptions) -> Bytes:
     rng = np.random.default_rng([options.seed, 6, index])
     # Channels differ by less than photographs do.
     gains = np.exp(options.exposure * (rng.standard_normal() + 0.25 * rng.standard_normal(3)))
-    values: Floats = image * gains.astype(np.float32)
+    values = image.astype(np.float32) * gains.astype(np.float32)
     values += np.float32(options.grain) * rng.standard_normal(image.shape, np.float32)
     exposed: Bytes = np.clip(values + 0.5, 0, 255).astype(np.uint8)
     return exposed

@@ -30,7 +30,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // rows: (means, scales[, four moments of these, last_step, moment_step, table]), blitzgs/ops/blocks.py.
   m.def("update_block_bounds_(Tensor(a!) bounds, Tensor? ids, Tensor[] rows) -> ()");
   m.def(
-      "cull_blocks(Tensor bounds, Tensor[] rows, Tensor[] cameras, int[] size, float[] limits, "
+      "cull_blocks(Tensor bounds, Tensor[] rows, Tensor viewmats, Tensor Ks, int width, int height, "
+      "float near_plane, float far_plane, float eps2d, "
       "Tensor? level_ranges=None, Tensor? level=None, float[] reach=[], int lod_views=0, Tensor? cull=None, "
       "int[] columns=[], int? capacity_blocks=None) "
       "-> (Tensor active_ids, Tensor active_views, Tensor count, Tensor n_blocks)");
@@ -39,55 +40,54 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "gate_views_(Tensor ids, Tensor(a!) views, Tensor? count, Tensor means, Tensor level, Tensor viewmats, "
       "float[] reach, int lod_views, Tensor? cull, int[] columns) -> ()");
 
-  // Projection: parameters to screen-space splats, ordered by (Gaussian, view). Groups of arguments, as
-  // blitzgs/ops/projection_types.py names them: gaussians (means, quats, scales, opacities[, sh]); cameras
-  // (viewmats, Ks); active ([ids[, views[, count[, n_blocks]]]]); rank_tiles (begin and end of each rank);
-  // capacity ([visible, splats]; empty: the op waits for the numbers); splats (camera_ids, visible_ids,
-  // splat_offsets); ints (width, height, tile_size, sh_degree, antialiased, raw); floats (near_plane,
-  // far_plane, eps2d, radius_clip[, fade_slope, reach of each level]). level: the levels of the Gaussians for
-  // smooth levels (csrc/project/project.h).
+  // Projection: parameters to screen-space splats, ordered by (Gaussian, view). gaussians: means, quats,
+  // scales, opacities[, sh]. The options, from width to fade, are those of `blitzgs.ops.project.project`;
+  // fade: empty or, for smooth levels, the slope and the reach of each level (csrc/project/project.h), with
+  // the levels of the Gaussians in `level`. active_ids: the Gaussians to consider, of which the first
+  // n_active [1] are valid, and active_views: the views of each; absent: all. rank_tiles: begin and end of
+  // the tiles of each rank. The capacities: numbers of visible Gaussians and splats for which there is
+  // memory; absent: the op waits for the numbers.
   m.def(
-      "project_fwd(Tensor[] gaussians, Tensor[] cameras, Tensor[] active, int[] ints, float[] floats, "
-      "int[] rank_tiles, int[] capacity, Tensor? ids, Tensor? level) -> (Tensor gaussian_ids, "
+      "project_fwd(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, "
+      "Tensor? n_active, Tensor? n_blocks, Tensor? ids, Tensor? level, "
+      "int width, int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, "
+      "float radius_clip, bool antialiased, bool raw, float[] fade, "
+      "int[] rank_tiles, int? visible_capacity, int? splat_capacity) -> (Tensor gaussian_ids, "
       "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor means2d, Tensor conics, "
       "Tensor depths, Tensor splat_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
       "Tensor rank_masks, Tensor splat_ids, Tensor totals)");
-  // Gathers the visible Gaussians of a projection without sh, and computes the colours of its splats. tables:
-  // (means, quats, scales, opacities) of all Gaussians; sh: their SH in any number of parts, which become
-  // one; splats: (visible_ids, splat_offsets, camera_ids); shown: (opacities, radii, tiles_touched), set to 0
-  // for splats whose colour is not finite; totals: those of the projection if the splats have spare capacity.
-  // Returns the numbers of the rows, 0 to U - 1, visible_ids as int64, the colours, and the rows of tables
-  // and sh.
+  // scale_reg, opacity_reg: for each view, weights of the Gaussians' smallest axes and opacities. v_splats:
+  // (v_means2d, v_conics, v_opacities[, v_colors]) or, on CUDA, one table of splat gradients.
   m.def(
-      "color_rows_(Tensor[] tables, Tensor[] sh, Tensor[] cameras, Tensor[] splats, Tensor(a!)[] shown, "
-      "int[] ints, float[] floats, Tensor? totals=None) -> Tensor[] rows");
-  // views: cameras and, of each view, weights of the Gaussians' smallest axes and opacities:
-  // (viewmats, Ks[, scale_reg[, opacity_reg]]). v_splats: (v_means2d, v_conics, v_opacities[,
-  // v_colors]) or, on CUDA, one table of splat gradients.
-  m.def(
-      "project_bwd(Tensor[] gaussians, Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, "
-      "Tensor[] v_splats, Tensor? v_depths, bool need_viewmats, bool dense=False, Tensor? level=None) -> ("
+      "project_bwd(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor? scale_reg, Tensor? opacity_reg, "
+      "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor? level, "
+      "int width, int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, "
+      "float radius_clip, bool antialiased, bool raw, float[] fade, "
+      "Tensor[] v_splats, Tensor? v_depths, bool need_viewmats, bool dense=False) -> ("
       "Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, Tensor v_sh, "
       "Tensor v_viewmats)");
-  // project_bwd, then lazy_adam_step_ of the visible Gaussians. splats: (camera_ids, visible_ids,
-  // splat_offsets[, places]); with places, v_splats are the tables of the ranks that composited the splats.
-  // Groups of the optimiser, as blitzgs/ops/lazy_adam.py names them: state (params, exp_avgs, exp_avg_sqs,
-  // last_step, moment_step); tables (table, lr_table[, final_rules]).
+  // project_bwd, then lazy_adam_step_ of the visible Gaussians. With places, v_splats are the tables of the
+  // ranks that composited the splats. Groups of the optimiser, as blitzgs/ops/lazy_adam.py names them: state
+  // (params, exp_avgs, exp_avg_sqs, last_step, moment_step); tables (table, lr_table[, final_rules]).
   m.def(
       "project_bwd_step_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
-      "float beta2, float eps, Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, "
-      "Tensor[] v_splats, Tensor? level=None, Tensor(b!)? means2d_sums=None) -> ()");
+      "float beta2, float eps, Tensor viewmats, Tensor Ks, Tensor? scale_reg, Tensor? opacity_reg, "
+      "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor? level, "
+      "int width, int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, "
+      "float radius_clip, bool antialiased, bool raw, float[] fade, "
+      "Tensor[] v_splats, Tensor? places=None, Tensor(b!)? means2d_sums=None) -> ()");
   // The offsets of mean2d, conic, opacity, color and mean2d_abs in the floats of a splat gradient, then the
   // number of these floats.
   m.def("splat_gradient_layout() -> int[]");
 
-  // The splats that each tile composites, front to back by (depth, id). grid: n_cameras, width, height,
-  // tile_size, tile_begin, tile_end (-1: all tiles). unchecked: the caller itself checks whether n_isects is
-  // too small, and CUDA does not wait for the number.
+  // The splats that each tile composites, front to back by (depth, id). tile_begin, tile_end: the range of
+  // tiles to composite; end -1: all tiles. unchecked: the caller itself checks whether n_isects is too small,
+  // and CUDA does not wait for the number.
   m.def(
       "intersect(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor depths, Tensor camera_ids, "
-      "Tensor? ids, int[] grid, int n_isects, Tensor? n_splats=None, bool unchecked=False) -> ("
-      "Tensor isect_splats, Tensor tile_offsets)");
+      "Tensor? ids, int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, int "
+      "n_isects, "
+      "Tensor? n_splats=None, bool unchecked=False) -> (Tensor isect_splats, Tensor tile_offsets)");
 
   // The exchange of splats between ranks: packed for a collective, or written to the memory of peers (CUDA).
   m.def(
@@ -116,40 +116,50 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Alpha compositing. composited: (transmittances, last_ids, packed_splats, tile_order) of the forward pass.
   m.def(
       "rasterize_fwd(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
-      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, int[] grid, "
+      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, "
+      "int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, "
       "bool clear_rest=True, bool backward_follows=False, Tensor? n_splats=None) -> (Tensor renders, "
       "Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor packed_splats, Tensor tile_order, "
       "Tensor splat_gradients)");
-  // intersect, unchecked, and then rasterize_fwd. splats: (means2d, conics, splat_opacities, colors). Returns
-  // isect_splats and tile_offsets, then what rasterize_fwd returns, and alphas.
+  // rasterize_fwd for a backward pass that sums gradients in a given table, which it sets to zero. It does
+  // not write the pixels of tiles that are not owned (CUDA). An op of its own, because torch registers
+  // gradients for ops without mutable arguments alone.
   m.def(
-      "list_and_rasterize(Tensor[] splats, Tensor depths, Tensor camera_ids, Tensor? backgrounds, int[] "
-      "grid, "
-      "int n_isects, bool backward_follows, Tensor? n_splats=None) -> Tensor[] outputs");
-  // rasterize_fwd for a backward pass that sums gradients in the table `packed`, which it sets to zero. It
-  // does not write the pixels of tiles that are not owned (CUDA).
-  m.def(
-      "rasterize_fwd_packed_(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
-      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, int[] grid, Tensor(a!) packed, "
-      "Tensor? n_splats=None) -> (Tensor renders, Tensor transmittances, Tensor last_ids, Tensor tile_work, "
-      "Tensor packed_splats, Tensor tile_order)");
-  // Groups, as blitzgs/ops/rasterize.py names them: splats (means2d, conics, splat_opacities, colors); lists
-  // (isect_splats, tile_offsets).
+      "rasterize_fwd_(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
+      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, "
+      "int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, "
+      "Tensor(a!) gradients, Tensor? n_splats=None) -> (Tensor renders, Tensor transmittances, "
+      "Tensor last_ids, Tensor tile_work, Tensor packed_splats, Tensor tile_order)");
+  // splats: (means2d, conics, splat_opacities, colors); lists: (isect_splats, tile_offsets). With gradients
+  // (CUDA), the gradients of the splats are added to this table, and the columns returned are empty.
   m.def(
       "rasterize_bwd(Tensor[] splats, Tensor? backgrounds, Tensor[] lists, Tensor[] composited, "
-      "Tensor v_renders, Tensor? v_alphas, int[] grid, bool absgrad, bool deterministic) -> ("
-      "Tensor v_means2d, "
+      "Tensor v_renders, Tensor? v_alphas, "
+      "int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, "
+      "bool absgrad, bool deterministic, Tensor(a!)? gradients=None) -> (Tensor v_means2d, "
       "Tensor v_conics, Tensor v_splat_opacities, Tensor v_colors, Tensor v_means2d_abs)");
+  // What follows the projection of a call, in one op. It gives splats the colours of the visible rows of
+  // `gaussians` (means, quats, scales, opacities), whose SH are in parts in `sh`; opacities, radii and
+  // tiles_touched become 0 where a colour is not finite. Then it lists the splats by tile and composites the
+  // channels: `channels` or, without, the colours and, with_depth, the depths. Without gaussians no rows are
+  // gathered. totals: those of the projection, if the splats have spare capacity. Returns isect_splats,
+  // tile_offsets, the outputs of rasterize_fwd, alphas, and with gaussians: colors, the numbers of the rows,
+  // 0 to U - 1, visible_ids as int64, and the rows of the gaussians and of the joined sh.
   m.def(
-      "rasterize_bwd_packed_(Tensor[] splats, Tensor? backgrounds, Tensor[] lists, Tensor[] composited, "
-      "Tensor v_renders, int[] grid, bool deterministic, Tensor(a!) packed, bool absgrad=False) -> ()");
+      "render(Tensor means2d, Tensor conics, Tensor(a!) splat_opacities, Tensor depths, Tensor camera_ids, "
+      "Tensor visible_ids, Tensor splat_offsets, Tensor(b!) radii, Tensor(c!) tiles_touched, "
+      "Tensor? channels, bool with_depth, Tensor[] gaussians, Tensor[] sh, Tensor viewmats, Tensor Ks, "
+      "int width, int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, "
+      "float radius_clip, bool antialiased, bool raw, float[] fade, "
+      "Tensor? backgrounds, int n_isects, bool backward_follows, Tensor? totals) -> Tensor[] outputs");
 
   // The contributions of the splats to the image, without colours: the sums of their weights alpha T, their
   // pixels and, if asked for, the sums of the squares of the weights (otherwise [0]).
   m.def(
       "contributions(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor isect_splats, "
-      "Tensor tile_offsets, int[] grid, Tensor? n_splats=None, bool squares=False) -> (Tensor weights, "
-      "Tensor pixels, Tensor squares)");
+      "Tensor tile_offsets, int n_cameras, int width, int height, int tile_size, int tile_begin, int "
+      "tile_end, "
+      "Tensor? n_splats=None, bool squares=False) -> (Tensor weights, Tensor pixels, Tensor squares)");
 
   // For each segment, the fewest items that hold a share of its weight. Runs the steps `first_step` to
   // `last_step` - 1 of the search; between calls the sums may be added up over ranks.
@@ -184,10 +194,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "divide_tiles(Tensor[] costs, Tensor[] similar, int tiles, int grain, float tile_cost, int parts) -> "
       "int[] bounds");
-  // The loss of whole images, and its gradient. weights: (l1_weights, ssim_weights, samples) of each view,
-  // for the gradient; factors: (l1, ssim, offset), by which the loss follows from the sums over all views.
+  // The loss of whole images, and its gradient. weights and samples: of each view, for the gradient; the loss
+  // is l1_factor and ssim_factor times the sums over all views, plus offset.
   m.def(
-      "l1_ssim_fwd_bwd(Tensor renders, Tensor targets, Tensor[] weights, float[] factors) -> (Tensor loss, "
+      "l1_ssim_fwd_bwd(Tensor renders, Tensor targets, Tensor l1_weights, Tensor ssim_weights, "
+      "Tensor samples, float l1_factor, float ssim_factor, float offset) -> (Tensor loss, "
       "Tensor v_renders)");
 
   // The optimiser: dense Adam over a list of rows, with the arguments of project_bwd_step_; and the
@@ -226,10 +237,6 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
 
   // Rows of a table, old and new, in another order.
   m.def("take_rows(Tensor column, Tensor rows, Tensor? fresh) -> Tensor");
-  // The same rows of several columns, and then those of `joined`, side by side along the second dimension.
-  m.def("gather_rows(Tensor[] columns, Tensor[] joined, Tensor ids) -> Tensor[]");
-  // The inverse of joining: the parts of rows along the second dimension, each in memory of its own.
-  m.def("split_rows(Tensor rows, int[] lengths) -> Tensor[]");
   // The first rows of columns, in the same memory without autograd's knowledge.
   m.def("first_rows(Tensor[] columns, int[] lengths) -> Tensor[]");
 

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from blitzgs.call.arguments import Gaussians, Scene
 from blitzgs.call.covariances import Decomposed, shaped_by
-from blitzgs.ops.project import differentiable_splats, gaussian_tensors
+from blitzgs.call.queued import Rendered, ShTables
+from blitzgs.ops.project import differentiable_splats, gaussian_tensors, project_splats
+from blitzgs.ops.project_gradient import TableRows
 from blitzgs.ops.projection_types import MOST_VIEWS, ProjectedSplats, ProjectionInputs, ProjectionOptions
-from blitzgs.ops.render import Rendered
 
 
 class Group(NamedTuple):
@@ -23,11 +24,27 @@ class Group(NamedTuple):
         inputs: of the projection.
         first_image: number of its first view among the images of the call.
         covariances: the covariances that the caller gave instead of quats and scales; None: none.
+        rows: the rows that `inputs` were gathered from, as long as these; None: `inputs` are the tables.
     """
 
     inputs: ProjectionInputs
     first_image: int
     covariances: Decomposed | None
+    rows: Gathered | None = None
+
+
+class Gathered(NamedTuple):
+    """Rows of tables that some view sees.
+
+    Attributes:
+        ids: int32 [A], the rows.
+        tables: means, quats, scales and opacities.
+        sh: the SH.
+    """
+
+    ids: Tensor
+    tables: ProjectionInputs
+    sh: ShTables
 
 
 def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
@@ -48,6 +65,25 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
             )
             groups.append(Group(inputs, s * gaussians.views + part * most, scene.covariances))
     return groups
+
+
+@torch.no_grad()
+def gathered_groups(groups: Sequence[Group], sh: ShTables) -> list[Group]:
+    """Return groups of the Gaussians alone that a view of any group sees.
+
+    Args:
+        groups: of one scene, without SH.
+        sh: the SH.
+    """
+    ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
+    sh.before(ids, None)
+    rows = [table.index_select(0, ids) for table in groups[0].inputs.gaussians]
+    if sh.parts:
+        rows.append(torch.cat([part.index_select(0, ids) for part in sh.parts], dim=1))
+    return [
+        group._replace(inputs=group.inputs._replace(gaussians=rows), rows=Gathered(ids, group.inputs, sh))
+        for group in groups
+    ]
 
 
 def _sh_of_views(gaussians: Gaussians, scene: Scene, parts: int) -> Sequence[Tensor | None]:
@@ -75,7 +111,10 @@ def project_groups(groups: Sequence[Group], sparse_grad: bool, ready: Rendered |
     parts = []
     for group in groups:
         done = () if ready is None else (ready.splats, ready.rows)
-        splats = differentiable_splats(group.inputs, sparse_grad, *done)
+        if group.rows is not None:
+            done = _splats_of_rows(group)
+        tables = group.inputs if group.rows is None else group.rows.tables
+        splats = differentiable_splats(tables, sparse_grad, *done)
         if group.covariances is not None:
             splats = shaped_by(splats, group.inputs, group.covariances)
         parts.append(splats)
@@ -97,3 +136,12 @@ def project_groups(groups: Sequence[Group], sparse_grad: bool, ready: Rendered |
     joined["camera_ids"] = torch.cat(images)
     joined["counts"] = torch.stack([splats.counts for splats in parts]).sum(dim=0)
     return ProjectedSplats(**joined)
+
+
+def _splats_of_rows(group: Group) -> tuple[ProjectedSplats, TableRows]:
+    """Project rows that were gathered from tables; the splats have the numbers of the tables."""
+    assert group.rows is not None
+    splats, (ids, _, sh) = project_splats(group.inputs), group.rows
+    indices = ids.long()[splats.visible_ids]
+    rows = TableRows(group.inputs, splats.visible_ids, indices, sh.parts)
+    return splats._replace(gaussian_ids=ids[splats.gaussian_ids], visible_ids=indices.int()), rows

@@ -16,10 +16,11 @@ from blitzgs.call.finite import find_bad_cameras, watch_for_non_finite
 from blitzgs.call.groups import Group, groups_of, project_groups
 from blitzgs.call.layout import Layout
 from blitzgs.call.meta import Lists, make_meta
+from blitzgs.call.queued import Rendered, ShTables, render_queued
 from blitzgs.call.ranks import Job, send_splats
+from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import Through, rasterize
-from blitzgs.ops.render import Rendered, ShTables, render_queued
 
 # The tile size of the CUDA kernels. If the caller asks for another one, only meta's lists have it.
 CUDA_TILE_SIZE = 16
@@ -141,6 +142,7 @@ def _queued(group: Group, gaussians: Gaussians, image: ImageOptions, tables: ShT
     return render_queued(
         inputs,
         lambda splats: _channels(splats, gaussians, image.render_mode, with_spare=not exact),
+        image.render_mode != "RGB",
         image.backgrounds,
         differentiable and not image.absgrad,
         exact,
@@ -182,7 +184,7 @@ def _lists(
     def lists_of(size: int, n_isects: int) -> Lists:
         isect_splats, offsets = torch.ops.blitzgs.intersect(
             splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, None,
-            [images, width, height, size, 0, -1], n_isects, None, True,
+            *TileGrid(images, width, height, size), n_isects, None, True,
         )  # fmt: skip
         return Lists(isect_splats, offsets, width, height, size)
 

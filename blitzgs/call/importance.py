@@ -11,6 +11,7 @@ from blitzgs.call.finite import warn_of_non_finite
 from blitzgs.call.images import CUDA_TILE_SIZE
 from blitzgs.call.intrinsics import check_intrinsics
 from blitzgs.ops.importance import UNITS, splat_contributions
+from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
 
@@ -109,8 +110,8 @@ def _contributions_of_splats(
 ) -> tuple[Tensor, Tensor]:
     """Return the weights and pixels of all splats of a projection."""
     geometry = splats.means2d, splats.conics, splats.opacities
-    grid = [n_views, width, height, CUDA_TILE_SIZE, 0, -1]
+    grid = TileGrid(n_views, width, height, CUDA_TILE_SIZE)
     lists = torch.ops.blitzgs.intersect(
-        *geometry, splats.depths, splats.camera_ids, None, grid, int(splats.counts[2]), None, True
+        *geometry, splats.depths, splats.camera_ids, None, *grid, int(splats.counts[2]), None, True
     )
     return splat_contributions(*geometry, *lists, n_cameras=n_views, width=width, height=height)[:2]

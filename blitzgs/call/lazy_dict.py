@@ -35,12 +35,6 @@ class LazyDict(dict[str, Any]):
         """Iterate over the keys; defined so that `dict(self)` and `**self` read values by `__getitem__`."""
         return super().__iter__()
 
-    def change(self, key: str, function: Callable[[Any], Any]) -> None:
-        """Replace a value by a function of it, without computing either before it is read."""
-        before = super().__getitem__(key)
-        compute = before.compute if isinstance(before, Later) else lambda: before
-        self[key] = Later(lambda: function(compute()))
-
     def get(self, key: str, default: Any = None) -> Any:
         """Return the value of a key, or `default`."""
         return self[key] if key in self else default  # noqa: SIM401

@@ -102,7 +102,7 @@ class _L1Ssim(torch.autograd.Function):
             weights = _constants(views, 3 * height * width, float(weight), renders.dtype, renders.device)
             factors = ((1 - weight) / samples, -weight / samples, weight)
             loss: Tensor
-            loss, v_renders = torch.ops.blitzgs.l1_ssim_fwd_bwd(renders, targets, weights, factors)
+            loss, v_renders = torch.ops.blitzgs.l1_ssim_fwd_bwd(renders, targets, *weights, *factors)
             ctx.save_for_backward(v_renders)
             return loss
         counts = pixel_counts(renders, masks)

@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
 import torch
@@ -16,22 +15,17 @@ from blitzgs.call.arguments import (
     MAX_SH_DEGREE,
     RAW_DEFAULTS,
     Gaussians,
-    Scene,
     background_rows,
     check_further,
     check_options,
     check_tensors,
     gaussians_of,
 )
-from blitzgs.call.groups import Group, groups_of
+from blitzgs.call.groups import gathered_groups, groups_of
 from blitzgs.call.images import ImageOptions, may_queue, render
 from blitzgs.call.intrinsics import check_intrinsics
-from blitzgs.call.lazy_dict import LazyDict
-from blitzgs.ops.gather_rows import gather_rows, split_rows
-from blitzgs.ops.project import project_splats
+from blitzgs.call.queued import ShTables
 from blitzgs.ops.projection_types import ProjectionOptions
-from blitzgs.ops.render import ShTables
-from blitzgs.ops.sparse_rows import full_gradients
 
 
 class CatchesUp(Protocol):
@@ -165,34 +159,9 @@ def raw_rasterization(
     tables = ShTables(harmonics if shaded else (), catch_up_sh)
     if may_queue(groups):
         return render("raw_rasterization", gaussians, project, image, tables=tables, groups=groups)
-    # Several groups, no Gaussians, or another tile size.
-    ids, visible = _gather_visible(gaussians, groups, tables, sparse_grad)
-    renders, alphas, meta = render("raw_rasterization", visible, project, image._replace(sparse_grad=False))
-    assert isinstance(meta, LazyDict)
-    meta.change("gaussian_ids", lambda index_in_visible: ids.long()[index_in_visible])
-    return renders, alphas, meta
-
-
-def _gather_visible(
-    gaussians: Gaussians, groups: Sequence[Group], tables: ShTables, sparse_grad: bool
-) -> tuple[Tensor, Gaussians]:
-    """Return the Gaussians that a view of any group sees, int32 [U], and these Gaussians alone.
-
-    Args:
-        gaussians: all Gaussians, one scene.
-        groups: `groups_of` the Gaussians.
-        tables: the SH.
-        sparse_grad: whether the gradients of the parameters are sparse.
-    """
-    ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
-    tables.before(ids, None)
-    (scene,) = gaussians.scenes
-    read = (scene.means, scene.quats, scene.scales, scene.opacities, *tables.parts)
-    means, quats, scales, opacities, sh = _Visible.apply(  # type: ignore[no-untyped-call]
-        ids, sparse_grad, *read
-    )
-    scene = Scene(means, quats, scales, opacities, sh, scene.viewmats, scene.Ks)
-    return ids, replace(gaussians, scenes=(scene,), colors=sh, opacities=opacities)
+    # Several groups, no Gaussians, or another tile size: gather the Gaussians that any group sees.
+    groups = gathered_groups(groups, tables)
+    return render("raw_rasterization", gaussians, project, image, groups=groups)
 
 
 def _check_leaves(params: Mapping[str, Tensor | None]) -> None:
@@ -232,33 +201,3 @@ def _checked_degree(harmonics: list[Tensor], count: int, degree: int | None, sha
     if shaded and (degree + 1) ** 2 > given:
         raise ValueError(f"sh_degree {degree} needs {(degree + 1) ** 2} SH coefficients, got {given}")
     return degree
-
-
-class _Visible(torch.autograd.Function):
-    """Gathers the rows `ids` of means, quats, scales and opacities, and of SH in any number of parts.
-
-    The result has the SH in one tensor, or None without parts. The gradients of the tables are sparse, or
-    dense if `sparse` is False.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, ids: Tensor, sparse: bool, *tables: Tensor) -> tuple[Tensor | None, ...]:
-        ctx.save_for_backward(ids)
-        ctx.sparse, ctx.shapes = sparse, [table.shape for table in tables]
-        ctx.set_materialize_grads(False)
-        parts = tables[4:]
-        ctx.lengths = [part.shape[1] for part in parts]
-        rows = gather_rows(tables[:4], parts, ids)
-        return (*rows, *([] if parts else [None]))
-
-    @staticmethod
-    def backward(ctx: Any, *v_rows: Tensor | None) -> Any:
-        (ids,) = ctx.saved_tensors
-        *gradients, v_sh = v_rows
-        if len(ctx.lengths) == 1 or v_sh is None:
-            gradients += [v_sh] * len(ctx.lengths)
-        else:
-            gradients += split_rows(v_sh, ctx.lengths)
-        needed = ctx.needs_input_grad[2:]
-        gradients = [gradient if need else None for gradient, need in zip(gradients, needed, strict=True)]
-        return None, None, *full_gradients(ids, gradients, ctx.shapes, [ctx.sparse] * len(gradients))

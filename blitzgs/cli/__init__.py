@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `blitzgs train | eval | render | export | gate | synth`, one file per command.
+"""The command line: `blitzgs train | eval | render | view | export | gate | synth`, one file per command.
 
 A command's file is imported when the command is used: `blitzgs --help` needs no torch.
 """
@@ -28,6 +28,7 @@ Train 3D Gaussian Splatting models of photographs with known cameras: models of 
 These commands lead from a capture (a COLMAP model and its photographs) to pictures and a file for viewers:
 
   blitzgs train --data CAPTURE --out RUN
+  blitzgs view RUN
   blitzgs render RUN --out PICTURES
   blitzgs export RUN --ply MODEL.ply
 
@@ -39,6 +40,7 @@ COMMANDS = {
     "train": ("blitzgs.cli.train", "train a model of photographs with known cameras"),
     "eval": ("blitzgs.cli.evaluate", "measure PSNR and SSIM of a run's held-out views"),
     "render": ("blitzgs.cli.render", "render the views of a run to files (needs no photographs)"),
+    "view": ("blitzgs.cli.view", "look at a model in the browser"),
     "export": ("blitzgs.cli.export", "write the model of a run as a PLY file for viewers"),
     "gate": ("blitzgs.cli.gate", "fit and evaluate spawn gates, which make smaller models"),
     "synth": (

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from blitzgs.cli.arguments import Commands, add_command, add_device, named_path
+from blitzgs.cli.live import add_live_page, check_live_page, live_page
 from blitzgs.config.describe import describe, describe_all
 from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, load_config, to_dict
@@ -105,6 +106,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         help="read the capture, print what was understood and roughly what the training will take, and stop; "
         "needs no GPU and no --out",
     )
+    add_live_page(parser)
     add_device(parser)
 
 
@@ -154,6 +156,7 @@ def run(args: argparse.Namespace) -> int:
     if args.show_config:
         print(json.dumps(to_dict(config), indent=1))
         return 0
+    check_live_page(args.viewer)
     if args.resume and not config.data.path and not (args.out / run_files.CONFIG).exists():
         raise FileNotFoundError(
             f"{args.out} holds no run to continue (it has no config.yaml): check --out, or name the capture "
@@ -175,7 +178,10 @@ def run(args: argparse.Namespace) -> int:
         if ranks.rank == 0:
             _print_block(understood(config, capture, images))
         with locked(args.out, ranks):
-            summary = Trainer(config, capture, images, args.out, ranks, args.resume, args.extend).train()
+            trainer = Trainer(config, capture, images, args.out, ranks, args.resume, args.extend)
+            if args.viewer is not None:
+                trainer.watch(live_page(trainer.state, args.viewer, args.viewer_host))
+            summary = trainer.train()
         if summary is not None and ranks.rank == 0:
             _print_summary(summary, args.out)
     return 0

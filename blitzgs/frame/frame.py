@@ -10,6 +10,7 @@ and later returns their gradients.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -17,9 +18,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs._library import below_autograd
+from blitzgs.frame.run import run
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import (
+    Exchange,
     LocalTransport,
     Mark,
     Traffic,
@@ -29,8 +31,14 @@ from blitzgs.frame.transport import (
     unmarked,
 )
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.capacity import Attempt
-from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions, Splats
+from blitzgs.ops.intersect import TileGrid
+from blitzgs.ops.projection_types import (
+    ProjectedSplats,
+    ProjectionInputs,
+    ProjectionOptions,
+    Sizes,
+    Splats,
+)
 from blitzgs.ops.rasterize import RasterizeSaved
 from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients, absolute_column
 from blitzgs.table.table import GaussianTable
@@ -145,7 +153,7 @@ def forward(
     table: GaussianTable,
     views: Views,
     options: RenderOptions,
-    active: ActiveRows | None = None,
+    active: ActiveRows | Callable[[Sizes | None], ActiveRows] | None = None,
     assignment: TileAssignment | None = None,
     transport: Transport | None = None,
     mark: Mark = unmarked,
@@ -157,7 +165,8 @@ def forward(
         table: the Gaussians.
         views: at most 32 views.
         options: how to render.
-        active: rows to consider, and the views of each; None: all rows in all views.
+        active: rows to consider, and the views of each; None: all rows in all views. Or a function that finds
+            them, given the estimated sizes of the frame (see `run`).
         assignment: the tiles of each rank; every rank of the job calls this with its table. None: render all
             tiles from this table alone.
         transport: sends the splats to the ranks that composite them. A transport that is used for several
@@ -173,59 +182,37 @@ def forward(
     """
     if transport is None:
         transport = LocalTransport() if assignment is None else open_transport(assignment.ranks)
-    for attempt in transport.capacity.attempts():
-        frame = forward_once(
-            table, views, options, active, assignment, transport, attempt, mark, backward_follows
-        )
-    assert frame is not None  # or there would be another attempt
-    return frame
-
-
-def forward_once(
-    table: GaussianTable,
-    views: Views,
-    options: RenderOptions,
-    active: ActiveRows | None,
-    assignment: TileAssignment | None,
-    transport: Transport,
-    attempt: Attempt,
-    mark: Mark = unmarked,
-    backward_follows: bool = False,
-) -> Frame | None:
-    """Make one attempt of `forward`: queue all work, then wait for the sizes.
-
-    Arguments as for `forward`; `attempt` has the sizes of the memory to allocate.
-
-    Returns:
-        The frame; None if the estimated sizes of the active rows or of `attempt` were too small.
-    """
-    inputs, grid = inputs_of(table, views, options, active), tile_grid(views, options, assignment)
+    grid = tile_grid(views, options, assignment)
     backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
-    # Skip autograd: for an op with a registered gradient formula, its Python takes 20 us of the host's time.
-    with below_autograd():
-        exchange = transport.project_and_send(inputs, assignment, attempt, mark)
+    rows = active if active is None or isinstance(active, ActiveRows) else None
+
+    def inputs(sizes: Sizes | None) -> ProjectionInputs:
+        nonlocal rows
+        if callable(active):
+            rows = active(sizes)
+        return inputs_of(table, views, options, rows)
+
+    def composite(exchange: Exchange) -> _Composited:
         splats, n_splats, n_isects = exchange.arrived
         geometry = (splats.means2d, splats.conics, splats.opacities)
-        isect_splats, tile_offsets = torch.ops.blitzgs.intersect(
-            *geometry, splats.depths, splats.camera_ids, splats.ids, grid, n_isects, n_splats, True
+        lists = torch.ops.blitzgs.intersect(
+            *geometry, splats.depths, splats.camera_ids, splats.ids, *grid, n_isects, n_splats, True
         )
         mark("sort")
-        arguments = (*geometry, splats.colors, backgrounds, isect_splats, tile_offsets, grid)
-        gradient_table = exchange.gradient_table
-        if gradient_table is not None and backward_follows:
-            composited = torch.ops.blitzgs.rasterize_fwd_packed_(*arguments, gradient_table, n_splats)
-            zeros = gradient_table
+        arguments = (*geometry, splats.colors, backgrounds, *lists, *grid)
+        table = exchange.gradient_table
+        if table is not None and backward_follows:
+            images = torch.ops.blitzgs.rasterize_fwd_(*arguments, table, n_splats)
+            zeros = table
         else:
-            *composited, zeros = torch.ops.blitzgs.rasterize_fwd(
-                *arguments, False, backward_follows, n_splats
-            )
-            if gradient_table is not None:
+            *images, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, False, backward_follows, n_splats)
+            if table is not None:
                 zeros = None  # the gradients must be in this table, which the backward pass then zeroes
         mark("raster")
-        result = exchange.finish()
-    if result is None:
-        return None
-    renders, transmittances, last_ids, tile_work, packed_splats, tile_order = composited
+        return _Composited(list(lists), images, zeros)
+
+    result, (lists, images, zeros) = run(transport, inputs, assignment, composite, mark)
+    renders, transmittances, last_ids, tile_work, packed_splats, tile_order = images
     splats = result.splats
     return Frame(
         views=views,
@@ -236,17 +223,25 @@ def forward_once(
         way_back=result.way_back,
         traffic=result.traffic,
         visible=result.visible,
-        active=active,
+        active=rows,
         renders=renders,
         tile_work=tile_work,
         saved=RasterizeSaved(
             [splats.means2d, splats.conics, splats.opacities, splats.colors],
             backgrounds,
-            [isect_splats, tile_offsets],
+            lists,
             [transmittances, last_ids, packed_splats, tile_order],
         ),
         gradients=GradientBuffer(zeros, None if result.way_back is None else result.way_back.cleared_table),
     )
+
+
+class _Composited(NamedTuple):
+    """The tiles' lists, the outputs of `rasterize_fwd`, and memory for the gradients of the splats."""
+
+    lists: list[Tensor]
+    images: Sequence[Tensor]
+    zeros: Tensor | None
 
 
 def inputs_of(
@@ -263,10 +258,10 @@ def inputs_of(
     return ProjectionInputs(gaussians, cameras, options.projection(views), active or (), table["id"], level)
 
 
-def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> list[int]:
-    """Return the grid of tiles, and the range of them that this rank composites, as the ops take both."""
+def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> TileGrid:
+    """Return the grid of tiles, with the range of them that this rank composites."""
     tiles = (0, -1) if assignment is None else assignment.composited_tiles
-    return [len(views), views.width, views.height, options.tile_size, *tiles]
+    return TileGrid(len(views), views.width, views.height, options.tile_size, *tiles)
 
 
 @lru_cache(maxsize=16)
@@ -291,18 +286,18 @@ def backward_splats(
     """
     views, options, way_back = frame.views, frame.options, frame.way_back
     tiles = (0, -1) if frame.assignment is None else frame.assignment.own_tiles
-    grid = [len(views), views.width, views.height, options.tile_size, *tiles]
+    grid = TileGrid(len(views), views.width, views.height, options.tile_size, *tiles)
     if way_back is not None:
         way_back.check_still_valid()
     if v_renders.is_cuda:
         packed = frame.gradients.take(frame.splats.means2d)
-        torch.ops.blitzgs.rasterize_bwd_packed_(
-            *frame.saved, v_renders, grid, options.deterministic, packed, absolute
+        torch.ops.blitzgs.rasterize_bwd(
+            *frame.saved, v_renders, None, *grid, absolute, options.deterministic, packed
         )
         gradients = SplatGradients([packed], None, absolute_column(packed) if absolute else None)
     else:
         *parts, v_abs = torch.ops.blitzgs.rasterize_bwd(
-            *frame.saved, v_renders, None, grid, absolute, options.deterministic
+            *frame.saved, v_renders, None, *grid, absolute, options.deterministic
         )
         gradients = SplatGradients(parts, None, v_abs if absolute else None)
     mark("raster back")

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs._library import below_autograd
 from blitzgs.frame.frame import RenderOptions, Views, inputs_of, tile_grid
+from blitzgs.frame.run import run
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport import LocalTransport, Transport, open_transport
+from blitzgs.frame.transport import Exchange, LocalTransport, Transport, open_transport
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.projection_types import ProjectedSplats
 from blitzgs.table.table import GaussianTable
@@ -63,17 +63,15 @@ def survey(
     inputs = inputs_of(table, views, options, active, colored=False)
     grid = tile_grid(views, options, assignment)
 
-    with below_autograd():
-        for attempt in transport.capacity.attempts():
-            exchange = transport.project_and_send(inputs, assignment, attempt)
-            splats, n_splats, n_isects = exchange.arrived
-            geometry = (splats.means2d, splats.conics, splats.opacities)
-            lists = torch.ops.blitzgs.intersect(
-                *geometry, splats.depths, splats.camera_ids, splats.ids, grid, n_isects, n_splats, True
-            )
-            sums = torch.ops.blitzgs.contributions(*geometry, *lists, grid, n_splats, squares)
-            result = exchange.finish()
-    assert result is not None  # or there would be another attempt
+    def measure(exchange: Exchange) -> tuple[Tensor, Tensor, Tensor]:
+        splats, n_splats, n_isects = exchange.arrived
+        geometry = (splats.means2d, splats.conics, splats.opacities)
+        lists = torch.ops.blitzgs.intersect(
+            *geometry, splats.depths, splats.camera_ids, splats.ids, *grid, n_isects, n_splats, True
+        )
+        return torch.ops.blitzgs.contributions(*geometry, *lists, *grid, n_splats, squares)
+
+    result, sums = run(transport, lambda _: inputs, assignment, measure)
     columns = [column[: len(result.splats.depths)] for column in (sums if squares else sums[:2])]
     if result.way_back is not None:
         returned = result.way_back.return_sums(torch.stack([column.long() for column in columns], 1))

@@ -169,9 +169,13 @@ def cull_blocks(
     ids, views, length, blocks = torch.ops.blitzgs.cull_blocks(
         bounds,
         _rows(means, scales, pending),
-        [viewmats, Ks],
-        [width, height],
-        [near_plane, far_plane, eps2d],
+        viewmats,
+        Ks,
+        width,
+        height,
+        near_plane,
+        far_plane,
+        eps2d,
         *(() if rules is None else (level_ranges, *rules)),
         capacity_blocks=capacity_blocks,
     )

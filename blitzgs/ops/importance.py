@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -61,7 +59,7 @@ def splat_contributions(
     """
     sums: tuple[Tensor, Tensor, Tensor] = torch.ops.blitzgs.contributions(
         means2d, conics, splat_opacities, isect_splats, tile_offsets,
-        [n_cameras, width, height, tile_size, tile_begin, tile_end], n_splats, squares,
+        n_cameras, width, height, tile_size, tile_begin, tile_end, n_splats, squares,
     )  # fmt: skip
     return sums
 
@@ -73,7 +71,12 @@ def _(
     splat_opacities: Tensor,
     isect_splats: Tensor,
     tile_offsets: Tensor,
-    grid: Sequence[int],
+    n_cameras: int,
+    width: int,
+    height: int,
+    tile_size: int,
+    tile_begin: int,
+    tile_end: int,
     n_splats: Tensor | None = None,
     squares: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:

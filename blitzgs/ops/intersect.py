@@ -3,12 +3,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
+
+
+class TileGrid(NamedTuple):
+    """The tiles of B views, as the ops take them."""
+
+    n_cameras: int  # B
+    width: int  # of every view, pixels
+    height: int
+    tile_size: int = 16  # edge of a tile, pixels
+    tile_begin: int = 0  # the range of tiles to composite
+    tile_end: int = -1  # -1: all tiles
 
 
 def tile_counts(width: int, height: int, tile_size: int) -> tuple[int, int]:
@@ -79,8 +90,8 @@ def intersect(
             more, or more intersections than ``n_isects``.
     """
     splats = (means2d, conics, splat_opacities, depths, camera_ids, ids)
-    grid = [n_cameras, width, height, tile_size, tile_begin, tile_end]
-    lists: tuple[Tensor, Tensor] = torch.ops.blitzgs.intersect(*splats, grid, n_isects, n_splats)
+    grid = TileGrid(n_cameras, width, height, tile_size, tile_begin, tile_end)
+    lists: tuple[Tensor, Tensor] = torch.ops.blitzgs.intersect(*splats, *grid, n_isects, n_splats)
     return lists
 
 
@@ -92,12 +103,16 @@ def _(
     depths: Tensor,
     camera_ids: Tensor,
     ids: Tensor | None,
-    grid: Sequence[int],
+    n_cameras: int,
+    width: int,
+    height: int,
+    tile_size: int,
+    tile_begin: int,
+    tile_end: int,
     n_isects: int,
     n_splats: Tensor | None = None,
     unchecked: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    n_cameras, width, height, tile_size, *_ = grid
     tiles_x, tiles_y = tile_counts(width, height, tile_size)
     size = n_isects if n_isects >= 0 else torch.library.get_ctx().new_dynamic_size()
     return (

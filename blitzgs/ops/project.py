@@ -4,21 +4,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from blitzgs._library import below_autograd
-from blitzgs.ops.capacity import CapacityEstimate, Sizes
-from blitzgs.ops.host import HostCopy
+from blitzgs.ops.host import to_host
 from blitzgs.ops.project_gradient import Project, ProjectCall, TableRows
 from blitzgs.ops.projection_types import (
+    N_OPTIONS,
     VIEW_TOTALS,
     ProjectedSplats,
     ProjectionInputs,
     ProjectionOptions,
+    Sizes,
     splats_of,
 )
 
@@ -114,22 +114,8 @@ def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
         inputs: the inputs of the projection.
     """
     with below_autograd():
-        for attempt in capacity_for(inputs).attempts():
-            projected = inputs.run(attempt.sizes)
-            needed = Sizes(*HostCopy(projected.totals).read()[:3].tolist())
-            attempt.end(needed, attempt.sizes is None or attempt.sizes.holds(needed[:2]))
-        return splats_of(projected.splats, needed)
-
-
-def capacity_for(inputs: ProjectionInputs) -> CapacityEstimate:
-    """Return the capacity estimate shared by all calls of this size."""
-    means = inputs.gaussians[0]
-    return _estimate(means.device, means.shape[0], inputs.n_views)
-
-
-@lru_cache(maxsize=16)
-def _estimate(_device: torch.device, _gaussians: int, _views: int) -> CapacityEstimate:
-    return CapacityEstimate()
+        projected = inputs.run(None)
+        return splats_of(projected.splats, Sizes(*to_host(projected.totals)[:3].tolist()))
 
 
 def differentiable_splats(
@@ -159,32 +145,27 @@ def differentiable_splats(
     if sparse_grad:
         raise ValueError("sparse_grad is not supported under torch.compile")
     *columns, _, totals = torch.ops.blitzgs.project_fwd(
-        list(inputs.gaussians),
-        [viewmats, Ks],
-        list(inputs.active),
-        inputs.options.ints,
-        inputs.options.floats,
-        [],
-        [],
-        None,
-        inputs.level,
-    )
+        list(inputs.gaussians), viewmats, Ks, *inputs.active_arguments, None, inputs.level, *inputs.options,
+        [], None, None,
+    )  # fmt: skip
     return ProjectedSplats._make((*columns, totals.cpu()[:3]))
 
 
 @torch.library.register_fake("blitzgs::project_fwd")
 def _(
     gaussians: Sequence[Tensor],
-    cameras: Sequence[Tensor],
-    active: Sequence[Tensor],
-    ints: Sequence[int],
-    floats: Sequence[float],
-    rank_tiles: Sequence[int],
-    capacity: Sequence[int],
+    viewmats: Tensor,
+    Ks: Tensor,
+    active_ids: Tensor | None,
+    active_views: Tensor | None,
+    n_active: Tensor | None,
+    n_blocks: Tensor | None,
     ids: Tensor | None,
     level: Tensor | None,
+    *others: Any,
 ) -> tuple[Tensor, ...]:
     context, means = torch.library.get_ctx(), gaussians[0]
+    rank_tiles: Sequence[int] = others[N_OPTIONS]
     U, P = context.new_dynamic_size(), context.new_dynamic_size()
 
     def ints_of(*shape: Any) -> Tensor:
@@ -204,5 +185,5 @@ def _(
         ints_of(P),
         means.new_empty(P if rank_tiles else 0, dtype=torch.int64),
         means.new_empty(0 if ids is None else P, dtype=torch.int64),
-        means.new_empty(VIEW_TOTALS + cameras[0].shape[0] + len(rank_tiles), dtype=torch.int64),
+        means.new_empty(VIEW_TOTALS + viewmats.shape[0] + len(rank_tiles), dtype=torch.int64),
     )

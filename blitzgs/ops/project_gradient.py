@@ -9,10 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.ops.color_rows import VisibleRows
 from blitzgs.ops.derivatives import first_only
-from blitzgs.ops.gather_rows import split_rows
-from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
+from blitzgs.ops.projection_types import N_OPTIONS, ProjectedSplats, ProjectionInputs, ProjectionOptions
 from blitzgs.ops.sparse_rows import full_gradients
 from blitzgs.ops.splat_gradients import packed_table
 
@@ -21,11 +19,15 @@ class TableRows(NamedTuple):
     """The visible rows of tables, gathered for the colours and the backward pass.
 
     Attributes:
-        visible: the rows.
+        inputs: the inputs of the projection with these Gaussians alone, and their SH.
+        numbers: int32 [U], the rows of `inputs` that are visible.
+        indices: int64 [U], their numbers in the tables, as the indices of sparse gradients.
         sh: the SH of all Gaussians in parts, from which the rows' SH were joined; empty: without SH.
     """
 
-    visible: VisibleRows
+    inputs: ProjectionInputs
+    numbers: Tensor
+    indices: Tensor
     sh: Sequence[Tensor]
 
 
@@ -34,7 +36,7 @@ def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats, rows: Tab
     ctx.set_materialize_grads(False)
     read, visible_ids, ids, ctx.tables, ctx.parts = inputs, splats.visible_ids, None, None, []
     if rows is not None:
-        read, visible_ids, ids = rows.visible
+        read, visible_ids, ids = rows[:3]
         # The tables are not saved: the gradient does not depend on their values, which may change.
         ctx.tables, ctx.parts = (*inputs.gaussians, *rows.sh), [part.shape[1] for part in rows.sh]
     index = splats.camera_ids, visible_ids, splats.splat_offsets
@@ -120,16 +122,14 @@ def _first_gradients(
     )
     # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
     dense = all_dense and not complete and all(needed)
-    # Torch resolves the negative bit of an op's tensors, but not of those in a list of optional ones.
-    cameras = [tensor.resolve_neg() for tensor in saved.cameras]
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
-        saved.gaussians, cameras, saved.splats, ctx.options.ints, ctx.options.floats,
-        _splat_gradients(saved, v), v.depths, need_viewmats, dense, saved.level,
+        saved.gaussians, *saved.cameras, None, None, *saved.splats, saved.level, *ctx.options,
+        _splat_gradients(saved, v), v.depths, need_viewmats, dense,
     )  # fmt: skip
     found: list[Tensor | None] = gradients[: len(saved.gaussians)]
     if len(ctx.parts) > 1:
         # Autograd would copy a gradient that is not contiguous, and its indices with it.
-        found[4:] = split_rows(gradients[4], ctx.parts)
+        found[4:] = [part.contiguous() for part in gradients[4].split(ctx.parts, 1)]
     if not dense:
         found = [gradient if wanted else None for gradient, wanted in zip(found, needed, strict=True)]
     if not dense and not complete:
@@ -189,31 +189,24 @@ class Project(torch.autograd.Function):
 
 
 def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-    gaussians, cameras, *others = inputs
-    _, ints, floats, *_, level = others
-    options = ProjectionOptions.of(ints, floats)
-    # Torch wants a gradient for each argument, and for each tensor of a list.
-    ctx.no_gradients = [_no_gradient(argument) for argument in others]
+    gaussians, viewmats, Ks, *others = inputs  # noqa: N806
+    options = ProjectionOptions(*others[6 : 6 + N_OPTIONS])
+    # To torch an empty list of numbers is one of tensors, which has an empty list of gradients.
+    ctx.no_gradients = [[] if isinstance(x, (list, tuple)) and not x else None for x in (Ks, *others)]
     *columns, _, _ = output
     _save(
         ctx,
-        ProjectionInputs(gaussians, cameras, options, level=level),
+        ProjectionInputs(gaussians, (viewmats, Ks), options, level=others[5]),
         ProjectedSplats._make((*columns, None)),
     )
 
 
 def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
-    needed, (need_viewmats, _), *_ = ctx.needs_input_grad
+    needed, need_viewmats, *_ = ctx.needs_input_grad
     *v_columns, _, _ = v_output
     v = _Differentiable.of(ProjectedSplats._make((*v_columns, None)))
     v_viewmats, *gradients = _gradients(ctx, needed, need_viewmats, [False] * len(needed), v)
-    return gradients, [v_viewmats, None], *ctx.no_gradients
-
-
-def _no_gradient(argument: object) -> list[None] | None:
-    """Return what the backward pass returns for an argument without gradients."""
-    tensors = isinstance(argument, (list, tuple)) and all(isinstance(x, Tensor) for x in argument)
-    return [None] * len(argument) if tensors else None  # type: ignore[arg-type]
+    return gradients, v_viewmats, *ctx.no_gradients
 
 
 torch.library.register_autograd("blitzgs::project_fwd", _backward, setup_context=_setup_context)
@@ -222,18 +215,20 @@ torch.library.register_autograd("blitzgs::project_fwd", _backward, setup_context
 @torch.library.register_fake("blitzgs::project_bwd")
 def _(
     gaussians: Sequence[Tensor],
-    views: Sequence[Tensor | None],
-    splats: Sequence[Tensor],
-    ints: Sequence[int],
-    floats: Sequence[float],
-    v_splats: Sequence[Tensor],
-    v_depths: Tensor | None,
-    need_viewmats: bool,
+    viewmats: Tensor,
+    Ks: Tensor,
+    scale_reg: Tensor | None,
+    opacity_reg: Tensor | None,
+    camera_ids: Tensor,
+    visible_ids: Tensor,
+    splat_offsets: Tensor,
+    level: Tensor | None,
+    *options: Any,
     dense: bool = False,
-    level: Tensor | None = None,
+    **_gradients: Any,
 ) -> tuple[Tensor, ...]:
-    means, (_, visible_ids, _), viewmats = gaussians[0], splats, views[0]
-    assert viewmats is not None
+    means, (need_viewmats, *given) = gaussians[0], options[N_OPTIONS + 2 :]
+    dense = given[0] if given else dense
     length = (means if dense else visible_ids).shape[0]
     return (
         means.new_empty(length, 3),

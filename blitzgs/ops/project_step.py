@@ -47,20 +47,19 @@ def project_bwd_step_(
     Raises:
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
-    of_splats = [splats.camera_ids, splats.visible_ids, splats.splat_offsets]
-    if gradients.places is not None:
-        of_splats.append(gradients.places)
     with below_autograd():
         torch.ops.blitzgs.project_bwd_step_(
             state.tensors,
             [schedule.table, schedule.lr_table],
             *schedule.constants(step),
-            list(views),
-            of_splats,
-            options.ints,
-            options.floats,
-            list(gradients.parts),
+            *views,
+            splats.camera_ids,
+            splats.visible_ids,
+            splats.splat_offsets,
             level,
+            *options,
+            gradients.parts,
+            gradients.places,
             means2d_sums,
         )
 

@@ -13,12 +13,24 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
-from blitzgs.ops.capacity import Sizes
 
 # Largest number of views of one launch (kMaxViews of csrc/common/kernel.h): an int32 has a bit for each.
 MOST_VIEWS = 32
 # Where the splats of the views begin in `ProjectionOutputs.totals` (kTotalViews of csrc/project/project.h).
 VIEW_TOTALS = 4
+
+
+class Sizes(NamedTuple):
+    """Numbers of Gaussians, splats, tile entries and blocks that a frame needs, or has memory for."""
+
+    visible: int  # Gaussians seen by at least one view
+    splats: int  # pairs of a Gaussian and a view that sees it
+    isects: int  # entries of the tiles' lists
+    blocks: int = 0  # of rows of the table, of which some view may see a part
+
+    def holds(self, needed: Sequence[int]) -> bool:
+        """Tell whether these sizes suffice for `needed`, which has the first of these fields in order."""
+        return all(n <= size for n, size in zip(needed, self, strict=False))
 
 
 class ProjectedSplats(NamedTuple):
@@ -41,16 +53,19 @@ class ProjectedSplats(NamedTuple):
     counts: Tensor  # int64 [3] on the CPU: U, P, and at least the sum of tiles_touched
 
 
-def splats_of(allocated: Sequence[Tensor], sizes: Sizes) -> ProjectedSplats:
+def splats_of(allocated: Sequence[Tensor], sizes: Sizes, counts: Tensor | None = None) -> ProjectedSplats:
     """Return the valid splats of columns that were allocated with more capacity.
 
     Args:
         allocated: a `ProjectedSplats`; its `counts` are not read.
         sizes: numbers of valid Gaussians and splats; `blocks` is not read.
+        counts: the first three of `sizes` as a CPU tensor, if there is one.
     """
     if allocated[0].shape[0] > sizes.splats or allocated[2].shape[0] > sizes.visible:
         allocated = first_rows(allocated[:12], lengths_of(sizes))
-    return ProjectedSplats._make((*allocated[:12], torch.tensor(sizes[:3], device="cpu")))
+    if counts is None:
+        counts = torch.tensor(sizes[:3], device="cpu")
+    return ProjectedSplats._make((*allocated[:12], counts))
 
 
 def lengths_of(sizes: Sizes) -> list[int]:
@@ -101,7 +116,7 @@ class Splats(NamedTuple):
 
 
 class ProjectionOptions(NamedTuple):
-    """How Gaussians are projected; each field is the argument of `project` of this name."""
+    """How Gaussians are projected: the arguments of `project` of these names, in the order of the ops."""
 
     width: int
     height: int
@@ -115,31 +130,12 @@ class ProjectionOptions(NamedTuple):
     raw: bool = True
     fade: tuple[float, ...] = ()  # `blitzgs.view.gate.LodGate.fade`; empty: opacities do not fade
 
-    @classmethod
-    def of(cls, ints: Sequence[int], floats: Sequence[float]) -> ProjectionOptions:
-        """Return the options from which `ints` and `floats` were made."""
-        width, height, tile_size, sh_degree, antialiased, raw = ints
-        near_plane, far_plane, eps2d, radius_clip, *fade = floats
-        return cls(
-            width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip,
-            bool(antialiased), bool(raw), tuple(fade),
-        )  # fmt: skip
 
-    @property
-    def ints(self) -> list[int]:
-        """Return the integer options in the order in which the ops take them."""
-        return [
-            self.width, self.height, self.tile_size, self.sh_degree, int(self.antialiased), int(self.raw)
-        ]  # fmt: skip
-
-    @property
-    def floats(self) -> list[float]:
-        """Return the float options in the order in which the ops take them."""
-        return [self.near_plane, self.far_plane, self.eps2d, self.radius_clip, *self.fade]
+N_OPTIONS = len(ProjectionOptions._fields)
 
 
 class WeightedViews(NamedTuple):
-    """B views as the backward ops take them: cameras, and weights of regularisers.
+    """B views as the backward ops take them, in this order: cameras, and weights of regularisers.
 
     Attributes:
         viewmats: [B, 4, 4], world to camera.
@@ -155,8 +151,11 @@ class WeightedViews(NamedTuple):
     opacity_reg: Tensor | None = None
 
 
+_ALL_ROWS = (None, None, None, None)
+
+
 class ProjectionInputs(NamedTuple):
-    """The inputs of a projection, in the groups of arguments that the ops take.
+    """The inputs of a projection.
 
     Attributes:
         gaussians: means, quats, scales, opacities and, if given, sh.
@@ -180,6 +179,11 @@ class ProjectionInputs(NamedTuple):
         """The number of views B."""
         return self.cameras[0].shape[0]
 
+    @property
+    def active_arguments(self) -> Sequence[Tensor | None]:
+        """The four arguments of the op that tell which Gaussians to consider."""
+        return (*self.active, *_ALL_ROWS[len(self.active) :])
+
     def run(self, capacity: Sizes | None, rank_tiles: Sequence[tuple[int, int]] = ()) -> ProjectionOutputs:
         """Project the Gaussians, without gradients.
 
@@ -189,15 +193,14 @@ class ProjectionInputs(NamedTuple):
             rank_tiles: for each rank the [begin, end) of the tiles that it composites, in ascending order.
         """
         *columns, splat_ids, totals = torch.ops.blitzgs.project_fwd(
-            list(self.gaussians),
-            list(self.cameras),
-            [tensor for tensor in self.active if tensor is not None],
-            self.options.ints,
-            self.options.floats,
-            [tile for tiles in rank_tiles for tile in tiles],
-            [] if capacity is None else [capacity.visible, capacity.splats],
+            self.gaussians,
+            *self.cameras,
+            *self.active_arguments,
             self.ids,
             self.level,
+            *self.options,
+            [tile for tiles in rank_tiles for tile in tiles],
+            *((None, None) if capacity is None else capacity[:2]),
         )
         return ProjectionOutputs(ProjectedSplats._make((*columns, None)), splat_ids, totals)
 
@@ -233,6 +236,7 @@ class ProjectionOutputs(NamedTuple):
         colors = s.colors if s.colors.shape[0] == s.conics.shape[0] else s.conics
         return Splats(s.means2d, s.conics, s.opacities, colors, s.depths, s.camera_ids, self.ids)
 
-    def first(self, sizes: Sizes) -> ProjectionOutputs:
+    def first(self, sizes: Sizes, counts: Tensor | None = None) -> ProjectionOutputs:
         """Return only the valid splats, with their `counts`; `sizes` has the numbers in `totals`."""
-        return ProjectionOutputs(splats_of(self.splats, sizes), self.ids[: sizes.splats], self.totals)
+        ids = self.ids if self.ids.shape[0] <= sizes.splats else self.ids[: sizes.splats]
+        return ProjectionOutputs(splats_of(self.splats, sizes, counts), ids, self.totals)

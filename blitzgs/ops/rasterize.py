@@ -13,7 +13,7 @@ from torch import Tensor
 from blitzgs._library import without_autograd
 from blitzgs.ops.arrange_splats import Places
 from blitzgs.ops.derivatives import first_only
-from blitzgs.ops.intersect import pixels_of_tiles
+from blitzgs.ops.intersect import TileGrid, pixels_of_tiles
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, GradientBuffer, gradient_columns
 
 rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
@@ -117,11 +117,11 @@ def rasterize(
         ValueError: `tell_absgrad` under `torch.compile`.
     """
     splats = (means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets)
-    grid = [n_cameras, width, height, tile_size, tile_begin, tile_end]
+    grid = TileGrid(n_cameras, width, height, tile_size, tile_begin, tile_end)
     if torch.compiler.is_compiling():
         if tell_absgrad is not None:
             raise ValueError("absolute gradients are not supported under torch.compile")
-        renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, grid, True, False, None)
+        renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, *grid, True, False, None)
         alphas = 1 - transmittances
     else:
         geometry = (means2d, conics, splat_opacities) if through is None else through.columns
@@ -150,12 +150,16 @@ def _(
     backgrounds: Tensor | None,
     isect_splats: Tensor,
     tile_offsets: Tensor,
-    grid: Sequence[int],
+    n_cameras: int,
+    width: int,
+    height: int,
+    tile_size: int,
+    tile_begin: int,
+    tile_end: int,
     clear_rest: bool = True,
     backward_follows: bool = False,
     n_splats: Tensor | None = None,
 ) -> tuple[Tensor, ...]:
-    n_cameras, width, height, *_ = grid
     pixels, context = (n_cameras, height, width), torch.library.get_ctx()
     # The layout of packed splats differs between backends.
     splat_bytes, n_ordered = context.new_dynamic_size(), context.new_dynamic_size()
@@ -171,24 +175,6 @@ def _(
     )
 
 
-@torch.library.register_fake("blitzgs::list_and_rasterize")
-def _(
-    splats: Sequence[Tensor],
-    depths: Tensor,
-    camera_ids: Tensor,
-    backgrounds: Tensor | None,
-    grid: Sequence[int],
-    n_isects: int,
-    backward_follows: bool,
-    n_splats: Tensor | None = None,
-) -> list[Tensor]:
-    lists = torch.ops.blitzgs.intersect(*splats[:3], depths, camera_ids, None, grid, n_isects, n_splats, True)
-    outputs = torch.ops.blitzgs.rasterize_fwd(
-        *splats, backgrounds, *lists, grid, True, backward_follows, n_splats
-    )
-    return [*lists, *outputs, torch.empty_like(outputs[1])]
-
-
 @torch.library.register_fake("blitzgs::rasterize_bwd")
 def _(
     splats: Sequence[Tensor],
@@ -197,12 +183,18 @@ def _(
     composited: Sequence[Tensor],
     v_renders: Tensor,
     v_alphas: Tensor | None,
-    grid: Sequence[int],
+    n_cameras: int,
+    width: int,
+    height: int,
+    tile_size: int,
+    tile_begin: int,
+    tile_end: int,
     absgrad: bool,
     deterministic: bool,
+    gradients: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     means2d, _, _, colors = splats
-    n_splats = means2d.shape[0]
+    n_splats = means2d.shape[0] if gradients is None else 0
     return (
         means2d.new_empty(n_splats, 2),
         means2d.new_empty(n_splats, 3),
@@ -215,7 +207,7 @@ def _(
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
     _, _, *others = output
     ctx.mark_non_differentiable(*others)
-    *splats, grid, _, _, _ = inputs
+    splats, grid = inputs[:7], TileGrid(*inputs[7:13])
     _save(ctx, splats, grid, output)
 
 
@@ -243,7 +235,7 @@ def _backward(
 ) -> tuple[Tensor | None, ...]:
     v_alphas = None if v_transmittances is None else -v_transmittances
     *splat_gradients, _absolute = _gradients(ctx, v_renders, v_alphas, absgrad=False)
-    return (*splat_gradients, None, None, None, None, None, None)
+    return (*splat_gradients, *[None] * 11)  # for the lists, the grid and three options
 
 
 def _gradients(
@@ -281,11 +273,11 @@ def _first_gradients(
     v_splats: Sequence[Tensor]
     if may_pack and colors.is_cuda and colors.shape[1] == 3 and v_alphas is None and not absgrad:
         packed = ctx.gradients.take(means2d)
-        torch.ops.blitzgs.rasterize_bwd_packed_(*saved, v_renders, ctx.grid, deterministic, packed)
+        torch.ops.blitzgs.rasterize_bwd(*saved, v_renders, None, *ctx.grid, False, deterministic, packed)
         v_splats = gradient_columns(packed)
     else:
         *v_splats, v_abs = torch.ops.blitzgs.rasterize_bwd(
-            *saved, v_renders, v_alphas, ctx.grid, absgrad, deterministic
+            *saved, v_renders, v_alphas, *ctx.grid, absgrad, deterministic
         )
     if ctx.needs_input_grad[4]:
         # A matrix product would be of less precision under autocast.
@@ -297,7 +289,7 @@ class _Call(NamedTuple):
     """The arguments of `rasterize` that `_Rasterize` takes as one, because each argument takes host time."""
 
     splats: tuple[Any, ...]  # the tensors that the op takes
-    grid: list[int]
+    grid: TileGrid
     tell_absgrad: Callable[[Tensor], object] | None
     places: Places | None
     backward_follows: bool
@@ -314,7 +306,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
         *_, call = arguments
         if call.composited is None:
-            output = rasterize_fwd(*call.splats, call.grid, True, call.backward_follows)
+            output = rasterize_fwd(*call.splats, *call.grid, True, call.backward_follows)
             alphas = _ONE - output[1]
         else:
             *output, alphas = call.composited

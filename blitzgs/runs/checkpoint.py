@@ -172,6 +172,7 @@ def load_latest(
     ranks: Ranks,
     device: torch.device | str,
     problem: Callable[[dict[str, Tensor]], str | None] = lambda columns: None,
+    only: str | None = None,
 ) -> Loaded | None:
     """Load this rank's share of the newest sound checkpoint.
 
@@ -183,6 +184,7 @@ def load_latest(
         ranks: the job, of any world size.
         device: where the columns go.
         problem: returns what is wrong with a shard's columns, or None.
+        only: name of the one checkpoint to load; None: the newest.
 
     Returns:
         The checkpoint; None if the folder has none.
@@ -192,7 +194,7 @@ def load_latest(
     """
     found = ranks.broadcast_object(_names(Path(directory)) if ranks.rank == 0 else [])
     refused = []
-    for name in reversed(found):
+    for name in reversed(found) if only is None else [only]:
         try:
             columns, state, shared = load(Path(directory) / name, ranks, device)
             wrong = [text for text in ranks.all_gather_object(problem(columns)) if text]

@@ -180,19 +180,24 @@ class Restored:
     shared: dict[str, torch.Tensor]
 
 
-def restore(folder: Path, ranks: Ranks, device: torch.device | None = None) -> Restored | None:
+def restore(
+    folder: Path, ranks: Ranks, device: torch.device | None = None, only: str | None = None
+) -> Restored | None:
     """Read the newest undamaged checkpoint of a run; return None if the run has no checkpoint.
 
     Args:
         folder: folder of the run.
         ranks: the job.
         device: device of the Gaussians; None: the ranks' device.
+        only: name of the one checkpoint to read; None: the newest.
 
     Raises:
         CheckpointError: there are checkpoints, but all are damaged, or the newest is of another version or
             of another run.
     """
-    loaded = checkpoint.load_latest(folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns)
+    loaded = checkpoint.load_latest(
+        folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns, only
+    )
     if loaded is None:
         return None
     state = loaded.state
@@ -234,7 +239,11 @@ def check_is_run(folder: Path) -> None:
 
 
 def open_model(
-    folder: Path, ranks: Ranks, data: Path | None = None, resident_gb: float | None = None
+    folder: Path,
+    ranks: Ranks,
+    data: Path | None = None,
+    resident_gb: float | None = None,
+    only: str | None = None,
 ) -> TrainedModel:
     """Open the newest model of a run for rendering, with the configuration that was saved with it.
 
@@ -243,6 +252,7 @@ def open_model(
         ranks: the job.
         data: present folder of the capture; None: unchanged.
         resident_gb: gigabytes of each device for Gaussians; 0: no limit; None: as the run.
+        only: name of the one checkpoint to open; None: the newest.
 
     Raises:
         FileNotFoundError: the folder is not a run, or holds no checkpoint.
@@ -250,7 +260,7 @@ def open_model(
     check_is_run(folder)
     pool_bytes = int((_resident_gb(folder / CONFIG) if resident_gb is None else resident_gb) * 1e9)
     home = torch.device("cpu") if pool_bytes > 0 else ranks.device
-    restored = restore(folder, ranks, home)
+    restored = restore(folder, ranks, home, only)
     if restored is None:
         raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
     config, progress, table = restored.config, restored.progress, restored.table

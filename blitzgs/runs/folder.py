@@ -223,14 +223,15 @@ class RunFolder:
         """Return the cameras that the run was trained and measured with; see `run_cameras.load_cameras`."""
         return load_cameras(self.path)
 
-    def model(self, device: torch.device | str = "cpu") -> Model:
-        """Return the model of the newest undamaged checkpoint.
+    def model(self, device: torch.device | str = "cpu", checkpoint: str | None = None) -> Model:
+        """Return the model of the newest undamaged checkpoint, or of the one of a name.
 
         The optimiser's moments are read too, to apply pending steps; they are dropped before the model is
         copied to `device`.
 
         Args:
             device: "cpu", "cuda" or "cuda:N".
+            checkpoint: name of its folder in RUN/checkpoints; None: the newest.
 
         Raises:
             ValueError: there is no such device.
@@ -238,7 +239,7 @@ class RunFolder:
             CheckpointError: all checkpoints are damaged.
         """
         chosen, _ = resolve_device(str(device), local_rank=0, local_world_size=1, share_gpus=False)
-        found = run_files.open_model(self.path, Ranks())
+        found = run_files.open_model(self.path, Ranks(), only=checkpoint)
         columns = {name: found.table[name].to(chosen) for name in (*PARAMETERS, "level")}
         return Model(
             **columns,

@@ -57,7 +57,10 @@ class RunLog:
 
     Attributes:
         total: images of the whole run, from which the remaining time is estimated.
+        listener: called with the time and the values of every record, or None.
     """
+
+    listener: Callable[[int, Mapping[str, Any]], object] | None = None
 
     def __init__(
         self, folder: Path | None, total: int, done: int, tensorboard: bool, run_id: str = ""
@@ -188,6 +191,8 @@ class RunLog:
             self._file = None
 
     def _write(self, t: int, values: Mapping[str, Any]) -> None:
+        if self.listener is not None:
+            self.listener(t, values)
         if self._file is not None:
             self._file.add({"t": t} | ({"run": self._run_id} if self._run_id else {}) | dict(values))
 

@@ -12,6 +12,7 @@ import math
 import signal
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import FrameType
 
@@ -83,11 +84,13 @@ class Decision:
         signal: name of the signal that ends the run, or None.
         save: whether a checkpoint is due.
         lost: whether a rank could not read a photograph and continues without it.
+        watched: whether those who watch the run want something.
     """
 
     signal: str | None
     save: bool
     lost: bool = False
+    watched: bool = False
 
 
 class Agreement:
@@ -96,9 +99,14 @@ class Agreement:
     On GPUs the requests are collected while the next step runs, so the host does not wait for them.
     """
 
-    def __init__(self, ranks: Ranks, stop: StopRequest, clock: SaveClock) -> None:
-        """Prepare to collect the requests that `stop` and `clock` note on each of `ranks`."""
-        self._ranks, self._stop, self._clock = ranks, stop, clock
+    def __init__(
+        self, ranks: Ranks, stop: StopRequest, clock: SaveClock, wants: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Prepare to collect the requests that `stop`, `clock` and `wants` note on each of `ranks`.
+
+        `wants` returns whether those who watch the run want something of all ranks.
+        """
+        self._ranks, self._stop, self._clock, self._wants = ranks, stop, clock, wants
         self._next = 0
         self._last: tuple[int, float] | None = None
         # The requests of all ranks and the step after which they were collected, until they are read.
@@ -124,7 +132,7 @@ class Agreement:
     def now(self, step: int, lost: bool = False) -> Decision:
         """Return a decision at once, whatever the step; every rank calls this."""
         if self._ranks.world_size == 1:
-            return self._decision(self._stop.number, self._clock.is_due, lost)
+            return self._decision(self._stop.number, self._clock.is_due, lost, self._wants())
         return self._answer(step, *self._ask(step, lost))
 
     def _ask(self, step: int, lost: bool) -> tuple[int, HostCopy]:
@@ -134,20 +142,20 @@ class Agreement:
         seconds = MOST_SECONDS
         if self._last is not None and step > self._last[0]:
             seconds = (now - self._last[1]) / (step - self._last[0])
-        requests = [self._stop.number, self._clock.is_due, seconds, lost]
+        requests = [self._stop.number, self._clock.is_due, seconds, lost, self._wants()]
         values = to_device(torch.tensor(requests, dtype=torch.float64), self._ranks.device)
         return step, HostCopy(self._ranks.all_reduce(values, "max").view(torch.int64))
 
     def _answer(self, step: int, asked: int, requests: HostCopy) -> Decision:
         """Decide after `step` by the requests of all ranks after step `asked`; wait for them."""
         with self._ranks.watchdog.waiting("agree"):
-            number, due, slowest, any_lost = requests.read().view(torch.float64).tolist()
+            number, due, slowest, any_lost, watched = requests.read().view(torch.float64).tolist()
         self._asked = None
         interval = max(1, min(MOST_STEPS, int(MOST_SECONDS / max(slowest, 1e-9))))
         self._next, self._last = (asked // interval + 1) * interval, (step, time.monotonic())
         self._agreed_to_stop = number > 0
-        return self._decision(int(number), due > 0, any_lost > 0)
+        return self._decision(int(number), due > 0, any_lost > 0, watched > 0)
 
     @staticmethod
-    def _decision(number: int, due: bool, lost: bool) -> Decision:
-        return Decision(signal.Signals(number).name if number else None, due, lost)
+    def _decision(number: int, due: bool, lost: bool, watched: bool) -> Decision:
+        return Decision(signal.Signals(number).name if number else None, due, lost, watched)

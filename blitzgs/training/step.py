@@ -13,6 +13,8 @@ from blitzgs.frame.frame import Frame, RenderOptions
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import Mark, open_transport, unmarked
+from blitzgs.ops.blocks import ActiveRows
+from blitzgs.ops.projection_types import Sizes
 from blitzgs.ops.view_gate import gate_views_
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.position_noise import PositionNoise
@@ -103,29 +105,29 @@ class Stepper:
         """
         table, ranks, views = self.table, self._owners.ranks, batch.views
         rules = None if view_gate is None else view_gate.rules(table)
-
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
         on_gpu = views.viewmats.is_cuda
-        for attempt in self._transport.capacity.attempts():
+
+        def active(sizes: Sizes | None) -> ActiveRows:
             # On the CPU the number of blocks is known at once: lists of this size need no estimate, and are
             # complete at the first attempt.
-            capacity_blocks = attempt.sizes.blocks if attempt.sizes is not None and on_gpu else None
-            active = self._blocks.active(
+            capacity_blocks = sizes.blocks if sizes is not None and on_gpu else None
+            rows = self._blocks.active(
                 table, views.viewmats, views.Ks, views.width, views.height, options.near_plane,
                 options.far_plane, options.eps2d, rules, capacity_blocks,
             )  # fmt: skip
             if not on_gpu:
-                active = active._replace(blocks=None)
+                rows = rows._replace(blocks=None)
             mark("other")
-            self._optimiser.catch_up(table, active.ids, step - 1, active.length)
+            self._optimiser.catch_up(table, rows.ids, step - 1, rows.length)
             mark("optimiser")
             if rules is not None:
-                gate_views_(active, table["means"], views.viewmats, rules)
-            frame = pipeline.forward_once(
-                table, views, options, active, assignment, self._transport, attempt, mark,
-                backward_follows=True,
-            )  # fmt: skip
-        assert frame is not None  # or there would be another attempt
+                gate_views_(rows, table["means"], views.viewmats, rules)
+            return rows
+
+        frame = pipeline.forward(
+            table, views, options, active, assignment, self._transport, mark, backward_follows=True
+        )
         if self.exposures is None:
             terms = loss_terms(frame, batch, self._loss, self._extent)
         else:

@@ -26,6 +26,7 @@ from blitzgs.runs import files as run_files
 from blitzgs.runs.guard import LossGuard, ModelLostError
 from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.log import RunLog
+from blitzgs.runs.watch import Watcher
 from blitzgs.spawn.rules import lineage_subject
 from blitzgs.table.pool import PoolError
 from blitzgs.training import view_level
@@ -39,6 +40,7 @@ from blitzgs.training.population_report import MemoryMeter, describe, population
 from blitzgs.training.setup import set_up
 from blitzgs.training.state import never
 from blitzgs.training.step_report import StepRecord, log_step, measure_step
+from blitzgs.training.watching import Watching
 from blitzgs.util.output import write_file
 from blitzgs.view.views import render_options
 
@@ -79,7 +81,16 @@ class Trainer:
         # On CUDA a record is written one step later, so that the host does not wait for its figures.
         self._writes_late = ranks.device.type == "cuda"
         self._warned_of_masks = False
+        self._watching: Watching | None = None
         self.memory = MemoryMeter()
+
+    def watch(self, watcher: Watcher | None) -> None:
+        """Let somebody watch the training; every rank calls this before `train`.
+
+        Args:
+            watcher: who watches; None on ranks other than 0.
+        """
+        self._watching = Watching(self.state, watcher)
 
     @torch.no_grad()
     def train(self) -> dict[str, Any] | None:
@@ -101,10 +112,14 @@ class Trainer:
         folder = state.folder if state.ranks.rank == 0 else None
         board = state.config.log.tensorboard
         state.log = RunLog(folder, state.schedule.iterations, done * size, board, state.run_id)
+        watching = self._watching
+        if watching is not None:
+            state.log.listener = watching.told
         state.start_clock()
         try:
             with StopRequest() as stop:
-                agreement = Agreement(state.ranks, stop, state.save_clock)
+                wants = never if watching is None else watching.wants
+                agreement = Agreement(state.ranks, stop, state.save_clock, wants)
                 state.stops = lambda: agreement.now(state.progress.step).signal is not None
                 self._announce()
                 if self._saves_first:  # so that --resume knows the longer schedule
@@ -137,6 +152,9 @@ class Trainer:
                         break
                     if decision.save:
                         save.run(state)
+                    if decision.watched and watching is not None:
+                        self._write_record()
+                        watching.serve(state.stops)
                 self._write_record()
                 self._check_photographs()
                 return self.finish(agreement)
@@ -188,6 +206,8 @@ class Trainer:
 
     def close(self) -> None:
         """Stop loading batches and close the log."""
+        if self._watching is not None:
+            self._watching.close()
         self.loader.close()
         self.state.log.close()
         if self.state.lineage is not None:

@@ -7,8 +7,10 @@ it. The mask exists only for training views.
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -125,6 +127,14 @@ class SceneGate:
         level = table["level"][chosen].to(device).long().clamp(max=gate.count - 1)
         self._means, self._reach = table["means"][chosen].to(device).double(), reach[level]
         self._size = int(ranks.all_reduce(torch.tensor(len(level), device=device)).item())
+
+    def with_smooth(self, smooth: bool) -> SceneGate:
+        """Return this gate with levels that fade, or that are cut off; a gate that fades is in every view."""
+        other = copy.copy(self)
+        other.gate = replace(self.gate, smooth=smooth)
+        if smooth:
+            other.most_kept, other.least_kept = math.inf, 0.0
+        return other
 
     def kept(self, centres: Tensor) -> list[float]:
         """Predict the share of all Gaussians that each view keeps. Collective.

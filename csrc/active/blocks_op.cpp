@@ -63,27 +63,23 @@ void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in,
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
-    const Tensor& bounds, const std::vector<Tensor>& rows, const std::vector<Tensor>& cameras,
-    const std::vector<std::int64_t>& size, const std::vector<double>& limits,
+    const Tensor& bounds, const std::vector<Tensor>& rows, const Tensor& viewmats_in, const Tensor& Ks_in,
+    std::int64_t width, std::int64_t height, double near_plane, double far_plane, double eps2d,
     const std::optional<Tensor>& level_ranges_in, const std::optional<Tensor>& level,
     const std::vector<double>& reach, std::int64_t lod_views, const std::optional<Tensor>& cull,
     const std::vector<std::int64_t>& columns, std::optional<std::int64_t> capacity_in) {
   const char* op = "cull_blocks";
-  STD_TORCH_CHECK(cameras.size() == 2 && size.size() == 2 && limits.size() == 3, "blitzgs::", op,
-                  ": cameras are viewmats and Ks, size is width and height, limits are near_plane, "
-                  "far_plane and eps2d; got ",
-                  cameras.size(), ", ", size.size(), " and ", limits.size(), " of them");
   const HeldRows held = hold_rows(op, rows);
   check_bounds(op, bounds, held.rows.n);
-  const Tensor viewmats = checked(op, "viewmats", cameras[0], ScalarType::Float, {-1, 4, 4});
+  const Tensor viewmats = checked(op, "viewmats", viewmats_in, ScalarType::Float, {-1, 4, 4});
   const std::int64_t views = viewmats.size(0);
   STD_TORCH_CHECK(views <= kMaxViews, "blitzgs::", op, ": at most ", kMaxViews, " views at once, got ",
                   views);
-  const Tensor Ks = checked(op, "Ks", cameras[1], ScalarType::Float, {views, 3, 3});
-  const CullCamera camera{data<float>(viewmats),         data<float>(Ks),
-                          static_cast<int>(size[0]),     static_cast<int>(size[1]),
-                          static_cast<float>(limits[0]), static_cast<float>(limits[1]),
-                          static_cast<float>(limits[2])};
+  const Tensor Ks = checked(op, "Ks", Ks_in, ScalarType::Float, {views, 3, 3});
+  const CullCamera camera{data<float>(viewmats),          data<float>(Ks),
+                          static_cast<int>(width),        static_cast<int>(height),
+                          static_cast<float>(near_plane), static_cast<float>(far_plane),
+                          static_cast<float>(eps2d)};
   STD_TORCH_CHECK(level_ranges_in.has_value() == level.has_value(), "blitzgs::", op,
                   ": a gate needs level_ranges and level");
   BlockGate gate{};

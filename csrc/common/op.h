@@ -253,14 +253,10 @@ inline void check_tile_range(const char* op, std::int64_t begin, std::int64_t en
                   end, ")");
 }
 
-// The argument `grid` of an op, checked. numbers: n_cameras, width, height, tile_size, tile_begin, tile_end
-// (-1: all tiles).
-inline TileGrid checked_tile_grid(const char* op, const std::vector<std::int64_t>& numbers) {
-  STD_TORCH_CHECK(numbers.size() == 6, "blitzgs::", op,
-                  ": grid must be (n_cameras, width, height, tile_size, tile_begin, tile_end), got ",
-                  numbers.size(), " numbers");
-  const std::int64_t n_cameras = numbers[0], width = numbers[1], height = numbers[2], tile_size = numbers[3],
-                     tile_begin = numbers[4], tile_end = numbers[5];
+// The grid of tiles of an op's arguments, checked. tile_end: -1 for all tiles.
+inline TileGrid checked_tile_grid(const char* op, std::int64_t n_cameras, std::int64_t width,
+                                  std::int64_t height, std::int64_t tile_size, std::int64_t tile_begin,
+                                  std::int64_t tile_end) {
   constexpr std::int64_t kMost = std::numeric_limits<std::int32_t>::max();
   STD_TORCH_CHECK(n_cameras >= 0 && n_cameras <= kMost, "blitzgs::", op,
                   ": n_cameras must be at least 0, got ", n_cameras);

@@ -12,10 +12,12 @@ constexpr const char* kOp = "contributions";
 
 std::tuple<Tensor, Tensor, Tensor> contributions(const Tensor& means2d_in, const Tensor& conics_in,
                                                  const Tensor& opacities_in, const Tensor& isect_splats_in,
-                                                 const Tensor& tile_offsets_in,
-                                                 const std::vector<std::int64_t>& grid_numbers,
-                                                 const std::optional<Tensor>& n_splats, bool with_squares) {
-  const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
+                                                 const Tensor& tile_offsets_in, std::int64_t n_cameras,
+                                                 std::int64_t width, std::int64_t height,
+                                                 std::int64_t tile_size, std::int64_t tile_begin,
+                                                 std::int64_t tile_end, const std::optional<Tensor>& n_splats,
+                                                 bool with_squares) {
+  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   const std::int64_t splats = means2d_in.size(0);
   check_floating(kOp, "means2d", means2d_in);
   const ScalarType dtype = means2d_in.scalar_type();

@@ -25,12 +25,14 @@ void check_capacity(std::int64_t capacity, std::int64_t count) {
 
 }  // namespace
 
-// Not in the unnamed namespace, because list_and_rasterize_op.cpp calls it, too.
+// Not in the unnamed namespace, because render_op.cpp calls it, too.
 std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics,
                                      const Tensor& splat_opacities, const Tensor& depths,
                                      const Tensor& camera_ids, const std::optional<Tensor>& ids,
-                                     const std::vector<std::int64_t>& grid_numbers, std::int64_t n_isects,
-                                     const std::optional<Tensor>& known_splats, bool unchecked) {
+                                     std::int64_t n_cameras, std::int64_t width, std::int64_t height,
+                                     std::int64_t tile_size, std::int64_t tile_begin, std::int64_t tile_end,
+                                     std::int64_t n_isects, const std::optional<Tensor>& known_splats,
+                                     bool unchecked) {
   constexpr const char* kOp = "intersect";
   check_floating(kOp, "means2d", means2d);
   const std::int64_t n_splats = means2d.size(0);
@@ -42,7 +44,7 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
                cameras = checked(kOp, "camera_ids", camera_ids, ScalarType::Int, {n_splats});
   const std::optional<Tensor> id_splats = checked(kOp, "ids", ids, ScalarType::Long, {n_splats});
   const SplatCount splat_count = checked_splat_count(kOp, known_splats, means2d);
-  const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
+  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   STD_TORCH_CHECK(grid.count() <= std::numeric_limits<std::int32_t>::max(),
                   "blitzgs::intersect: tile numbers are 32-bit, got ", grid.count(),
                   " tiles; use larger tiles or render fewer views at once");

@@ -18,15 +18,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> photometric_fwd_bwd(
 namespace {
 
 std::tuple<Tensor, Tensor> l1_ssim_fwd_bwd(const Tensor& renders, const Tensor& targets,
-                                           const std::vector<Tensor>& weights,
-                                           const std::vector<double>& factors) {
-  STD_TORCH_CHECK(
-      weights.size() == 3 && factors.size() == 3,
-      "blitzgs::l1_ssim_fwd_bwd: expected weights (l1_weights, ssim_weights, samples) and factors "
-      "(l1, ssim, offset), got ",
-      weights.size(), " and ", factors.size(), " entries");
-  const auto outputs = photometric_fwd_bwd(renders, targets, std::nullopt, weights[0], weights[1], 16, 0, -1,
-                                           weights[2], std::nullopt, 0, 0);
+                                           const Tensor& l1_weights, const Tensor& ssim_weights,
+                                           const Tensor& samples, double l1_factor, double ssim_factor,
+                                           double offset) {
+  const auto outputs = photometric_fwd_bwd(renders, targets, std::nullopt, l1_weights, ssim_weights, 16, 0,
+                                           -1, samples, std::nullopt, 0, 0);
   const Tensor &parts = std::get<0>(outputs), &v_renders = std::get<1>(outputs);
   const double* sums = data<double>(parts);
   const std::int64_t n = parts.size(0) * parts.size(1);
@@ -34,7 +30,7 @@ std::tuple<Tensor, Tensor> l1_ssim_fwd_bwd(const Tensor& renders, const Tensor& 
   DeviceScope scope(renders);
   dispatch_floating(renders, [&](auto zero) {
     using T = decltype(zero);
-    const LossOfSums<T> args{sums, n, factors[0], factors[1], factors[2], mutable_data<T>(loss)};
+    const LossOfSums<T> args{sums, n, l1_factor, ssim_factor, offset, mutable_data<T>(loss)};
     backend::loss_of_sums(args, scope.workspace, scope.stream);
   });
   return {loss, v_renders};

@@ -87,41 +87,21 @@ class HeldSplatGradients {
 
 namespace {
 
-// The group of arguments `views`: the cameras, and the weights of the regularisers for each view.
-struct WeightedViews {
-  TensorList cameras;
-  OptionalTensor scale_reg, opacity_reg;
-
-  WeightedViews(const char* op, const OptionalTensorList& views) {
-    constexpr const char* kNames = "(viewmats, Ks[, scale_reg[, opacity_reg]])";
-    check_group(op, kNames, views, 2, 4);
-    STD_TORCH_CHECK(views[0] && views[1], "blitzgs::", op, ": expected ", kNames, ", got no viewmats or Ks");
-    cameras = {*views[0], *views[1]};
-    if (views.size() > 2) scale_reg = views[2];
-    if (views.size() > 3) opacity_reg = views[3];
-  }
-};
-
-// The group of arguments `splats`, the outputs of the forward pass that both ops read, and the weights of the
-// regularisers. The object holds the tensors, so that the raw pointers stay valid. Only project_bwd_step_
-// reads gradients at places.
+// The outputs of the forward pass that both ops read, and the weights of the regularisers for each view. The
+// object holds the tensors, so that the raw pointers stay valid.
 struct BackwardSplats {
   Tensor camera_ids, visible_ids, splat_offsets;
-  OptionalTensor places, scale_reg, opacity_reg;
+  OptionalTensor scale_reg, opacity_reg;
 
-  BackwardSplats(const char* op, const ProjectArguments& p, const WeightedViews& views,
-                 const TensorList& splats, bool reads_places) {
-    check_group(op,
-                reads_places ? "(camera_ids, visible_ids, splat_offsets[, places])"
-                             : "(camera_ids, visible_ids, splat_offsets)",
-                splats, 3, reads_places ? 4 : 3);
-    if (splats.size() > 3) places = splats[3];
-    camera_ids = checked(op, "camera_ids", splats[0], ScalarType::Int, {-1});
-    visible_ids = checked(op, "visible_ids", splats[1], ScalarType::Int, {-1});
-    splat_offsets = checked(op, "splat_offsets", splats[2], ScalarType::Int, {visible() + 1});
+  BackwardSplats(const char* op, const ProjectArguments& p, const Tensor& camera_ids_in,
+                 const Tensor& visible_ids_in, const Tensor& splat_offsets_in,
+                 const OptionalTensor& scale_reg_in, const OptionalTensor& opacity_reg_in) {
+    camera_ids = checked(op, "camera_ids", camera_ids_in, ScalarType::Int, {-1});
+    visible_ids = checked(op, "visible_ids", visible_ids_in, ScalarType::Int, {-1});
+    splat_offsets = checked(op, "splat_offsets", splat_offsets_in, ScalarType::Int, {visible() + 1});
     const ScalarType dtype = p.means.scalar_type();
-    scale_reg = checked(op, "scale_reg", views.scale_reg, dtype, {p.n_views});
-    opacity_reg = checked(op, "opacity_reg", views.opacity_reg, dtype, {p.n_views});
+    scale_reg = checked(op, "scale_reg", scale_reg_in, dtype, {p.n_views});
+    opacity_reg = checked(op, "opacity_reg", opacity_reg_in, dtype, {p.n_views});
   }
 
   std::int64_t visible() const { return visible_ids.numel(); }
@@ -138,14 +118,20 @@ struct BackwardSplats {
 
 using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-BackwardTensors project_bwd(const TensorList& gaussians, const OptionalTensorList& views_in,
-                            const TensorList& splats, const IntList& ints, const FloatList& floats,
-                            const TensorList& v_splats, const OptionalTensor& v_depths, bool need_viewmats,
-                            bool dense, const OptionalTensor& level) {
+BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
+                            const OptionalTensor& scale_reg, const OptionalTensor& opacity_reg,
+                            const Tensor& camera_ids, const Tensor& visible_ids, const Tensor& splat_offsets,
+                            const OptionalTensor& level, std::int64_t width, std::int64_t height,
+                            std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
+                            double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
+                            const FloatList& fade, const TensorList& v_splats, const OptionalTensor& v_depths,
+                            bool need_viewmats, bool dense) {
   constexpr const char* kOp = "project_bwd";
-  const WeightedViews views(kOp, views_in);
-  const ProjectArguments p(kOp, gaussians, views.cameras, ints, floats, level);
-  const BackwardSplats b(kOp, p, views, splats, /*reads_places=*/false);
+  const ProjectArguments p(kOp, gaussians, viewmats, Ks,
+                           checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
+                                           eps2d, radius_clip, antialiased, raw, fade),
+                           fade, level);
+  const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
                              std::nullopt);
   const std::int64_t length = dense ? p.count : b.visible();
@@ -175,16 +161,22 @@ BackwardTensors project_bwd(const TensorList& gaussians, const OptionalTensorLis
 
 void project_bwd_step(const TensorList& state_in, const TensorList& tables, std::int64_t step,
                       std::int64_t explicit_steps, double beta1, double beta2, double eps,
-                      const OptionalTensorList& views_in, const TensorList& splats, const IntList& ints,
-                      const FloatList& floats, const TensorList& v_splats, const OptionalTensor& level,
+                      const Tensor& viewmats, const Tensor& Ks, const OptionalTensor& scale_reg,
+                      const OptionalTensor& opacity_reg, const Tensor& camera_ids, const Tensor& visible_ids,
+                      const Tensor& splat_offsets, const OptionalTensor& level, std::int64_t width,
+                      std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
+                      double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
+                      const FloatList& fade, const TensorList& v_splats, const OptionalTensor& places,
                       const OptionalTensor& means2d_sums) {
   constexpr const char* kOp = "project_bwd_step_";
   AdamTensors state(kOp, state_in, tables, {step, explicit_steps, beta1, beta2, eps});
   state.check_takes_step();
-  const WeightedViews views(kOp, views_in);
-  const ProjectArguments p(kOp, state.params, views.cameras, ints, floats, level);
-  const BackwardSplats b(kOp, p, views, splats, /*reads_places=*/true);
-  const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt, b.places,
+  const ProjectArguments p(kOp, state.params, viewmats, Ks,
+                           checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
+                                           eps2d, radius_clip, antialiased, raw, fade),
+                           fade, level);
+  const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
+  const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt, places,
                              means2d_sums);
   if (b.visible() == 0) return;
   DeviceScope scope(p.means);

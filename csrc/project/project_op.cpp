@@ -8,20 +8,22 @@ namespace blitzgs {
 namespace {
 
 // The candidates of a projection: ids, the views that may see each, the number of valid ids, and the number
-// of blocks of the table to which they belong. If `active` is empty, all Gaussians in all views are
-// candidates.
+// of blocks of the table to which they belong. Without ids, all Gaussians in all views are candidates.
 struct Candidates {
   OptionalTensor ids, views, listed, blocks;
   std::int64_t count;
 
-  Candidates(const char* op, const TensorList& active, std::int64_t n_gaussians) : count(n_gaussians) {
-    check_group(op, "(ids, views, count, n_blocks), each left out with those behind it", active, 0, 4);
-    if (active.empty()) return;
-    ids = checked(op, "active_ids", active[0], ScalarType::Int, {-1});
+  Candidates(const char* op, const OptionalTensor& active_ids, const OptionalTensor& active_views,
+             const OptionalTensor& n_active, const OptionalTensor& n_blocks, std::int64_t n_gaussians)
+      : count(n_gaussians) {
+    STD_TORCH_CHECK(active_ids || (!active_views && !n_active && !n_blocks), "blitzgs::", op,
+                    ": active_views, n_active and n_blocks need active_ids");
+    if (!active_ids) return;
+    ids = checked(op, "active_ids", active_ids, ScalarType::Int, {-1});
     const std::int64_t length = ids->numel();
-    if (active.size() > 1) views = checked(op, "active_views", active[1], ScalarType::Int, {length});
-    if (active.size() > 2) listed = active[2];
-    if (active.size() > 3) blocks = checked(op, "n_blocks", active[3], ScalarType::Int, {1});
+    views = checked(op, "active_views", active_views, ScalarType::Int, {length});
+    listed = n_active;
+    blocks = checked(op, "n_blocks", n_blocks, ScalarType::Int, {1});
     count = max_listed(op, listed, length);
   }
 };
@@ -98,25 +100,36 @@ class TorchSplats final : public SplatMemory<T> {
   SplatTensors& t_;
 };
 
-std::optional<ProjectSizes> checked_capacity(const char* op, const IntList& capacity) {
-  if (capacity.empty()) return std::nullopt;
+std::optional<ProjectSizes> checked_capacity(const char* op, std::optional<std::int64_t> visible,
+                                             std::optional<std::int64_t> splats) {
   STD_TORCH_CHECK(
-      capacity.size() == 2 && capacity[0] > 0 && capacity[1] > 0, "blitzgs::", op,
+      visible.has_value() == splats.has_value() && visible.value_or(1) > 0 && splats.value_or(1) > 0,
+      "blitzgs::", op,
       ": capacity must be how many visible Gaussians and splats there is room for, at least 1 each");
-  return ProjectSizes{capacity[0], capacity[1]};
+  if (!visible) return std::nullopt;
+  return ProjectSizes{*visible, *splats};
 }
 
 using Projected = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
                              Tensor, Tensor, Tensor, Tensor>;
 
-Projected project_fwd(const TensorList& gaussians, const TensorList& cameras, const TensorList& active,
-                      const IntList& ints, const FloatList& floats, const IntList& rank_tiles,
-                      const IntList& capacity, const OptionalTensor& ids, const OptionalTensor& level) {
+Projected project_fwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
+                      const OptionalTensor& active_ids, const OptionalTensor& active_views,
+                      const OptionalTensor& n_active, const OptionalTensor& n_blocks,
+                      const OptionalTensor& ids, const OptionalTensor& level, std::int64_t width,
+                      std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
+                      double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
+                      const FloatList& fade, const IntList& rank_tiles,
+                      std::optional<std::int64_t> visible_capacity,
+                      std::optional<std::int64_t> splat_capacity) {
   constexpr const char* kOp = "project_fwd";
-  const ProjectArguments p(kOp, gaussians, cameras, ints, floats, level);
-  const Candidates candidates(kOp, active, p.count);
+  const ProjectArguments p(kOp, gaussians, viewmats, Ks,
+                           checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
+                                           eps2d, radius_clip, antialiased, raw, fade),
+                           fade, level);
+  const Candidates candidates(kOp, active_ids, active_views, n_active, n_blocks, p.count);
   const RankTiles ranks = checked_rank_tiles(kOp, rank_tiles);
-  const std::optional<ProjectSizes> sizes = checked_capacity(kOp, capacity);
+  const std::optional<ProjectSizes> sizes = checked_capacity(kOp, visible_capacity, splat_capacity);
   const OptionalTensor persistent = checked(kOp, "ids", ids, ScalarType::Long, {p.count});
   Tensor totals = make_empty(p.means, {project_totals(p.n_views, ranks.n_ranks)}, ScalarType::Long);
   SplatTensors t;

@@ -94,14 +94,15 @@ CompositedTensors composite(const Splats& splats, std::optional<Tensor> splat_gr
 
 }  // namespace
 
-// Not in the unnamed namespace, because list_and_rasterize_op.cpp calls it, too.
+// Not in the unnamed namespace, because render_op.cpp calls it, too.
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
     const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities, const Tensor& colors,
     const std::optional<Tensor>& backgrounds, const Tensor& isect_splats, const Tensor& tile_offsets,
-    const std::vector<std::int64_t>& grid_numbers, bool clear_rest, bool backward_follows,
+    std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
+    std::int64_t tile_begin, std::int64_t tile_end, bool clear_rest, bool backward_follows,
     const std::optional<Tensor>& known_splats) {
   constexpr const char* kOp = "rasterize_fwd";
-  const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
+  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   const Splats splats(kOp, means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets,
                       grid, known_splats);
   const bool packed = kPacked && backward_follows && splats.n_channels <= 4;
@@ -173,69 +174,68 @@ struct Composited {
   std::int64_t tiles() const { return order.size(0) > 0 ? order.size(0) - 1 : grid_count; }
 };
 
+// Checks a table of splat gradients that a caller gives (CUDA).
+void check_gradients(const char* op, const Splats& splats, const Tensor& gradients) {
+  STD_TORCH_CHECK(kPacked, "blitzgs::", op, ": tables of gradients need CUDA");
+  STD_TORCH_CHECK(splats.n_channels <= 4, "blitzgs::", op, ": colors must have 1 to 4 channels, got ",
+                  splats.n_channels);
+  check_in_place(op, "gradients", gradients, ScalarType::Float, {-1, kSplatGradient});
+  STD_TORCH_CHECK(gradients.size(0) >= splats.n_splats, "blitzgs::", op, ": gradients must have ",
+                  splats.n_splats, " splats or more, got ", gradients.size(0));
+}
+
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
     const std::vector<Tensor>& splats_in, const std::optional<Tensor>& backgrounds,
     const std::vector<Tensor>& lists, const std::vector<Tensor>& composited_in, const Tensor& v_renders,
-    const std::optional<Tensor>& v_alphas, const std::vector<std::int64_t>& grid_numbers, bool absgrad,
-    bool deterministic) {
+    const std::optional<Tensor>& v_alphas, std::int64_t n_cameras, std::int64_t width, std::int64_t height,
+    std::int64_t tile_size, std::int64_t tile_begin, std::int64_t tile_end, bool absgrad, bool deterministic,
+    std::optional<Tensor> gradients) {
   constexpr const char* kOp = "rasterize_bwd";
-  const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
+  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   const Splats splats = backward_splats(kOp, splats_in, backgrounds, lists, grid);
+  if (gradients) check_gradients(kOp, splats, *gradients);
+  STD_TORCH_CHECK(!gradients || !v_alphas, "blitzgs::", kOp, ": v_alphas needs gradients in columns");
   const Composited composited(kOp, splats, composited_in, v_renders, v_alphas);
-  const std::int64_t n_splats = splats.n_splats;
+  const std::int64_t n_splats = gradients ? 0 : splats.n_splats;
   Tensor v_means2d = make_empty(splats.means2d, {n_splats, 2});
   Tensor v_conics = make_empty(splats.means2d, {n_splats, 3});
   Tensor v_opacities = make_empty(splats.means2d, {n_splats});
   Tensor v_colors = make_empty(splats.means2d, {n_splats, splats.n_channels});
   Tensor v_means2d_abs = make_empty(splats.means2d, {absgrad ? n_splats : 0, 2});
   DeviceScope scope(splats.means2d);
+#ifdef BLITZGS_BACKEND_CUDA
+  if (gradients) {
+    cuda::rasterize_bwd_packed(splats.input<float>(), composited.saved<float>(), splats.isect_splats.size(0),
+                               composited.aux(), deterministic, absgrad, mutable_data<float>(*gradients),
+                               scope.workspace, scope.stream);
+    return {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs};
+  }
+#endif
   dispatch_floating(splats.means2d, [&](auto zero) {
     using T = decltype(zero);
-    const RasterizeGradients<T> gradients{mutable_data<T>(v_means2d), mutable_data<T>(v_conics),
-                                          mutable_data<T>(v_opacities), mutable_data<T>(v_colors),
-                                          absgrad ? mutable_data<T>(v_means2d_abs) : nullptr};
+    const RasterizeGradients<T> columns{mutable_data<T>(v_means2d), mutable_data<T>(v_conics),
+                                        mutable_data<T>(v_opacities), mutable_data<T>(v_colors),
+                                        absgrad ? mutable_data<T>(v_means2d_abs) : nullptr};
     backend::rasterize_bwd(splats.input<T>(), composited.saved<T>(), splats.isect_splats.size(0),
-                           composited.aux(), deterministic, gradients, scope.workspace, scope.stream);
+                           composited.aux(), deterministic, columns, scope.workspace, scope.stream);
   });
   return {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs};
 }
 
 #ifdef BLITZGS_BACKEND_CUDA
-void check_packed(const char* op, const Splats& splats, const Tensor& packed) {
-  STD_TORCH_CHECK(splats.n_channels <= 4, "blitzgs::", op, ": colors must have 1 to 4 channels, got ",
-                  splats.n_channels);
-  check_in_place(op, "packed", packed, ScalarType::Float, {-1, kSplatGradient});
-  STD_TORCH_CHECK(packed.size(0) >= splats.n_splats, "blitzgs::", op, ": packed must have ", splats.n_splats,
-                  " splats or more, got ", packed.size(0));
-}
-
-CompositedTensors rasterize_fwd_packed(const Tensor& means2d, const Tensor& conics,
-                                       const Tensor& splat_opacities, const Tensor& colors,
-                                       const std::optional<Tensor>& backgrounds, const Tensor& isect_splats,
-                                       const Tensor& tile_offsets,
-                                       const std::vector<std::int64_t>& grid_numbers, Tensor packed,
-                                       const std::optional<Tensor>& known_splats) {
-  constexpr const char* kOp = "rasterize_fwd_packed_";
-  const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
+CompositedTensors rasterize_fwd_into(const Tensor& means2d, const Tensor& conics,
+                                     const Tensor& splat_opacities, const Tensor& colors,
+                                     const std::optional<Tensor>& backgrounds, const Tensor& isect_splats,
+                                     const Tensor& tile_offsets, std::int64_t n_cameras, std::int64_t width,
+                                     std::int64_t height, std::int64_t tile_size, std::int64_t tile_begin,
+                                     std::int64_t tile_end, Tensor gradients,
+                                     const std::optional<Tensor>& known_splats) {
+  constexpr const char* kOp = "rasterize_fwd_";
+  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   const Splats splats(kOp, means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets,
                       grid, known_splats);
-  check_packed(kOp, splats, packed);
-  return composite(splats, packed, false);
-}
-
-void rasterize_bwd_packed(const std::vector<Tensor>& splats_in, const std::optional<Tensor>& backgrounds,
-                          const std::vector<Tensor>& lists, const std::vector<Tensor>& composited_in,
-                          const Tensor& v_renders, const std::vector<std::int64_t>& grid_numbers,
-                          bool deterministic, Tensor packed, bool absgrad) {
-  constexpr const char* kOp = "rasterize_bwd_packed_";
-  const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
-  const Splats splats = backward_splats(kOp, splats_in, backgrounds, lists, grid);
-  check_packed(kOp, splats, packed);
-  const Composited composited(kOp, splats, composited_in, v_renders, std::nullopt);
-  DeviceScope scope(splats.means2d);
-  cuda::rasterize_bwd_packed(splats.input<float>(), composited.saved<float>(), splats.isect_splats.size(0),
-                             composited.aux(), deterministic, absgrad, mutable_data<float>(packed),
-                             scope.workspace, scope.stream);
+  check_gradients(kOp, splats, gradients);
+  return composite(splats, gradients, false);
 }
 #endif
 
@@ -246,7 +246,6 @@ BLITZGS_REGISTER(m) {
   m.impl("rasterize_fwd", TORCH_BOX(&blitzgs::rasterize_fwd));
   m.impl("rasterize_bwd", TORCH_BOX(&blitzgs::rasterize_bwd));
 #ifdef BLITZGS_BACKEND_CUDA
-  m.impl("rasterize_fwd_packed_", TORCH_BOX(&blitzgs::rasterize_fwd_packed));
-  m.impl("rasterize_bwd_packed_", TORCH_BOX(&blitzgs::rasterize_bwd_packed));
+  m.impl("rasterize_fwd_", TORCH_BOX(&blitzgs::rasterize_fwd_into));
 #endif
 }

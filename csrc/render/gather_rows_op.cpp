@@ -83,44 +83,6 @@ std::vector<Tensor> gathered_rows(const char* op, const std::vector<Tensor>& col
 
 namespace {
 
-std::vector<Tensor> gather_rows(const std::vector<Tensor>& columns, const std::vector<Tensor>& joined,
-                                const Tensor& ids) {
-  constexpr const char* kOp = "gather_rows";
-  check_shape(kOp, "ids", ids, {-1});
-  check_dtype(kOp, "ids", ids, ScalarType::Int);
-  return gathered_rows(kOp, columns, joined, as_contiguous(ids), nullptr);
-}
-
-std::vector<Tensor> split_rows(const Tensor& joined_in, const std::vector<std::int64_t>& lengths) {
-  constexpr const char* kOp = "split_rows";
-  check_column(kOp, joined_in);
-  const Tensor joined = as_contiguous(joined_in);
-  STD_TORCH_CHECK(joined.dim() >= 2 && lengths.size() <= kMostGatheredColumns, "blitzgs::", kOp,
-                  ": rows must be [U, K, ...] of at most ", kMostGatheredColumns, " parts, got ",
-                  shape_of(joined), " and ", lengths.size(), " lengths");
-  GatherRows gather{nullptr, joined.size(0), nullptr, 0, {}};
-  const std::int64_t words = words_behind(joined, 2);
-  auto* from = static_cast<const std::uint32_t*>(joined.const_data_ptr());
-  std::vector<Tensor> parts;
-  std::int64_t total = 0;
-  for (const std::int64_t length : lengths) {
-    std::vector<std::int64_t> shape = shape_with(joined, joined.size(0));
-    shape[1] = length;
-    total += length;
-    STD_TORCH_CHECK(length >= 0 && total <= joined.size(1), "blitzgs::", kOp, ": lengths must add up to ",
-                    joined.size(1));
-    Tensor& part = parts.emplace_back(make_empty(joined, shape));
-    gather.columns[gather.n_columns++] = {from, static_cast<std::uint32_t*>(part.mutable_data_ptr()),
-                                          words * joined.size(1), words * length,
-                                          static_cast<std::uint32_t>(words * length)};
-    from += words * length;
-  }
-  STD_TORCH_CHECK(total == joined.size(1), "blitzgs::", kOp, ": lengths must add up to ", joined.size(1));
-  DeviceScope scope(joined);
-  backend::gather_rows(gather, scope.workspace, scope.stream);
-  return parts;
-}
-
 std::vector<Tensor> first_rows(const std::vector<Tensor>& columns, const std::vector<std::int64_t>& lengths) {
   constexpr const char* kOp = "first_rows";
   STD_TORCH_CHECK(columns.size() == lengths.size(), "blitzgs::", kOp, ": ", columns.size(),
@@ -138,8 +100,4 @@ std::vector<Tensor> first_rows(const std::vector<Tensor>& columns, const std::ve
 }  // namespace
 }  // namespace blitzgs
 
-BLITZGS_REGISTER(m) {
-  m.impl("gather_rows", TORCH_BOX(&blitzgs::gather_rows));
-  m.impl("split_rows", TORCH_BOX(&blitzgs::split_rows));
-  m.impl("first_rows", TORCH_BOX(&blitzgs::first_rows));
-}
+BLITZGS_REGISTER(m) { m.impl("first_rows", TORCH_BOX(&blitzgs::first_rows)); }

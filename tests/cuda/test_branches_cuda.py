@@ -28,7 +28,7 @@ def test_sorts_use_wide_states_above_the_limit(n, library):
     """The profiler names the kernels that ran, with the types of their states."""
     scene = Scene(n, views=1)
     rows = [r.cuda() if torch.is_tensor(r) else r for r in scene.project("cpu")]
-    splats = (rows[4], rows[5], rows[7], rows[6], rows[1], None, scene.grid())
+    splats = (rows[4], rows[5], rows[7], rows[6], rows[1], None, *scene.grid())
     n_isects = len(ops.intersect(*splats, -1)[0])
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         ops.intersect(*splats, n_isects)

@@ -12,10 +12,10 @@ def survey(scene, device="cuda", dtype=torch.float32, tile_size=16, begin=0, end
     projected = scene.project("cpu")
     splats = [projected.means2d, projected.conics, projected.opacities]
     grid = scene.grid(tile_size, begin, end)
-    lists = ops.intersect(*splats, projected.depths, projected.camera_ids, None, grid, -1)
+    lists = ops.intersect(*splats, projected.depths, projected.camera_ids, None, *grid, -1)
     moved = [t.to(device, dtype) for t in splats]
     lists = [t.to(device) for t in lists]
-    return moved, lists, grid, ops.contributions(*moved, *lists, grid, squares=True)
+    return moved, lists, grid, ops.contributions(*moved, *lists, *grid, squares=True)
 
 
 def test_a_crowded_scene_has_the_bits_of_its_image():
@@ -23,14 +23,14 @@ def test_a_crowded_scene_has_the_bits_of_its_image():
     scene = Scene(5000, width=170, height=110)
     splats, lists, grid, (weights, pixels, squares) = survey(scene)
     count = len(splats[0])
-    without = ops.contributions(*splats, *lists, grid)
+    without = ops.contributions(*splats, *lists, *grid)
     assert torch.equal(without[0], weights) and torch.equal(without[1], pixels) and not len(without[2])
     chosen = torch.randperm(count, generator=torch.Generator().manual_seed(1))[:64]
     assert pixels.max() > 256
     for four in chosen.view(-1, 4):
         channels = torch.zeros(count, 4, device="cuda")
         channels[four, torch.arange(4)] = 1
-        images = ops.rasterize_fwd(*splats, channels, None, *lists, grid, True, False)[0]
+        images = ops.rasterize_fwd(*splats, channels, None, *lists, *grid, True, False)[0]
         units = (images.double() * 2.0**32).round().long().sum((0, 1, 2))
         assert torch.equal(weights[four.cuda()], units)
         assert torch.equal(pixels[four.cuda()], (images > 0).sum((0, 1, 2)).int())
@@ -53,12 +53,12 @@ def test_repeats_and_adds_up():
     scene = Scene(20_000, views=4, width=500, height=300)
     splats, lists, grid, sums = survey(scene)
     for _ in range(20):
-        again = ops.contributions(*splats, *lists, grid, squares=True)
+        again = ops.contributions(*splats, *lists, *grid, squares=True)
         assert all(torch.equal(a, b) for a, b in zip(again, sums, strict=True))
     tiles = len(lists[1]) - 1
     cuts = [0, 1, 1, 90, tiles // 2, tiles]
     parts = [
-        ops.contributions(*splats, *lists, [*grid[:4], a, b], squares=True)
+        ops.contributions(*splats, *lists, *grid[:4], a, b, squares=True)
         for a, b in zip(cuts, cuts[1:], strict=False)
     ]
     assert all(torch.equal(sum(pieces), whole) for *pieces, whole in zip(*parts, sums, strict=True))
@@ -69,7 +69,7 @@ def test_entries_after_the_last_splat_are_not_read():
     count = len(splats[0])
     padded = [torch.cat((t, torch.full_like(t, float("nan")))) for t in splats]
     known = torch.tensor([count], device="cuda")
-    got = ops.contributions(*padded, *lists, grid, known, squares=True)
+    got = ops.contributions(*padded, *lists, *grid, known, squares=True)
     assert all(torch.equal(a[:count], b) and not a[count:].any() for a, b in zip(got, sums, strict=True))
 
 
@@ -83,7 +83,7 @@ def test_a_splat_over_every_pixel_fits():
     entries = torch.arange(3, dtype=torch.int32, device="cuda").repeat(tiles)
     offsets = torch.arange(0, 3 * tiles + 1, 3, device="cuda")
     weights, pixels, squares = ops.contributions(
-        means2d, conics, opacities, entries, offsets, grid, squares=True
+        means2d, conics, opacities, entries, offsets, *grid, squares=True
     )
     assert pixels.tolist() == [128 * 128, 128 * 128, 0]  # the third would take T below 1e-4
     alpha = torch.tensor(0.99)
@@ -96,4 +96,4 @@ def test_a_splat_over_every_pixel_fits():
 def test_other_tile_sizes_are_refused():
     splats, lists, grid, _ = survey(Scene(50), tile_size=16)
     with pytest.raises(RuntimeError, match="tile_size must be 16 on CUDA, got 64"):
-        ops.contributions(*splats, lists[0], lists[1][:13], [*grid[:3], 64, 0, -1])
+        ops.contributions(*splats, lists[0], lists[1][:13], *grid[:3], 64, 0, -1)

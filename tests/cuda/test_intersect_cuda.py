@@ -11,7 +11,7 @@ def lists(splats, grid, device, ids=None, count=-1):
     means2d, conics, depths, opacities = (splats[i].to(device) for i in (4, 5, 6, 7))
     entries, offsets = ops.intersect(
         means2d, conics, opacities, depths, splats[1].to(device), ids if ids is None else ids.to(device),
-        grid, count,
+        *grid, count,
     )  # fmt: skip
     offsets = offsets.cpu()
     return entries[: offsets[-1]].cpu(), offsets  # behind these nothing was written

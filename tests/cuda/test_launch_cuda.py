@@ -25,7 +25,7 @@ class Calls:
         )
         self.depths, self.cameras = projected[6], projected[1]
         means2d, conics, opacities, _ = self.splats
-        listed, _ = ops.intersect(means2d, conics, opacities, self.depths, self.cameras, None, self.grid, -1)
+        listed, _ = ops.intersect(means2d, conics, opacities, self.depths, self.cameras, None, *self.grid, -1)
         self.capacity = len(listed)
         size = (2, scene.height, scene.width, 3)
         self.targets = torch.randint(0, 256, size, generator=g, dtype=torch.uint8).cuda()
@@ -34,13 +34,13 @@ class Calls:
     def run(self) -> list[torch.Tensor]:
         means2d, conics, opacities, _ = self.splats
         lists = ops.intersect(
-            means2d, conics, opacities, self.depths, self.cameras, None, self.grid, self.capacity, None, True
+            means2d, conics, opacities, self.depths, self.cameras, None, *self.grid, self.capacity, None, True
         )
-        image = ops.rasterize_fwd(*self.splats, None, *lists, self.grid, True, False)
+        image = ops.rasterize_fwd(*self.splats, None, *lists, *self.grid, True, False)
         renders, rest, last, _, packed, order, _ = image
         _, v_renders = photometric_fwd_bwd(renders, self.targets, None, *self.weights)[:2]
         gradients = ops.rasterize_bwd(
-            self.splats, None, lists, [rest, last, packed, order], v_renders, None, self.grid, False, True
+            self.splats, None, lists, [rest, last, packed, order], v_renders, None, *self.grid, False, True
         )
         return [*lists, renders, rest, last, v_renders, *gradients[:4]]
 

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from blitzgs.frame import frame as pipeline
+from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.transport import LocalTransport
-from blitzgs.ops.capacity import CapacityEstimate, Sizes
+from blitzgs.ops.projection_types import Sizes, WeightedViews
 from blitzgs.ops.splat_gradients import gradient_columns
 from blitzgs.table.blocks import BlockIndex, morton_order
 from blitzgs.table.table import GaussianTable
@@ -31,15 +32,15 @@ def test_packed_gradients_equal_those_from_columns(degree):
     (packed,) = pipeline.backward_splats(frame, v_renders).parts
     assert packed.shape == (len(frame.splats.depths), 12)
     projected, grid = frame.projected, pipeline.tile_grid(views, options, None)
-    *unpacked, _ = ops.rasterize_bwd(*frame.saved, v_renders, None, grid, False, True)
+    *unpacked, _ = ops.rasterize_bwd(*frame.saved, v_renders, None, *grid, False, True)
     for x, y in zip(gradient_columns(packed), unpacked, strict=True):
         assert y.any() and torch.equal(x, y)
     scale_reg = torch.linspace(0.1, 0.3, 3, device="cuda")
     projection = options.projection(views)
     *expected, _ = ops.project_bwd(
-        list(table.parameters), [views.viewmats, views.Ks, scale_reg],
-        [projected.camera_ids, projected.visible_ids, projected.splat_offsets], projection.ints,
-        projection.floats, unpacked, None, False,
+        list(table.parameters), *WeightedViews(views.viewmats, views.Ks, scale_reg),
+        projected.camera_ids, projected.visible_ids, projected.splat_offsets, None, *projection,
+        unpacked, None, False,
     )  # fmt: skip
     gradients = parameter_gradients(table, frame, v_renders, scale_reg)
     for x, y in zip(gradients, expected, strict=True):
@@ -103,7 +104,8 @@ def test_an_active_set_that_did_not_fit_is_found_again():
     views, index, asked = cameras(3, device="cuda"), BlockIndex(table), []
     expected = pipeline.forward(table, views, OPTIONS)
 
-    def find(capacity_blocks):
+    def find(sizes):
+        capacity_blocks = None if sizes is None else sizes.blocks
         asked.append(capacity_blocks)
         return index.active(
             table, views.viewmats, views.Ks, views.width, views.height, OPTIONS.near_plane,
@@ -112,10 +114,7 @@ def test_an_active_set_that_did_not_fit_is_found_again():
 
     def rendered(transport):
         asked.clear()
-        for attempt in transport.capacity.attempts():
-            active = find(None if attempt.sizes is None else attempt.sizes.blocks)
-            frame = pipeline.forward_once(table, views, OPTIONS, active, None, transport, attempt)
-        return frame
+        return pipeline.forward(table, views, OPTIONS, find, transport=transport)
 
     blocks = int(find(None).blocks)
     assert blocks > 2

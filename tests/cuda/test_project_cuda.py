@@ -4,8 +4,7 @@
 import pytest
 import torch
 
-from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.projection_types import VIEW_TOTALS, splats_of
+from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, WeightedViews, splats_of
 from tests.cuda.scenes import Scene, ops, relative_error
 
 NAMES = ("gaussian_ids", "camera_ids", "visible_ids", "splat_offsets")
@@ -63,8 +62,8 @@ def test_gradients_match_float64(scene, degree, antialiased):
         *gradients, scale_reg = [t.to(device, dtype) for t in (*v, regularizer)]
         means2d, conics, depths, opacities, colors = gradients
         return ops.project_bwd(
-            inputs.gaussians, [*inputs.cameras, scale_reg], structure, inputs.options.ints,
-            inputs.options.floats, [means2d, conics, opacities, colors], depths, True,
+            inputs.gaussians, *WeightedViews(*inputs.cameras, scale_reg), *structure, None,
+            *inputs.options, [means2d, conics, opacities, colors], depths, True,
         )  # fmt: skip
 
     expected, gradients = backward("cpu", torch.float64), backward("cuda", torch.float32)
@@ -88,8 +87,8 @@ def test_nothing_visible(case):
     assert splats[3].tolist() == [0]
     inputs = scene.inputs("cuda")
     gradients = ops.project_bwd(
-        inputs.gaussians, list(inputs.cameras), [splats[i] for i in (1, 2, 3)], inputs.options.ints,
-        inputs.options.floats, [splats[i] for i in (4, 5, 7, 8)], splats.depths, True,
+        inputs.gaussians, *WeightedViews(*inputs.cameras), *splats[1:4], None,
+        *inputs.options, [splats[i] for i in (4, 5, 7, 8)], splats.depths, True,
     )  # fmt: skip
     assert gradients[0].shape == (0, 3)
     assert not gradients[5].any()

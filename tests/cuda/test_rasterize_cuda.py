@@ -28,7 +28,7 @@ class Job:
         self.splats = [splats[4], splats[5], splats[7], torch.rand(len(splats[0]), channels, generator=g)]
         self.backgrounds = torch.rand(len(scene.Ks), channels, generator=g)
         means2d, conics, opacities, _ = self.splats
-        self.lists = ops.intersect(means2d, conics, opacities, splats[6], splats[1], None, self.grid, -1)
+        self.lists = ops.intersect(means2d, conics, opacities, splats[6], splats[1], None, *self.grid, -1)
 
     def inputs(self, device, dtype):
         moved = [t.to(device, dtype) for t in (*self.splats, self.backgrounds)]
@@ -40,11 +40,11 @@ class Job:
         return RasterizeSaved(splats, backgrounds, [isect_splats, tile_offsets], kept_by(outputs))
 
     def forward(self, device, dtype=torch.float32, backward_follows=False):
-        return ops.rasterize_fwd(*self.inputs(device, dtype), self.grid, True, backward_follows)
+        return ops.rasterize_fwd(*self.inputs(device, dtype), *self.grid, True, backward_follows)
 
     def backward(self, device, dtype, saved, v_renders, v_alphas, absgrad, deterministic):
         v = [t.to(device, dtype) for t in (v_renders, v_alphas)]
-        return ops.rasterize_bwd(*self.saved(device, dtype, saved), *v, self.grid, absgrad, deterministic)
+        return ops.rasterize_bwd(*self.saved(device, dtype, saved), *v, *self.grid, absgrad, deterministic)
 
 
 def close_images(job):
@@ -93,8 +93,8 @@ def test_packed_gradients_are_the_same(scene, channels, absgrad):
     v_renders = torch.randn(renders.shape, generator=torch.Generator().manual_seed(7)).cuda()
     none = torch.zeros_like(rest)
     *columns, absolute = job.backward("cuda", torch.float32, saved, v_renders, none, absgrad, True)
-    arguments = *job.saved("cuda", torch.float32, saved), v_renders, job.grid
-    ops.rasterize_bwd_packed_(*arguments, True, table, absgrad)
+    arguments = *job.saved("cuda", torch.float32, saved), v_renders, None, *job.grid
+    ops.rasterize_bwd(*arguments, absgrad, True, table)
     assert torch.equal(table[:, : 6 + channels], torch.cat([c.view(len(c), -1) for c in columns], 1))
     if absgrad:
         assert absolute.any() and torch.equal(absolute_column(table), absolute)
@@ -125,9 +125,9 @@ def test_splats_of_many_channels_get_no_gradient_table(scene):
 def test_packed_gradients_have_four_channels_at_most(scene):
     job = Job(scene, 9)
     renders, *_, table = saved = job.forward("cuda")
-    arguments = *job.saved("cuda", torch.float32, saved), renders, job.grid
+    arguments = *job.saved("cuda", torch.float32, saved), renders, None, *job.grid
     with pytest.raises(RuntimeError, match="1 to 4 channels, got 9"):
-        ops.rasterize_bwd_packed_(*arguments, True, table)
+        ops.rasterize_bwd(*arguments, False, True, table)
 
 
 def test_deterministic_gradients_repeat(scene):

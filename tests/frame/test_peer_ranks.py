@@ -15,13 +15,13 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import Shared
 from blitzgs.frame import frame as pipeline
+from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.survey import survey
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.frame.transport import PeerTransport, peer
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, room_for
 from blitzgs.frame.transport.way_back import PeerWayBack
-from blitzgs.ops.capacity import CapacityEstimate, Sizes
-from blitzgs.ops.projection_types import VIEW_TOTALS
+from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes
 from blitzgs.ops.scatter import gather_splats, scatter_splats, words_of
 from blitzgs.table.table import GaussianTable
 from tests.frame.test_sharded_rendering import OPTIONS, cameras
@@ -104,14 +104,14 @@ def _send(columns, masks, everyone, rank, buffers, capacity):
 
 def _intersect(*arguments):
     """Replaces `intersect` for a capacity below the number of entries, which the CPU op refuses."""
-    *splats, grid, _, n_splats, _ = arguments
-    return INTERSECT(*splats, grid, -1, n_splats, True)
+    *given, _, n_splats, _ = arguments
+    return INTERSECT(*given, -1, n_splats, True)
 
 
 @pytest.fixture(autouse=True)
 def without_gpu(monkeypatch):
     monkeypatch.setattr(torch.ops.blitzgs, "send_splats_", _send)
-    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
+    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_", rasterize_into)
     monkeypatch.setattr(torch.ops.blitzgs, "intersect", _intersect)
     monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
     monkeypatch.setattr(peer, "current_stream", lambda _: None)

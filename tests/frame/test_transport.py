@@ -8,15 +8,16 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
+from blitzgs.frame.capacity import CapacityEstimate
+from blitzgs.frame.run import run
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.frame.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport, peer
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT
 from blitzgs.frame.transport.protocol import Traffic
 from blitzgs.frame.transport.way_back import CollectiveWayBack
-from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project_splats
-from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
+from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Sizes
 from blitzgs.ops.scatter import scatter_splats
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.distributed.rank_harness import run_ranks
@@ -78,12 +79,12 @@ def _round_trip(ranks, capacity):
     inputs = owned_by(scene(dtype=torch.float64), ranks.rank, ranks.world_size)
     transport = open_transport(ranks)
     assignment = TileAssignment(ranks, ranges_for(ranks.world_size))
-    attempt = Attempt(capacity)
-    exchange = transport.project_and_send(inputs, assignment, attempt)
+    exchange = transport.project_and_send(inputs, assignment, capacity)
     got = exchange.arrived.splats
     assert exchange.gradient_table is None
-    projected, splats, visible, traffic, way_back = exchange.finish()
-    assert attempt.fits and list(attempt.needed[:3]) == projected.counts.tolist()
+    needed, result = exchange.finish()
+    projected, splats, visible, traffic, way_back = result
+    assert list(needed[:3]) == projected.counts.tolist()
     assert splats is got and sum(traffic.received) == len(got.ids)
     for _ in range(2):
         way_back.check_still_valid()
@@ -165,7 +166,7 @@ def alone(monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
     monkeypatch.setattr(peer, "current_stream", lambda _: None)
-    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
+    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_", rasterize_into)
     return Ranks(memory=LoneMemory(64 * WORDS_PER_SPLAT))
 
 
@@ -175,13 +176,13 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
     transport = PeerTransport(alone)
 
     def finished():
-        for attempt in transport.capacity.attempts():
-            exchange = transport.project_and_send(inputs, assignment, attempt)
+        def check(exchange):
             arrived, table = exchange.arrived, exchange.gradient_table
             assert arrived.n_isects > 0 and len(arrived.splats.ids) >= len(table)
-            result = exchange.finish()
-            assert (result is None) != attempt.fits
-        return result, attempt.needed
+            return exchange
+
+        result, exchange = run(transport, lambda _: inputs, assignment, check)
+        return result, exchange.finish()[0]
 
     result, needed = finished()
     assert alone.memory.generation == 2  # the first attempt had too small a capacity
@@ -234,15 +235,15 @@ def test_traffic_of_uneven_ranks():
 def test_a_transport_that_does_not_serve_the_job_says_so():
     assignment = TileAssignment(Ranks(), ranges_for(1))
     with pytest.raises(ValueError, match="serves one rank"):
-        LocalTransport().project_and_send(scene(), assignment, Attempt(None))
+        LocalTransport().project_and_send(scene(), assignment, None)
     with pytest.raises(ValueError, match="need an assignment"):
-        CollectiveTransport(Ranks()).project_and_send(scene(), None, Attempt(None))
+        CollectiveTransport(Ranks()).project_and_send(scene(), None, None)
     with pytest.raises(ValueError, match="share no memory"):
         PeerTransport(Ranks())
 
 
 def test_one_rank_needs_no_way_back():
-    result = LocalTransport().project_and_send(scene(), None, Attempt(None)).finish()
+    _, result = LocalTransport().project_and_send(scene(), None, None).finish()
     assert result.way_back is None and result.traffic is None
 
 

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.shared_memory import Shared
+from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.protocol import Exchange, ExchangeResult, Mark, Transport, unmarked
-from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
-from blitzgs.ops.projection_types import ProjectionInputs
+from blitzgs.ops.projection_types import ProjectionInputs, Sizes
 
 
 class RecordingTransport:
@@ -32,33 +32,30 @@ class RecordingTransport:
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
-        attempt: Attempt,
+        sizes: Sizes | None,
         mark: Mark = unmarked,
     ) -> RecordingExchange:
         """See `Transport.project_and_send`."""
-        self.calls.append(("start", attempt.sizes))
-        return RecordingExchange(
-            self, self.inner.project_and_send(inputs, assignment, attempt, mark), attempt
-        )
+        self.calls.append(("start", sizes))
+        return RecordingExchange(self, self.inner.project_and_send(inputs, assignment, sizes, mark))
 
 
 class RecordingExchange:
     """An exchange of a `RecordingTransport`."""
 
-    def __init__(self, transport: RecordingTransport, inner: Exchange, attempt: Attempt) -> None:
+    def __init__(self, transport: RecordingTransport, inner: Exchange) -> None:
         """Wrap an exchange."""
-        self._transport, self._inner, self._attempt = transport, inner, attempt
+        self._transport, self._inner = transport, inner
         self.arrived, self.gradient_table = inner.arrived, inner.gradient_table
 
-    def finish(self) -> ExchangeResult | None:
+    def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """See `Exchange.finish`."""
         self._transport.calls.append(("finish", None))
-        result = self._inner.finish()
+        needed, result = self._inner.finish()
         if self._transport.too_small > 0:
             self._transport.too_small -= 1
-            self._attempt.fits = False
-            return None
-        return result
+            return needed, None
+        return needed, result
 
 
 class LoneMemory:
@@ -92,7 +89,7 @@ class IdleEvent:
 
 
 def rasterize_into(*arguments):
-    """Replaces `rasterize_fwd_packed_` on a CPU."""
+    """Replaces `rasterize_fwd_` on a CPU."""
     *rest, table, n_splats = arguments
     table[: int(n_splats)] = 0
     return torch.ops.blitzgs.rasterize_fwd(*rest, False, False, n_splats)[:6]

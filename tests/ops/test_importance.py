@@ -81,7 +81,7 @@ def test_parts_add_up_and_repeat(backend):
 def test_opcheck(squares):
     splats, lists, _ = lists_of(random_scene(20, 1, 40, 32))
     torch.library.opcheck(
-        torch.ops.blitzgs.contributions, (*splats, *lists, [1, 40, 32, 16, 0, -1], None, squares)
+        torch.ops.blitzgs.contributions, (*splats, *lists, 1, 40, 32, 16, 0, -1, None, squares)
     )
 
 

@@ -187,7 +187,7 @@ def test_errors_name_the_value():
     with pytest.raises(RuntimeError, match=r"range of the 30 tiles, got \[5, 31\)"):
         intersect(*splats.geometry(), tile_begin=5, tile_end=31, **options)
     with pytest.raises(RuntimeError, match=r"tile_size must be in \[1, 64\], got 0"):
-        torch.ops.blitzgs.intersect(*splats.geometry(), None, [1, WIDTH, HEIGHT, 0, 0, -1], -1)
+        torch.ops.blitzgs.intersect(*splats.geometry(), None, 1, WIDTH, HEIGHT, 0, 0, -1, -1)
     with pytest.raises(RuntimeError, match="tile numbers are 32-bit, got 4294967296 tiles"):
         intersect(*splats.geometry(), n_cameras=1, width=2**20, height=2**20)
 
@@ -197,5 +197,5 @@ def test_opcheck(known):
     splats = random_splats(20, WIDTH, HEIGHT)
     n_isects = len(intersect(*splats.geometry(), n_cameras=1, width=WIDTH, height=HEIGHT)[0]) if known else -1
     torch.library.opcheck(
-        torch.ops.blitzgs.intersect, (*splats.geometry(), None, [1, WIDTH, HEIGHT, 16, 0, -1], n_isects)
+        torch.ops.blitzgs.intersect, (*splats.geometry(), None, 1, WIDTH, HEIGHT, 16, 0, -1, n_isects)
     )

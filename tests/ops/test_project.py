@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project
-from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, ProjectionOptions
+from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, ProjectionOptions, WeightedViews
 from tests.helpers import BACKENDS, PARAMETERS, orbit_camera, random_scene, reference_images, relative_error
 
 FLOATS = ("means2d", "conics", "depths", "opacities", "colors")
@@ -194,8 +194,8 @@ def test_dense_gradients_equal_scattered_compact_ones(backend, degree, coefficie
     if sh is not None:
         gaussians, v_splats = [*gaussians, sh], [*v_splats, colors]
     arguments = (
-        gaussians, [scene.viewmats, scene.Ks], [splats.camera_ids, splats.visible_ids, splats.splat_offsets],
-        options.ints, options.floats, v_splats, depths[:, 0], True,
+        gaussians, *WeightedViews(scene.viewmats, scene.Ks), splats.camera_ids, splats.visible_ids,
+        splats.splat_offsets, None, *options, v_splats, depths[:, 0], True,
     )  # fmt: skip
     compact = torch.ops.blitzgs.project_bwd(*arguments)
     # The memory that is freed here, and probably used for the gradients, is not zero.
@@ -219,8 +219,8 @@ def test_regularisers_add_the_slopes_of_smallest_axis_and_opacity():
     options = ProjectionOptions(scene.width, scene.height)
     _, _, v_scales, v_opacities, _, _ = torch.ops.blitzgs.project_bwd(
         [scene.means, scene.quats, scene.scales, scene.opacities],
-        [scene.viewmats, scene.Ks, weights, others],
-        [splats.camera_ids, splats.visible_ids, splats.splat_offsets], options.ints, options.floats,
+        *WeightedViews(scene.viewmats, scene.Ks, weights, others),
+        splats.camera_ids, splats.visible_ids, splats.splat_offsets, None, *options,
         [zeros[:, :2], zeros, zeros[:, 0]], None, False,
     )  # fmt: skip
     log_scales, logits = scene.scales.requires_grad_(), scene.opacities.requires_grad_()
@@ -359,13 +359,13 @@ def test_opcheck():
         ids = torch.arange(10)
         arguments = (
             inputs.gaussians,
-            inputs.cameras,
-            [],
-            options.ints,
-            options.floats,
-            [0, 6],
-            [],
+            *inputs.cameras,
+            *[None] * 4,
             ids,
+            None,
+            *options,
+            [0, 6],
+            None,
             None,
         )
         # With gradients opcheck's own traced comparison cannot sum integer outputs; the next test is that
@@ -380,8 +380,7 @@ def test_groups_of_arguments_are_checked():
     inputs = inputs_of(random_scene(n=4, cameras=1))
     for change, text in (
         ({"gaussians": inputs.gaussians[:3]}, r"\(means, quats, scales, opacities\[, sh\]\), got 3 entries"),
-        ({"cameras": inputs.cameras[:1]}, r"\(viewmats, Ks\), got 1 entries"),
-        ({"active": [torch.arange(2, dtype=torch.int32)] * 5}, "got 5 entries"),
+        ({"active": (None, torch.arange(2, dtype=torch.int32))}, "active_views, .* need active_ids"),
         ({"ids": torch.arange(3)}, r"ids must have shape \[4\], got \[3\]"),
     ):
         with pytest.raises(RuntimeError, match=text):

@@ -72,7 +72,7 @@ class Scene:
 
     def backward_arguments(self, need_viewmats=False):
         return (
-            self.params, list(self.views()), self.splat_ids(), self.options.ints, self.options.floats,
+            self.params, *self.views(), *self.splat_ids(), None, *self.options,
             list(self.v.parts), None, need_viewmats,
         )  # fmt: skip
 
@@ -314,7 +314,7 @@ def test_opcheck():
     state, schedule = scene.state(), scene.schedule()
     torch.library.opcheck(
         torch.ops.blitzgs.project_bwd_step_,
-        (state.tensors, schedule.tables[:2], *schedule.constants(STEP), list(scene.views()),
-         scene.splat_ids(), scene.options.ints, scene.options.floats, list(scene.v.parts)),
+        (state.tensors, schedule.tables[:2], *schedule.constants(STEP), *scene.views(),
+         *scene.splat_ids(), None, *scene.options, list(scene.v.parts)),
     )  # fmt: skip
     torch.library.opcheck(torch.ops.blitzgs.project_bwd, scene.backward_arguments(True))

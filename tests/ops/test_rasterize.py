@@ -29,7 +29,12 @@ def forward(splats, n_cameras=1, tile_size=16, backgrounds=None, tile_begin=0, t
         *splats.values(),
         backgrounds,
         *tile_lists,
-        [n_cameras, WIDTH, HEIGHT, tile_size, tile_begin, tile_end],
+        n_cameras,
+        WIDTH,
+        HEIGHT,
+        tile_size,
+        tile_begin,
+        tile_end,
     )
 
 
@@ -44,7 +49,7 @@ def backward(
 ):
     return torch.ops.blitzgs.rasterize_bwd(
         splats.values(), backgrounds, lists(splats, n_cameras), kept_by(outputs), v_renders, v_alphas,
-        [n_cameras, WIDTH, HEIGHT, 16, *tiles], absgrad, True,
+        n_cameras, WIDTH, HEIGHT, 16, *tiles, absgrad, True,
     )  # fmt: skip
 
 
@@ -183,7 +188,7 @@ def test_last_ids_and_tile_work():
         alone = torch.zeros_like(offsets)
         alone[tile + 1 :] = work
         again = torch.ops.blitzgs.rasterize_fwd(
-            *splats.values(), None, shorter, alone, [1, WIDTH, HEIGHT, 16, tile, tile + 1]
+            *splats.values(), None, shorter, alone, 1, WIDTH, HEIGHT, 16, tile, tile + 1
         )
         assert torch.equal(again[2][0, y : y + 16, x : x + 16], last)
         assert again[3][tile] == work
@@ -192,7 +197,7 @@ def test_last_ids_and_tile_work():
             pixel = (last == last.max()).nonzero()[0]
             cut = alone.clamp(max=int(last.max()) - 1)
             less = torch.ops.blitzgs.rasterize_fwd(
-                *splats.values(), None, shorter, cut, [1, WIDTH, HEIGHT, 16, tile, tile + 1]
+                *splats.values(), None, shorter, cut, 1, WIDTH, HEIGHT, 16, tile, tile + 1
             )
             where = (0, y + pixel[0], x + pixel[1])
             assert less[1][where] > transmittances[where]
@@ -309,21 +314,19 @@ def test_zero_splats_and_empty_lists():
 def test_a_splat_that_is_not_finite_leaves_the_others_alone():
     splats = random_splats(40, WIDTH, HEIGHT)
     tile_lists = lists(splats)
-    clean = torch.ops.blitzgs.rasterize_fwd(
-        *splats.values(), None, *tile_lists, [1, WIDTH, HEIGHT, 16, 0, -1]
-    )
+    clean = torch.ops.blitzgs.rasterize_fwd(*splats.values(), None, *tile_lists, 1, WIDTH, HEIGHT, 16, 0, -1)
     victim = int(tile_lists[0][0])
     others = tile_lists[0] != victim
     kept = torch.tensor([int(others[: int(end)].sum()) for end in tile_lists[1]])
     expected = torch.ops.blitzgs.rasterize_fwd(
-        *splats.values(), None, tile_lists[0][others], kept, [1, WIDTH, HEIGHT, 16, 0, -1]
+        *splats.values(), None, tile_lists[0][others], kept, 1, WIDTH, HEIGHT, 16, 0, -1
     )
     assert not torch.equal(clean[0], expected[0])
     for column in ("means2d", "conics", "opacities"):
         broken = Splats(*(t.clone() for t in vars(splats).values()))
         getattr(broken, column)[victim] = float("nan")
         found = torch.ops.blitzgs.rasterize_fwd(
-            *broken.values(), None, *tile_lists, [1, WIDTH, HEIGHT, 16, 0, -1]
+            *broken.values(), None, *tile_lists, 1, WIDTH, HEIGHT, 16, 0, -1
         )
         assert torch.equal(found[0], expected[0])
         outputs = backward_with(broken, tile_lists, found)
@@ -333,7 +336,7 @@ def test_a_splat_that_is_not_finite_leaves_the_others_alone():
 def backward_with(splats, tile_lists, outputs):
     return torch.ops.blitzgs.rasterize_bwd(
         splats.values(), None, tile_lists, kept_by(outputs), torch.ones_like(outputs[0]), None,
-        [1, WIDTH, HEIGHT, 16, 0, -1], True, True,
+        1, WIDTH, HEIGHT, 16, 0, -1, True, True,
     )  # fmt: skip
 
 
@@ -400,9 +403,9 @@ def test_columns_of_no_table_are_not_one():
 
 def test_the_images_do_not_depend_on_a_backward_pass_to_follow():
     splats = random_splats(100, WIDTH, HEIGHT)
-    grid = [1, WIDTH, HEIGHT, 16, 0, -1]
+    grid = 1, WIDTH, HEIGHT, 16, 0, -1
     plain, prepared = (
-        torch.ops.blitzgs.rasterize_fwd(*splats.values(), None, *lists(splats), grid, True, follows)
+        torch.ops.blitzgs.rasterize_fwd(*splats.values(), None, *lists(splats), *grid, True, follows)
         for follows in (False, True)
     )
     for x, y in zip(plain[:4], prepared[:4], strict=True):
@@ -416,7 +419,7 @@ def test_opcheck(absgrad):
     values = [t.requires_grad_() for t in splats.values()]
     backgrounds = torch.rand(1, 3, requires_grad=True)
     tile_lists = lists(splats)
-    arguments = (*values, backgrounds, *tile_lists, [1, WIDTH, HEIGHT, 16, 0, -1])
+    arguments = (*values, backgrounds, *tile_lists, 1, WIDTH, HEIGHT, 16, 0, -1)
     torch.library.opcheck(torch.ops.blitzgs.rasterize_fwd, arguments)
     torch.library.opcheck(torch.ops.blitzgs.rasterize_fwd, (*arguments, False, True))
     with torch.no_grad():
@@ -424,5 +427,5 @@ def test_opcheck(absgrad):
         torch.library.opcheck(
             torch.ops.blitzgs.rasterize_bwd,
             ([t.detach() for t in values], None, tile_lists, kept_by(outputs), outputs[0], None,
-             [1, WIDTH, HEIGHT, 16, 0, -1], absgrad, False),
+             1, WIDTH, HEIGHT, 16, 0, -1, absgrad, False),
         )  # fmt: skip

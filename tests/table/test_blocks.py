@@ -356,6 +356,6 @@ def test_opcheck(device):
     utilities = ("test_schema", "test_autograd_registration", "test_faketensor")
     torch.library.opcheck(
         torch.ops.blitzgs.cull_blocks,
-        (bounds, rows, [viewmats, Ks], [WIDTH, HEIGHT], [NEAR, FAR, 0.3]),
+        (bounds, rows, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR, 0.3),
         test_utils=utilities,
     )

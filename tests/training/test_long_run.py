@@ -18,6 +18,7 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import RenderOptions
+from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.views import Space, ViewSet
@@ -94,8 +95,8 @@ class DenseAdam:
         """Take a step with the gradients that the trainer's optimiser gets next."""
         splats, options = frame.projected, frame.options.projection(frame.views)
         *v, _ = torch.ops.blitzgs.project_bwd(
-            list(table.parameters), [frame.views.viewmats, frame.views.Ks, scale_reg],
-            [splats.camera_ids, splats.visible_ids, splats.splat_offsets], options.ints, options.floats,
+            list(table.parameters), *WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg),
+            splats.camera_ids, splats.visible_ids, splats.splat_offsets, None, *options,
             list(gradients.parts), None, False,
         )  # fmt: skip
         self.move.grad.zero_().index_copy_(0, splats.visible_ids.long(), flat(v))

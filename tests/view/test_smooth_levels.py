@@ -196,8 +196,8 @@ def test_opcheck(device):
     table = faint_scene(50, device)
     viewmats, Ks = make_views(2, device)
     options = FADED.projection(Views(viewmats, Ks, WIDTH, HEIGHT))
-    arguments = (list(table.parameters), [viewmats, Ks], [], options.ints, options.floats, [], [], None)
+    arguments = (list(table.parameters), viewmats, Ks, *[None] * 5, table["level"], *options, [], None, None)
     torch.library.opcheck(
-        torch.ops.blitzgs.project_fwd, (*arguments, table["level"]),
+        torch.ops.blitzgs.project_fwd, arguments,
         test_utils=("test_schema", "test_faketensor", "test_autograd_registration"),
     )  # fmt: skip

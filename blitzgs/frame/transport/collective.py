@@ -7,12 +7,12 @@ import torch.distributed as dist
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.protocol import Arrived, ExchangeResult, Mark, Traffic, unmarked
 from blitzgs.frame.transport.way_back import CollectiveWayBack
-from blitzgs.ops.capacity import Attempt, CapacityEstimate
 from blitzgs.ops.host import to_host
-from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Splats
+from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats
 from blitzgs.ops.scatter import gather_splats, scatter_splats, words_per_splat
 
 
@@ -35,13 +35,13 @@ class CollectiveTransport:
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
-        attempt: Attempt,
+        sizes: Sizes | None,
         mark: Mark = unmarked,
     ) -> CollectiveExchange:
         """See `Transport.project_and_send`."""
         if assignment is None:
             raise ValueError("several ranks need an assignment of tiles")
-        return CollectiveExchange(self._ranks, inputs, assignment, attempt, mark)
+        return CollectiveExchange(self._ranks, inputs, assignment, sizes, mark)
 
 
 class CollectiveExchange:
@@ -52,11 +52,11 @@ class CollectiveExchange:
         ranks: Ranks,
         inputs: ProjectionInputs,
         assignment: TileAssignment,
-        attempt: Attempt,
+        sizes: Sizes | None,
         mark: Mark,
     ) -> None:
         """Project, exchange the numbers of splats, and send the splats."""
-        sizes, tiles, n_views = attempt.sizes, assignment.composited_by_rank, assignment.ranges.n_views
+        tiles, n_views = assignment.composited_by_rank, assignment.ranges.n_views
         # Without sizes the projection waits for the device, which may still wait for other ranks.
         with ranks.watchdog.waiting("project"):
             projected = inputs.run(sizes, tiles)
@@ -69,11 +69,9 @@ class CollectiveExchange:
             visible = everyone[:, VIEW_TOTALS : VIEW_TOTALS + n_views].sum(0)
             totals = to_host(everyone).tolist()
         traffic = Traffic.of(totals, n_views, ranks.rank)
-        needed = traffic.own._replace(blocks=traffic.most_blocks)
+        self._needed = needed = traffic.own._replace(blocks=traffic.most_blocks)
         if sizes is not None and not sizes.holds(needed[:2]):
             projected = inputs.run(None, tiles)  # no queued work waits for another rank now
-        # All ranks decide the same, because they have estimated the same number of blocks.
-        attempt.end(needed, sizes is None or needed.blocks <= sizes.blocks)
         mark("project")
         projected = projected.first(needed)
         own, sent = projected.splats, projected.for_compositing
@@ -89,11 +87,12 @@ class CollectiveExchange:
         self.gradient_table: Tensor | None = None
         self.arrived = Arrived(splats, None, traffic.n_isects)
         self._result: ExchangeResult | None = None
-        if attempt.fits:
+        # All ranks decide the same, because they have estimated the same number of blocks.
+        if sizes is None or needed.blocks <= sizes.blocks:
             way_back = CollectiveWayBack(ranks, traffic, places)
             self._result = ExchangeResult(own, splats, visible, traffic, way_back)
         mark("exchange")
 
-    def finish(self) -> ExchangeResult | None:
+    def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """See `Exchange.finish`; the host has known all numbers since the splats were sent."""
-        return self._result
+        return self._needed, self._result

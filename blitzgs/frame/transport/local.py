@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.protocol import Arrived, ExchangeResult, Mark, unmarked
-from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.host import HostCopy
-from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs
+from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes
 
 
 class LocalTransport:
@@ -23,40 +23,51 @@ class LocalTransport:
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
-        attempt: Attempt,
+        sizes: Sizes | None,
         mark: Mark = unmarked,
     ) -> LocalExchange:
         """See `Transport.project_and_send`."""
         if assignment is not None:
             raise ValueError("a local transport serves one rank, which composites all tiles")
-        return LocalExchange(inputs, attempt, mark)
+        return LocalExchange(inputs, sizes, mark)
 
 
 class LocalExchange:
-    """See `Exchange`."""
+    """See `Exchange`.
 
-    def __init__(self, inputs: ProjectionInputs, attempt: Attempt, mark: Mark) -> None:
+    Attributes:
+        projected: the projection, of which `arrived` has the columns that compositing reads.
+    """
+
+    def __init__(self, inputs: ProjectionInputs, sizes: Sizes | None, mark: Mark) -> None:
         """Project."""
         # On the CPU the sizes are known at once, so no estimate is needed.
-        self._attempt, self._capacity = attempt, attempt.sizes if inputs.gaussians[0].is_cuda else None
-        self._projected = projected = inputs.run(self._capacity)
-        self._visible = projected.totals[VIEW_TOTALS : VIEW_TOTALS + inputs.n_views]
+        self._capacity = sizes if inputs.gaussians[0].is_cuda else None
+        self.projected = projected = inputs.run(self._capacity)
+        self._n_views = inputs.n_views
+        self._totals: list[int] | None = None
         splats = projected.for_compositing
         self._copy = HostCopy(projected.totals)
         mark("project")
         if self._capacity is None:
-            self.arrived = Arrived(splats, None, int(self._copy.read()[2]))
+            self.arrived = Arrived(splats, None, self.totals()[2])
         else:
             self.arrived = Arrived(splats, projected.n_splats, self._capacity.isects)
         self.gradient_table: Tensor | None = None
         mark("exchange")
 
-    def finish(self) -> ExchangeResult | None:
+    def totals(self) -> list[int]:
+        """Wait for `ProjectionOutputs.totals`."""
+        if self._totals is None:
+            self._totals = self._copy.read().tolist()
+        return self._totals
+
+    def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """See `Exchange.finish`."""
-        needed = Sizes(*self._copy.read()[:VIEW_TOTALS].tolist())
-        fits = self._capacity is None or self._capacity.holds(needed)
-        self._attempt.end(needed, fits)
-        if not fits:
-            return None  # the splats are undefined
-        own = self._projected.first(needed)
-        return ExchangeResult(own.splats, own.for_compositing, self._visible, None, None)
+        needed = Sizes(*self.totals()[:VIEW_TOTALS])
+        if self._capacity is not None and not self._capacity.holds(needed):
+            return needed, None  # the splats are undefined
+        own = self.projected.first(needed, self._copy.read()[:3])
+        composited = self.arrived.splats if self._capacity is None else own.for_compositing
+        visible = own.totals[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
+        return needed, ExchangeResult(own.splats, composited, visible, None, None)

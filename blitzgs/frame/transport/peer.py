@@ -44,12 +44,12 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.protocol import Arrived, ExchangeResult, Mark, Traffic, unmarked
 from blitzgs.frame.transport.way_back import PeerWayBack
-from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.host import current_stream
-from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Splats, splats_of
+from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
 
@@ -125,21 +125,21 @@ class PeerTransport:
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
-        attempt: Attempt,
+        sizes: Sizes | None,
         mark: Mark = unmarked,
     ) -> PeerExchange:
         """See `Transport.project_and_send`."""
         if assignment is None:
             raise ValueError("several ranks need an assignment of tiles")
-        if attempt.sizes is not None:
+        if sizes is not None:
             present = self._memory.buffers[0].shape[0]
-            words = room_for(attempt.sizes.splats, present)
+            words = room_for(sizes.splats, present)
             if words > present:
                 with self._ranks.watchdog.waiting("reserve"):
                     self._memory.reserve(words)
         if self._buffers is None or self._buffers.buffers[0] is not self._memory.buffers[0]:
             self._buffers = PeerBuffers(self._memory.buffers, self._ranks.rank)
-        return PeerExchange(self._ranks, self._buffers, self._counted, inputs, assignment, attempt, mark)
+        return PeerExchange(self._ranks, self._buffers, self._counted, inputs, assignment, sizes, mark)
 
 
 class PeerExchange:
@@ -152,13 +152,13 @@ class PeerExchange:
         counted: torch.cuda.Event,
         inputs: ProjectionInputs,
         assignment: TileAssignment,
-        attempt: Attempt,
+        sizes: Sizes | None,
         mark: Mark,
     ) -> None:
         """Queue the projection and the writing of the splats; record `counted` behind the counts."""
         assert ranks.memory is not None  # see `PeerTransport`
         self._memory = memory = ranks.memory
-        self._ranks, self._buffers, self._counted, self._attempt = ranks, buffers, counted, attempt
+        self._ranks, self._buffers, self._counted, self._sizes = ranks, buffers, counted, sizes
         self._n_views = inputs.n_views
         self._traffic: Traffic | None = None
         capacity = Sizes(buffers.length, buffers.length, 0)
@@ -174,27 +174,27 @@ class PeerExchange:
         memory.generation += 1
         self._generation = memory.generation
         mark("project")
-        n_isects = self._read().n_isects if attempt.sizes is None else attempt.sizes.isects
+        n_isects = self._read().n_isects if sizes is None else sizes.isects
         self.arrived = Arrived(buffers.splats, plan[:1], n_isects)
         self.gradient_table: Tensor | None = buffers.tables[ranks.rank]
         mark("exchange")
 
-    def finish(self) -> ExchangeResult | None:
+    def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """See `Exchange.finish`."""
-        traffic, sizes = self._read(), self._attempt.sizes
+        traffic, sizes = self._read(), self._sizes
         fits = traffic.most <= self._buffers.length
         if sizes is not None:
             fits = fits and traffic.most_isects <= sizes.isects and traffic.most_blocks <= sizes.blocks
-        self._attempt.end(traffic.needed, fits)
         if not fits:
-            return None
+            return traffic.needed, None
         visible = self._shared.sums[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
         composited = self._buffers.splats.first(sum(traffic.received))
         way_back = PeerWayBack(
             self._ranks, self._memory, self._generation, self._buffers.tables, traffic,
             self._places[: runs_of(traffic.own.splats)],
         )  # fmt: skip
-        return ExchangeResult(splats_of(self._own, traffic.own), composited, visible, traffic, way_back)
+        own = splats_of(self._own, traffic.own)
+        return traffic.needed, ExchangeResult(own, composited, visible, traffic, way_back)
 
     def _read(self) -> Traffic:
         """Wait for the counts of all ranks."""

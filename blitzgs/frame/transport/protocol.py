@@ -5,14 +5,14 @@ Every rank projects the Gaussians that it owns. Each splat (a Gaussian in a view
 that composite tiles which it touches, and its gradient is returned (BlitzGS, section 3.1). The calls of one
 frame, on every rank::
 
-    exchange = transport.project_and_send(inputs, assignment, attempt, mark)
+    exchange = transport.project_and_send(inputs, assignment, sizes, mark)
     exchange.arrived, exchange.gradient_table                # for compositing
-    result = exchange.finish()                               # None: the capacity was too small
+    needed, result = exchange.finish()                       # result None: the capacity was too small
     result.way_back.check_still_valid()                      # before the backward pass of compositing
     gradients = result.way_back.return_gradients(gradients)  # gradients of this rank's own splats
 
-The last two may be repeated. `local`, `collective` and `peer` each have one transport; `way_back` returns the
-gradients for the last two.
+`blitzgs.frame.run` makes the first three, and the last two may be repeated. `local`, `collective` and `peer`
+each have one transport; `way_back` returns the gradients for the latter two.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
+from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
-from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, Splats
+from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, Sizes, Splats
 from blitzgs.ops.splat_gradients import SplatGradients
 
 # Called at the end of each stage of a step with the stage's name, for benchmarks.
@@ -131,11 +131,12 @@ class Exchange(Protocol):
     arrived: Arrived
     gradient_table: Tensor | None
 
-    def finish(self) -> ExchangeResult | None:
-        """Wait for the numbers and end the attempt.
+    def finish(self) -> tuple[Sizes, ExchangeResult | None]:
+        """Wait for the numbers.
 
         Returns:
-            The result; None if the capacity was too small and the frame must be started again.
+            The sizes that the frame needs, from which `Transport.capacity` learns; and the result, None if
+            the capacity was too small and the frame must be started again.
         """
 
 
@@ -184,7 +185,7 @@ class Transport(Protocol):
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
-        attempt: Attempt,
+        sizes: Sizes | None,
         mark: Mark = unmarked,
     ) -> Exchange:
         """Project this rank's Gaussians and send the splats to the ranks that composite them. Collective.
@@ -192,6 +193,6 @@ class Transport(Protocol):
         Args:
             inputs: inputs of the projection, with the Gaussians' ids.
             assignment: the tiles of each rank; None: this rank composites all tiles.
-            attempt: the sizes to allocate; without sizes the host first waits for the numbers.
+            sizes: the sizes to allocate; None: the host first waits for the numbers.
             mark: called at the end of the stages "project" and "exchange".
         """

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The op list_and_rasterize is intersect (intersect.h), then rasterize_fwd (rasterize.h), then this kernel:
+// The op render is what follows the projection of a call: the colours of the splats from gathered rows
+// (color_rows.h, project.h), intersect (intersect.h), rasterize_fwd (rasterize.h), and this kernel:
 // alphas[i] = 1 - transmittances[i], 0 <= i < n.
 #pragma once
 #include <cstdint>

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "render/list_and_rasterize.h"
+#include "render/render.h"
 
 #include "common/parallel.h"
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/cuda.cuh"
-#include "render/list_and_rasterize.h"
+#include "render/render.h"
 
 namespace blitzgs::cuda {
 
@@ -21,8 +21,8 @@ __global__ void __launch_bounds__(kThreads)
 template <>
 void alphas_of<float>(const float* transmittances, std::int64_t n, float* alphas, CudaStream stream) {
   if (n == 0) return;
-  launch_early("list_and_rasterize", alphas_kernel, {blocks_for(n, kThreads), kThreads, stream},
-               transmittances, n, alphas);
+  launch_early("render", alphas_kernel, {blocks_for(n, kThreads), kThreads, stream}, transmittances, n,
+               alphas);
 }
 
 }  // namespace blitzgs::cuda

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command `blitzgs view`: look at a model in the browser."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, named_path
+from blitzgs.distributed.group import Ranks, resolve_device
+from blitzgs.runs import files as run_files
+from blitzgs.training.inputs import open_capture
+
+HELP = """\
+Look at a model in the browser. MODEL is the folder of a run, a checkpoint in it, or a PLY file of Gaussians.
+The machine that holds the model renders, on its GPU or its CPU; the browser may be on another one:
+
+  blitzgs view RUN                               # then open http://localhost:8080
+  ssh -L 8080:localhost:8080 MACHINE blitzgs view RUN
+  blitzgs view RUN --host 0.0.0.0                # prints an address with a token; without it nobody gets in
+
+Needs the package viser: pip install "blitzgs[view]".
+"""
+
+
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
+    """Add the command."""
+    parser = add_command(commands, "view", run, summary, HELP)
+    parser.add_argument("model", type=named_path, metavar="MODEL", help="run, checkpoint or PLY file")
+    add_address(parser)
+    add_capture(parser)
+    parser.add_argument(
+        "--paths",
+        type=named_path,
+        metavar="DIR",
+        help="folder for camera paths and screenshots (default: RUN/paths, or the folder of the PLY file)",
+    )
+    add_device(parser)
+
+
+def add_address(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the address to listen on."""
+    parser.add_argument(
+        "--port", type=int, default=8080, help="port to listen on; 0: any (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on (default: %(default)s, this machine only)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show a model until Ctrl-C; returns the exit status."""
+    from blitzgs.viewer.page import require_viser
+
+    require_viser()
+    from blitzgs.viewer.studio import Studio, open_model
+
+    device, _ = resolve_device(args.device, local_rank=0, local_world_size=1, share_gpus=False)
+    ranks = Ranks(device=device)
+    model: Path = args.model
+    photograph = None if model.is_file() else photographs(_run_of(model), args.data)
+    studio = Studio(open_model(model, ranks, photograph, args.paths), args.host, args.port)
+    print(f"{model}: open {studio.page.url} (Ctrl-C ends)", flush=True)
+    try:
+        while True:
+            time.sleep(3600)
+    except KeyboardInterrupt:
+        print()
+    finally:
+        studio.close()
+    return 0
+
+
+def _run_of(model: Path) -> Path:
+    """Return the folder of the run of a run's folder or a checkpoint."""
+    inside = model.resolve().parent
+    return inside.parent if inside.name == run_files.CHECKPOINTS else model
+
+
+def photographs(folder: Path, data: Path | None) -> Callable[[int], npt.NDArray[np.uint8]] | None:
+    """Return a function that reads the photographs of a run's cameras; None if the capture is not there."""
+    import dataclasses
+
+    from blitzgs.config.files import load_config
+
+    try:
+        config = load_config(folder / run_files.CONFIG)
+        if data is not None:
+            config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
+        _, images = open_capture(config, Ranks(), "--data DIR")
+    except (OSError, ValueError) as error:
+        print(f"no photographs to compare with: {error}")
+        return None
+    return lambda index: np.asarray(images.get(index).numpy())

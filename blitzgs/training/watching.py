@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Serves those who watch a training: draws pictures between two steps, pauses and saves on request."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.runs.lod import scene_gate
+from blitzgs.runs.watch import Watcher, Wish
+from blitzgs.table.pool import Pool
+from blitzgs.training.events import save
+from blitzgs.training.state import TrainingState
+from blitzgs.view.draw import Drawer, Subject
+from blitzgs.view.look import Look, Picture
+
+T = TypeVar("T")
+# Seconds between two questions to the watcher while the training is paused and nothing is to be drawn.
+_PAUSE_SECONDS = 0.03
+
+
+class Watching:
+    """Stands between a training and its watcher; every rank has one, and rank 0's knows the watcher."""
+
+    def __init__(self, state: TrainingState, watcher: Watcher | None) -> None:
+        """Prepare; `watcher` is None on ranks other than 0."""
+        self._state, self._watcher = state, watcher
+
+    def wants(self) -> bool:
+        """Tell whether this rank's watcher has a wish."""
+        return self._watcher is not None and bool(self._asked(lambda watcher: watcher.wants(), False))
+
+    def told(self, t: int, values: Mapping[str, Any]) -> None:
+        """Pass a record of the log on."""
+        self._asked(lambda watcher: watcher.told(t, values), None)
+
+    def serve(self, stops: Callable[[], bool]) -> None:
+        """Fulfil what the watcher wants between two steps; every rank calls this together.
+
+        Args:
+            stops: returns whether the run has to stop, the same on every rank.
+        """
+        wish = self._next()
+        if wish.pause:
+            with self._state.paused_clock():
+                while wish.pause and not stops():
+                    self._fulfil(wish)
+                    if wish.look is None:
+                        time.sleep(_PAUSE_SECONDS)
+                    wish = self._next()
+        if not wish.pause:
+            self._fulfil(wish)
+
+    def close(self) -> None:
+        """Tell the watcher that the training has ended."""
+        self._asked(lambda watcher: watcher.close(), None)
+        self._watcher = None
+
+    def _next(self) -> Wish:
+        wish = self._asked(lambda watcher: watcher.wish(), Wish())
+        return self._state.ranks.broadcast_object(wish)
+
+    def _fulfil(self, wish: Wish) -> None:
+        if wish.save:
+            save.run(self._state)
+        if wish.look is None:
+            return
+        begin, look = time.perf_counter(), wish.look
+        try:
+            picture = self._drawn(look)
+        except RuntimeError as error:
+            if self._state.ranks.world_size > 1:
+                raise  # the other ranks are in the middle of the picture
+            reason = str(error)
+            self._asked(lambda watcher: watcher.failed(reason), None)
+            return
+        if picture is not None:
+            shown, seconds = picture, time.perf_counter() - begin
+            self._asked(lambda watcher: watcher.show(shown, seconds), None)
+
+    def _drawn(self, look: Look) -> Picture | None:
+        state = self._state
+        scene = state.stepper.scene
+        if isinstance(scene, Pool):
+            # The pool is filled for the view, and written back with nothing pending.
+            state.catch_up()
+        lod = scene_gate(state.config, state.progress, state.table, state.ranks)
+        subject = Subject(scene, state.render_options, state.space.unit, lod)
+        return Drawer(subject, TileOwners(state.ranks)).draw(look)
+
+    def _asked(self, call: Callable[[Watcher], T], otherwise: T) -> T:
+        """Call the watcher; without one, or if it fails, return `otherwise`. After an error it is gone."""
+        if self._watcher is None:
+            return otherwise
+        try:
+            return call(self._watcher)
+        except Exception as error:
+            watcher, self._watcher = self._watcher, None
+            warnings.warn(
+                f"the viewer failed ({type(error).__name__}: {error}); training goes on without it",
+                stacklevel=3,
+            )
+            with contextlib.suppress(Exception):
+                watcher.close()
+            return otherwise

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a viewer asks to see of a model, and the picture that answers it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+Mode = Literal["RGB", "depth", "alpha", "count", "level"]
+MODES: tuple[Mode, ...] = get_args(Mode)
+# Pictures have at most this many pixels on a side.
+MOST_PIXELS = 8192
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """One view of a model, with what to show of it; lengths in trained units.
+
+    Attributes:
+        viewmat: trained world to camera, float64 [4, 4].
+        K: intrinsics in pixels, float64 [3, 3].
+        width: pixels.
+        height: pixels.
+        mode: "RGB"; "depth", the expected depth in the capture's unit; "alpha", the opacity; "count", how
+            many entries of its tile's list a pixel goes through; "level", RGB with a colour for each octree
+            level.
+        sh_degree: spherical-harmonics degree; None: the model's. At most the model's is used.
+        background: RGB in [0, 1]; None: the model's.
+        lod: apply the model's LOD gate, if it has one.
+        smooth: fade the levels of the gate; None: as the model was trained.
+        crop: two opposite corners of a box; Gaussians with their centres outside are left out. None: none
+            are.
+        near: near plane; None: the model's.
+        far: far plane; None: the model's.
+    """
+
+    viewmat: npt.NDArray[np.float64]
+    K: npt.NDArray[np.float64]
+    width: int
+    height: int
+    mode: Mode = "RGB"
+    sh_degree: int | None = None
+    background: tuple[float, float, float] | None = None
+    lod: bool = True
+    smooth: bool | None = None
+    crop: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    near: float | None = None
+    far: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values, which come from a browser.
+
+        Raises:
+            ValueError: a value is impossible; the message names it.
+        """
+        if self.mode not in MODES:
+            raise ValueError(f"mode must be one of {', '.join(MODES)}, got {self.mode!r}")
+        for name, size in (("width", self.width), ("height", self.height)):
+            if not 1 <= size <= MOST_PIXELS:
+                raise ValueError(f"{name} must be from 1 to {MOST_PIXELS}, got {size}")
+        for name, matrix, shape in (("viewmat", self.viewmat, (4, 4)), ("K", self.K, (3, 3))):
+            if matrix.shape != shape or not np.isfinite(matrix).all():
+                raise ValueError(f"{name} must be a finite matrix {shape}, got {matrix.tolist()}")
+        if min(self.K[0, 0], self.K[1, 1]) <= 0:
+            raise ValueError(f"K must have positive focal lengths, got {self.K.tolist()}")
+        near, far = self.near or 0.0, self.far or np.inf
+        if not 0 <= near < far:
+            raise ValueError(f"the near plane must be before the far plane, got {near} and {far}")
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A rendered `Look`.
+
+    Attributes:
+        values: uint8 [H, W, 3] for "RGB" and "level"; else float32 [H, W]: depth in the capture's unit (0
+            where nothing is), opacity in [0, 1], or a number of entries.
+        gaussians: number of Gaussians that the view sees.
+        milliseconds: time that rendering took, with the copy to the host.
+    """
+
+    values: npt.NDArray[np.uint8] | npt.NDArray[np.float32]
+    gaussians: int
+    milliseconds: float

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one port of the page: lets in who may, and passes their bytes on to the web server behind it.
+
+Without a token, only pages and programs that name this machine as localhost get in; a web site that the
+browser shows at the same time does not. With a token, the page's address begins with it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import ipaddress
+import threading
+from urllib.parse import urlsplit
+
+_MOST_HEAD = 32_768
+_HEAD_SECONDS = 15.0
+_CHUNK = 1 << 18
+
+
+class Door:
+    """Listens on an address, and forwards to a port of 127.0.0.1.
+
+    Attributes:
+        port: the port that it listens on.
+    """
+
+    def __init__(self, host: str, port: int, behind: int, token: str) -> None:
+        """Listen.
+
+        Args:
+            host: address of this machine.
+            port: 0: any free one.
+            behind: port of 127.0.0.1 to forward to.
+            token: beginning of the address's path; empty: none is needed.
+
+        Raises:
+            OSError: the address is not this machine's, or the port is in use.
+        """
+        self._behind, self._token, self.port = behind, token, port
+        self._loop = asyncio.new_event_loop()
+        self._open: set[asyncio.Task[None]] = set()
+        started: list[OSError | None] = []
+        ready = threading.Event()
+        self._thread = threading.Thread(
+            target=self._serve, args=(host, port, started, ready), daemon=True, name="viewer door"
+        )
+        self._thread.start()
+        ready.wait()
+        if started[0] is not None:
+            raise OSError(f"the viewer cannot listen on {host}:{port}: {started[0]}") from started[0]
+
+    def close(self) -> None:
+        """Stop listening and end all connections."""
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(timeout=2)
+
+    def _serve(self, host: str, port: int, started: list[OSError | None], ready: threading.Event) -> None:
+        asyncio.set_event_loop(self._loop)
+        try:
+            server = self._loop.run_until_complete(asyncio.start_server(self._visit, host, port))
+            self.port = server.sockets[0].getsockname()[1]
+        except (OSError, OverflowError) as error:
+            started.append(error if isinstance(error, OSError) else OSError(str(error)))
+            ready.set()
+            return
+        started.append(None)
+        ready.set()
+        try:
+            self._loop.run_forever()
+        finally:
+            server.close()
+            for task in self._open:
+                task.cancel()
+            self._loop.run_until_complete(asyncio.gather(*self._open, return_exceptions=True))
+            self._loop.close()
+
+    async def _visit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._open.add(task)
+        try:
+            with contextlib.suppress(
+                OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, TimeoutError
+            ):
+                head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_SECONDS)
+                answer, passed = self._judged(head[:_MOST_HEAD].decode("latin-1"))
+                if passed is None:
+                    writer.write(answer)
+                    await writer.drain()
+                else:
+                    await self._pass_on(passed, reader, writer)
+        except asyncio.CancelledError:
+            pass
+        finally:
+            self._open.discard(task)
+            with contextlib.suppress(OSError, RuntimeError):
+                writer.close()
+
+    def _judged(self, head: str) -> tuple[bytes, bytes | None]:
+        """Return an answer, or the request to pass on."""
+        first, *lines = head.split("\r\n")
+        headers = {
+            name.strip().lower(): value.strip() for name, _, value in (line.partition(":") for line in lines)
+        }
+        method, _, rest = first.partition(" ")
+        path, _, version = rest.rpartition(" ")
+        if method not in ("GET", "HEAD"):
+            return _answer("405 Method Not Allowed", "only GET"), None
+        upgrades = headers.get("upgrade", "").lower() == "websocket"
+        host = headers.get("host", "")
+        if self._token:
+            begin, _, query = path.partition("?")
+            given, _, inner = begin.lstrip("/").partition("/")
+            if not hmac.compare_digest(given.encode(), self._token.encode()):
+                return _answer("403 Forbidden", "this address needs the token that blitzgs printed"), None
+            if begin == f"/{self._token}" and not upgrades:  # relative addresses need the slash
+                return _answer(
+                    "302 Found", "", f"Location: /{self._token}/{'?' + query if query else ''}\r\n"
+                ), None
+            path = f"/{inner}" + (f"?{query}" if query else "")
+        elif not _is_local(host):
+            return _answer("403 Forbidden", "open http://localhost or http://127.0.0.1 instead"), None
+        origin = headers.get("origin")
+        if upgrades and origin is not None and urlsplit(origin).netloc != host:
+            return _answer("403 Forbidden", "another site's page may not use this viewer"), None
+        if not upgrades:  # one request a connection, so that each is judged
+            lines = [line for line in lines if not line.lower().startswith("connection:")]
+            lines.insert(0, "Connection: close")
+        return b"", "\r\n".join([f"{method} {path} {version}", *lines]).encode("latin-1")
+
+    async def _pass_on(self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        upgrades = b"\r\nupgrade: websocket" in head.lower()
+        inner_reader, inner_writer = await asyncio.open_connection("127.0.0.1", self._behind)
+        try:
+            inner_writer.write(head)
+            ways = [_copy(inner_reader, writer)]
+            if upgrades:
+                ways.append(_copy(reader, inner_writer))
+            tasks = [asyncio.ensure_future(way) for way in ways]
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        finally:
+            inner_writer.close()
+
+
+async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    while chunk := await reader.read(_CHUNK):
+        writer.write(chunk)
+        await writer.drain()
+
+
+def is_loopback(host: str) -> bool:
+    """Tell whether an address to listen on is reached from this machine only."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _is_local(host: str) -> bool:
+    """Tell whether a header "Host: NAME:PORT" names this machine by an address that no name server gives."""
+    name = urlsplit(f"//{host}").hostname or ""
+    return is_loopback(name) or name.endswith(".localhost")
+
+
+def _answer(status: str, text: str, extra: str = "") -> bytes:
+    body = (text + "\n").encode()
+    return (
+        f"HTTP/1.1 {status}\r\nContent-Type: text/plain; charset=utf-8\r\nContent-Length: {len(body)}\r\n"
+        f"{extra}Connection: close\r\n\r\n"
+    ).encode() + body

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page: a web server on one port, the capture's cameras in the scene, and the visitors."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import secrets
+import threading
+import time
+import warnings
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+from blitzgs.view.look import Picture
+from blitzgs.viewer.door import Door, is_loopback
+from blitzgs.viewer.exhibit import Exhibit
+from blitzgs.viewer.frustums import Frustums
+from blitzgs.viewer.overlay import overlay
+from blitzgs.viewer.pace import MOVING_MS
+from blitzgs.viewer.panel import Panel
+from blitzgs.viewer.visitor import Ask, Shown, Visitor
+from blitzgs.viewer.world import World
+
+if TYPE_CHECKING:
+    import viser
+
+MISSING = 'the viewer needs the package viser: pip install "blitzgs[view]"'
+# Seconds between two updates of the figures on the page.
+_FIGURES_SECONDS = 0.2
+
+
+def require_viser() -> None:
+    """Check that the optional package of the viewer is installed.
+
+    Raises:
+        ImportError: it is not; the message says how to install it.
+    """
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f"{MISSING} ({error})") from error
+
+
+class Page:
+    """Serves the page; the caller draws what `next_ask` returns and gives it to `deliver`.
+
+    Attributes:
+        url: address to open.
+        visitors: those who look at present, by viser's numbers.
+        woken: set when a picture may be needed.
+        send_seconds: seconds of a processor that packing pictures has taken so far.
+        folders: called for each new visitor with viser's handle, to add folders of the caller's own.
+    """
+
+    def __init__(
+        self,
+        exhibit: Exhibit,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        folders: Callable[[Any], None] | None = None,
+        memory: Callable[[], str] = lambda: "",
+        moving_ms: float = MOVING_MS,
+    ) -> None:
+        """Start to serve.
+
+        Args:
+            exhibit: what is shown.
+            host: address to listen on. If others than this machine reach it, a random token is part of `url`.
+            port: 0: any free one.
+            folders: see the class.
+            memory: returns the memory of the model as text.
+            moving_ms: milliseconds that a picture may take while the camera moves.
+
+        Raises:
+            ImportError: viser is not installed.
+            OSError: the address is not this machine's, or the port is in use.
+        """
+        require_viser()
+        import viser
+
+        self.exhibit, self.folders, self.memory = exhibit, folders, memory
+        self.woken = threading.Event()
+        self.visitors: dict[int, Visitor] = {}
+        self.panels: dict[int, Panel] = {}
+        self.send_seconds = 0.0
+        self._moving_ms = moving_ms
+        self._figured: dict[int, float] = {}
+        self._turn = 0
+        self._sender = ThreadPoolExecutor(1, "viewer sender")
+        self._sending = threading.Semaphore(2)
+        box = exhibit.box
+        self.world = World(exhibit.space, exhibit.cameras, box.mean(axis=0))
+        # Its address behind the door is nobody's concern.
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server = viser.ViserServer(host="127.0.0.1", port=0, label=exhibit.title, verbose=False)
+        try:
+            token = "" if is_loopback(host) else secrets.token_urlsafe(16)
+            self._door = Door(host, port, self._server.get_port(), token)
+        except OSError:
+            self._server.stop()
+            raise
+        shown = "localhost" if is_loopback(host) else host
+        self.url = f"http://{shown}:{self._door.port}/" + (f"{token}/" if token else "")
+        self._set_up()
+
+    def _set_up(self) -> None:
+        server, world = self._server, self.world
+        server.gui.configure_theme(
+            control_width="large", dark_mode=True, show_logo=False, show_share_button=False
+        )
+        server.gui.set_panel_label(self.exhibit.title)
+        server.gui.main_panel.dock_right()
+        server.scene.set_up_direction(world.up)
+        server.scene.world_axes.visible = False
+        start = world.start()
+        server.initial_camera.position = start.position
+        server.initial_camera.look_at = world.middle
+        server.initial_camera.up = world.up
+        server.initial_camera.fov = start.fov
+        self.frustums = Frustums(server, world, self.exhibit, self._stand)
+        server.on_client_connect(self._enter)
+        server.on_client_disconnect(self._leave)
+
+    def _enter(self, client: viser.ClientHandle) -> None:
+        visitor = Visitor(client, self.world, self.exhibit, self.woken.set, self._moving_ms)
+        panel = Panel(visitor, self.frustums)
+        if self.folders is not None:
+            self.folders(client)
+        panel.build()
+        self.panels[client.client_id] = panel
+        self.visitors[client.client_id] = visitor
+        self.woken.set()
+
+    def _leave(self, client: viser.ClientHandle) -> None:
+        visitor = self.visitors.pop(client.client_id, None)
+        if visitor is not None:
+            visitor.leave()
+        self.panels.pop(client.client_id, None)
+        self.woken.set()
+
+    def _stand(self, client_id: int | None, index: int) -> None:
+        for visitor in [v for number, v in list(self.visitors.items()) if client_id in (None, number)]:
+            visitor.stand_at(index)
+
+    def next_ask(self) -> tuple[Visitor, Ask] | None:
+        """Return the next picture that a visitor waits for; they take turns. None: there is none."""
+        visitors = list(self.visitors.values())
+        for shift in range(len(visitors)):
+            visitor = visitors[(self._turn + shift) % len(visitors)]
+            try:
+                ask = visitor.next_ask()
+            except Exception as error:  # a browser may send anything
+                warnings.warn(f"the viewer has dropped a visitor: {error}", stacklevel=2)
+                self.visitors.pop(visitor.client.client_id, None)
+                continue
+            if ask is not None:
+                self._turn += shift + 1
+                return visitor, ask
+        return None
+
+    def deliver(self, visitor: Visitor, ask: Ask, picture: Picture) -> None:
+        """Send a picture to a visitor; waits only if two others are still being sent."""
+        self._sending.acquire()
+        try:
+            self._sender.submit(self._send, visitor, ask, picture)
+        except RuntimeError:  # the page is closed
+            self._sending.release()
+
+    def _send(self, visitor: Visitor, ask: Ask, picture: Picture) -> None:
+        begin = time.thread_time()
+        try:
+            shown = visitor.take(ask, picture)
+            if shown is None:
+                return
+            visitor.shown = shown
+            sharp = ask.scale >= 1.0
+            visitor.client.scene.set_background_image(
+                shown.image, format="jpeg", jpeg_quality=88 if sharp else 70
+            )
+            self._figures(visitor, shown, sharp)
+        except Exception as error:
+            # A browser that has gone, or one picture less: neither may end the page or a training.
+            if visitor.client.client_id in self.visitors:
+                warnings.warn(f"the viewer could not send a picture: {error}", stacklevel=2)
+        finally:
+            self.send_seconds += time.thread_time() - begin
+            self._sending.release()
+
+    def _figures(self, visitor: Visitor, shown: Shown, sharp: bool) -> None:
+        number, now = visitor.client.client_id, time.monotonic()
+        if not sharp and now < self._figured.get(number, 0.0) + _FIGURES_SECONDS:
+            return
+        self._figured[number] = now
+        if (panel := self.panels.get(number)) is not None:
+            panel.figures.content = overlay(visitor, shown, self.memory())
+
+    def close(self) -> None:
+        """Stop to serve."""
+        self._door.close()
+        with contextlib.suppress(Exception), contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
+        self._sender.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The controls of the page, for one visitor."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import torch
+
+from blitzgs.capture.pictures import encode_image
+from blitzgs.view.look import MODES
+from blitzgs.viewer import compare
+from blitzgs.viewer.files import note, safe_name, save_beside
+from blitzgs.viewer.frustums import Frustums
+from blitzgs.viewer.route import Route
+from blitzgs.viewer.settings import Triple
+from blitzgs.viewer.visitor import Visitor
+from blitzgs.viewer.world import SCALE
+
+HELP = (
+    "**Orbit**: drag turns around a point, right drag moves it, the wheel nears it. "
+    "**Fly**: drag turns your head. **Walk**: the same, at eye height above the ground. "
+    "Keys: W A S D, Q down, E up, arrows turn. Click a frustum to stand there."
+)
+
+
+class Panel:
+    """Builds the controls, and changes the visitor's settings as they are used.
+
+    Attributes:
+        figures: the element with the figures over the picture.
+    """
+
+    figures: Any
+
+    def __init__(self, visitor: Visitor, frustums: Frustums) -> None:
+        """Prepare the controls of a visitor."""
+        self._visitor, self._frustums, self._exhibit = visitor, frustums, visitor.exhibit
+        self._gui: Any = visitor.client.gui
+
+    def build(self) -> None:
+        """Add all controls."""
+        self.figures = self._gui.add_html("")
+        with self._gui.add_folder("Show"):
+            self._show()
+        if self._exhibit.cameras:
+            with self._gui.add_folder("Photographs"):
+                self._photographs()
+        with self._gui.add_folder("Move"):
+            self._move()
+        with self._gui.add_folder("Model", expand_by_default=False):
+            self._model()
+        with self._gui.add_folder("Crop box", expand_by_default=False):
+            self._crop()
+        with self._gui.add_folder("Viewpoints and path", expand_by_default=False):
+            Route(self._visitor, self._gui).build()
+
+    def _show(self) -> None:
+        visitor, gui = self._visitor, self._gui
+        modes = [mode for mode in MODES if mode != "level" or self._exhibit.levels]
+        mode = gui.add_dropdown("Mode", modes, initial_value="RGB")
+        mode.on_update(lambda _: visitor.change(mode=mode.value))
+        quality = gui.add_slider("Longest side", min=320, max=3840, step=160, initial_value=1920)
+        quality.on_update(lambda _: visitor.change(most_side=int(quality.value)))
+        adapts = gui.add_checkbox("Coarse while moving", True)
+        adapts.on_update(lambda _: visitor.change(adapts=adapts.value))
+        gui.add_button("Screenshot").on_click(lambda _: self._screenshot())
+
+    def _photographs(self) -> None:
+        visitor, gui, exhibit = self._visitor, self._gui, self._exhibit
+        shown = gui.add_checkbox("Show cameras", True, hint="Blue: trained on. Orange: held out.")
+        shown.on_update(lambda _: self._frustums.show(shown.value))
+        size = gui.add_slider("Camera size", min=0.1, max=4.0, step=0.1, initial_value=1.0)
+        size.on_update(lambda _: self._frustums.resize(size.value, visitor.world))
+        number = gui.add_slider(
+            "Camera", min=0, max=max(1, len(exhibit.cameras) - 1), step=1, initial_value=0
+        )
+        name = gui.add_markdown("")
+        choice = gui.add_dropdown(
+            "Compare", compare.KINDS, initial_value="off", disabled=exhibit.photograph is None,
+            hint="With the photograph, where you stand at its camera",
+        )  # fmt: skip
+        wipe = gui.add_slider("Wipe", min=0.0, max=1.0, step=0.01, initial_value=0.5)
+
+        def stand(_: Any) -> None:
+            if number.value < len(exhibit.cameras):
+                visitor.stand_at(int(number.value))
+
+        def tell() -> None:
+            at = visitor.standing
+            name.content = f"Standing at **{exhibit.cameras[at].name}**" if at is not None else "*Free*"
+
+        def chosen(_: Any) -> None:
+            visitor.change(comparison=choice.value)
+            if choice.value != "off" and visitor.standing is None:
+                stand(None)
+
+        gui.add_button("Stand there").on_click(stand)
+        choice.on_update(chosen)
+        wipe.on_update(lambda _: visitor.change(wipe=float(wipe.value)))
+        visitor.listeners.append(tell)
+        tell()
+
+    def _move(self) -> None:
+        visitor, gui = self._visitor, self._gui
+        motion = gui.add_button_group("Motion", ("orbit", "fly", "walk"))
+        motion.on_click(lambda _: visitor.choose_motion(motion.value))
+        fov = gui.add_slider(
+            "Field of view", min=10, max=110, step=1, initial_value=50, hint="Vertical, degrees"
+        )
+
+        def turn(_: Any) -> None:
+            visitor.client.camera.fov = float(np.radians(fov.value))
+
+        fov.on_update(turn)
+        gui.add_button("Level the horizon").on_click(lambda _: visitor.go(visitor.stance))
+        gui.add_button("Back to the start").on_click(lambda _: self._restart())
+        gui.add_markdown(HELP)
+
+    def _restart(self) -> None:
+        world = self._visitor.world
+        start = world.start()
+        self._visitor.go(start, float(np.linalg.norm(start.position - world.middle)))
+
+    def _model(self) -> None:
+        visitor, gui, exhibit = self._visitor, self._gui, self._exhibit
+        lod = gui.add_checkbox("LOD gate", exhibit.lod, disabled=not exhibit.lod)
+        lod.on_update(lambda _: visitor.change(lod=lod.value))
+        smooth = gui.add_checkbox("Smooth levels", exhibit.smooth, disabled=not exhibit.lod)
+        smooth.on_update(lambda _: visitor.change(smooth=smooth.value))
+        degree = gui.add_slider("SH degree", min=0, max=max(1, exhibit.sh_degree), step=1,
+                                initial_value=exhibit.sh_degree, disabled=exhibit.sh_degree == 0)  # fmt: skip
+        degree.on_update(lambda _: visitor.change(sh_degree=int(degree.value)))
+        colour = tuple(round(255 * value) for value in exhibit.background)
+        background = gui.add_rgb("Background", initial_value=colour)
+        background.on_update(
+            lambda _: visitor.change(background=tuple(value / 255 for value in background.value))
+        )
+        unit = exhibit.space.unit
+        near = gui.add_number(
+            "Near", 0.0, min=0.0, step=0.01 * unit * exhibit.space.extent, hint="0: the model's"
+        )
+        far = gui.add_number(
+            "Far", 0.0, min=0.0, step=0.1 * unit * exhibit.space.extent, hint="0: the model's"
+        )
+        near.on_update(lambda _: visitor.change(near=near.value / unit or None))
+        far.on_update(lambda _: visitor.change(far=far.value / unit or None))
+
+    def _crop(self) -> None:
+        visitor, gui, exhibit = self._visitor, self._gui, self._exhibit
+        offset, unit = np.array(exhibit.space.offset), exhibit.space.unit
+        least, most = exhibit.box * unit + offset
+        crops = gui.add_checkbox("Crop", False)
+        sliders = [
+            gui.add_multi_slider(
+                axis, min=float(least[k]), max=float(most[k]), step=float((most[k] - least[k]) / 200) or 1.0,
+                initial_value=(float(least[k]), float(most[k])),
+            )
+            for k, axis in enumerate("xyz")
+        ]  # fmt: skip
+        outline = visitor.client.scene.add_box(
+            "/crop", color=(255, 220, 80), dimensions=(1.0, 1.0, 1.0), wireframe=True, visible=False
+        )
+
+        def update(_: Any) -> None:
+            ends = np.array([slider.value for slider in sliders], dtype=np.float64)
+            corners = ((ends.T - offset) / unit).tolist()
+            box: tuple[Triple, Triple] = (tuple(corners[0]), tuple(corners[1]))
+            low, high = SCALE * np.array(box)
+            outline.dimensions = tuple(high - low)
+            outline.position = (low + high) / 2
+            outline.visible = crops.value
+            visitor.change(crops=crops.value, box=box)
+
+        for control in (crops, *sliders):
+            control.on_update(update)
+
+    def _screenshot(self) -> None:
+        visitor = self._visitor
+        shown = visitor.shown
+        if shown is None:
+            return
+        content = encode_image(torch.from_numpy(shown.image), ".png")
+        name = f"{safe_name(self._exhibit.title)}_{time.strftime('%Y%m%d_%H%M%S')}.png"
+        visitor.client.send_file_download(name, content, save_immediately=True)
+        note(visitor, save_beside(self._exhibit.paths, name, content))

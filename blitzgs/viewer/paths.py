@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Camera paths as JSON files in the layout of nerfstudio's camera_path.json.
+
+Matrices are camera to world, row by row, in the capture's own coordinates; a camera's axes are right, up and
+backward (OpenGL). Angles are vertical fields of view in degrees.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.util.output import write_file
+
+Array = npt.NDArray[np.float64]
+# From a camera with the axes right, down, forward to one with right, up, backward.
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass
+class Keyframe:
+    """A viewpoint: camera to world [4, 4] (right, down, forward), vertical fov in degrees, width / height."""
+
+    camera_to_world: Array
+    fov: float
+    aspect: float
+
+
+@dataclass
+class CameraPath:
+    """Keyframes, and how they are played.
+
+    Attributes:
+        keyframes: at least one.
+        width: pixels of a rendered frame.
+        height: pixels.
+        fps: frames a second.
+        seconds: duration of the film.
+        is_cycle: whether the last keyframe leads to the first.
+    """
+
+    keyframes: list[Keyframe] = field(default_factory=list)
+    width: int = 1920
+    height: int = 1080
+    fps: float = 24.0
+    seconds: float = 4.0
+    is_cycle: bool = False
+
+    def frames(self) -> list[Keyframe]:
+        """Return the viewpoints of all frames: positions on a Catmull-Rom spline, rotations interpolated."""
+        count = max(1, round(self.fps * self.seconds))
+        keys = self.keyframes + (self.keyframes[:1] if self.is_cycle else [])
+        if len(keys) < 2:
+            return keys * count
+        times = np.linspace(0, len(keys) - 1, count, endpoint=not self.is_cycle)
+        return [interpolated(keys, float(time), self.is_cycle) for time in times]
+
+
+def interpolated(keys: Sequence[Keyframe], time: float, is_cycle: bool = False) -> Keyframe:
+    """Return the viewpoint at a time, counted in keyframes from 0."""
+    first = min(int(time), len(keys) - 2)
+    share, last = time - first, len(keys) - 1
+
+    def position(index: int) -> Array:
+        if is_cycle:  # the last keyframe is the first again
+            index %= last
+        return keys[min(max(index, 0), last)].camera_to_world[:3, 3]
+
+    p0, p1, p2, p3 = (position(first + shift) for shift in (-1, 0, 1, 2))
+    place = 0.5 * (
+        2 * p1
+        + (p2 - p0) * share
+        + (2 * p0 - 5 * p1 + 4 * p2 - p3) * share**2
+        + (3 * p1 - p0 - 3 * p2 + p3) * share**3
+    )
+    a, b = keys[first], keys[first + 1]
+    pose = np.eye(4)
+    pose[:3, :3] = _slerp(a.camera_to_world[:3, :3], b.camera_to_world[:3, :3], share)
+    pose[:3, 3] = place
+    return Keyframe(pose, a.fov + share * (b.fov - a.fov), a.aspect + share * (b.aspect - a.aspect))
+
+
+def _slerp(a: Array, b: Array, share: float) -> Array:
+    """Turn from rotation `a` to `b` about one axis by a share of the angle."""
+    turn = a.T @ b
+    angle = math.acos(max(-1.0, min(1.0, (np.trace(turn) - 1) / 2)))
+    if angle < 1e-9:
+        return a
+    if angle > math.pi - 1e-4:  # the axis: the column of turn + 1 that is longest
+        columns = turn + np.eye(3)
+        axis = columns[:, np.linalg.norm(columns, axis=0).argmax()]
+        axis = axis / np.linalg.norm(axis)
+    else:
+        twist = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        axis = twist / (2 * math.sin(angle))
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    part = share * angle
+    turned: Array = a @ (np.eye(3) + math.sin(part) * cross + (1 - math.cos(part)) * cross @ cross)
+    return turned
+
+
+def to_json(path: CameraPath) -> str:
+    """Return a path as text."""
+    frames = [
+        {"camera_to_world": _rows(frame), "fov": frame.fov, "aspect": frame.aspect} for frame in path.frames()
+    ]
+    keyframes = [{"matrix": _rows(key), "fov": key.fov, "aspect": key.aspect} for key in path.keyframes]
+    content = {
+        "camera_type": "perspective",
+        "render_width": path.width,
+        "render_height": path.height,
+        "fps": path.fps,
+        "seconds": path.seconds,
+        "is_cycle": path.is_cycle,
+        "smoothness_value": 0.0,
+        "default_fov": path.keyframes[0].fov if path.keyframes else 50.0,
+        "default_transition_sec": path.seconds / max(1, len(path.keyframes) - (not path.is_cycle)),
+        "keyframes": keyframes,
+        "camera_path": frames,
+        "crop": None,
+    }
+    return json.dumps(content, indent=1) + "\n"
+
+
+def from_json(text: str) -> CameraPath:
+    """Read a path; one without keyframes has its frames as keyframes.
+
+    Raises:
+        ValueError: it is no camera path; the message says why.
+    """
+    try:
+        content: dict[str, Any] = json.loads(text)
+        found = content.get("keyframes") or content["camera_path"]
+        keys = [_keyframe(entry) for entry in found]
+        return CameraPath(
+            keys,
+            int(content.get("render_width", 1920)),
+            int(content.get("render_height", 1080)),
+            float(content.get("fps", 24.0)),
+            float(content.get("seconds", 4.0)),
+            bool(content.get("is_cycle", False)),
+        )
+    except (LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        raise ValueError(f"this is no camera path in the layout of nerfstudio: {error}") from error
+
+
+def save_path(file: Path, path: CameraPath) -> None:
+    """Write a path."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_file(file, to_json(path))
+
+
+def _rows(key: Keyframe) -> list[float]:
+    flat: list[float] = (key.camera_to_world @ _FLIP).ravel().tolist()
+    return flat
+
+
+def _keyframe(entry: dict[str, Any]) -> Keyframe:
+    matrix = entry["matrix"] if "matrix" in entry else entry["camera_to_world"]
+    if isinstance(matrix, str):  # files of old versions have the matrix as text, column by column
+        pose = np.array(json.loads(matrix), dtype=np.float64).reshape(4, 4).T
+    else:
+        pose = np.array(matrix, dtype=np.float64).reshape(4, 4)
+    if not np.isfinite(pose).all():
+        raise ValueError("a matrix is not finite")
+    return Keyframe(pose @ _FLIP, float(entry.get("fov", 50.0)), float(entry.get("aspect", 16 / 9)))

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shows a model at rest: opens it, and draws what the visitors of its page ask for."""
+
+from __future__ import annotations
+
+import math
+import re
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from blitzgs.config.fields import Config, ModelConfig
+from blitzgs.distributed.group import Ranks
+from blitzgs.formats.ply import GaussianPly, read_ply
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.runs import files as run_files
+from blitzgs.runs.cameras import CAMERAS, load_cameras
+from blitzgs.runs.folder import open_run
+from blitzgs.table.blocks import morton_order
+from blitzgs.table.table import PARAMETERS, GaussianTable
+from blitzgs.view.draw import Drawer, Subject, table_of_parameters
+from blitzgs.view.gate import LodGate, SceneGate
+from blitzgs.view.views import Space, render_options
+from blitzgs.viewer.exhibit import Exhibit
+from blitzgs.viewer.page import Page
+
+Photograph = Callable[[int], npt.NDArray[np.uint8]]
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A model on its device, ready to be shown."""
+
+    exhibit: Exhibit
+    subject: Subject
+    table: GaussianTable
+    ranks: Ranks
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the Gaussians take on the device."""
+        return sum(self.table[name].nbytes for name in (*PARAMETERS, "level", "id"))
+
+
+def open_model(
+    path: Path, ranks: Ranks, photograph: Photograph | None = None, paths: Path | None = None
+) -> Opened:
+    """Open the folder of a run, a checkpoint in it, or a PLY file.
+
+    Args:
+        path: the folder or the file.
+        ranks: the device.
+        photograph: returns the photograph of a camera of the run; None: there are none.
+        paths: folder for camera paths and screenshots; None: RUN/paths, or the folder of the file.
+
+    Raises:
+        FileNotFoundError: there is no such file, or no run or checkpoint in the folder.
+        ValueError: the file is damaged.
+    """
+    if path.is_file():
+        return _open_ply(path, ranks, paths or path.parent)
+    checkpoint = None
+    if path.resolve().parent.name == run_files.CHECKPOINTS:
+        checkpoint, path = path.resolve().name, path.resolve().parent.parent
+    model = open_run(path).model(str(ranks.device), checkpoint)
+    columns = {name: getattr(model, name) for name in (*PARAMETERS, "level")}
+    table = table_of_parameters(columns)
+    options = render_options(
+        model.config, model.space, model.sh_degree, model.lod.gate if model.lod else None
+    )
+    subject = Subject(table, options, model.space.unit, model.lod)
+    stored = load_cameras(path) if (path / CAMERAS).exists() else None
+    exhibit = Exhibit(
+        title=path.resolve().name + (f" {checkpoint}" if checkpoint else ""),
+        space=model.space,
+        sh_degree=model.sh_degree,
+        near=options.near_plane,
+        far=options.far_plane,
+        background=options.background,
+        levels=bool((model.level > 0).any()),
+        lod=model.lod is not None,
+        smooth=model.lod is not None and model.lod.gate.smooth,
+        box=box_of(model.means),
+        cameras=() if stored is None else stored.cameras,
+        test=() if stored is None else stored.test,
+        photograph=photograph if stored is not None else None,
+        paths=paths or path / "paths",
+    )
+    return Opened(exhibit, subject, table, ranks)
+
+
+def _open_ply(path: Path, ranks: Ranks, paths: Path) -> Opened:
+    found = read_ply(path)
+    if len(found.means) == 0:
+        raise ValueError(f"{path} holds no Gaussians")
+    offset = _numbers(found, r"comment offset (\S+) (\S+) (\S+)") or (0.0, 0.0, 0.0)
+    box = box_of(found.means)
+    middle, extent = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
+    # Centred, so that float32 resolves the positions of a georeferenced model as finely as the file does.
+    space = Space.of(middle + np.array(offset), max(extent, 1e-6))
+    columns: dict[str, Tensor] = {
+        "means": ((found.means.double() - torch.from_numpy(middle)) / space.unit).float(),
+        "quats": found.quats,
+        "scales": found.scales - math.log(space.unit),
+        "opacities": found.opacities,
+        "sh": found.sh,
+    }
+    if found.levels is not None:
+        columns["level"] = found.levels.clamp(0, 255).to(torch.uint8)
+    order = morton_order(columns["means"])
+    table = table_of_parameters({name: column[order].to(ranks.device) for name, column in columns.items()})
+    antialiased = any(line.strip() == "comment SplatRenderMode: mip" for line in found.comments)
+    config = Config(model=ModelConfig(antialiased=antialiased, near=1e-3))
+    gate = _gate(found, space.unit)
+    degree = round(found.sh.shape[1] ** 0.5) - 1
+    options = render_options(config, space, degree, gate)
+    lod = None if gate is None else SceneGate(gate, math.inf if gate.smooth else 0.95, table, ranks)
+    exhibit = Exhibit(
+        title=path.name,
+        space=space,
+        sh_degree=degree,
+        near=options.near_plane,
+        far=options.far_plane,
+        background=options.background,
+        levels=found.levels is not None,
+        lod=lod is not None,
+        smooth=gate is not None and gate.smooth,
+        box=(box - middle) / space.unit,
+        paths=paths,
+    )
+    return Opened(exhibit, Subject(table, options, space.unit, lod), table, ranks)
+
+
+def _numbers(found: GaussianPly, pattern: str) -> tuple[float, ...] | None:
+    for line in found.comments:
+        if match := re.fullmatch(pattern, line.strip()):
+            return tuple(float(text) for text in match.groups())
+    return None
+
+
+def _gate(found: GaussianPly, unit: float) -> LodGate | None:
+    """Return the LOD gate that `blitzgs export` writes into a header; None: there is none."""
+    pattern = r"comment lod reference_distance (\S+) fork (\S+) levels (\d+) finest (\d+)(?: smooth)?"
+    values = _numbers(found, pattern)
+    if values is None or found.levels is None:
+        return None
+    smooth = any(line.strip().endswith(" smooth") for line in found.comments if "comment lod" in line)
+    return LodGate(values[0] / unit, values[1], int(values[2]), int(values[3]), smooth)
+
+
+def box_of(means: Tensor) -> npt.NDArray[np.float64]:
+    """Return the corners of a box that holds nearly all means and some room around, float64 [2, 3]."""
+    some = means[:: max(1, len(means) // 100_000)].double().cpu()
+    low, high = (torch.quantile(some, share, dim=0).numpy() for share in (0.01, 0.99))
+    room = 0.15 * (high - low).max() + 1e-6
+    return np.stack([low - room, high + room])
+
+
+class Studio:
+    """Draws for the visitors of a page until it is closed.
+
+    Attributes:
+        page: the page.
+        drawn: number of pictures so far.
+    """
+
+    def __init__(self, opened: Opened, host: str = "127.0.0.1", port: int = 8080) -> None:
+        """Start the page and the thread that draws; errors are those of `Page`."""
+        self._drawer = Drawer(opened.subject, TileOwners(opened.ranks))
+        count, size = len(opened.table), opened.bytes / 1e6
+        memory = f"{count:,} in all &middot; {size:,.0f} MB"
+        self.page = Page(opened.exhibit, host, port, memory=lambda: memory)
+        self.drawn = 0
+        self._ends = threading.Event()
+        self._thread = threading.Thread(target=self._draw, daemon=True, name="viewer studio")
+        self._thread.start()
+
+    def _draw(self) -> None:
+        page = self.page
+        while not self._ends.is_set():
+            page.woken.clear()
+            asked = page.next_ask()
+            if asked is None:
+                # Look again soon: a camera that rests for a while gets a finer picture.
+                page.woken.wait(0.05 if page.visitors else 1.0)
+                continue
+            visitor, ask = asked
+            try:
+                picture = self._drawer.draw(ask.look)
+            except RuntimeError as error:  # most likely out of memory
+                visitor.failed(ask, str(error))
+                continue
+            self.drawn += 1
+            if picture is not None:
+                page.deliver(visitor, ask, picture)
+
+    def close(self) -> None:
+        """Stop drawing, and close the page."""
+        self._ends.set()
+        self.page.woken.set()
+        self._thread.join(timeout=10)
+        self.page.close()

@@ -1,0 +1,335 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One browser that shows the page: its camera, what it has to be shown next, and its pictures."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.view.draw import intrinsics
+from blitzgs.view.look import Look, Picture
+from blitzgs.viewer import compare
+from blitzgs.viewer.exhibit import Exhibit
+from blitzgs.viewer.pace import STILL_SECONDS, Pace
+from blitzgs.viewer.settings import Settings
+from blitzgs.viewer.shade import Shaded, shaded
+from blitzgs.viewer.world import SCALE, Stance, World
+
+if TYPE_CHECKING:
+    import viser
+
+# A visitor who was put before a photograph's camera stays there until the browser's camera is elsewhere. In
+# the first second, the browser may still report where it was before.
+_ARRIVING_SECONDS = 1.0
+# Eye height above the ground of a visitor who walks, as a share of the scene's extent.
+EYE_HEIGHT = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Ask:
+    """A picture that a visitor waits for.
+
+    Attributes:
+        look: what to draw.
+        version: number of the visitor's viewpoint and choices.
+        scale: side relative to full quality.
+        settings: the choices.
+        camera: index of the photograph's camera to compare with; None: no comparison.
+        columns: of the grid of images side by side.
+        is_sounding: the look is down from the camera, to find the ground.
+    """
+
+    look: Look
+    version: int
+    scale: float
+    settings: Settings
+    camera: int | None = None
+    columns: int = 1
+    is_sounding: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """The newest picture of a visitor, for the figures on the page and for screenshots."""
+
+    image: npt.NDArray[np.uint8]
+    ask: Ask
+    picture: Picture
+    low: float | None
+    high: float | None
+    psnr: float | None
+
+
+class Visitor:
+    """The state of one browser; any thread may call any method.
+
+    Attributes:
+        client: viser's handle.
+        settings: the visitor's choices; replaced as a whole when one changes.
+        shown: the newest picture, or None.
+        motion: "orbit", "fly" or "walk".
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        world: World,
+        exhibit: Exhibit,
+        wake: Callable[[], None],
+        moving_ms: float,
+    ) -> None:
+        """Begin with the browser's camera.
+
+        Args:
+            client: viser's handle.
+            world: the page's coordinates.
+            exhibit: what is shown.
+            wake: called whenever a picture is needed.
+            moving_ms: milliseconds that a picture may take while the camera moves.
+        """
+        self.client, self.world, self.exhibit, self._wake = client, world, exhibit, wake
+        self.settings = Settings()
+        self.shown: Shown | None = None
+        self.motion = "orbit"
+        self.standing: int | None = None
+        self._place: Stance | None = None  # of the camera at which the visitor stands
+        self._arrived = 0.0
+        self._lock = threading.Lock()
+        self.version, self._drawn = 0, -1
+        self._drawn_scale = 0.0
+        self._moved, self._stance = 0.0, self._read()
+        self._pace = Pace(moving_ms)
+        self._sounded = -1
+        self._stale = False
+        self._gone = threading.Event()
+        self.listeners: list[Callable[[], None]] = []
+        client.camera.on_update(self._on_camera)
+
+    # -- the camera ----------------------------------------------------------------------------------------
+
+    @property
+    def stance(self) -> Stance:
+        """Where the visitor is; exactly the photograph's camera for one who stands there."""
+        return self._place if self.standing is not None and self._place is not None else self._stance
+
+    def _read(self) -> Stance:
+        camera = self.client.camera
+        w, x, y, z = camera.wxyz
+        rotation = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        return Stance(np.array(camera.position, dtype=np.float64), rotation, float(camera.fov))
+
+    def _on_camera(self, _: object) -> None:
+        stance = self._read()
+        with self._lock:
+            same = stance.is_near(self._stance, 1e-6, 1e-6) and stance.fov == self._stance.fov
+            self._stance = stance
+            if self.standing is not None and self._place is not None:
+                here = stance.is_near(self._place, 0.02, 0.01)
+                if here or time.monotonic() < self._arrived + _ARRIVING_SECONDS:
+                    return
+                self.standing = None
+            elif same:
+                self.version += self._size_changed()
+                self._wake()
+                return
+            self.version += 1
+            self._moved = time.monotonic()
+        self._wake()
+        self._tell()
+
+    def _size_changed(self) -> bool:
+        shown = self.shown
+        if shown is None:
+            return True
+        height, width = shown.image.shape[:2]
+        return abs(width / height / self.client.camera.aspect - 1) > 0.05
+
+    def _tell(self) -> None:
+        for listener in self.listeners:
+            listener()
+
+    def go(
+        self, stance: Stance, distance: float | None = None, up: npt.NDArray[np.float64] | None = None
+    ) -> None:
+        """Move the browser's camera to a stance.
+
+        Args:
+            stance: where to go.
+            distance: to the point around which the browser orbits, page units; None: as the motion needs.
+            up: the orbit's axis; None: the scene's up.
+        """
+        camera = self.client.camera
+        if distance is None:
+            distance = float(np.linalg.norm(np.array(camera.look_at) - np.array(camera.position)))
+            distance = 0.02 if self.motion != "orbit" else max(distance, 0.1)
+        with self.client.atomic():
+            camera.up_direction = self.world.up if up is None else up
+            camera.position = stance.position
+            camera.look_at = stance.position + stance.forward * distance
+            camera.fov = stance.fov
+
+    def stand_at(self, index: int) -> None:
+        """Put the visitor where a photograph was taken."""
+        camera = self.exhibit.cameras[index]
+        pose = self.world.poses[index]
+        fov = compare.fitting_fov(camera, self.client.camera.aspect)
+        stance = self.world.stance(pose, fov)
+        distance = float(np.linalg.norm(stance.position - self.world.middle))
+        with self._lock:
+            self.standing, self._place, self._arrived = index, stance, time.monotonic()
+            self.version += 1
+        self.go(stance, max(0.1, distance), up=-stance.rotation[:, 1])
+        self._wake()
+        self._tell()
+
+    def change(self, **choices: object) -> None:
+        """Change some of the settings."""
+        with self._lock:
+            self.settings = replace(self.settings, **choices)  # type: ignore[arg-type]
+            self.version += 1
+        self._wake()
+
+    def choose_motion(self, motion: str) -> None:
+        """Choose how the camera moves: "orbit", "fly" or "walk"."""
+        self.motion = motion
+        distance = None
+        if motion == "orbit":
+            distance = float(np.linalg.norm(self.stance.position - self.world.middle))
+        self.go(self.stance, distance)
+
+    def refresh(self) -> None:
+        """Ask for a new picture of the same, as fine as the last, for a model that has changed."""
+        self._stale = True
+
+    # -- pictures ------------------------------------------------------------------------------------------
+
+    @property
+    def is_moving(self) -> bool:
+        """Tell whether the camera moved just now."""
+        return time.monotonic() < self._moved + STILL_SECONDS
+
+    def next_ask(self) -> Ask | None:
+        """Return what to draw next; None: nothing at present."""
+        with self._lock:
+            moving, version, settings = self.is_moving, self.version, self.settings
+            drawn = self._drawn_scale if self._drawn == version else None
+            scale = (
+                self._pace.next_scale(drawn, moving) if settings.adapts else (1.0 if drawn is None else None)
+            )
+            stance, index = self.stance, self.standing
+            if scale is None and self._stale and not moving:
+                scale = drawn
+            if scale == 1.0:
+                self._stale = False
+            if scale is None:
+                if self.motion == "walk" and not moving and self._sounded != version:
+                    self._sounded = version
+                    return self._sounding(stance, version, settings)
+                return None
+        camera = self.client.camera
+        try:
+            return self._ask(stance, index, camera.image_width, camera.image_height, scale, version, settings)
+        except (ValueError, ArithmeticError):  # an impossible choice, such as a near plane behind the far one
+            with self._lock:
+                self._drawn, self._drawn_scale = version, 1.0
+            return None
+
+    def _ask(
+        self,
+        stance: Stance,
+        index: int | None,
+        width: int,
+        height: int,
+        scale: float,
+        version: int,
+        settings: Settings,
+    ) -> Ask:
+        if settings.comparison == "off" or self.exhibit.photograph is None:
+            index = None
+        elif index is None:
+            settings = replace(settings, comparison="off")
+        columns = 1
+        share = scale * min(1.0, settings.most_side / max(width, height, 1))
+        w, h = max(16, round(width * share)), max(16, round(height * share))
+        if index is not None and settings.comparison == "side by side":
+            columns = compare.grid_columns(self.exhibit.cameras[index], w, h)
+            w, h = max(16, w // columns), max(16, h // compare.ROWS[columns])
+        if index is not None:
+            K = compare.fitted(self.exhibit.cameras[index], w, h)  # noqa: N806
+        else:
+            K = intrinsics(w, h, stance.fov)  # noqa: N806
+        look = settings.look(self.world.viewmat(stance), K, w, h)
+        return Ask(look, version, scale, settings, index, columns)
+
+    def _sounding(self, stance: Stance, version: int, settings: Settings) -> Ask:
+        """Return a look straight down, to find the ground under a visitor who walks."""
+        down = -self.world.up
+        side = stance.rotation[:, 0] - self.world.up * float(stance.rotation[:, 0] @ self.world.up)
+        side = side / max(1e-9, float(np.linalg.norm(side)))
+        rotation = np.stack([side, np.cross(down, side), down], axis=1)
+        pose = self.world.viewmat(Stance(stance.position, rotation, 0.2))
+        plain = replace(settings, mode="depth", comparison="off", near=1e-6)
+        return Ask(plain.look(pose, intrinsics(32, 32, 0.2), 32, 32), version, 1.0, plain, is_sounding=True)
+
+    def take(self, ask: Ask, picture: Picture) -> Shown | None:
+        """Note a drawn picture, and return what to show; None: nothing, or it is out of date."""
+        if ask.is_sounding:
+            self._step_to_ground(ask, picture)
+            return None
+        with self._lock:
+            self._pace.measured(ask.scale, picture.milliseconds)
+            if ask.version >= self._drawn:
+                self._drawn, self._drawn_scale = ask.version, ask.scale
+            else:
+                return None
+        result, psnr = shaded(picture, ask.look.mode), None
+        if ask.camera is not None and self.exhibit.photograph is not None:
+            try:
+                photograph = self.exhibit.photograph(ask.camera)
+            except (OSError, ValueError, RuntimeError):
+                return Shown(result.image, ask, picture, None, None, None)
+            camera = self.exhibit.cameras[ask.camera]
+            kind, wipe = ask.settings.comparison, ask.settings.wipe
+            compared = compare.compare(kind, result.image, photograph, camera, ask.look.K, wipe, ask.columns)
+            result, psnr = Shaded(compared.image), compared.psnr
+        return Shown(result.image, ask, picture, result.low, result.high, psnr)
+
+    def _step_to_ground(self, ask: Ask, picture: Picture) -> None:
+        """Put a visitor who walks at eye height above the ground under them."""
+        known = picture.values[picture.values > 0]
+        if len(known) == 0 or self.motion != "walk" or ask.version != self.version:
+            return
+        eye = EYE_HEIGHT * self.exhibit.space.extent * SCALE
+        height = float(np.median(known)) / self.exhibit.space.unit * SCALE
+        if abs(height - eye) < 0.1 * eye or not math.isfinite(height):
+            return
+        stance = self.stance
+        self.go(replace(stance, position=stance.position - self.world.up * (height - eye)))
+
+    @property
+    def is_gone(self) -> bool:
+        """Tell whether the browser has closed the page."""
+        return self._gone.is_set()
+
+    def leave(self) -> None:
+        """Note that the browser has closed the page."""
+        self._gone.set()
+
+    def failed(self, ask: Ask, reason: str) -> None:
+        """Note that a picture cannot be drawn, and tell the visitor; the next movement asks again."""
+        with self._lock:
+            self._drawn, self._drawn_scale = max(ask.version, self._drawn), 1.0
+        self.client.add_notification("BlitzGS", reason, auto_close_seconds=10.0, color="red")

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The coordinates of the page: trained units times a constant, with the scene's own up direction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.capture.cameras import camera_centres
+from blitzgs.view.views import CameraLike, Space, viewmat
+
+Array = npt.NDArray[np.float64]
+# Page units per trained unit. The scene is then 5 to 10 page units wide; the keys move 2 a second.
+SCALE = 5.0
+# The z axis is up if it is nearer to the cameras' up than this; many captures are georeferenced.
+_NEAR_Z = math.cos(math.radians(40))
+
+
+@dataclass(frozen=True)
+class Stance:
+    """A camera of the page: where it is, how it is turned, and its vertical field of view in radians.
+
+    Attributes:
+        position: [3], page units.
+        rotation: camera to world, [3, 3]; the axes are right, down and forward.
+        fov: radians.
+    """
+
+    position: Array
+    rotation: Array
+    fov: float
+
+    @property
+    def forward(self) -> Array:
+        """The direction of view."""
+        return self.rotation[:, 2]
+
+    def is_near(self, other: Stance, distance: float = 1e-3, angle: float = 0.005) -> bool:
+        """Tell whether another stance differs by less than a distance (page units) and an angle (radians)."""
+        cosine = (np.trace(self.rotation.T @ other.rotation) - 1) / 2
+        near = np.linalg.norm(self.position - other.position) < distance
+        return bool(near and math.acos(max(-1.0, min(1.0, cosine))) < angle)
+
+
+class World:
+    """Maps between the page's coordinates, the trained ones and those of the capture."""
+
+    def __init__(self, space: Space, cameras: Sequence[CameraLike], middle: Array | None = None) -> None:
+        """Find up and the middle of a scene.
+
+        Args:
+            space: the trained world.
+            cameras: the capture's; may be empty.
+            middle: a point in the middle of the Gaussians, trained units; None: guess it from the cameras.
+        """
+        self.space = space
+        self.poses = [viewmat(camera, space) for camera in cameras]
+        self.up = up_direction(self.poses)
+        self.middle = SCALE * (middle if middle is not None else np.zeros(3))
+
+    def viewmat(self, stance: Stance) -> Array:
+        """Return the pose [4, 4], trained world to camera."""
+        pose = np.eye(4)
+        pose[:3, :3] = stance.rotation.T
+        pose[:3, 3] = -stance.rotation.T @ (stance.position / SCALE)
+        return pose
+
+    def stance(self, pose: Array, fov: float) -> Stance:
+        """Return the stance of a pose [4, 4], trained world to camera."""
+        rotation = pose[:3, :3].T
+        return Stance(-rotation @ pose[:3, 3] * SCALE, rotation.copy(), fov)
+
+    def capture_position(self, position: Array) -> Array:
+        """Return a position of the page in the capture's coordinates."""
+        return position / SCALE * self.space.unit + np.array(self.space.offset)
+
+    def page_position(self, position: Array) -> Array:
+        """Return a position of the capture in the page's coordinates."""
+        return (position - np.array(self.space.offset)) / self.space.unit * SCALE
+
+    def start(self) -> Stance:
+        """Return a first stance: slanted from above the middle, from as far as the cameras are."""
+        distance, fov = 1.2 * SCALE * self.space.extent, math.radians(50)
+        if self.poses:
+            centres = SCALE * camera_centres(np.stack(self.poses))
+            distance = (
+                float(np.clip(np.median(np.linalg.norm(centres - self.middle, axis=1)), 0.2, distance)) * 1.3
+            )
+        side = np.array([1.0, 0, 0]) if abs(self.up[0]) < 0.9 else np.array([0, 1.0, 0])
+        side -= self.up * (side @ self.up)
+        side /= np.linalg.norm(side)
+        away = np.cross(self.up, side) * -0.8 + self.up * 0.6
+        return looking(self.middle + away * distance, self.middle, self.up, fov)
+
+
+def looking(position: Array, target: Array, up: Array, fov: float) -> Stance:
+    """Return the stance at a position that looks at a target, with `up` upwards in the image."""
+    forward = (target - position) / max(1e-12, float(np.linalg.norm(target - position)))
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross(forward, np.roll(up, 1))
+    right = right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
+    return Stance(position.astype(np.float64), rotation, fov)
+
+
+def up_direction(poses: Sequence[Array]) -> Array:
+    """Guess which direction is up from the cameras' poses, each world to camera [4, 4].
+
+    Cameras that look around stand upright, so the mean of their up vectors is up. Cameras that look down from
+    above are turned in all directions, so their mean direction of view is down. The z axis is taken if it is
+    near either, or if nothing is known.
+    """
+    z = np.array([0.0, 0.0, 1.0])
+    if not poses:
+        return z
+    upright = -np.mean([pose[1, :3] for pose in poses], axis=0)
+    backward = -np.mean([pose[2, :3] for pose in poses], axis=0)
+    for guess in (upright, backward):
+        length = float(np.linalg.norm(guess))
+        if length > 0.3 and guess @ z / length > _NEAR_Z:
+            return z
+    best = upright if np.linalg.norm(upright) > 0.5 else backward
+    length = float(np.linalg.norm(best))
+    return best / length if length > 1e-3 else z

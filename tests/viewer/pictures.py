@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Makes the pictures of docs/guide/view.md.
+
+    python -m tests.viewer.pictures RUN [--data CAPTURE]
+
+RUN is the run of `make demo`; the live page trains its capture anew in a temporary folder for a while.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+
+from blitzgs.cli.view import photographs
+from blitzgs.distributed.group import Ranks
+from blitzgs.runs.folder import open_run
+from blitzgs.viewer.studio import Studio, open_model
+from blitzgs.viewer.world import looking
+from tests.browser import Browser, wait_for
+
+IMAGES = Path(__file__).parents[2] / "docs" / "images"
+WIDTH = 1200
+
+
+def save(browser: Browser, name: str) -> None:
+    """Write the page as a JPEG file, without notes such as that on the missing graphics card."""
+    browser.evaluate("document.querySelectorAll('[class*=Notification-root]').forEach(e => e.remove())")
+    time.sleep(0.3)
+    image = browser.screenshot()[..., ::-1]
+    image = cv2.resize(image, (WIDTH, WIDTH * image.shape[0] // image.shape[1]), interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(IMAGES / name), image, [cv2.IMWRITE_JPEG_QUALITY, 82])
+
+
+def settle(visitor) -> None:  # noqa: ANN001
+    time.sleep(1)
+    wait_for(
+        lambda: visitor.shown.ask.scale == 1.0 and visitor.shown.ask.version == visitor.version, 120, "sharp"
+    )
+    time.sleep(1)
+
+
+def at_rest(run: Path, data: Path | None) -> None:
+    studio = Studio(open_model(run, Ranks(), photographs(run, data)), port=0)
+    with Browser(studio.page.url, 1600, 900) as browser:
+        wait_for(browser.figures, 120, "a picture")
+        visitor = next(iter(studio.page.visitors.values()))
+        world, start = studio.page.world, studio.page.world.start()
+        visitor.go(
+            looking(world.middle + 1.15 * (start.position - world.middle), world.middle, world.up, 0.9), 5
+        )
+        settle(visitor)
+        save(browser, "view_page.jpg")
+        visitor.stand_at(studio.page.exhibit.test[len(studio.page.exhibit.test) // 2])
+        visitor.change(comparison="wipe", wipe=0.5)
+        settle(visitor)
+        save(browser, "view_compare.jpg")
+    studio.close()
+
+
+def live(data: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "blitzgs", "train", "--config", "smoke", "--data", str(data)]
+        training = subprocess.Popen(
+            [*command, "--out", f"{folder}/city", f"--viewer={port}"],
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        )
+        for line in training.stdout:
+            if "viewer: open" in line:
+                break
+        with Browser(f"http://localhost:{port}/", 1600, 900) as browser:
+            wait_for(browser.figures, 120, "a picture")
+            for line in training.stdout:
+                if line.strip().startswith("400/"):
+                    break
+            time.sleep(8)
+            save(browser, "view_live.jpg")
+        os.kill(training.pid, signal.SIGTERM)
+        training.communicate(timeout=120)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--data", type=Path)
+    args = parser.parse_args()
+    at_rest(args.run, args.data)
+    live(args.data or Path(open_run(args.run).config().data.path))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page in a headless Chromium, with models rendered on the CPU."""
+
+import contextlib
+import json
+import math
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="the extra view is not installed")
+
+from blitzgs.cli.live import live_page
+from blitzgs.cli.view import photographs
+from blitzgs.distributed.group import Ranks
+from blitzgs.runs.export import export_ply
+from blitzgs.runs.folder import open_run
+from blitzgs.training.trainer import Trainer
+from blitzgs.viewer.paths import from_json
+from blitzgs.viewer.studio import Studio, open_model
+from tests.browser import Browser, chromium, wait_for
+from tests.training.tiny import tiny_config, tiny_scene
+
+needs_chromium = pytest.mark.skipif(
+    chromium() is None, reason="Chromium is missing: install it (Debian: apt-get install chromium)"
+)
+
+
+def settled(studio):
+    """Wait until the one visitor sees a picture of full quality of what is asked for; return the visitor."""
+    wait_for(lambda: studio.page.visitors, 60, "the page is open")
+    visitor = next(iter(studio.page.visitors.values()))
+    time.sleep(0.4)  # the camera is still
+
+    def sharp():
+        shown = visitor.shown
+        return shown is not None and shown.ask.scale == 1.0 and shown.ask.version == visitor.version
+
+    wait_for(sharp, 60, "a picture of full quality")
+    time.sleep(0.6)  # the browser draws it
+    return visitor
+
+
+def picture(browser):
+    """Return the page without its panel and the figures."""
+    return browser.screenshot()[160:560, 20:760].astype(int)
+
+
+@pytest.fixture(scope="module")
+def studio(trained):
+    data, folder = trained
+    opened = open_model(folder, Ranks(), photographs(folder, data))
+    studio = Studio(opened, port=0)
+    yield studio
+    studio.close()
+
+
+@pytest.fixture(scope="module")
+def browser(studio):
+    with Browser(studio.page.url) as browser:
+        settled(studio)
+        yield browser
+
+
+def test_pictures_take_their_share_of_a_training(tmp_path):
+    trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
+    live = live_page(trainer.state, 0, "127.0.0.1")
+    try:
+        assert not live.wants()  # nobody looks
+        live._last = (None, None)
+        live.page.deliver = lambda *_: None
+        before = time.monotonic()
+        live.show(None, 0.3)
+        assert live._allowed - before == pytest.approx(0.3 / 0.03, abs=0.5)
+    finally:
+        live.close()
+
+
+def test_a_port_in_use_does_not_end_a_training(tmp_path, capsys):
+    trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        assert live_page(trainer.state, taken.getsockname()[1], "127.0.0.1") is None
+    assert "training goes on without the viewer" in capsys.readouterr().out
+
+
+@needs_chromium
+def test_the_page_shows_the_model(studio, browser):
+    settled(studio)
+    shown = picture(browser)
+    assert shown.std() > 3
+    assert "Gaussians in view" in browser.figures() and "units" in browser.figures()
+    assert browser.errors() == []
+
+
+@needs_chromium
+def test_a_drag_turns_the_camera(studio, browser):
+    visitor = settled(studio)
+    before, place = picture(browser), visitor.stance.position
+    browser.drag((300, 300), (420, 330))
+    settled(studio)
+    assert np.linalg.norm(visitor.stance.position - place) > 0.05
+    assert np.abs(picture(browser) - before).mean() > 2
+
+
+@needs_chromium
+def test_a_control_changes_the_picture(studio, browser):
+    visitor = settled(studio)
+    before = picture(browser)
+    box = browser.evaluate(
+        """(() => {
+          const field = [...document.querySelectorAll('input')].find(e => e.value === 'RGB');
+          const box = field.getBoundingClientRect();
+          return [box.x + box.width / 2, box.y + box.height / 2];
+        })()"""
+    )
+    browser.click(*box)
+    browser.press("depth")
+    wait_for(lambda: visitor.settings.mode == "depth", 10, "the mode is chosen")
+    settled(studio)
+    assert np.abs(picture(browser) - before).mean() > 5
+    assert "depth" in browser.figures()
+    visitor.change(mode="RGB")
+    assert browser.errors() == []
+
+
+@needs_chromium
+def test_a_click_on_a_frustum_stands_there(studio, browser):
+    visitor = settled(studio)
+    world = studio.page.world
+    start = world.start()
+    middle = world.middle
+    visitor.go(start.__class__(middle + 2 * (start.position - middle), start.rotation, start.fov), 5.0)
+    settled(studio)
+    camera, stance = visitor.client.camera, visitor.stance
+    focal = 0.5 * camera.image_height / math.tan(camera.fov / 2)
+    width = browser.evaluate("document.querySelector('canvas').getBoundingClientRect().width")
+    for index in studio.page.frustums.indices:
+        place = stance.rotation.T @ (world.stance(world.poses[index], 1.0).position - stance.position)
+        x, y = place[:2] / place[2] * focal * width / camera.image_width
+        x, y = x + width / 2, y + 360
+        if place[2] > 0 and 330 < x < width - 20 and 20 < y < 600:
+            browser.click(x, y)
+            try:
+                wait_for(lambda: visitor.standing is not None, 3, "somebody stands")
+                break
+            except AssertionError:
+                continue  # another thing is in front
+    assert visitor.standing is not None
+    settled(studio)
+    wanted = world.stance(world.poses[visitor.standing], visitor.stance.fov)
+    assert visitor.stance.is_near(wanted)
+    assert visitor._stance.is_near(wanted, 0.02, 0.01)  # the browser's own camera
+    name = studio.page.exhibit.cameras[visitor.standing].name
+    wait_for(lambda: browser.place_of(f"Standing at {name}"), 10, "the panel names the photograph")
+
+
+@needs_chromium
+def test_photograph_and_render_are_compared(studio, browser):
+    visitor = settled(studio)
+    visitor.stand_at(0)
+    pictures = {}
+    for kind in ("off", "wipe", "side by side", "error"):
+        visitor.change(comparison=kind)
+        settled(studio)
+        pictures[kind] = picture(browser)
+        assert ("dB" in browser.figures()) == (kind != "off")
+    for kind in ("wipe", "side by side", "error"):
+        assert np.abs(pictures[kind] - pictures["off"]).mean() > 1, kind
+    visitor.change(comparison="off")
+
+
+@needs_chromium
+def test_a_path_is_saved(studio, browser):
+    visitor = settled(studio)
+    browser.press("Viewpoints and path")
+    browser.press("Add viewpoint")
+    browser.press("Back to the start")
+    settled(studio)
+    browser.press("Add viewpoint")
+    wait_for(lambda: browser.place_of("2 viewpoints"), 10, "two viewpoints")
+    browser.press("Save path")
+    file = studio.page.exhibit.paths / "path.json"
+    wait_for(file.exists, 10, "the path is written")
+    path = from_json(file.read_text())
+    assert len(path.keyframes) == 2
+    assert json.loads(file.read_text())["camera_type"] == "perspective"
+    place = visitor.world.capture_position(visitor.stance.position)
+    np.testing.assert_allclose(
+        path.keyframes[1].camera_to_world[:3, 3], place, atol=1e-3 * np.abs(place).max()
+    )
+
+
+@needs_chromium
+def test_walking_is_at_eye_height(studio, browser):
+    visitor = settled(studio)
+    browser.press("walk")
+    wait_for(lambda: visitor.motion == "walk", 10, "the motion is chosen")
+    settled(studio)
+    browser.press("orbit")
+    wait_for(lambda: visitor.motion == "orbit", 10, "the motion is chosen")
+    settled(studio)
+    assert browser.errors() == []
+
+
+@needs_chromium
+def test_a_ply_file_behind_a_token(trained, tmp_path):
+    file = tmp_path / "model.ply"
+    export_ply(open_run(trained[1]).model(), file)
+    studio = Studio(open_model(file, Ranks()), host="0.0.0.0", port=0)
+    try:
+        url = studio.page.url.replace("0.0.0.0", "127.0.0.1")
+        with Browser(url) as browser:
+            settled(studio)
+            assert picture(browser).std() > 5
+            assert browser.errors() == []
+    finally:
+        studio.close()
+
+
+@needs_chromium
+def test_the_live_page_follows_a_training(tmp_path, monkeypatch):
+    step = Trainer.step
+
+    ends = threading.Event()
+
+    def slow(self, number):
+        if ends.is_set():
+            raise KeyboardInterrupt
+        time.sleep(0.02)
+        step(self, number)
+
+    def run():
+        with contextlib.suppress(KeyboardInterrupt):
+            trainer.train()
+
+    monkeypatch.setattr(Trainer, "step", slow)
+    settings = ("schedule.iterations=3000", "schedule.densify_until=90", "log.every=20")
+    trainer = Trainer(tiny_config(*settings), *tiny_scene(), tmp_path, Ranks())
+    live = live_page(trainer.state, 0, "127.0.0.1")
+    trainer.watch(live)
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    with Browser(live.page.url) as browser:
+        wait_for(browser.figures, 60, "a picture")
+        wait_for(lambda: picture(browser).std() > 3, 60, "the picture is on the page")
+        first = picture(browser)
+        wait_for(lambda: np.abs(picture(browser) - first).mean() > 1, 60, "another picture")
+        plots = "document.querySelectorAll('.uplot').length"
+        wait_for(lambda: browser.evaluate(plots) == 3, 30, "three curves")
+        browser.press("Pause")
+        wait_for(lambda: browser.place_of("Go on"), 20, "the training pauses")
+
+        def rests():
+            before = trainer.state.progress.step
+            time.sleep(1.0)
+            return trainer.state.progress.step == before
+
+        wait_for(rests, 30, "the training rests")
+        at = trainer.state.progress.step
+        browser.press("Save now")
+        wait_for(lambda: list((tmp_path / "checkpoints").glob("checkpoint_*")), 20, "the model is saved")
+        browser.press("Go on")
+        wait_for(lambda: trainer.state.progress.step > at, 20, "the training goes on")
+        assert browser.errors() == []
+    live.page._server.stop()  # the viewer dies
+    at = trainer.state.progress.step
+    wait_for(lambda: trainer.state.progress.step > at + 5, 20, "the training goes on")
+    ends.set()
+    thread.join(timeout=20)

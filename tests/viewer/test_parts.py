@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The viewer's parts without a browser: coordinates, paths, comparisons, the door, the pace."""
+
+import json
+import math
+import socket
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from blitzgs.view.look import Picture
+from blitzgs.view.views import Space
+from blitzgs.viewer import compare, paths
+from blitzgs.viewer.curves import Curves
+from blitzgs.viewer.door import Door, is_loopback
+from blitzgs.viewer.frustums import quaternion
+from blitzgs.viewer.overlay import round_length
+from blitzgs.viewer.pace import Pace
+from blitzgs.viewer.shade import shaded
+from blitzgs.viewer.world import World, looking, up_direction
+
+
+@dataclass
+class Camera:
+    K: np.ndarray
+    width: int = 40
+    height: int = 30
+    name: str = "a.png"
+
+
+def camera_at(position, target, up=(0.0, 0.0, 1.0)):
+    stance = looking(np.array(position, float), np.array(target, float), np.array(up), 1.0)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = stance.rotation.T, -stance.rotation.T @ stance.position
+    return pose
+
+
+def test_up_is_found_for_ground_and_aerial_captures():
+    ring = [camera_at((3 * math.sin(a), -1.0, 3 * math.cos(a)), (0, 0, 0), (0, -1, 0)) for a in range(8)]
+    np.testing.assert_allclose(up_direction(ring), [0, -1, 0], atol=0.2)
+    nadir = [camera_at((x, y, 10.0), (x, y, 0.0), (0, (-1) ** x, 0)) for x in range(4) for y in range(3)]
+    np.testing.assert_allclose(up_direction(nadir), [0, 0, 1])
+    np.testing.assert_allclose(up_direction([]), [0, 0, 1])
+
+
+def test_coordinates_go_there_and_back():
+    world = World(Space((500_000.0, 4e6, 30.0), 64.0, 1.5), [])
+    pose = camera_at((0.1, 0.2, 0.3), (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(world.viewmat(world.stance(pose, 1.0)), pose, atol=1e-12)
+    place = np.array([500_010.0, 4_000_001.0, 33.0])
+    np.testing.assert_allclose(world.capture_position(world.page_position(place)), place)
+
+
+def test_quaternions_turn_as_their_rotations():
+    for pose in (camera_at((1, 2, 3), (0, 0, 0)), np.diag([1.0, -1.0, -1.0, 1.0]), np.eye(4)):
+        w, x, y, z = quaternion(pose[:3, :3])
+        forward = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
+        np.testing.assert_allclose(forward, pose[:3, 2], atol=1e-9)
+
+
+def key(angle, fov=50.0):
+    return paths.Keyframe(
+        np.linalg.inv(camera_at((math.sin(angle), math.cos(angle), 1), (0, 0, 0))), fov, 1.5
+    )
+
+
+def test_a_path_survives_its_file():
+    path = paths.CameraPath([key(0.0), key(0.5, 60.0), key(1.0)], fps=10, seconds=2)
+    text = paths.to_json(path)
+    content = json.loads(text)
+    assert len(content["camera_path"]) == 20
+    assert {"camera_to_world", "fov", "aspect"} <= content["camera_path"][0].keys()
+    # A camera of OpenGL looks along -z.
+    first = np.array(content["keyframes"][0]["matrix"]).reshape(4, 4)
+    np.testing.assert_allclose(-first[:3, 2], path.keyframes[0].camera_to_world[:3, 2])
+    again = paths.from_json(text)
+    for a, b in zip(path.keyframes, again.keyframes, strict=True):
+        np.testing.assert_allclose(a.camera_to_world, b.camera_to_world, atol=1e-12)
+        assert (a.fov, a.aspect) == (b.fov, b.aspect)
+
+
+def test_frames_pass_through_the_keyframes():
+    keys = [key(angle) for angle in (0.0, 0.4, 1.0)]
+    frames = paths.CameraPath(keys, fps=1, seconds=5).frames()
+    for frame, wanted in zip((frames[0], frames[2], frames[4]), keys, strict=True):
+        np.testing.assert_allclose(frame.camera_to_world, wanted.camera_to_world, atol=1e-9)
+    for frame in frames:
+        rotation = frame.camera_to_world[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", '{"keyframes": [{"matrix": [1, 2], "fov": 3}]}', '{"camera_path": 3}']
+)
+def test_files_that_are_no_paths_are_refused(text):
+    with pytest.raises(ValueError, match="no camera path"):
+        paths.from_json(text)
+
+
+def test_an_old_path_of_nerfstudio_is_read():
+    matrix = np.linalg.inv(camera_at((0, 0, 5), (1, 0, 0))) @ np.diag([1, -1, -1, 1])
+    text = json.dumps(
+        {"keyframes": [{"matrix": json.dumps(matrix.T.ravel().tolist()), "fov": 40, "aspect": 1}]}
+    )
+    found = paths.from_json(text).keyframes[0]
+    np.testing.assert_allclose(found.camera_to_world[:3, 3], [0, 0, 5], atol=1e-9)
+
+
+def test_a_photograph_lies_where_the_render_shows_its_pixels():
+    camera = Camera(np.array([[35.0, 0, 20], [0, 35, 15], [0, 0, 1]]))
+    photograph = np.random.default_rng(0).integers(0, 255, (30, 40, 3), dtype=np.uint8)
+    same = compare.compare("wipe", photograph, photograph, camera, camera.K, 1.0)
+    np.testing.assert_array_equal(same.image[:, :-2], photograph[:, :-2])
+    assert same.psnr > 100
+    K = compare.fitted(camera, 120, 120)  # noqa: N806
+    shown = compare.compare("error", np.zeros((120, 120, 3), np.uint8), photograph, camera, K)
+    assert (shown.image[:14] == 0).all() and (shown.image[16:104] > 0).any()
+    grid = compare.compare("side by side", photograph, photograph, camera, camera.K, columns=2)
+    assert grid.image.shape == (60, 80, 3)
+
+
+@pytest.mark.parametrize(("size", "columns"), [((900, 200), 3), ((400, 300), 2), ((200, 900), 1)])
+def test_images_side_by_side_are_as_large_as_they_can_be(size, columns):
+    assert compare.grid_columns(Camera(np.eye(3)), *size) == columns
+
+
+def test_numbers_become_colours():
+    depth = np.linspace(1, 9, 64, dtype=np.float32).reshape(8, 8)
+    depth[0, 0] = 0
+    found = shaded(Picture(depth, 1, 1.0), "depth")
+    assert found.image.shape == (8, 8, 3) and (found.image[0, 0] == 0).all()
+    assert 1 <= found.low < found.high <= 9
+    empty = shaded(Picture(np.zeros((2, 2), np.float32), 0, 1.0), "count")
+    assert (empty.image == 0).all()
+
+
+def test_pictures_are_coarse_while_the_camera_moves():
+    pace = Pace()
+    pace.measured(1.0, 500.0)
+    coarse = pace.next_scale(None, moving=True)
+    assert coarse < 0.3
+    assert pace.next_scale(coarse, moving=True) is None
+    finer = pace.next_scale(coarse, moving=False)
+    assert coarse < finer < 1.0
+    assert pace.next_scale(finer, moving=False) == 1.0
+    assert pace.next_scale(1.0, moving=False) is None
+    quick = Pace()
+    quick.measured(1.0, 5.0)
+    assert quick.next_scale(None, moving=True) == 1.0
+
+
+def test_scale_bars_are_round():
+    assert [round_length(x) for x in (0.9, 1.0, 3.0, 7.0, 99.0)] == pytest.approx([0.5, 1, 2, 5, 50])
+
+
+def test_curves_take_steps_and_evaluations():
+    curves = Curves()
+    assert "no figures" in curves.status(10)
+    curves.add(5, {"loss": 0.5, "psnr": 20.0, "gaussians": 7, "images_per_second": 3.0})
+    curves.add(5, {"event": "evaluation", "psnr": 21.0})
+    curves.add(6, {"event": "densify", "gaussians": 9})
+    assert curves.version == 2
+    assert "held out: 21.00 dB" in curves.status(10)
+
+
+# -- the door ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def behind():
+    """A server that answers each request with its first line."""
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def serve():
+        while True:
+            try:
+                connection, _ = server.accept()
+            except OSError:
+                return
+            with connection:
+                head = connection.recv(65536)
+                line = head.split(b"\r\n")[0]
+                connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%s" % (len(line), line))
+
+    threading.Thread(target=serve, daemon=True).start()
+    yield server.getsockname()[1]
+    server.close()
+
+
+def ask(port, path="/", host="localhost", extra="", method="GET"):
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+        connection.sendall(f"{method} {path} HTTP/1.1\r\nHost: {host}\r\n{extra}\r\n".encode())
+        answer = b""
+        while chunk := connection.recv(65536):
+            answer += chunk
+    return answer.decode()
+
+
+def test_the_door_without_a_token_is_for_this_machine(behind):
+    door = Door("127.0.0.1", 0, behind, "")
+    try:
+        assert "GET / HTTP/1.1" in ask(door.port, host=f"localhost:{door.port}")
+        assert "GET /a?b" in ask(door.port, "/a?b", host="127.0.0.1:1")
+        assert " 403 " in ask(door.port, host="evil.example")  # a name that was made to lead here
+        upgrade = "Upgrade: websocket\r\nOrigin: http://evil.example\r\n"
+        assert " 403 " in ask(door.port, extra=upgrade)
+        assert "200 OK" in ask(door.port, extra="Upgrade: websocket\r\nOrigin: http://localhost\r\n")
+        assert " 405 " in ask(door.port, method="POST")
+    finally:
+        door.close()
+
+
+def test_the_door_with_a_token(behind):
+    door = Door("127.0.0.1", 0, behind, "secret")
+    try:
+        assert " 403 " in ask(door.port, host="machine")
+        assert " 403 " in ask(door.port, "/secrets/", host="machine")
+        assert " 403 " in ask(door.port, extra="Upgrade: websocket\r\n")
+        assert "Location: /secret/" in ask(door.port, "/secret", host="machine")
+        assert "GET /x HTTP/1.1" in ask(door.port, "/secret/x", host="machine")
+        assert "GET / HTTP/1.1" in ask(door.port, "/secret", extra="Upgrade: websocket\r\n")
+    finally:
+        door.close()
+
+
+def test_a_port_in_use_is_an_error(behind):
+    with pytest.raises(OSError, match=f"cannot listen on 127.0.0.1:{behind}"):
+        Door("127.0.0.1", behind, behind, "")
+
+
+def test_addresses_of_this_machine():
+    assert is_loopback("localhost") and is_loopback("127.0.0.1") and is_loopback("::1")
+    assert not is_loopback("0.0.0.0") and not is_loopback("machine.example")
