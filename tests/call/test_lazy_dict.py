@@ -84,14 +84,6 @@ def test_values_may_be_replaced_and_deleted():
         values["radii"]
 
 
-def test_a_changed_value_is_computed_when_it_is_read():
-    values, computed = lazy()
-    values.change("ids", lambda ids: [*ids, 4])
-    values.change("image", lambda image: image + 1)
-    assert computed == []
-    assert values["ids"] == [2, 3, 4] and values["image"] == 2 and computed == ["ids"]
-
-
 LATE_READERS = (
     "dict",
     "unpacked",
