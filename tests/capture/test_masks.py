@@ -9,7 +9,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.capture.image_files import decode_mask
 from blitzgs.capture.images import ImageStore
 from blitzgs.capture.masks import find_masks
-from tests.capture.helpers import write_capture, write_image
+from tests.capture.helpers import smooth_image, write_capture, write_image
 from tests.capture.image_bytes import png, tiff
 
 SHAPE = (48, 64)
@@ -191,3 +191,16 @@ def test_messages_about_masks_speak_of_masks(tmp_path):
     store = ImageStore(load_capture(root))
     with pytest.raises(ValueError, match=r"the mask .*masks/a.png: at byte \d+: truncated PNG"):
         store.mask(0)
+
+
+def test_a_photograph_is_not_taken_for_its_own_mask(tmp_path):
+    """Absolute names and `..`, joined to the folder of masks, would lead to the photographs."""
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "capture" / "masks").mkdir(parents=True)
+    write_image(tmp_path / "photos" / "a.png", smooth_image(64, 48))
+    photo = str(tmp_path / "photos" / "a.png")
+    for name in (photo, "../../photos/a.png"):
+        assert find_masks(tmp_path / "capture", None, [name], [None]) == [None]
+    cv2.imwrite(str(tmp_path / "capture" / "masks" / "a.png"), np.ones((4, 4), dtype=np.uint8))
+    found = find_masks(tmp_path / "capture", None, [photo], [None])
+    assert found == [tmp_path / "capture" / "masks" / "a.png"]
