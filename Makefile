@@ -105,7 +105,7 @@ sanitize-%:
 # in build-fuzz; add it to csrc/io/fuzz/corpus once it is mended. Needs clang (Debian: apt-get install clang).
 FUZZ_CXX ?= clang++
 FUZZ_SECONDS ?= 60
-FUZZERS = jpeg qoi ply colmap_binary colmap_text
+FUZZERS = jpeg image_header qoi ply colmap_binary colmap_text
 FUZZ_SOURCES = csrc/io/fuzz/readers_fuzz.cpp $(filter-out %_test.cpp %/module.cpp,$(wildcard csrc/io/*.cpp))
 fuzz: $(FUZZERS:%=fuzz-%)
 fuzz-%: build-fuzz/%

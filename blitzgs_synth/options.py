@@ -81,11 +81,11 @@ PRESETS = {
     # Flat crops from straight above, with grain: a capture on which training can lose what it has learnt
     # (docs/decisions/recipe.md).
     "farmland": CityOptions(
-        extent=240.0,
+        extent=600.0,
         views=166,
         width=800,
         height=600,
-        points_per_view=1200,
+        points_per_view=450,
         oblique=0.0,
         built=False,
         grain=5.0,

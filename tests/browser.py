@@ -129,10 +129,16 @@ class Browser:
         )
         return None if found is None else tuple(found)
 
-    def press(self, text: str, timeout: float = 20):
+    def press(self, text: str, timeout: float = 60):
         """Click on the element with a text."""
         wait_for(lambda: self.place_of(text), timeout, f"{text!r} is on the page")
-        time.sleep(0.2)
+
+        def rests():
+            before = self.place_of(text)
+            time.sleep(0.4)  # folders open slowly
+            return before is not None and self.place_of(text) == before
+
+        wait_for(rests, timeout, f"{text!r} rests")
         self.click(*self.place_of(text))
 
     def figures(self) -> str:

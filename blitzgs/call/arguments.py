@@ -14,7 +14,7 @@ from torch import Tensor
 
 from blitzgs._torch import func_transforms_are_active
 from blitzgs.call.covariances import Decomposed, decompose
-from blitzgs.capture.cameras import MOST_SIDE
+from blitzgs.capture.cameras import MAX_SIDE
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -175,7 +175,7 @@ def check_options(
     """
     for name, size in (("width", width), ("height", height)):
         _check_whole(name, size)
-        if not 1 <= size <= MOST_SIDE:
+        if not 1 <= size <= MAX_SIDE:
             raise ValueError(f"{name} must be 1 to 2^20 px, got {size}")
     _check_whole("tile_size", tile_size)
     if not 1 <= tile_size <= 64:

@@ -14,7 +14,7 @@ from blitzgs.call.covariances import Decomposed, shaped_by
 from blitzgs.call.queued import Rendered, ShTables
 from blitzgs.ops.project import differentiable_splats, project_splats
 from blitzgs.ops.project_gradient import TableRows
-from blitzgs.ops.projection_types import MOST_VIEWS, ProjectedSplats, ProjectionInputs, ProjectionOptions
+from blitzgs.ops.projection_types import MAX_VIEWS, ProjectedSplats, ProjectionInputs, ProjectionOptions
 
 # The tile size of the CUDA kernels. If the caller asks for another one, only meta's lists have it.
 CUDA_TILE_SIZE = 16
@@ -54,7 +54,7 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
     """Divide the views into groups; one scene of up to 32 views with common colours is one group."""
     groups = []
     sh_per_view = gaussians.per_view and gaussians.sh_degree is not None
-    most = 1 if sh_per_view else MOST_VIEWS
+    most = 1 if sh_per_view else MAX_VIEWS
     for s, scene in enumerate(gaussians.scenes):
         # Do not split a single group: the split would add a node to autograd's graph.
         views = [(scene.viewmats, scene.Ks)]

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture.cameras import (
-    MOST_SIDE,
+    MAX_SIDE,
     Camera,
     Float64,
     camera_centres,
@@ -25,11 +25,16 @@ from blitzgs.capture.cameras import (
     same_shape,
     scaled_matrix,
 )
-from blitzgs.capture.files import find_mask
+from blitzgs.capture.check_files import damaged
+from blitzgs.capture.files import MissingImagesError as MissingImagesError
+from blitzgs.capture.files import existing
 from blitzgs.capture.image_files import ImageHeader, read_header
 from blitzgs.capture.layouts import Source, SourceView, read_layout
 from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_extent
 from blitzgs.capture.lens import Lens
+from blitzgs.capture.masks import excluded_share, find_masks
+from blitzgs.capture.names import check_inside
+from blitzgs.capture.points import SourcePoints
 from blitzgs.capture.splits import split_capture, without_unused
 from blitzgs.capture.undistort import Rectification, rectify
 from blitzgs.capture.usable import (
@@ -44,7 +49,6 @@ from blitzgs.util.arguments import check_number
 # In pixels. SSIM compares windows of 11 pixels, and a much smaller image shows too little to train on.
 _LEAST_SIDE = 8
 _HEADER_THREADS = 16
-_MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp")
 
 
 @dataclass(eq=False)
@@ -96,10 +100,20 @@ class About:
     """Number of views that see none of the points."""
     random_points: bool
     """Whether the capture has no points, so that training starts from random ones."""
-
-
-class MissingImagesError(FileNotFoundError):
-    """Some of the images that a capture names are not on disk."""
+    points_from: str = ""
+    """The file of the points, relative to the capture."""
+    colors_from: str = ""
+    """What in it gives their colours; empty: nothing."""
+    with_alpha: int = 0
+    """Number of photographs that have alpha."""
+    extra_bands: int = 0
+    """Number of photographs with a band that is neither colour nor alpha; it is not used."""
+    with_mask: int = 0
+    """Number of photographs that have a mask."""
+    mask_share: float | None = None
+    """Mean share of the pixels that masks exclude, of a few masks."""
+    damaged: int = 0
+    """Number of views that `allow_missing` left out because their image or mask is damaged."""
 
 
 def load_capture(
@@ -114,6 +128,7 @@ def load_capture(
     allow_missing: bool = False,
     sparse: str = "largest",
     stray_cameras: str = "drop",
+    inside_only: bool = False,
 ) -> Capture:
     """Load a capture without decoding its images.
 
@@ -131,12 +146,15 @@ def load_capture(
         undistort: "crop" or "mask" the part of a pinhole image that the distorted image does not cover.
         exif: "auto" turns an image by its EXIF orientation only if its stored size does not fit the camera
             and its turned size does (COLMAP itself ignores the tag); "apply" always turns it, "ignore" never.
-        allow_missing: drop views whose image is not on disk, with a warning, instead of failing. The world's
+        allow_missing: drop views whose image is not on disk, or whose image or mask is damaged, with a
+            warning, instead of failing; all files are read for that. The world's
             origin, the extent and the split are still computed from all views with a pose.
         sparse: which of several COLMAP models is read: the "largest", "all" of them, which must have the same
             world coordinates, or a folder such as "sparse/1", relative to `path`.
         stray_cameras: "drop" the cameras that lie apart from all others and hardly show a point, or "keep"
             them; no length is measured by them either way.
+        inside_only: refuse names that lead outside the capture, for captures that somebody else has made;
+            otherwise they are read with a warning.
 
     Raises:
         FileNotFoundError: the folder has no capture, or images are missing on disk (`MissingImagesError`).
@@ -168,26 +186,31 @@ def load_capture(
     centres = camera_centres(np.stack([view.world_to_camera for view in views]))
     offset = centres[~apart].mean(axis=0)
     train_centres = centres[[i for i in train if not apart[i]] or train] - offset
-    kept = _existing(views, root, images, allow_missing)
+    _check_inside(root, views, points, images, masks, inside_only)
+    kept = existing([v.name for v in views], [v.path for v in views], root, images, allow_missing)
     missing = len(views) - len(kept)
+    kept, found, damage = _with_files(views, kept, root, masks, allow_missing)
     kept = without_strays(views, kept, strays, keep=stray_cameras == "keep")
     place = {index: position for position, index in enumerate(kept)}
-    views = [views[index] for index in kept]
+    views = [replace(views[index], mask_path=found[index]) for index in kept]
     train, test = ([place[index] for index in part if index in place] for part in (train, test))
     apart_left = [place[index] for index in kept if apart[index]]
     if not train:
         raise MissingImagesError(f"{root}: no image of a training view is on disk")
     with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # the files may be on a slow network disk
         headers = list(pool.map(lambda view: read_header(view.path), views))
-    mask_folder = _mask_folder(root, masks)
-    if masks is False:
-        views = [replace(view, mask_path=None) for view in views]
+    extra_bands = [view for view, header in zip(views, headers, strict=True) if header.extra_bands]
+    if extra_bands:
+        warnings.warn(
+            f"{len(extra_bands)} of {len(views)} photographs have a further band that their file does not "
+            f"call alpha (first: {extra_bands[0].name}), near infrared for example; it is not used",
+            stacklevel=2,
+        )
     plans: dict[Lens, Rectification] = {}
     cameras = [
-        _camera(view, header, offset, downscale, undistort, exif, mask_folder, plans)
+        _camera(view, header, offset, downscale, undistort, exif, plans)
         for view, header in zip(views, headers, strict=True)
     ]
-    _check_masks(cameras, mask_folder)
     has_points = len(points.positions) > 0
     if not has_points:
         points = points_at_random(root, [c for i, c in enumerate(cameras) if i not in apart_left], offset)
@@ -210,72 +233,60 @@ def load_capture(
         has_alpha=any(header.has_alpha for header in headers),
         near=near,
         apart=apart_left,
-        about=About(source, why, strays, unused, missing, blind, not has_points),
+        about=About(
+            source,
+            why,
+            strays,
+            unused,
+            missing,
+            blind,
+            not has_points,
+            points_from=_relative(points.path, root),
+            colors_from=points.colors_from,
+            with_alpha=sum(header.has_alpha for header in headers),
+            extra_bands=len(extra_bands),
+            with_mask=sum(view.mask_path is not None for view in views),
+            mask_share=excluded_share([view.mask_path for view in views]),
+            damaged=len(damage),
+        ),
     )
 
 
-def _existing(views: list[SourceView], root: Path, images: str, allow_missing: bool) -> list[int]:
-    """Return the indices of the views whose image is on disk."""
-    exists = [view.path.is_file() for view in views]
-    missing = [view.name for view, there in zip(views, exists, strict=True) if not there]
-    found = [index for index, there in enumerate(exists) if there]
-    if not missing:
-        return found
-    shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
-    # The names of a transforms.json are paths in the capture; those of a COLMAP model, in its image folder.
-    are_paths = all(view.path == root / view.name for view in views if not view.path.is_file())
-    folder = root if are_paths else root / images
-    message = f"{len(missing)} of {len(views)} images are not in {folder}: {shown}"
-    if not found and are_paths:
-        raise FileNotFoundError(f"{message}; put them there, or correct file_path in its transforms.json")
-    if not found:
-        # A user may name the folder of the model, CAPTURE/sparse/0.
-        above = next((folder for folder in root.resolve().parents[:2] if (folder / images).is_dir()), None)
-        if above is not None and not (root / images).is_dir():
-            raise FileNotFoundError(f"{message}; the capture may be the folder above: --data={above}")
-        raise FileNotFoundError(
-            f"{message}; name their folder, relative to the capture, with --data.images=FOLDER"
-        )
-    if not allow_missing:
-        raise MissingImagesError(f"{message}; put them back, or leave those views out with allow_missing")
-    warnings.warn(f"{message}; dropped", stacklevel=3)
-    return found
-
-
-def _mask_folder(root: Path, masks: str | bool | None) -> Path | None:
-    if masks is False:
-        return None
-    folder = root / (masks if isinstance(masks, str) else "masks")
-    if folder.is_dir():
-        return folder
-    if masks is not None:
-        raise FileNotFoundError(f"{folder}: no such folder of masks")
-    return None
-
-
-def _check_masks(cameras: Sequence[Camera], folder: Path | None) -> None:
-    """Check that the masks belong to the images, so that no mask is ignored without a message."""
-    used = {camera.mask_path for camera in cameras if camera.mask_path is not None}
-    missing = sorted(str(path) for path in used if not path.is_file())
-    if missing:
-        raise FileNotFoundError(
-            f"{len(missing)} masks are missing (first: {missing[0]}); use --data.masks=false to train without"
-        )
-    if folder is None:
-        return
-    files = {path for path in folder.rglob("*") if path.suffix.lower() in _MASK_SUFFIXES}
-    unused = sorted(str(path.relative_to(folder)) for path in files - used)
-    if files and not used:
-        raise ValueError(
-            f"none of the {len(files)} masks in {folder} belongs to an image: they are called like "
-            f"{unused[0]}, the images like {cameras[0].name}; rename them to NAME.png, or use "
-            "--data.masks=false"
-        )
-    if unused:
+def _with_files(
+    views: Sequence[SourceView], kept: list[int], root: Path, masks: str | bool | None, allow: bool
+) -> tuple[list[int], dict[int, Path | None], dict[int, str]]:
+    """Return the views that are left, the mask of each, and what is wrong with those that are left out."""
+    some = [views[index] for index in kept]
+    found = find_masks(root, masks, [view.name for view in some], [view.mask_path for view in some])
+    damage = damaged([(view.path, mask) for view, mask in zip(some, found, strict=True)]) if allow else {}
+    if damage:
         warnings.warn(
-            f"{len(unused)} of {len(files)} masks in {folder} belong to no image (first: {unused[0]})",
+            f"{len(damage)} of {len(some)} images or their masks are damaged; dropped (first: "
+            f"{next(iter(damage.values()))})",
             stacklevel=3,
         )
+    left = [place for place in range(len(kept)) if place not in damage]
+    return [kept[place] for place in left], {kept[place]: found[place] for place in left}, damage
+
+
+def _relative(path: Path | None, root: Path) -> str:
+    if path is None:
+        return ""
+    return str(path.relative_to(root) if path.is_relative_to(root) else path)
+
+
+def _check_inside(
+    root: Path,
+    views: Sequence[SourceView],
+    points: SourcePoints,
+    images: str,
+    masks: str | bool | None,
+    refuse: bool,
+) -> None:
+    """See `names.check_inside`; the folders that the options name may be anywhere."""
+    named = [path for view in views for path in (view.path, view.mask_path) if path is not None]
+    folders = [root / images] + ([root / masks] if isinstance(masks, str) else [])
+    check_inside(named + ([points.path] if points.path else []), root, folders, refuse)
 
 
 def _camera(
@@ -285,7 +296,6 @@ def _camera(
     downscale: float,
     policy: str,
     exif: str,
-    mask_folder: Path | None,
     plans: dict[Lens, Rectification],
 ) -> Camera:
     orientation = _orientation(view, header, exif)
@@ -296,9 +306,9 @@ def _camera(
             f"{view.path} is {width} x {height}, which does not fit its camera of {view.lens.width} x "
             f"{view.lens.height}: the image was cropped or turned after the poses were found"
         )
-    if max(width, height) > MOST_SIDE:
+    if max(width, height) > MAX_SIDE:
         raise ValueError(
-            f"{view.path} is {width} x {height}: no side may be longer than {MOST_SIDE:,} pixels; put a "
+            f"{view.path} is {width} x {height}: no side may be longer than {MAX_SIDE:,} pixels; put a "
             "smaller copy in its place"
         )
     lens = view.lens.scaled(width, height)
@@ -319,9 +329,6 @@ def _camera(
         )
     pose = view.world_to_camera.copy()
     pose[:3, 3] += pose[:3, :3] @ offset
-    mask = view.mask_path
-    if mask is None and mask_folder is not None:
-        mask = find_mask(mask_folder, view.name)
     return Camera(
         name=view.name,
         width=size[0],
@@ -329,7 +336,7 @@ def _camera(
         K=scaled_matrix(plan.K, (plan.width, plan.height), size),
         world_to_camera=pose,
         image_path=view.path,
-        mask_path=mask,
+        mask_path=view.mask_path,
         orientation=orientation,
         rectification=plan,
     )

@@ -88,6 +88,8 @@ class ColmapModel:
     cameras: list[ColmapCamera] = field(default_factory=list)
     images: ColmapImages = field(default_factory=ColmapImages)
     points: ColmapPoints = field(default_factory=ColmapPoints)
+    points_path: Path | None = None
+    """The file of the points. If it is a PLY, `points` is empty, and the caller reads it."""
 
 
 @cache
@@ -133,13 +135,22 @@ def _numbered(folder: Path) -> list[Path]:
 
 
 def _has(folder: Path, enough: Callable[[Iterable[bool]], bool]) -> bool:
-    return any(enough((folder / (name + suffix)).is_file() for name in FILES) for suffix in _SUFFIXES)
+    return any(enough(_file(folder, name, suffix).is_file() for name in FILES) for suffix in _SUFFIXES)
+
+
+def _file(folder: Path, name: str, suffix: str) -> Path:
+    """Return a file of a model; programs that change a model may leave its points as points3D.ply alone."""
+    path = folder / (name + suffix)
+    others = [folder / (name + other) for other in (".bin", ".txt")]
+    if name == "points3D" and not any(other.is_file() for other in others):
+        path = path.with_suffix(".ply") if path.with_suffix(".ply").is_file() else path
+    return path
 
 
 def count_images(folder: Path) -> int:
     """Return the number of images of a model; 0 if its file is damaged, so that an undamaged one is used."""
     path = folder / "images.bin"
-    if not all((folder / f"{name}.bin").is_file() for name in FILES):
+    if not all(_file(folder, name, ".bin").is_file() for name in FILES):
         path = folder / "images.txt"
     try:
         return len(native_io().read_images(os.fsencode(path), False)["ids"])
@@ -160,17 +171,18 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
         ValueError: a file is damaged; names the file, the byte offset or line, and the reason.
     """
     folder = Path(folder)
-    binary, text = ({name: folder / (name + suffix) for name in FILES} for suffix in _SUFFIXES)
+    binary, text = ({name: _file(folder, name, suffix) for name in FILES} for suffix in _SUFFIXES)
     complete = (kind for kind in (binary, text) if all(path.is_file() for path in kind.values()))
     paths = next(complete, binary if binary["cameras"].is_file() else text)
     for path in paths.values():
         if not path.is_file():
             raise FileNotFoundError(f"{path} is missing: {folder} is not a complete COLMAP sparse model")
-    io = native_io()
+    io, in_ply = native_io(), paths["points3D"].suffix == ".ply"
     return ColmapModel(
         [ColmapCamera(*row) for row in io.read_cameras(os.fsencode(paths["cameras"]))],
         ColmapImages(**io.read_images(os.fsencode(paths["images"]), points2d)),
-        ColmapPoints(**io.read_points(os.fsencode(paths["points3D"]), tracks)),
+        ColmapPoints() if in_ply else ColmapPoints(**io.read_points(os.fsencode(paths["points3D"]), tracks)),
+        paths["points3D"],
     )
 
 

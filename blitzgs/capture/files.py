@@ -1,17 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the images and masks of a COLMAP capture on disk."""
+"""Finds the images of a capture on disk, and says which are missing."""
 
 from __future__ import annotations
 
 import os
 import warnings
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
 from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
+from blitzgs.capture.names import match_names, what_is_at
 
 _SUFFIXES = (".jpg", ".JPG", ".jpeg", ".png", ".PNG")
+
+
+class MissingImagesError(FileNotFoundError):
+    """Some of the images that a capture names are not on disk."""
 
 
 class ImageFinder:
@@ -36,7 +42,12 @@ class ImageFinder:
                 if problem is None:
                     return [path for path in paths if path is not None]
                 warnings.warn(f"{problem}; downscaling {self.images} instead", stacklevel=2)
-        return [self._find(name) for name in names]
+        files = [self._find(name) for name in names]
+        there = [path.is_file() for path in files]
+        lost = [name for name, found in zip(names, there, strict=True) if not found]
+        found = [name for name, is_there in zip(names, there, strict=True) if is_there]
+        matches = match_names(lost, found, self.root / self.images)
+        return [matches.get(name, path) for name, path in zip(names, files, strict=True)]
 
     def _find(self, name: str) -> Path:
         first = self.root / self.images / name
@@ -94,17 +105,60 @@ def read_lines(path: Path) -> list[str]:
     return os.fsdecode(path.read_bytes()).removeprefix("\ufeff").splitlines()
 
 
-def find_mask(folder: Path, name: str) -> Path | None:
-    """Return the mask of an image, or None: NAME.png (as in COLMAP), STEM.png or the image's own name.
+def existing(names: Sequence[str], paths: Sequence[Path], root: Path, images: str, allow: bool) -> list[int]:
+    """Return the indices of the views whose image is on disk.
 
-    Of a name that is absolute or leads out of its folder, only the last part is used: the whole name, joined
-    to the folder of masks, could be the path of the photograph itself.
+    Args:
+        names: of the views.
+        paths: of their images.
+        root: folder of the capture.
+        images: folder of the images, relative to `root`.
+        allow: warn of missing images instead of failing.
+
+    Raises:
+        MissingImagesError: images are missing.
+        FileNotFoundError: all are missing.
+        ValueError: two views have one image.
     """
-    pure = PurePath(name)
-    leads_out = pure.is_absolute() or ".." in pure.parts
-    for candidate in (f"{name}.png", str(pure.with_suffix(".png")), name):
-        inner = folder / PurePath(candidate).name
-        for path in (inner,) if leads_out else (folder / candidate, inner):
-            if path.is_file():
-                return path
-    return None
+    exists = [path.is_file() for path in paths]
+    owners = defaultdict(list)
+    for name, path, there in zip(names, paths, exists, strict=True):
+        if there:
+            owners[path].append(name)
+    if twice := next((found for found in owners.values() if len(found) > 1), None):
+        raise ValueError(f"{root}: {twice[0]} and {twice[1]} would be the same file; put both images there")
+    missing = [(name, path) for name, path, there in zip(names, paths, exists, strict=True) if not there]
+    found = [index for index, there in enumerate(exists) if there]
+    if not missing:
+        return found
+    shown = ", ".join(name for name, _ in missing[:5]) + (", ..." if len(missing) > 5 else "")
+    # The names of a transforms.json are paths in the capture; those of a COLMAP model, in its image folder.
+    are_paths = all(path == root / name for name, path in missing)
+    folder = root if are_paths else root / images
+    message = f"{len(missing)} of {len(names)} images are not in {folder}: {shown}"
+    if instead := _instead(folder, missing):
+        message, remedy = f"{message}; {instead}", "put the photographs themselves there"
+        if not allow:
+            raise MissingImagesError(f"{message}: {remedy}, or leave those views out with allow_missing")
+    if not found and are_paths:
+        raise FileNotFoundError(f"{message}; put them there, or correct file_path in its transforms.json")
+    if not found:
+        # A user may name the folder of the model, CAPTURE/sparse/0.
+        above = next((folder for folder in root.resolve().parents[:2] if (folder / images).is_dir()), None)
+        if above is not None and not (root / images).is_dir():
+            raise FileNotFoundError(f"{message}; the capture may be the folder above: --data={above}")
+        remedy = "put them there, or name their folder, relative to the capture, with --data.images=FOLDER"
+        if not (root / images).is_dir():
+            remedy = "name their folder, relative to the capture, with --data.images=FOLDER"
+        raise FileNotFoundError(f"{message}; {remedy}")
+    if not allow:
+        raise MissingImagesError(f"{message}; put them back, or leave those views out with allow_missing")
+    warnings.warn(f"{message}; dropped", stacklevel=3)
+    return found
+
+
+def _instead(folder: Path, missing: Sequence[tuple[str, Path]]) -> str | None:
+    """Return what is in the place of the images, if something is."""
+    if os.path.lexists(folder) and not folder.is_dir():
+        return f"{folder} is {what_is_at(folder) or 'a file, no folder'}"
+    return next((f"{path} is {what}" for _, path in missing if (what := what_is_at(path))), None)

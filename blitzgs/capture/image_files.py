@@ -1,13 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads size and orientation of image files from their headers, and decodes images; refuses damaged files."""
+"""Reads size, orientation and bands of image files from their headers, and decodes images and masks.
+
+Damaged files are refused, and files of a kind that is not supported are called so. Alpha is used only where
+the file says that a band is alpha: decoders take any fourth band for it.
+"""
 
 from __future__ import annotations
 
 import os
-import struct
+import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,127 +24,127 @@ from blitzgs.formats.native import native_io
 UInt8 = npt.NDArray[np.uint8]
 
 _HEADER_BYTES = 1 << 16
-_EXIF_ORIENTATION = 0x0112
-_TIFF_STARTS = (b"II*\0", b"MM\0*")
+_TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_HEADERS_WITH_SIZE = ("JPEG", "PNG", "TIFF")
+_PNG_START = b"\x89PNG\r\n\x1a\n"
 _TURNS: dict[int, tuple[int, ...]] = {3: (cv2.ROTATE_180,), 6: (cv2.ROTATE_90_CLOCKWISE,)}
 _TURNS[8] = (cv2.ROTATE_90_COUNTERCLOCKWISE,)
+# Formats without a mark by which their content would tell them.
+_FORMATS_BY_SUFFIX = {".tga": "TGA", ".pcx": "PCX", ".svg": "SVG", ".eps": "EPS", ".psd": "Photoshop"}
+_FORMATS_BY_SUFFIX |= dict.fromkeys((".raw", ".nef", ".arw", ".cr2", ".orf", ".rw2", ".pef"), "camera raw")
+_CONVERT = "convert it to PNG or JPEG"
+# A mask of black and white: how far, of the whole range, its black and white may be from 0 and 1.
+_NEARLY = 1 / 16
+# The least brightness, of the whole range, that the counted pixels of a lossy mask have.
+_LEAST_WHITE = 1 / 4
 
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """The stored size (pixels), the EXIF orientation (1 to 8) and whether there is an alpha channel."""
+    """The stored size (pixels), the EXIF orientation (1 to 8), whether there is alpha, and unused bands."""
 
     width: int
     height: int
     orientation: int = 1
     has_alpha: bool = False
+    extra_bands: int = 0
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Return size and orientation of an image file; JPEG and PNG files are not decoded.
+    """Return size, orientation and bands of an image file; JPEG, PNG and TIFF files are not decoded.
 
     Raises:
-        ValueError: the file is damaged or not an image; names it.
+        ValueError: the file is damaged, not an image, or of a kind that is not supported; names it.
     """
     with path.open("rb") as file:
         data = file.read(_HEADER_BYTES)
-        if data[:2] == b"\xff\xd8":
+        found = None
+        if data[:4] not in _TIFF_STARTS:  # a TIFF may have its header at its end
             try:
-                header = _jpeg_header(data)
-            except (EOFError, struct.error):  # the size follows a large preview or colour profile
-                try:
-                    header = _jpeg_header(data + file.read())
-                except (EOFError, struct.error):
-                    raise ValueError(f"{path}: truncated JPEG: the file ends inside its header") from None
-            if header is None:
-                raise ValueError(f"{path}: damaged JPEG: no size in its header")
-            return header
-    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 26:
-        width, height = struct.unpack(">II", data[16:24])
-        # Palettes and single colours may be transparent too (the chunk tRNS, before the pixels).
-        has_alpha = data[25] in (4, 6) or b"tRNS" in data.partition(b"IDAT")[0]
-        return ImageHeader(width, height, has_alpha=has_alpha)
-    data = path.read_bytes()
-    pixels = _imdecode(data, cv2.IMREAD_UNCHANGED, str(path))
-    orientation = _exif_orientation(data) if data[:4] in _TIFF_STARTS else 1
-    has_alpha = pixels.ndim == 3 and pixels.shape[2] == 4
-    return ImageHeader(pixels.shape[1], pixels.shape[0], orientation, has_alpha)
+                found = _describe(data, str(path))
+            except ValueError:  # the size follows a large preview or colour profile
+                found = None
+        if found is None or found["format"] not in _HEADERS_WITH_SIZE:
+            data += file.read()
+            found = _describe(data, str(path))
+    _check_supported(found, str(path))
+    width, height = found["width"], found["height"]
+    if found["format"] not in _HEADERS_WITH_SIZE:
+        pixels = _imdecode(data, cv2.IMREAD_UNCHANGED, str(path), found)
+        height, width = pixels.shape[:2]
+    return ImageHeader(width, height, found["orientation"], bool(found["alpha"]), found["extras"])
 
 
-def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield marker and payload of each segment before the image data; EOFError if the bytes end earlier."""
-    at = 2
-    while True:
-        if at + 4 > len(data):
-            raise EOFError
-        if data[at] != 0xFF:
-            return
-        marker = data[at + 1]
-        if marker == 0xFF:  # fill byte
-            at += 1
-            continue
-        (length,) = struct.unpack(">H", data[at + 2 : at + 4])
-        if at + 2 + length > len(data):
-            raise EOFError
-        yield marker, data[at + 4 : at + 2 + length]
-        if marker == 0xDA:
-            return
-        at += 2 + length
+def _describe(data: bytes, name: str) -> dict[str, Any]:
+    """Return what the header of a file says (csrc/io/image_header.h)."""
+    found: dict[str, Any] = native_io().read_image_header(data, os.fsencode(name))
+    suffix = Path(name).suffix.lower()
+    if not found["format"] and suffix in _FORMATS_BY_SUFFIX:
+        return found | {"format": _FORMATS_BY_SUFFIX[suffix], "supported": False}
+    return found
 
 
-def _jpeg_header(data: bytes) -> ImageHeader | None:
-    orientation = 1
-    for marker, payload in _jpeg_segments(data):
-        if marker == 0xE1 and payload[:6] == b"Exif\0\0":
-            orientation = _exif_orientation(payload[6:])
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", payload[1:5])
-            return ImageHeader(width, height, orientation)
-    return None
+def _check_supported(header: dict[str, Any], name: str) -> None:
+    """Refuse a photograph of a kind that would be decoded wrongly or not at all."""
+    kind, bits, colors, alpha = (header[key] for key in ("format", "bits", "colors", "alpha"))
+    bands = colors + header["extras"] + bool(alpha)
+    if not header["supported"]:
+        raise ValueError(f"{name}: not supported: {kind}; {_CONVERT}")
+    if header["samples"] != "uint" or bits > 16:
+        number = f"{header['samples']}{bits}"
+        raise ValueError(
+            f"{name}: pixels must be of 8 or 16 bits, got {number}; not supported: {number} {kind}; "
+            f"{_CONVERT}"
+        )
+    reason = None
+    if kind != "JPEG" and bands > max(4, colors):
+        reason = f"{kind} of {bands} bands; convert it to a file of its red, green and blue band"
+    elif kind in ("TIFF", "JPEG 2000") and alpha and colors == 1:
+        reason = f"grey {kind} with an alpha channel; {_CONVERT}"
+    elif kind == "TIFF" and colors == 4 and (bits != 8 or bands > 4):
+        reason = f"CMYK {kind} of {bits} bits and {bands} bands; {_CONVERT}"
+    elif kind == "TIFF" and alpha and bits not in (8, 16):
+        reason = f"{kind} of {bits} bits with an alpha channel; {_CONVERT}"
+    elif kind == "JPEG" and bits != 8:
+        reason = f"JPEG of {bits} bits; convert it to JPEG of 8 bits"
+    if reason is not None:
+        raise ValueError(f"{name}: not supported: {reason}")
 
 
-def _exif_orientation(tiff: bytes) -> int:
-    """Return the orientation tag of the first directory; 1 if it is missing or invalid."""
-    found = _orientation_field(tiff)
-    return found[1] if found is not None and 1 <= found[1] <= 8 else 1
+_quiet_lock = threading.Lock()
+_quiet_count, _loud = 0, 0
 
 
-def _orientation_field(tiff: bytes) -> tuple[slice, int] | None:
-    """Return the two bytes of the orientation tag in the first directory, and its value; None: no tag."""
-    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
-    if order is None:
-        return None
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep OpenCV from writing to the terminal; our messages name the file and the reason."""
+    global _quiet_count, _loud
+    log = cv2.utils.logging
+    with _quiet_lock:
+        if _quiet_count == 0:
+            _loud = log.setLogLevel(log.LOG_LEVEL_SILENT)
+        _quiet_count += 1
     try:
-        (at,) = struct.unpack(order + "I", tiff[4:8])
-        (entries,) = struct.unpack(order + "H", tiff[at : at + 2])
-        for entry in range(at + 2, at + 2 + 12 * entries, 12):
-            tag, _, _, value = struct.unpack(order + "HHIH", tiff[entry : entry + 10])
-            if tag == _EXIF_ORIENTATION:
-                return slice(entry + 8, entry + 10), value
-    except struct.error:
-        pass
-    return None
+        yield
+    finally:
+        with _quiet_lock:
+            _quiet_count -= 1
+            if _quiet_count == 0:
+                log.setLogLevel(_loud)
 
 
-def _unturned(tiff: bytes) -> bytes:
-    """Return a TIFF file without its orientation: OpenCV turns TIFF files by their tag whatever the flags."""
-    found = _orientation_field(tiff)
-    if found is None:
-        return tiff
-    field, _ = found
-    upright = (1).to_bytes(2, "little" if tiff[:2] == b"II" else "big")
-    return tiff[: field.start] + upright + tiff[field.stop :]
-
-
-def _imdecode(data: bytes, flags: int, name: str) -> UInt8:
+def _imdecode(data: bytes, flags: int, name: str, header: dict[str, Any]) -> npt.NDArray[Any]:
     if data[:4] in _TIFF_STARTS:
-        data = _unturned(data)
+        data = native_io().tiff_as_stored(data, os.fsencode(name))
     try:
-        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+        with _quiet():
+            pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
     except cv2.error as error:
         raise ValueError(f"{name}: cannot be decoded: {error}") from error
     if pixels is None:
-        raise ValueError(f"{name}: cannot be decoded (damaged, truncated or not an image)")
+        kind = header["format"]
+        reader = f", or a {kind} that OpenCV {cv2.__version__} does not read" if kind else ""
+        raise ValueError(f"{name}: cannot be decoded (damaged, truncated or not an image{reader})")
     return np.asarray(pixels)
 
 
@@ -146,7 +152,8 @@ def read_whole(path: Path) -> bytes:
     """Return the bytes of an image file; refuse a file if a decoder would conceal its damage.
 
     Decoders show the lost part of a JPEG as grey, without an error, so this function walks the codes of the
-    file. Damage that leaves a valid sequence of codes (most changes of a single bit) cannot be detected.
+    file. Damage that leaves a valid sequence of codes (most changes of a single bit) cannot be detected. The
+    checksums of a PNG are compared, because decoders complain of them on the terminal.
 
     Raises:
         ValueError: the file is truncated or damaged; names it, the byte offset and the reason.
@@ -154,6 +161,8 @@ def read_whole(path: Path) -> bytes:
     data = path.read_bytes()
     if data[:2] == b"\xff\xd8":
         native_io().check_jpeg(data, os.fsencode(path))
+    elif data[:8] == _PNG_START:
+        native_io().check_png(data, os.fsencode(path))
     return data
 
 
@@ -163,42 +172,113 @@ def decode_rgb(data: bytes, name: str, background: tuple[float, float, float] | 
     Args:
         data: the file, from `read_whole`.
         name: names the file in errors.
-        background: colour (0 to 1) over which an alpha channel is composited; None: drop the channel.
+        background: colour (0 to 1) over which the colours are composited if the file says that it has alpha;
+            None: use the colours as they are stored.
 
     Raises:
-        ValueError: the file cannot be decoded.
+        ValueError: the file cannot be decoded, or is of a kind that is not supported.
     """
-    if background is not None:
-        pixels = _imdecode(data, cv2.IMREAD_UNCHANGED, name)
+    header = _describe(data, name)
+    _check_supported(header, name)
+    if background is not None and header["alpha"]:
+        pixels = _imdecode(data, cv2.IMREAD_UNCHANGED, name, header)
+        if (grey := header["transparent_grey"]) is not None and pixels.ndim == 2:
+            pixels = _with_transparent_grey(pixels, grey, header["bits"])
         if pixels.ndim == 3 and pixels.shape[2] == 4:
-            if pixels.dtype.kind != "u":
-                raise ValueError(f"{name}: pixels must be of 8 or 16 bits, got {pixels.dtype}")
-            return _over(pixels, background)
-    pixels = _imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, name)
+            return _over(pixels, background, _full(pixels, header), header["alpha"] == "associated")
+    pixels = _imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, name, header)
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
 
 
-def _over(bgra: npt.NDArray[np.uint8], background: tuple[float, float, float]) -> UInt8:
-    full = float(np.iinfo(bgra.dtype).max)
+def check_photograph(path: Path) -> bool:
+    """Check that a photograph can be decoded, and tell whether some pixel is not fully transparent.
+
+    JPEG and PNG files without alpha are not decoded: `read_whole` finds their damage.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: the file is damaged or not supported; names it.
+    """
+    data, name = read_whole(path), str(path)
+    header = _describe(data, name)
+    _check_supported(header, name)
+    if header["format"] in ("JPEG", "PNG") and not header["alpha"]:
+        return True
+    pixels = _imdecode(data, cv2.IMREAD_UNCHANGED, name, header)
+    if header["alpha"] and pixels.ndim == 3 and pixels.shape[2] == 4:
+        return bool(pixels[..., 3].any())
+    return True
+
+
+def _full(pixels: npt.NDArray[Any], header: dict[str, Any]) -> float:
+    """Return the number that stands for white or opaque."""
+    if pixels.dtype.kind == "f":
+        return 1.0
+    # Samples of 10 or 12 bits are decoded to 16 bits as they are.
+    if pixels.dtype == np.uint16 and header["format"] in ("AVIF", "JPEG 2000"):
+        return float((1 << header["bits"]) - 1)
+    return float(np.iinfo(pixels.dtype).max)
+
+
+def _with_transparent_grey(grey: npt.NDArray[Any], value: int, bits: int) -> npt.NDArray[Any]:
+    """Return BGRA of a PNG in which one grey value is transparent; OpenCV ignores that value."""
+    full = np.iinfo(grey.dtype).max
+    stored = value * (full // ((1 << bits) - 1)) if bits < 8 else value
+    alpha = np.where(grey == stored, 0, full).astype(grey.dtype)
+    return np.stack([grey, grey, grey, alpha], axis=2)
+
+
+def _over(
+    bgra: npt.NDArray[Any], background: tuple[float, float, float], full: float, associated: bool
+) -> UInt8:
+    """Composite over a colour: rgb a + background (1 - a), where associated colours have the factor a."""
     alpha = bgra[..., 3:].astype(np.float32) / full
     rgb = bgra[..., 2::-1].astype(np.float32) / full
-    blended = rgb * alpha + np.asarray(background, dtype=np.float32) * (1 - alpha)
-    return np.asarray((blended * 255 + 0.5).astype(np.uint8))
+    if not associated:
+        rgb *= alpha
+    blended = rgb + np.asarray(background, dtype=np.float32) * (1 - alpha)
+    return np.asarray((np.minimum(blended, 1) * 255 + 0.5).astype(np.uint8))
 
 
 def decode_mask(data: bytes, name: str) -> UInt8:
-    """Decode a mask to uint8 [H, W]: 0 where the file is black (excluded), 1 elsewhere.
+    """Decode a mask to uint8 [H, W]: 0 where the file is black or transparent (excluded), 1 elsewhere.
+
+    Numbers and colours may be labels, so of a lossless file only black is black; but a file of nothing else
+    than nearly black and nearly white pixels has no labels. In a lossy file all darker than half its
+    brightest pixel is black. If all colours are black, the transparent pixels are the excluded ones.
 
     Raises:
         ValueError: the file cannot be decoded.
     """
+    header = _describe(data, name)
+    if not header["supported"]:
+        raise ValueError(f"{name}: not supported: {header['format']}; {_CONVERT}")
     # Labels may be small numbers of 16 bits or dark colours: a conversion to 8 bits or to grey would make
     # them black.
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    pixels = _imdecode(data, flags, name)
+    pixels = _imdecode(data, cv2.IMREAD_UNCHANGED if header["alpha"] else flags, name, header)
+    full = _full(pixels, header)
+    if (grey := header["transparent_grey"]) is not None and pixels.ndim == 2:
+        pixels = _with_transparent_grey(pixels, grey, header["bits"])
+    if header["is_white_zero"] and pixels.dtype == np.uint16:  # which OpenCV turns round for 8 bits only
+        pixels = np.asarray(np.iinfo(np.uint16).max - pixels)
+    opaque = None
+    if pixels.ndim == 3 and pixels.shape[2] == 4 and header["alpha"]:
+        opaque = pixels[..., 3] * 2.0 >= full
     if pixels.ndim == 3:
-        pixels = pixels.max(axis=2)
-    return np.asarray((pixels > 0).astype(np.uint8))
+        pixels = pixels[..., :3].max(axis=2)
+    counted = pixels > _black(pixels, full, header["is_lossy"])
+    if opaque is not None:
+        counted = counted & opaque if counted.any() or opaque.all() else opaque
+    return np.asarray(counted.astype(np.uint8))
+
+
+def _black(pixels: npt.NDArray[Any], full: float, is_lossy: bool) -> float:
+    """Return the brightest value of a mask that stands for black."""
+    if is_lossy:
+        return max(float(pixels.max()), _LEAST_WHITE * full) / 2
+    dark, bright = pixels <= _NEARLY * full, pixels >= (1 - _NEARLY) * full
+    return full / 2 if bright.any() and bool((dark | bright).all()) else 0.0
 
 
 def apply_orientation(pixels: UInt8, orientation: int) -> UInt8:

@@ -20,7 +20,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -28,63 +28,17 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from blitzgs.capture.bounded_cache import BoundedCache as BoundedCache
 from blitzgs.capture.cameras import Camera, same_shape
 from blitzgs.capture.capture import Capture
+from blitzgs.capture.check_files import FileCheck, mask_error
 from blitzgs.capture.image_files import UInt8, apply_orientation, decode_mask, decode_rgb, read_whole
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.capture.undistort import Rectification
 from blitzgs.formats.native import native_io
 
-K = TypeVar("K")
-V = TypeVar("V")
 DEFAULT_BUDGET = 4 << 30
 _MAPS_KEPT = 4
-
-
-class BoundedCache(Generic[K, V]):
-    """A least-recently-used cache with a budget of bytes; an entry larger than the budget is not stored.
-
-    Attributes:
-        budget: the largest size, in bytes.
-        bytes: the size now.
-        most_bytes: the largest size so far.
-    """
-
-    def __init__(self, budget: int) -> None:
-        """Hold at most `budget` bytes."""
-        self.budget = budget
-        self.bytes = 0
-        self.most_bytes = 0
-        self._entries: OrderedDict[K, tuple[V, int]] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, key: K) -> V | None:
-        """Return the entry and mark it as the most recently used; None if it is not stored."""
-        with self._lock:
-            if key not in self._entries:
-                return None
-            self._entries.move_to_end(key)
-            return self._entries[key][0]
-
-    def put(self, key: K, value: V, size: int) -> None:
-        """Add or replace an entry of `size` bytes, dropping the oldest until all fit."""
-        with self._lock:
-            if key in self._entries:
-                self.bytes -= self._entries.pop(key)[1]
-            if size > self.budget:
-                return
-            while self.bytes + size > self.budget:
-                self.bytes -= self._entries.popitem(last=False)[1][1]
-            self._entries[key] = (value, size)
-            self.bytes += size
-            self.most_bytes = max(self.most_bytes, self.bytes)
-
-    def resize(self, budget: int) -> None:
-        """Change the budget, dropping the oldest entries until the others fit."""
-        with self._lock:
-            self.budget = budget
-            while self.bytes > budget:
-                self.bytes -= self._entries.popitem(last=False)[1][1]
 
 
 @dataclass(frozen=True)
@@ -200,6 +154,7 @@ class ImageStore:
         self._pending_lock = threading.Lock()
         self._budget_lock = threading.Lock()
         self._times_decoded = 0
+        self._check: FileCheck | None = None
         self._pool = ThreadPoolExecutor(max(1, threads), thread_name_prefix="blitzgs-images")
 
     def get(self, index: int) -> Tensor:
@@ -243,8 +198,25 @@ class ImageStore:
             self.compressed.most_bytes, self.compressed.budget, decoded, self._room(), self._times_decoded
         )
 
+    def check_files(self, indices: Iterable[int]) -> FileCheck:
+        """Start to check the files of these cameras in the background, those of held-out views first.
+
+        As soon as one is found to be damaged, `get` and `mask` raise its error for every image: a training
+        then ends at its beginning, and not when it comes to that image.
+        """
+        test = set(self.capture.test)
+        order = sorted(indices, key=lambda index: index not in test)
+        self._check = FileCheck(self.capture.cameras, order, self._has_counted)
+        return self._check
+
+    def _has_counted(self, camera: Camera) -> bool:
+        assert camera.mask_path is not None
+        return bool(self._file_mask(camera, camera.mask_path).any())
+
     def close(self) -> None:
         """Stop the threads; images whose decoding has not begun are not decoded."""
+        if self._check is not None:
+            self._check.close()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _room(self) -> int:
@@ -259,6 +231,8 @@ class ImageStore:
         return budget // 4 + budget - self.compressed.bytes
 
     def _result(self, kind: str, index: int) -> UInt8:
+        if self._check is not None and self._check.damage is not None:
+            raise ValueError(self._check.damage)
         found = self._submit(kind, index)
         return found.result() if isinstance(found, Future) else found
 
@@ -342,7 +316,10 @@ class ImageStore:
 
     def _file_mask(self, camera: Camera, path: Path) -> UInt8:
         lens = camera.rectification.lens
-        mask = decode_mask(self._read(path), str(path))
+        try:
+            mask = decode_mask(self._read(path), str(path))
+        except ValueError as error:
+            raise mask_error(error) from error
         stored = (lens.width, lens.height) if camera.orientation < 5 else (lens.height, lens.width)
         if (mask.shape[1], mask.shape[0]) == stored:
             mask = apply_orientation(mask, camera.orientation)

@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from blitzgs.capture import colmap, transforms
 from blitzgs.capture.cameras import Float64
 from blitzgs.capture.files import ImageFinder
 from blitzgs.capture.lens import Lens
-from blitzgs.formats.ply import read_points
+from blitzgs.capture.points import SourcePoints, ply_points, transforms_points
 
 _PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 # What programs write beside the images of a synthetic capture.
@@ -35,16 +34,6 @@ class SourceView:
     world_to_camera: Float64
     part: str | None = None
     """See `transforms.Frame.part`."""
-
-
-@dataclass(eq=False)
-class SourcePoints:
-    """The points as the capture's file describes them, in its own world; see `Capture` for the columns."""
-
-    positions: Float64
-    colors: npt.NDArray[np.uint8]
-    track_lengths: npt.NDArray[np.int64] | None = None
-    errors: Float64 | None = None
 
 
 @dataclass(frozen=True)
@@ -86,7 +75,7 @@ def read_layout(
     by_default = sparse in ("largest", "all")
     has_transforms = by_default and bool(transforms.find_transforms(root))
     if has_transforms and (folder is None or "colmap" in folder.relative_to(root).parts):
-        views, points, source = _read_transforms(root)
+        views, points, source = _read_transforms(root, folder)
     elif folder is not None:
         read = [_read_colmap(root, model, images, downscale) for model in models]
         views, points = read[0] if len(read) == 1 else _joined(root, read)
@@ -174,6 +163,8 @@ def _joined(
         np.concatenate([p.colors for p in points]),
         np.concatenate(tracks) if len(tracks) == len(points) else None,
         np.concatenate(errors) if len(errors) == len(points) else None,
+        points[0].path,
+        points[0].colors_from,
     )
     return list(views.values()), joined
 
@@ -203,7 +194,7 @@ def _with_photographs(root: Path, source: Source, views: Sequence[SourceView]) -
     return replace(source, without_camera=len(without))
 
 
-def _read_transforms(root: Path) -> tuple[list[SourceView], SourcePoints, Source]:
+def _read_transforms(root: Path, model: Path | None) -> tuple[list[SourceView], SourcePoints, Source]:
     content = transforms.read_transforms(root)
     views = [
         SourceView(f.name, f.path, f.mask_path, f.lens, f.world_to_camera, f.part) for f in content.frames
@@ -217,9 +208,7 @@ def _read_transforms(root: Path) -> tuple[list[SourceView], SourcePoints, Source
         if not note.startswith("fields without effect"):
             warnings.warn(f"{content.files[0]}: {note}", stacklevel=4)
     source = Source(" and ".join(path.name for path in content.files), content.split, tuple(notes))
-    if content.points_path is None:
-        return views, SourcePoints(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)), source
-    return views, SourcePoints(*read_points(content.points_path)), source
+    return views, transforms_points(root, content, model), source
 
 
 def _read_colmap(
@@ -251,5 +240,10 @@ def _read_colmap(
         SourceView(prefix + name, path, None, lens, pose)
         for name, path, lens, pose in zip(names, paths, lens_of, poses, strict=True)
     ]
+    if model.points_path is not None and model.points_path.suffix == ".ply":
+        return views, ply_points(model.points_path)
     p = model.points
-    return views, SourcePoints(p.positions, p.colors, p.track_lengths, p.errors)
+    path = model.points_path
+    return views, SourcePoints(
+        p.positions, p.colors, p.track_lengths, p.errors, path, "the model's own colours"
+    )

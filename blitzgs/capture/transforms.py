@@ -18,6 +18,7 @@ import numpy as np
 
 from blitzgs.capture.cameras import Float64
 from blitzgs.capture.lens import Lens
+from blitzgs.capture.names import match_names
 from blitzgs.capture.transforms_lens import FIELDS, read_lens
 
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
@@ -59,6 +60,14 @@ class Transforms:
     """What in the files decides on the split, as text; empty if nothing does."""
     notes: list[str]
     """What was decided between fields, and which fields have no effect."""
+    applied: Float64 | None = None
+    """[3, 4] what nerfstudio applied to COLMAP's world, where it says so."""
+
+    def moved(self, positions: Float64) -> Float64:
+        """Return positions [N, 3] of COLMAP's world in that of the frames."""
+        if self.applied is None:
+            return positions
+        return np.asarray(positions @ self.applied[:, :3].T + self.applied[:, 3])
 
 
 def find_transforms(root: Path) -> list[Path]:
@@ -76,7 +85,7 @@ def read_transforms(root: Path) -> Transforms:
         ValueError: a field is missing or makes no sense; names the file, the frame and the field.
     """
     frames: list[Frame] = []
-    points_path = None
+    points_path, applied = None, None
     files = find_transforms(root)
     notes: dict[str, None] = {}
     ignored: dict[str, None] = {}
@@ -86,17 +95,22 @@ def read_transforms(root: Path) -> Transforms:
         if "ply_file_path" in content:
             if not isinstance(content["ply_file_path"], str):
                 raise ValueError(f"{path}: ply_file_path must be text, got {content['ply_file_path']!r}")
-            points_path = root / content["ply_file_path"]
+            points_path = _found(root, [content["ply_file_path"]]).popitem()[1]
+        applied = _applied(path, content) if applied is None else applied
         lists = _lists(path, content)
         split += [f"{key}_filenames" for key in lists] if path.name == "transforms.json" else [path.name]
         own: list[Frame] = []
+        named = [
+            entry[key] for key in ("file_path", "mask_path") for entry in entries if _names_file(entry, key)
+        ]
+        paths = _found(root, named)
         for index, entry in enumerate(entries):
             try:
                 if not isinstance(entry, dict):
                     raise TypeError(
                         f"must be an object with file_path and transform_matrix, got {entry!r:.40}"
                     )
-                own.append(_read_frame(root, path, content, entry, lists, notes))
+                own.append(_read_frame(path, content, entry, lists, notes, paths))
             except (KeyError, TypeError, ValueError, ArithmeticError) as error:
                 reason = f"the field {error} is missing" if isinstance(error, KeyError) else str(error)
                 raise ValueError(f"{path}: frame {index}: {reason}") from error
@@ -113,7 +127,36 @@ def read_transforms(root: Path) -> Transforms:
         raise ValueError(
             f"{' and '.join(map(str, files))}: images of more than one frame: {shown}; keep one frame of each"
         )
-    return Transforms(frames, points_path, files, " and ".join(split), list(notes))
+    return Transforms(frames, points_path, files, " and ".join(split), list(notes), applied)
+
+
+def _applied(file: Path, content: Mapping[str, Any]) -> Float64 | None:
+    """Return nerfstudio's applied_transform and applied_scale as one matrix; None: there is neither."""
+    if "applied_transform" not in content and "applied_scale" not in content:
+        return None
+    try:
+        matrix = np.asarray(content.get("applied_transform", np.eye(4)), dtype=np.float64)[:3]
+        scale = float(content.get("applied_scale", 1.0))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{file}: applied_transform must be 3 x 4 and applied_scale a number") from error
+    if matrix.shape != (3, 4):
+        raise ValueError(f"{file}: applied_transform must be 3 x 4, got the shape {matrix.shape}")
+    return matrix * scale
+
+
+def _found(root: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Return the file of each name, also if it is written in another notation (`names.match_names`)."""
+    paths = {
+        name: next((p for s in _SUFFIXES if (p := root / (name + s)).is_file()), root / _name(name))
+        for name in names
+    }
+    there = [
+        path.relative_to(root).as_posix()
+        for path in paths.values()
+        if path.is_relative_to(root) and ".." not in path.parts and path.is_file()
+    ]
+    lost = [name for name, path in paths.items() if not path.is_file()]
+    return paths | match_names(lost, there, root)
 
 
 def _read_file(path: Path) -> tuple[dict[str, Any], list[Any]]:
@@ -143,7 +186,7 @@ def _lists(file: Path, content: Mapping[str, Any]) -> dict[str, set[str]]:
         names = content[key]
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"{file}: {key} must be a list of the file_path of frames")
-        lists[part] = {str(Path(name)) for name in names}
+        lists[part] = {_name(name) for name in names}
     return lists
 
 
@@ -169,26 +212,35 @@ def _part(file: Path, lists: Mapping[str, set[str]], name: str) -> str | None:
     return "test" if held_out else "unused"
 
 
+def _name(relative: str) -> str:
+    """Return the name of a view, with slashes, whatever system wrote it."""
+    return str(Path(relative.replace("\\", "/")))
+
+
+def _names_file(entry: object, key: str) -> bool:
+    return isinstance(entry, dict) and isinstance(entry.get(key), str) and bool(PurePath(entry[key]).name)
+
+
 def _read_frame(
-    root: Path,
     file: Path,
     content: Mapping[str, Any],
     entry: Mapping[str, Any],
     lists: Mapping[str, set[str]],
     notes: dict[str, None],
+    paths: Mapping[str, Path],
 ) -> Frame:
     relative = entry["file_path"]
-    if not isinstance(relative, str) or not PurePath(relative).name:
+    if not _names_file(entry, "file_path"):
         raise ValueError(f"file_path must name an image, got {relative!r}")
-    path = next((p for s in _SUFFIXES if (p := root / (relative + s)).is_file()), root / relative)
+    path = paths[relative]
     mask = entry.get("mask_path")
-    if mask is not None and (not isinstance(mask, str) or not PurePath(mask).name):
+    if mask is not None and not _names_file(entry, "mask_path"):
         raise ValueError(f"mask_path must name an image or be null, got {mask!r}")
-    name = str(Path(relative))
+    name = _name(relative)
     return Frame(
         name=name,
         path=path,
-        mask_path=None if mask is None else root / mask,
+        mask_path=None if mask is None else paths[mask],
         lens=read_lens(content, entry, path, notes),
         world_to_camera=_read_pose(entry["transform_matrix"]),
         part=_part(file, lists, name),
@@ -205,12 +257,12 @@ def _read_pose(matrix: object) -> Float64:
     pose = np.eye(4)
     rotation = camera_to_world[:3, :3] * np.array([1.0, -1.0, -1.0])
     if np.isfinite(camera_to_world).all():  # views whose pose is not finite are dropped later
-        last = camera_to_world[3:].ravel()
-        if last.size and not np.allclose(last, [0, 0, 0, 1], atol=1e-6):
-            raise ValueError(f"the last row of transform_matrix must be 0, 0, 0, 1, got {last.tolist()}")
         lengths = np.linalg.norm(rotation, axis=0)
         if lengths.max() == 0:
             raise ValueError("transform_matrix has a rotation of zeros only: leave out frames without a pose")
+        last = camera_to_world[3:].ravel()
+        if last.size and not np.allclose(last, [0, 0, 0, 1], atol=1e-6):
+            raise ValueError(f"the last row of transform_matrix must be 0, 0, 0, 1, got {last.tolist()}")
         # Some exporters do not remove the scale of the rig, which is the same along all axes.
         if lengths.min() < 0.999 * lengths.max():
             raise ValueError(

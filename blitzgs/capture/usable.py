@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture.cameras import Camera, Float64
-from blitzgs.capture.layouts import SourcePoints, SourceView
+from blitzgs.capture.layouts import SourceView
 from blitzgs.capture.lengths import StrayCamera, random_points
 from blitzgs.capture.lens import Lens, check_lens
+from blitzgs.capture.points import SourcePoints
 
 # Coordinates from here on are damage; the squares of smaller ones are finite.
 _FARTHEST = 1e100
@@ -95,6 +96,8 @@ def finite_points(points: SourcePoints) -> SourcePoints:
         points.colors[finite],
         points.track_lengths[finite] if points.track_lengths is not None else None,
         points.errors[finite] if points.errors is not None else None,
+        points.path,
+        points.colors_from,
     )
 
 

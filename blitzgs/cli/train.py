@@ -175,6 +175,8 @@ def run(args: argparse.Namespace) -> int:
         # A capture that cannot be read leaves no empty folder behind.
         capture, images = open_capture(config, ranks)
         check_worlds(capture)
+        # Otherwise a damaged photograph would be found when its turn comes, a held-out one at the end.
+        images.check_files(range(ranks.rank, len(capture.cameras), ranks.world_size))
         if ranks.rank == 0:
             _print_block(understood(config, capture, images))
         with locked(args.out, ranks):
@@ -245,6 +247,7 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
     for text in (
         f"pictures: {folder / run_files.EVALUATION}",
         "next:",
+        f"  blitzgs view {name}                       the model in the browser",
         f"  blitzgs render {name} --out PICTURES      the held-out views as pictures",
         f"  blitzgs export {name} --ply MODEL.ply     the model for viewers",
         f"  blitzgs train --out {name} --extend 1.5   train half as long again",

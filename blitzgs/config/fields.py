@@ -32,7 +32,8 @@ class DataConfig:
             cuts it off, "mask" masks it.
         exif: "auto" turns an image by its EXIF tag if only the turned image fits its camera; "apply" always
             turns it, "ignore" never.
-        allow_missing: drop views whose image is missing instead of failing.
+        allow_missing: drop views whose image is missing or damaged instead of failing.
+        inside_only: refuse captures with names that lead outside their folder.
         sparse: which of several COLMAP models (sparse/0, sparse/1, ...) is read: the "largest", "all" of
             them, which must have the same world coordinates, or a folder inside the capture.
         stray_cameras: "drop" leaves out cameras that lie far apart from all others and hardly show a point,
@@ -53,6 +54,7 @@ class DataConfig:
     undistort: str = "crop"
     exif: str = "auto"
     allow_missing: bool = False
+    inside_only: bool = False
     sparse: str = "largest"
     stray_cameras: str = "drop"
     cache_bytes: int = 8_000_000_000
@@ -72,8 +74,11 @@ class ModelConfig:
         near: near plane, relative to extent. 0: a quarter of the depth of the nearest points that training
             views see, 0.01 at most; the run's own configuration has the result.
         deterministic: make a run repeat bit for bit on CUDA too, at some cost in time (the CPU always does).
-        exposure: each training photograph has a gain and a bias of its channels, if the photographs differ;
-            the model has the mean exposure.
+        exposure: if photographs differ in exposure, each training photograph has a gain and a bias of its
+            channels: gains are estimated from the points' tracks, where there are tracks, and both are
+            refined in training. Views are rendered with the mean exposure (`blitzgs render --exposure`:
+            with the photograph's), so held-out photographs are farther from them: `psnr_corrected` compares
+            without exposure.
     """
 
     sh_degree: int = 3
@@ -99,11 +104,11 @@ class LodConfig:
 
 
 # The largest factor by which `schedule.images_per_view` makes a run longer.
-MOST_STRETCH = 4.0
+MAX_STRETCH = 4.0
 
 # The limits of the `loss.opacity` that a run computes from `loss.opacity_total`: about the range that was
 # measured (docs/decisions/recipe.md).
-LEAST_OPACITY, MOST_OPACITY = 0.005, 0.05
+LEAST_OPACITY, MAX_OPACITY = 0.005, 0.05
 
 
 @dataclass(frozen=True)
@@ -114,7 +119,7 @@ class ScheduleConfig:
         iterations: length of the run.
         scale: stretches or compresses the whole schedule without changing its shape.
         images_per_view: how often a new run sees each training view on average, at least: it multiplies
-            `scale` by the factor that is needed for this, from 1 to `MOST_STRETCH`. The run's own
+            `scale` by the factor that is needed for this, from 1 to `MAX_STRETCH`. The run's own
             configuration has the product in `scale`, and 0 here. With 0 or with `minutes` the length does not
             depend on the number of views.
         minutes: wall time of training that the schedule is fitted into (`blitzgs train --minutes`): the run
@@ -190,7 +195,7 @@ class LossConfig:
             Gaussians; here the term does not act on Gaussians that a step does not see).
         opacity_total: weight of the same mean beside the sum of the losses of all training views. A run
             minimises the mean of these losses, so a new run sets `opacity` to this weight divided by the
-            number of training views, from `LEAST_OPACITY` to `MOST_OPACITY`. The run's own configuration has
+            number of training views, from `LEAST_OPACITY` to `MAX_OPACITY`. The run's own configuration has
             the result in `opacity`, and 0 here. 0: `opacity` is the weight.
         scale: weight of the mean smallest axis of the visible Gaussians.
         scale_reference: that axis is measured in units of extent x scale_reference.

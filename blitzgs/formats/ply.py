@@ -11,8 +11,10 @@ of this layout and writing it again gives the same bytes.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -216,30 +218,92 @@ def _moved(means: Tensor, offset: npt.NDArray[np.float64] | None) -> npt.NDArray
     return (means.detach().cpu().double().numpy() + np.asarray(offset)).astype(np.float32)
 
 
-def read_points(path: Path | str) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
-    """Read positions, float64 [M, 3], and colours, uint8 [M, 3] (grey if there are none), of a point cloud.
+# The names of colours, in any case; a file of Gaussians has coefficients instead.
+_COLORS = [(f"{prefix}red", f"{prefix}green", f"{prefix}blue") for prefix in ("", "diffuse_", "vertex_")]
+_COLORS += [
+    ("r", "g", "b"),
+    ("color_r", "color_g", "color_b"),
+    ("ambient_red", "ambient_green", "ambient_blue"),
+]
+_COEFFICIENTS = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SH_C0 = 0.28209479177387814
+_GREY = 128
+# Rounding and sharpening overshoot the range of a colour by this share.
+_OVERSHOOT = 0.05
 
-    Colours that are floats count as fractions of white if none is above 1, else as numbers from 0 to 255.
+
+@dataclass
+class PointCloud:
+    """M coloured points."""
+
+    positions: npt.NDArray[np.float64]
+    """[M, 3]."""
+    colors: npt.NDArray[np.uint8]
+    """[M, 3]; grey if the file has none."""
+    colors_from: str
+    """The properties that give the colours, as text; empty: none."""
+    properties: tuple[str, ...]
+    """All properties of a point."""
+
+
+def read_points(path: Path | str) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
+    """Return positions and colours of `read_point_cloud`."""
+    cloud = read_point_cloud(path)
+    return cloud.positions, cloud.colors
+
+
+def read_point_cloud(path: Path | str) -> PointCloud:
+    """Read points; those of a file of Gaussians are their centres in the colours that all sides show.
 
     Raises:
         ValueError: the file is damaged, has no x, y, z, or has colours of another kind.
     """
     _, table = _read_table(Path(path))
-    names = table.dtype.names or ()
-    if not {"x", "y", "z"} <= set(names):
+    stored = {name.lower(): name for name in reversed(table.dtype.names or ())}
+    if not {"x", "y", "z"} <= stored.keys():
         raise ValueError(f"{path}: the points have no x, y, z")
-    positions = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    if not {"red", "green", "blue"} <= set(names):
-        return positions, np.full((len(table), 3), 128, dtype=np.uint8)
-    colors = np.stack([table[channel] for channel in ("red", "green", "blue")], axis=1)
-    # Some programs write bytes as signed ones.
-    if colors.dtype.itemsize > 1 and not (usable := (colors >= 0) & (colors <= 255)).all():
+
+    def columns(names: Sequence[str]) -> npt.NDArray[Any]:
+        return np.stack([table[stored[name]] for name in names], axis=1)
+
+    positions, every = columns("xyz").astype(np.float64), table.dtype.names or ()
+    names = next((names for names in _COLORS if set(names) <= stored.keys()), None)
+    if names is not None:
+        return PointCloud(positions, _color_bytes(columns(names), path), ", ".join(names), every)
+    if set(_COEFFICIENTS) <= stored.keys():
+        fractions = 0.5 + _SH_C0 * columns(_COEFFICIENTS).astype(np.float64)
+        _check_colors(np.isfinite(fractions), fractions, path)
+        colors = (np.clip(fractions, 0, 1) * 255 + 0.5).astype(np.uint8)
+        return PointCloud(positions, colors, "f_dc_0 to f_dc_2", every)
+    return PointCloud(positions, np.full((len(table), 3), _GREY, dtype=np.uint8), "", every)
+
+
+def _color_bytes(colors: npt.NDArray[Any], path: Path | str) -> npt.NDArray[np.uint8]:
+    """Return colours as bytes; floats are fractions of white or numbers from 0 to 255."""
+    if colors.dtype.kind != "f":
+        # Some programs write bytes as signed ones.
+        if colors.dtype.itemsize > 1:
+            _check_colors((colors >= 0) & (colors <= 255), colors, path)
+        return colors.astype(np.uint8)
+    full = 1.0 if _are_fractions(colors) else 255.0
+    low, high = -_OVERSHOOT * full, (1 + _OVERSHOOT) * full
+    # A few fractions above white are what brighter points have in programs that do not clip.
+    _check_colors((colors >= low) & ((colors <= high) | (full == 1.0)) & np.isfinite(colors), colors, path)
+    return np.asarray(np.clip(colors * (255 / full) + 0.5, 0, 255).astype(np.uint8))
+
+
+def _are_fractions(colors: npt.NDArray[Any]) -> bool:
+    """Tell fractions of white from numbers up to 255; a few fractions may be above 1."""
+    top = float(colors.max(initial=0))
+    if top <= 1:
+        return True
+    between = bool(((colors > 0) & (colors < 1)).any())
+    return between and (top <= 2 or float((colors <= 1).mean()) >= 0.99)
+
+
+def _check_colors(usable: npt.NDArray[np.bool_], colors: npt.NDArray[Any], path: Path | str) -> None:
+    if not usable.all():
         raise ValueError(
             f"{path}: a point has the colour {colors[~usable][0]}: numbers from 0 to 255 are read, or "
-            "fractions if none is above 1; write the colours as uchar"
+            "fractions of white; write the colours as uchar"
         )
-    if colors.dtype.kind == "f":
-        # Some programs write fractions of white as floats, others bytes.
-        scale = 255 if colors.max(initial=0) <= 1 else 1
-        colors = np.clip(colors * scale + 0.5, 0, 255)
-    return positions, colors.astype(np.uint8)

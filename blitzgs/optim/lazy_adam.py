@@ -221,7 +221,10 @@ class LazyAdam(torch.optim.Optimizer):
         self.catch_up(moments=True)
 
     def state_dict(self) -> dict[str, Any]:
-        """Bring all rows up to date and return the state of `torch.optim.Adam`, which can load it."""
+        """Bring all rows up to date and return the state of `torch.optim.Adam`, which can load it.
+
+        Torch's class goes on with `lr` for all values of a row; `lr_rest` is kept for this class.
+        """
         self.catch_up(moments=True)
         packed = super().state_dict()
         for group in packed["param_groups"]:

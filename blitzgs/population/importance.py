@@ -41,7 +41,8 @@ from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import open_transport
 from blitzgs.ops.cull_mask import WORD_BITS
 from blitzgs.ops.view_sums import ViewSums, view_sums_
-from blitzgs.table.table import CULL, GaussianTable
+from blitzgs.table.layouts import CULL
+from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import SceneGate
 from blitzgs.view.visible import Scene, VisibleFinder, VisibleScene, table_of
 

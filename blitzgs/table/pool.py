@@ -29,7 +29,8 @@ from blitzgs.ops.pool import swap_blocks_
 from blitzgs.table.block_visibility import BlockVisibility, Cameras, culled_blocks
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.host_table import HostTable
-from blitzgs.table.table import CULL, EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
+from blitzgs.table.layouts import CULL, LAYOUTS, sectors_in
+from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 
 # Columns that steps change and that are therefore written back to the host.
 _WRITTEN = (
@@ -123,8 +124,10 @@ class Pool:
         levels = torch.zeros(1, 2, dtype=torch.uint8)
         self._bounds = torch.cat((index.bounds, nothing)).to(self._device)
         self._level_ranges = torch.cat((index.level_ranges, levels)).to(self._device)
-        cull = self.table.cull
-        self._culled = None if cull is None else culled_blocks(cull[: self._blocks]).to(self._device)
+        mask = self.table.columns.get(CULL)
+        self._culled = (
+            None if mask is None else culled_blocks(sectors_in(mask)[: self._blocks]).to(self._device)
+        )
 
     def _make_pool(self) -> None:
         """Allocate as many slots as the budget allows; a last, partial block has its own slot."""
@@ -161,17 +164,16 @@ class Pool:
     @staticmethod
     def _held_of(columns: Mapping[str, Tensor], rows: int) -> GaussianTable:
         """Return a table of the first `rows` rows of columns in their stored form."""
-        held = GaussianTable({name: column[:rows] for name, column in columns.items() if name != CULL})
-        if CULL in columns:
-            held.columns[CULL] = columns[CULL][: -(-rows // BLOCK_ROWS) * BLOCK_ROWS]
+        held = GaussianTable({name: column[:rows] for name, column in columns.items() if name not in LAYOUTS})
+        for name in LAYOUTS.keys() & columns.keys():
+            held.columns[name] = columns[name][: LAYOUTS[name].length(rows)]
         return held
 
     def _open(self) -> None:
         """Begin to use the pool: load the last, partial block, which stays."""
         if not self._is_open and self._rest:
             for name, column in self.held.columns.items():
-                # The mask of the last block has the length of a full block.
-                count = BLOCK_ROWS if name == CULL else self._rest
+                count = LAYOUTS[name].length(self._rest) if name in LAYOUTS else self._rest
                 column[-count:].copy_(self.table.columns[name][-count:])
         self._is_open = True
 

@@ -12,8 +12,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from blitzgs.ops.cull_mask import SECTOR_WORDS, WORD_BITS, rows_of_sectors, sectors_of_rows
 from blitzgs.ops.take_rows import take_rows
+from blitzgs.table.layouts import LAYOUTS
 
 # The learned parameters, before activation: log scales, opacity logits, unnormalised quaternions.
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
@@ -29,8 +29,6 @@ _PARAMETERS_OF, _EXP_AVGS_OF, _EXP_AVG_SQS_OF = (
     itemgetter(*names) for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)
 )
 NO_PARENT = -1
-# The cull matrix, from the first importance pass on: which views leave a row out.
-CULL = "cull"
 
 
 class RowExchange(Protocol):
@@ -97,8 +95,8 @@ def opacity_logit(opacity: float) -> float:
 
 
 def as_stored(name: str, column: Tensor) -> Tensor:
-    """Return the form in which `GaussianTable.columns` stores a column [N, ...]: unchanged, except `CULL`."""
-    return sectors_of_rows(column).view(-1, column.shape[1]) if name == CULL else column
+    """Return a column [N, ...] as `GaussianTable.columns` stores it: unchanged, unless it has a layout."""
+    return LAYOUTS[name].stored(column) if name in LAYOUTS else column
 
 
 class GaussianTable:
@@ -107,12 +105,10 @@ class GaussianTable:
     The operations `append`, `keep`, `permute`, `renew` and `exchange` act on all columns, one column at a
     time, so that peak memory exceeds the table by one column and not by a second table.
 
-    The column `CULL`, int32 [N, words] with a bit for each view, is stored by blocks of rows, in the layout
-    of `cull`. It is transposed whenever it is set, read or moved.
+    A column of `LAYOUTS` is converted whenever it is set, read or moved.
 
     Attributes:
-        columns: the stored columns by name; `CULL` is stored as the memory of `cull`, [256 ceil(N / 256),
-            words].
+        columns: the columns by name, those of `LAYOUTS` in their stored form.
     """
 
     def __init__(self, columns: Mapping[str, Tensor]) -> None:
@@ -166,9 +162,8 @@ class GaussianTable:
         return int(self.columns["means"].shape[0])
 
     def __getitem__(self, name: str) -> Tensor:
-        if name == CULL and self.cull is not None:
-            return rows_of_sectors(self.cull, len(self))
-        return self.columns[name]
+        column = self.columns[name]
+        return LAYOUTS[name].rows(column, len(self)) if name in LAYOUTS else column
 
     def __delitem__(self, name: str) -> None:
         """Drop a column."""
@@ -187,8 +182,8 @@ class GaussianTable:
         self._store_raw(name, as_stored(name, tensor))
 
     def _to_change(self) -> list[str]:
-        """Return the columns in the order in which they change: `CULL` while others tell its length."""
-        return sorted(self, key=lambda name: name != CULL)
+        """Return the columns in the order in which they change: those of `LAYOUTS` while others tell N."""
+        return sorted(self, key=lambda name: name not in LAYOUTS)
 
     def release(self) -> dict[str, Tensor]:
         """Return all columns, [N, ...], and leave the table without any."""
@@ -202,12 +197,6 @@ class GaussianTable:
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.columns)
-
-    @property
-    def cull(self) -> Tensor | None:
-        """The column `CULL` by blocks, int32 [ceil(N / 256), columns, 8], see `blitzgs.ops.cull_mask`."""
-        stored = self.columns.get(CULL)
-        return None if stored is None else stored.view(-1, WORD_BITS * stored.shape[1], SECTOR_WORDS)
 
     def row_of(self, name: str) -> Column:
         """Return the dtype and the row shape of a column."""

@@ -50,6 +50,11 @@ class Exposures:
         self.measured[:, 0] = 1
         self.counts = torch.zeros(len(train), dtype=torch.float64, device=ranks.device)
 
+    def begin_with(self, gains: Tensor) -> None:
+        """Begin with gains that were measured before the training, [T, 3]; they count as several visits."""
+        self.measured[:, 0] = gains.to(self.measured)
+        self.counts.fill_(1 / _LEAST_SHARE)
+
     def effective(self) -> Tensor:
         """Return gain and bias of each training view as they are used, float64 [T, 2, 3]; does not wait."""
         return effective(self.measured)

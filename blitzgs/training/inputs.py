@@ -57,6 +57,7 @@ def open_capture(
             undistort=data.undistort,
             exif=data.exif,
             allow_missing=data.allow_missing,
+            inside_only=data.inside_only,
             sparse=data.sparse,
             stray_cameras=data.stray_cameras,
         )

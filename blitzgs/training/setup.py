@@ -23,6 +23,7 @@ from blitzgs.population.position_noise import PositionNoise
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import CAMERAS, save_cameras
 from blitzgs.runs.evaluation import load_lpips
+from blitzgs.runs.exposure import SHARED
 from blitzgs.runs.files import Progress
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
 from blitzgs.runs.log import LOG, RunLog
@@ -43,6 +44,7 @@ from blitzgs.training.population_report import PICTURE
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
+from blitzgs.training.track_gains import differ, track_gains
 from blitzgs.training.view_level import keep_to_views
 from blitzgs.view.levels import measure_levels
 from blitzgs.view.views import Space, ViewSet, trained_centres
@@ -117,10 +119,7 @@ def set_up(
         config, table, optimiser, owners, space.extent, UpcomingCameras(sampler, capture.train, views)
     )
     if config.model.exposure:
-        stepper.exposures = Exposures(capture.train, ranks)
-        # As with the tiles, rows are those of the same training views.
-        if restored is not None and restored.progress.train_views in ("", progress.train_views):
-            stepper.exposures.restore(restored.shared)
+        stepper.exposures = _exposures(capture, images, ranks, progress, restored)
     return TrainingState(
         config=config,
         capture=capture,
@@ -212,6 +211,29 @@ def _tile_owners(ranks: Ranks, progress: Progress, restored: run_files.Restored 
     return owners
 
 
+def _exposures(
+    capture: Capture,
+    images: Images,
+    ranks: Ranks,
+    progress: Progress,
+    restored: run_files.Restored | None,
+) -> Exposures | None:
+    """Return the photographs' exposures, from the checkpoint or the tracks; None if they are equal."""
+    exposures = Exposures(capture.train, ranks)
+    if restored is not None:
+        if SHARED not in restored.shared:
+            return None
+        # As with the tiles, rows are those of the same training views.
+        if restored.progress.train_views in ("", progress.train_views):
+            exposures.restore(restored.shared)
+            return exposures
+    gains = track_gains(capture, images, ranks)
+    if gains is None:
+        return exposures
+    exposures.begin_with(gains)
+    return exposures if restored is not None or differ(gains) else None
+
+
 def _stepper(
     config: Config,
     table: GaussianTable,
@@ -289,6 +311,6 @@ def first_gaussians(
         level_count=levels.count,
         peak_gaussians=len(first),
         seconds=0.0,
-        milestones={"initial": len(first), "found": first.found},
+        milestones={"initial": len(first)} | ({"found": first.found} if first.found > len(first) else {}),
         reference_distance=levels.reference_distance,
     )

@@ -30,8 +30,8 @@ from blitzgs.runs.watch import Watcher
 from blitzgs.spawn.rules import lineage_subject
 from blitzgs.table.pool import PoolError
 from blitzgs.training import view_level
-from blitzgs.training.agreement import MOST_STEPS, Agreement, StopRequest
-from blitzgs.training.batches import MOST_MASKED, BatchLoader
+from blitzgs.training.agreement import MAX_STEPS, Agreement, StopRequest
+from blitzgs.training.batches import MAX_MASKED, BatchLoader
 from blitzgs.training.budget import Budget
 from blitzgs.training.events import evaluate, events_left, handle_all, save
 from blitzgs.training.glances import Glances
@@ -160,8 +160,10 @@ class Trainer:
                 return self.finish(agreement)
         except PhotographError as error:  # on every rank
             self._stop(f"saved after {state.images_seen:,} images, before a photograph that cannot be read")
+            what = "mask" if "the mask " in str(error) else "photograph"
             raise PhotographError(
-                f"{error}. The model so far is saved: put the photograph back and continue with --resume"
+                f"{error}. The model so far is saved: put the {what} back and continue with --resume, or "
+                "leave damaged ones out with --data.allow_missing=true"
             ) from error
         finally:
             state.stops = never
@@ -192,7 +194,7 @@ class Trainer:
         lost = [f"rank {rank}: {reason}" for rank, reason in enumerate(reasons) if reason is not None]
         if lost:
             raise PhotographError(
-                f"{'; '.join(lost)}. The last steps, {MOST_STEPS + 1} at most, went without it"
+                f"{'; '.join(lost)}. The last steps, {MAX_STEPS + 1} at most, went without it"
             )
 
     def _stop(self, reason: str) -> None:
@@ -257,7 +259,7 @@ class Trainer:
         self._warned_of_masks = True
         if self.state.ranks.rank == 0:
             warnings.warn(
-                f"{masked} of the first {read} training views are masked by more than {MOST_MASKED:.0%}: "
+                f"{masked} of the first {read} training views are masked by more than {MAX_MASKED:.0%}: "
                 "black excludes a pixel and white counts. Invert the masks if they mean the opposite, or "
                 "train without them (--data.masks=false)",
                 stacklevel=2,
@@ -296,9 +298,9 @@ class Trainer:
             f"{views['train']} training views, {views['test']} held out; "
             f"{images:,} images, {images / views['train']:,.0f} per view"
         )
-        found = state.progress.milestones.get("found", 0)
-        if state.progress.step == 0 and found > (kept := state.progress.milestones["initial"]):
-            text += f"; thinned from {found:,} to population.max_gaussians={kept}"
+        if state.progress.step == 0 and (found := state.progress.milestones.get("found", 0)):
+            most = state.config.population.max_gaussians
+            text += f"; thinned from {found:,} to population.max_gaussians={most}"
         if state.config.data.downscale > 1:
             factor = f"data.downscale={state.config.data.downscale:g}"
             text += f"; images of {largest_size(state.capture)} ({factor})"

@@ -183,6 +183,7 @@ def _photographs(capture: Capture) -> str:
         (about.source.without_camera, "without a camera"),
         (about.unused, "in no list of the capture's split"),
         (about.missing, "not on disk"),
+        (about.damaged, "damaged"),
     ):
         if count:
             parts.append(f"{count} {text}")
@@ -240,7 +241,9 @@ def _alpha(capture: Capture, config: Config) -> str:
     if not capture.has_alpha:
         return "none"
     colour = ", ".join(f"{value:g}" for value in config.model.background)
-    return f"some photographs have it; composited over model.background ({colour})"
+    about = capture.about
+    extra = f"; a further band of {about.extra_bands} is not used" if about.extra_bands else ""
+    return f"{about.with_alpha} photographs have it; composited over model.background ({colour}){extra}"
 
 
 def _points(capture: Capture) -> str:
@@ -252,7 +255,9 @@ def _points(capture: Capture) -> str:
         f"all of colour {tuple(colours[0].tolist())}" if grey else f"mean colour {colours.mean():.0f} of 255"
     )
     blind = f"; {capture.about.blind} views see none" if capture.about.blind else ""
-    return f"{len(capture.points):,}, {shown}{blind}"
+    about = capture.about
+    colours_from = f"colours from {about.colors_from}" if about.colors_from else "no colours in the file"
+    return f"{len(capture.points):,} of {about.points_from}, {colours_from}, {shown}{blind}"
 
 
 def _exposure(pictures: Pictures) -> str:

@@ -12,7 +12,8 @@ from blitzgs.capture.fingerprint import train_views_fingerprint
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.files import Progress
 from blitzgs.runs.lod import lod_gate, scene_gate
-from blitzgs.table.table import CULL, GaussianTable
+from blitzgs.table.layouts import CULL
+from blitzgs.table.table import GaussianTable
 from blitzgs.training.state import TrainingState
 from blitzgs.view.gate import ViewGate, lod_bits
 

@@ -19,6 +19,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.view_gate import gate_views_
+from blitzgs.table.layouts import CULL, sectors_in
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.levels import farthest
 
@@ -27,7 +28,7 @@ SAMPLE = 16_384
 # Key of the sample's random draws, so that they differ from other draws for the same ids.
 _SAMPLE_KEY = 0x1EAF
 # Largest number of distances that are in memory at once.
-_MOST_DISTANCES = 1 << 24
+_MAX_DISTANCES = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,9 @@ class ViewGate:
 
     def rules(self, table: GaussianTable) -> GateRules:
         """Return the rules for a table, as the ops take them."""
-        return GateRules(table["level"], list(self.reach), self.lod_views, table.cull, list(self.columns))
+        mask = table.columns.get(CULL)
+        sectors = None if mask is None else sectors_in(mask)
+        return GateRules(table["level"], list(self.reach), self.lod_views, sectors, list(self.columns))
 
 
 class SceneGate:
@@ -143,7 +146,7 @@ class SceneGate:
             centres: positions of the cameras, float64 [V, 3].
         """
         counts = torch.zeros(len(centres), dtype=torch.int64, device=self._means.device)
-        length = max(1, _MOST_DISTANCES // max(1, len(self._means)))
+        length = max(1, _MAX_DISTANCES // max(1, len(self._means)))
         for begin in range(0, len(centres), length):
             some = centres[begin : begin + length].to(self._means.device)
             distances = torch.cdist(some, self._means, compute_mode="donot_use_mm_for_euclid_dist")

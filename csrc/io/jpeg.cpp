@@ -6,6 +6,8 @@
 #include <utility>
 #include <vector>
 
+#include "io/jpeg_codes.h"
+
 namespace blitzgs::io {
 
 namespace {
@@ -18,76 +20,11 @@ constexpr std::uint8_t kSof0 = 0xc0, kSof2 = 0xc2, kDht = 0xc4, kRst0 = 0xd0, kS
 constexpr unsigned kHoleBytes = 64 + 8;
 
 // Limits the memory that a small file can ask for: 8 bytes for each block of all components.
-constexpr std::uint64_t kMostBlocks = 1 << 24;
-constexpr unsigned kMostComponents = 4;
+constexpr std::uint64_t kMaxBlocks = 1 << 24;
+constexpr unsigned kMaxComponents = 4;
 
-// The Huffman tables that decoders use where a file has none (T.81, K.3), as the payload of a DHT segment.
-// Frames of Motion JPEG, as webcams write them, leave them out.
-constexpr std::uint8_t kStandardTables[] = {
-    0x00, 0x00, 0x01, 0x05, 0x01, 0x01, 0x01, 0x01, 0x01, 0x01, 0x00, 0x00, 0x00, 0x00, 0x00, 0x00, 0x00,
-    0x00, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0a, 0x0b, 0x10, 0x00, 0x02, 0x01, 0x03,
-    0x03, 0x02, 0x04, 0x03, 0x05, 0x05, 0x04, 0x04, 0x00, 0x00, 0x01, 0x7d, 0x01, 0x02, 0x03, 0x00, 0x04,
-    0x11, 0x05, 0x12, 0x21, 0x31, 0x41, 0x06, 0x13, 0x51, 0x61, 0x07, 0x22, 0x71, 0x14, 0x32, 0x81, 0x91,
-    0xa1, 0x08, 0x23, 0x42, 0xb1, 0xc1, 0x15, 0x52, 0xd1, 0xf0, 0x24, 0x33, 0x62, 0x72, 0x82, 0x09, 0x0a,
-    0x16, 0x17, 0x18, 0x19, 0x1a, 0x25, 0x26, 0x27, 0x28, 0x29, 0x2a, 0x34, 0x35, 0x36, 0x37, 0x38, 0x39,
-    0x3a, 0x43, 0x44, 0x45, 0x46, 0x47, 0x48, 0x49, 0x4a, 0x53, 0x54, 0x55, 0x56, 0x57, 0x58, 0x59, 0x5a,
-    0x63, 0x64, 0x65, 0x66, 0x67, 0x68, 0x69, 0x6a, 0x73, 0x74, 0x75, 0x76, 0x77, 0x78, 0x79, 0x7a, 0x83,
-    0x84, 0x85, 0x86, 0x87, 0x88, 0x89, 0x8a, 0x92, 0x93, 0x94, 0x95, 0x96, 0x97, 0x98, 0x99, 0x9a, 0xa2,
-    0xa3, 0xa4, 0xa5, 0xa6, 0xa7, 0xa8, 0xa9, 0xaa, 0xb2, 0xb3, 0xb4, 0xb5, 0xb6, 0xb7, 0xb8, 0xb9, 0xba,
-    0xc2, 0xc3, 0xc4, 0xc5, 0xc6, 0xc7, 0xc8, 0xc9, 0xca, 0xd2, 0xd3, 0xd4, 0xd5, 0xd6, 0xd7, 0xd8, 0xd9,
-    0xda, 0xe1, 0xe2, 0xe3, 0xe4, 0xe5, 0xe6, 0xe7, 0xe8, 0xe9, 0xea, 0xf1, 0xf2, 0xf3, 0xf4, 0xf5, 0xf6,
-    0xf7, 0xf8, 0xf9, 0xfa, 0x01, 0x00, 0x03, 0x01, 0x01, 0x01, 0x01, 0x01, 0x01, 0x01, 0x01, 0x01, 0x00,
-    0x00, 0x00, 0x00, 0x00, 0x00, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0a, 0x0b, 0x11,
-    0x00, 0x02, 0x01, 0x02, 0x04, 0x04, 0x03, 0x04, 0x07, 0x05, 0x04, 0x04, 0x00, 0x01, 0x02, 0x77, 0x00,
-    0x01, 0x02, 0x03, 0x11, 0x04, 0x05, 0x21, 0x31, 0x06, 0x12, 0x41, 0x51, 0x07, 0x61, 0x71, 0x13, 0x22,
-    0x32, 0x81, 0x08, 0x14, 0x42, 0x91, 0xa1, 0xb1, 0xc1, 0x09, 0x23, 0x33, 0x52, 0xf0, 0x15, 0x62, 0x72,
-    0xd1, 0x0a, 0x16, 0x24, 0x34, 0xe1, 0x25, 0xf1, 0x17, 0x18, 0x19, 0x1a, 0x26, 0x27, 0x28, 0x29, 0x2a,
-    0x35, 0x36, 0x37, 0x38, 0x39, 0x3a, 0x43, 0x44, 0x45, 0x46, 0x47, 0x48, 0x49, 0x4a, 0x53, 0x54, 0x55,
-    0x56, 0x57, 0x58, 0x59, 0x5a, 0x63, 0x64, 0x65, 0x66, 0x67, 0x68, 0x69, 0x6a, 0x73, 0x74, 0x75, 0x76,
-    0x77, 0x78, 0x79, 0x7a, 0x82, 0x83, 0x84, 0x85, 0x86, 0x87, 0x88, 0x89, 0x8a, 0x92, 0x93, 0x94, 0x95,
-    0x96, 0x97, 0x98, 0x99, 0x9a, 0xa2, 0xa3, 0xa4, 0xa5, 0xa6, 0xa7, 0xa8, 0xa9, 0xaa, 0xb2, 0xb3, 0xb4,
-    0xb5, 0xb6, 0xb7, 0xb8, 0xb9, 0xba, 0xc2, 0xc3, 0xc4, 0xc5, 0xc6, 0xc7, 0xc8, 0xc9, 0xca, 0xd2, 0xd3,
-    0xd4, 0xd5, 0xd6, 0xd7, 0xd8, 0xd9, 0xda, 0xe2, 0xe3, 0xe4, 0xe5, 0xe6, 0xe7, 0xe8, 0xe9, 0xea, 0xf2,
-    0xf3, 0xf4, 0xf5, 0xf6, 0xf7, 0xf8, 0xf9, 0xfa,
-};
-
-struct Code {
-  std::uint8_t length = 0;  // in bits; 0: no such code
-  std::uint8_t symbol = 0;
-};
-
-// Huffman codes of 1 to 16 bits. Codes of up to kShort bits are looked up by the next kShort bits of the
-// file. Longer codes, which are rare, are searched length by length: codes of one length are consecutive
-// numbers, and those of a greater length come after them.
-struct CodeTable {
-  static constexpr unsigned kShort = 9;
-
-  std::array<Code, 1 << kShort> short_codes{};
-  std::array<std::uint32_t, 17> ends{};  // by length: the first 16-bit number beyond the codes of this length
-  std::array<int, 17> bases{};           // by length: the index of its first symbol minus its first code
-  std::vector<std::uint8_t> symbols;     // empty: there is no such table
-
-  Code find(std::uint32_t bits16) const {
-    const Code found = short_codes[bits16 >> (16 - kShort)];
-    if (found.length > 0) return found;
-    for (unsigned length = kShort + 1; length <= 16; ++length) {
-      if (bits16 < ends[length]) {
-        const int code = static_cast<int>(bits16 >> (16 - length));
-        return {static_cast<std::uint8_t>(length), symbols[static_cast<std::size_t>(bases[length] + code)]};
-      }
-    }
-    return {};
-  }
-};
-
-struct Component {
-  std::uint8_t id;
-  unsigned h, v;
-  // For each block of a progressive file, the coefficients that are not zero so far, as bits in zigzag order.
-  std::vector<std::uint64_t> nonzero;
-};
-
-std::uint64_t ceil_div(std::uint64_t a, std::uint64_t b) { return (a + b - 1) / b; }
+// More bytes than these after the last block of a scan are image data.
+constexpr std::size_t kMaxForeignBytes = 4096;
 
 // The check of one file (jpeg.h).
 class Checker {
@@ -143,24 +80,7 @@ class Checker {
       const unsigned kind = payload[0] >> 4, id = payload[0] & 15;
       if (kind > 1 || id > 3) fail("damaged JPEG: a Huffman table has an impossible number");
       CodeTable& table = tables_[kind][id];
-      table = CodeTable{};
-      std::uint32_t begin = 0;
-      for (unsigned length = 1; length <= 16; ++length) {
-        const std::uint32_t count = payload[length], step = 1u << (16 - length);
-        const std::size_t first = table.symbols.size();
-        if (payload.size() - 17 < first + count || begin + count * step > (1u << 16))
-          fail("damaged JPEG: a Huffman table is impossible");
-        table.bases[length] = static_cast<int>(first) - static_cast<int>(begin / step);
-        const auto symbols = payload.subspan(17 + first, count);
-        table.symbols.insert(table.symbols.end(), symbols.begin(), symbols.end());
-        for (std::uint32_t k = 0; length <= CodeTable::kShort && k < count; ++k) {
-          const unsigned shift = 16 - CodeTable::kShort;
-          const auto at = table.short_codes.begin() + ((begin + k * step) >> shift);
-          std::fill_n(at, step >> shift, Code{static_cast<std::uint8_t>(length), symbols[k]});
-        }
-        begin += count * step;
-        table.ends[length] = begin;
-      }
+      if (!table.build(payload)) fail("damaged JPEG: a Huffman table is impossible");
       payload = payload.subspan(17 + table.symbols.size());
     }
   }
@@ -171,9 +91,9 @@ class Checker {
     progressive_ = marker == kSof2;
     height_ = payload[1] * 256u + payload[2];
     width_ = payload[3] * 256u + payload[4];
-    if (payload[5] > kMostComponents) {
+    if (payload[5] > kMaxComponents) {
       fail("damaged JPEG: it claims " + std::to_string(payload[5]) +
-           " components, and no picture has more than " + std::to_string(kMostComponents));
+           " components, and no picture has more than " + std::to_string(kMaxComponents));
     }
     components_.clear();
     h_max_ = v_max_ = 1;
@@ -191,7 +111,7 @@ class Checker {
     for (const Component& component : components_) blocks += count_blocks(component);
     // A height of 0 means that the height follows after the first scan. In such files only the markers are
     // checked.
-    walked_ = walked_ && width_ > 0 && height_ > 0 && blocks <= kMostBlocks;
+    walked_ = walked_ && width_ > 0 && height_ > 0 && blocks <= kMaxBlocks;
   }
 
   std::uint64_t count_blocks(const Component& component) const {
@@ -263,19 +183,64 @@ class Checker {
         end_of_interval();
         if (next_marker() != kRst0 + restarts++ % 8) fail("damaged JPEG: restart markers are out of order");
       }
-      for (const Block& block : blocks) {
-        if (!progressive_) {
-          read_block(block);
-        } else if (band.first == 0) {
-          take(band.refines ? 1 : next_symbol(*block.dc) & 15u);
-        } else if (band.refines) {
-          refine_band(*block.ac, band, block.component->nonzero[unit]);
-        } else {
-          read_band(*block.ac, band, block.component->nonzero[unit]);
-        }
+      read_unit(blocks, band, unit);
+    }
+    skip_foreign_bytes(blocks, band);
+    end_of_interval();
+  }
+
+  void read_unit(const std::vector<Block>& blocks, const Band& band, std::uint64_t unit) {
+    for (const Block& block : blocks) {
+      if (!progressive_) {
+        read_block(block);
+      } else if (band.first == 0) {
+        take(band.refines ? 1 : next_symbol(*block.dc) & 15u);
+      } else if (band.refines) {
+        refine_band(*block.ac, band, block.component->nonzero[unit]);
+      } else {
+        read_band(*block.ac, band, block.component->nonzero[unit]);
       }
     }
-    end_of_interval();
+  }
+
+  // Skips bytes between the last block of a scan and the next marker, as decoders do: some cameras leave
+  // bytes there. But where an earlier part of the scan is damaged, the blocks that were read too early are
+  // followed by the other ones. So the bytes are not skipped if they are blocks up to their end, if the last
+  // block does not end as encoders end it (its last byte filled with ones), or if they are many.
+  void skip_foreign_bytes(const std::vector<Block>& blocks, const Band& band) {
+    const unsigned fill = (held_ - padding_) % 8;
+    if (end_run_ > 0 || (fill > 0 && bits_ >> (64 - fill) != (1u << fill) - 1)) return;
+    std::size_t end = at_;
+    while (end + 1 < file_.size() && (file_[end] != 0xff || file_[end + 1] == 0)) ++end;
+    const std::size_t begin = at_ - std::min(at_, std::size_t{(held_ - padding_) / 8});
+    const bool is_scan_end = end + 1 < file_.size() && (file_[end + 1] < kRst0 || file_[end + 1] >= kSoi);
+    const std::size_t foreign = end - begin;
+    if (!is_scan_end || foreign == 0 || foreign > kMaxForeignBytes || are_blocks(blocks, band)) return;
+    at_ = end;
+    held_ = padding_ = 0;
+  }
+
+  // Tells whether the rest of a scan's data are further blocks, without a rest.
+  bool are_blocks(const std::vector<Block>& blocks, const Band& band) const {
+    Checker rest(file_, name_);
+    rest.at_ = at_;
+    rest.bits_ = bits_;
+    rest.held_ = held_;
+    rest.padding_ = padding_;
+    rest.progressive_ = progressive_;
+    Component any{0, 1, 1, {0}};
+    std::vector<Block> copies = blocks;
+    for (Block& block : copies) block.component = &any;
+    try {
+      for (std::size_t unit = 0; unit < 8 * kMaxForeignBytes; ++unit) {
+        rest.refill();
+        const unsigned left = rest.held_ - rest.padding_;
+        if (left < 8 && (left == 0 || rest.bits_ >> (64 - left) == (1u << left) - 1)) return unit > 0;
+        rest.read_unit(copies, band, 0);
+      }
+    } catch (const FormatError&) {
+    }
+    return false;
   }
 
   // Reads one block in the first scan of a band.

@@ -4,11 +4,11 @@
 //
 // The check reads all markers and, for sequential and progressive Huffman files (nearly all photographs),
 // every code of the image data, without computing pixels. It refuses data that end before the last block,
-// codes that are in no table, blocks of more than 64 coefficients, restart markers out of order, bytes other
-// than zeros after the last block of a scan, and coefficients from a long run of zero bytes, which a lost
-// disk sector leaves. In other files (arithmetic coding, 12 bits, more than 2^24 blocks, which are 340
-// megapixels of full colour) it reads only the markers, up to the end marker. It cannot detect damage that
-// leaves a valid sequence of codes. O(bytes), about 150 MB/s.
+// codes that are in no table, blocks of more than 64 coefficients, restart markers out of order, further
+// blocks after the last block of a scan, and coefficients from a long run of zero bytes, which a lost disk
+// sector leaves. In other files (arithmetic coding, 12 bits, more than 2^24 blocks, which are 340 megapixels
+// of full colour) it reads only the markers, up to the end marker. It cannot detect damage that leaves a
+// valid sequence of codes. O(bytes), about 150 MB/s.
 #pragma once
 #include <cstdint>
 #include <span>

@@ -92,6 +92,19 @@ TEST_CASE("whole JPEGs pass") {
   REQUIRE(problem(followed).empty());
 }
 
+TEST_CASE("bytes after the last block are skipped as decoders do, if they are no blocks") {
+  REQUIRE(problem(jpeg(8, 8, {0x3f, 0x12, 0x35})).empty());
+  REQUIRE(problem(jpeg(8, 8, {0x3f, 0x12, 0x3f})).empty());
+  REQUIRE(problem(jpeg(8, 8, {0x3f, 0xff, 0x00, 0xff, 0x00, 0xfe})).empty());
+  Bytes many = {0x3f};
+  append(many, Bytes(4096, 0xfe));
+  REQUIRE(problem(jpeg(8, 8, many)).empty());
+  many.push_back(0xfe);
+  REQUIRE(mentions(jpeg(8, 8, many), "image data go on after the last block"));
+  // Between restart intervals a block may be lost.
+  REQUIRE(mentions(jpeg(16, 8, {0x3f, 0xfe, 0xff, 0xd0, 0x3f}, 0xc0, 1), "go on after the last block"));
+}
+
 TEST_CASE("a JPEG without Huffman tables has the standard ones") {
   const auto bare = [](const Bytes& data, std::uint8_t tables) {
     Bytes out = {0xff, 0xd8};
@@ -118,8 +131,8 @@ TEST_CASE("cut JPEGs are refused wherever they end") {
 
 TEST_CASE("damaged image data are refused with the reason") {
   REQUIRE(mentions(jpeg(32, 16, {0x00}), "image data end before the last block"));
-  REQUIRE(mentions(jpeg(16, 16, {0x00, 0x01}), "image data go on after the last block"));
-  REQUIRE(mentions(jpeg(8, 8, {0x3f, 0x12, 0x34}), "image data go on after the last block"));
+  REQUIRE(mentions(jpeg(8, 8, {0x00, 0x3f}), "image data go on after the last block"));
+  REQUIRE(mentions(jpeg(8, 8, {0x1f, 0xd2, 0x34}), "image data go on after the last block"));
   REQUIRE(mentions(jpeg(8, 8, {0x7e, 0x00}), "no such Huffman code"));         // 0 then 111
   REQUIRE(mentions(jpeg(8, 8, {0x6d, 0xb0, 0x00}), "too many coefficients"));  // 0 then 110 four times
   REQUIRE(mentions(jpeg(24, 8, {0x3f, 0xff, 0xd0, 0x3f, 0xff, 0xd2, 0x3f}, 0xc0, 1), "out of order"));
@@ -134,6 +147,7 @@ TEST_CASE("every code of a progressive JPEG is read") {
   REQUIRE(mentions(progressive({}, {0xa1}, {0x47}), "image data end before the last block"));
   REQUIRE(mentions(progressive({0x0f}, {0xbf}, {0x47}), "no such Huffman code"));
   REQUIRE(mentions(progressive({0x0f}, {0xa1, 0x55}, {0x47}), "image data go on after the last block"));
+  REQUIRE(problem(progressive({0x0f, 0xfe, 0xfe}, {0xa1}, {0x47, 0xfe, 0xfe})).empty());
   // Without its bit the last block's code is missing: bits 0000, and 0 more than the scan has.
   REQUIRE(mentions(progressive({0x0f}, {0xa1}, {}), "image data end before the last block"));
   Bytes file = progressive({0x0f}, {0xa1}, {0x47});

@@ -17,6 +17,7 @@
 #include <string_view>
 
 #include "io/colmap.h"
+#include "io/image_header.h"
 #include "io/jpeg.h"
 #include "io/ply.h"
 #include "io/qoi.h"
@@ -217,6 +218,35 @@ void check_jpeg(const py::bytes& data, const std::string& name) {
   io::check_jpeg({reinterpret_cast<const std::uint8_t*>(view.data()), view.size()}, name);
 }
 
+io::ImageBytes bytes_of(const std::string_view& view) {
+  return {reinterpret_cast<const std::uint8_t*>(view.data()), view.size()};
+}
+
+void check_png(const py::bytes& data, const std::string& name) {
+  const std::string_view view = data;
+  py::gil_scoped_release release;
+  io::check_png(bytes_of(view), name);
+}
+
+py::dict read_image_header(const py::bytes& data, const std::string& name) {
+  const io::ImageHeader header = io::read_image_header(bytes_of(data), name);
+  constexpr const char* kAlpha[] = {"", "straight", "associated"};
+  constexpr const char* kSamples[] = {"uint", "int", "float"};
+  return py::dict("format"_a = header.format, "supported"_a = header.supported, "width"_a = header.width,
+                  "height"_a = header.height, "orientation"_a = header.orientation, "bits"_a = header.bits,
+                  "colors"_a = header.colors, "extras"_a = header.extras,
+                  "samples"_a = kSamples[static_cast<int>(header.samples)],
+                  "alpha"_a = kAlpha[static_cast<int>(header.alpha)],
+                  "transparent_grey"_a = header.transparent_grey, "is_white_zero"_a = header.is_white_zero,
+                  "is_lossy"_a = header.is_lossy);
+}
+
+py::bytes tiff_as_stored(const py::bytes& data, const std::string& name) {
+  const std::vector<std::uint8_t> changed = io::tiff_as_stored(bytes_of(data), name);
+  if (changed.empty()) return data;
+  return py::bytes(reinterpret_cast<const char*>(changed.data()), changed.size());
+}
+
 py::bytes encode_qoi(const Column<std::uint8_t>& rgb) {
   if (rgb.ndim() != 3 || rgb.shape(2) != 3) throw std::invalid_argument("qoi: the image must be [H, W, 3]");
   const io::QoiSize size{static_cast<std::uint32_t>(rgb.shape(1)), static_cast<std::uint32_t>(rgb.shape(0))};
@@ -266,6 +296,9 @@ PYBIND11_MODULE(_io, m) {
   m.def("write_images", &write_images, "path"_a, "columns"_a);
   m.def("write_points", &write_points, "path"_a, "columns"_a);
   m.def("check_jpeg", &check_jpeg, "data"_a, "name"_a);
+  m.def("check_png", &check_png, "data"_a, "name"_a);
+  m.def("read_image_header", &read_image_header, "data"_a, "name"_a);
+  m.def("tiff_as_stored", &tiff_as_stored, "data"_a, "name"_a);
   m.def("encode_qoi", &encode_qoi, "rgb"_a);
   m.def("decode_qoi", &decode_qoi, "data"_a);
   m.def("set_flag", &set_flag, "flags"_a.noconvert(), "index"_a);

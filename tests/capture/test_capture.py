@@ -10,7 +10,6 @@ from PIL import Image
 from blitzgs.capture import colmap
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.capture import load_capture
-from blitzgs.capture.files import find_mask
 from blitzgs.capture.image_files import ImageHeader, apply_orientation, read_header
 from blitzgs.capture.images import ImageStore
 from tests.capture.helpers import edit_model, shared_data, smooth_image, write_capture, write_image
@@ -398,18 +397,6 @@ def test_masks_that_belong_to_no_image_are_not_ignored(tmp_path, name):
     cv2.imwrite(str(root / "masks" / f"{NAMES[1]}.png"), mask)
     with pytest.warns(UserWarning, match=f"1 of 2 masks in .* belong to no image .first: {name}"):
         load_capture(root)
-
-
-def test_a_photograph_is_not_taken_for_its_own_mask(tmp_path):
-    """Absolute names and `..`, joined to the folder of masks, would lead to the photographs."""
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "capture" / "masks").mkdir(parents=True)
-    write_image(tmp_path / "photos" / "a.png", smooth_image(64, 48))
-    photo = str(tmp_path / "photos" / "a.png")
-    assert find_mask(tmp_path / "capture" / "masks", photo) is None
-    assert find_mask(tmp_path / "capture" / "masks", "../../photos/a.png") is None
-    cv2.imwrite(str(tmp_path / "capture" / "masks" / "a.png"), np.ones((4, 4), dtype=np.uint8))
-    assert find_mask(tmp_path / "capture" / "masks", photo) == tmp_path / "capture" / "masks" / "a.png"
 
 
 def test_a_list_file_may_begin_with_a_byte_order_mark(tmp_path):

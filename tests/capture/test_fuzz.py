@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import plyfile
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,8 +19,9 @@ from hypothesis import strategies as st
 from blitzgs.capture.image_files import decode_rgb, read_header, read_whole
 from blitzgs.capture.transforms import read_transforms
 from blitzgs.formats.native import native_io
-from blitzgs.formats.ply import read_ply
+from blitzgs.formats.ply import read_ply, read_point_cloud
 from tests.capture.helpers import ROOT, reconstruction, smooth_image, write_image
+from tests.capture.image_bytes import tiff
 from tests.formats.test_ply import gaussians, inria_file
 
 SETTINGS = settings(max_examples=150, deadline=None, derandomize=True)
@@ -34,10 +36,18 @@ def samples():
     inria_file(folder / "model.ply", gaussians(4, 1))
     write_image(folder / "photo.jpg", smooth_image(48, 64))
     assert cv2.imwrite(str(folder / "stages.jpg"), smooth_image(48, 64), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
+    write_image(folder / "photo.png", smooth_image(8, 8))
+    (folder / "photo.tif").write_bytes(tiff(np.ones((8, 8, 4), dtype=np.uint8), 2, t274=6))
+    rows = np.zeros(4, [(name, "f4") for name in ("x", "y", "z", "red", "green", "blue")])
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")], text=True).write(folder / "cloud.ply")
     (folder / "QOI").write_bytes(native_io().encode_qoi(smooth_image(48, 64)))
     frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "mask_path": "b.png"}
-    lens = {"w": 64, "h": 48, "fl_x": 60.0, "k1": 0.1, "ply_file_path": "p.ply"}
-    (folder / "transforms.json").write_text(json.dumps(lens | {"frames": [frame], "test_filenames": []}))
+    frame |= {"camera_angle_x": 1.0, "camera_angle_y": 0.8, "cx": 31.5, "is_fisheye": False}
+    lens = {"w": 64, "h": 48, "fl_x": 60.0, "k1": 0.1, "ply_file_path": "p.ply", "camera_model": "RADIAL"}
+    lens |= {"fl_y": 61.0, "cy": 24.0, "p1": 0.001, "distortion_params": [0.1, 0, 0, 0, 0.001, 0]}
+    lens |= {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 0.5}
+    lists = {"train_filenames": ["a.png"], "val_filenames": [], "test_filenames": []}
+    (folder / "transforms.json").write_text(json.dumps(lens | lists | {"frames": [frame]}))
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
@@ -54,7 +64,20 @@ def read_image(path: str) -> None:
     decode_rgb(read_whole(Path(path)), path)
 
 
+def read_parts(path: str) -> None:
+    """Read what this package reads of a file itself, before OpenCV decodes it."""
+    data, name = Path(path).read_bytes(), path.encode()
+    native_io().read_image_header(data, name)
+    if path.endswith(".tif"):
+        native_io().tiff_as_stored(data, name)
+    if path.endswith(".png"):
+        native_io().check_png(data, name)
+
+
 READERS = {
+    "photo.png": read_parts,
+    "photo.tif": read_parts,
+    "cloud.ply": read_point_cloud,
     "cameras.bin": native_io().read_cameras,
     "images.bin": lambda path: native_io().read_images(path, True),
     "points3D.bin": lambda path: native_io().read_points(path, True),
@@ -188,3 +211,29 @@ def test_flat_areas_are_no_holes(tmp_path, progressive):
         flags += [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive]
         assert cv2.imwrite(str(tmp_path / "a.jpg"), pixels, flags)
         read_whole(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".jp2", ".webp", ".gif", ".bmp", ".avif", ".jpg"])
+def test_damaged_headers_of_all_formats_are_read_or_refused(suffix):
+    data = cv2.imencode(suffix, np.full((64, 64, 4 if suffix != ".jpg" else 3), 90, np.uint8))[1].tobytes()[
+        :600
+    ]
+    name = b"file"
+
+    def attempt(damaged: bytes) -> None:
+        try:
+            found = native_io().read_image_header(damaged, name)
+            if found["format"] == "TIFF":
+                assert len(native_io().tiff_as_stored(damaged, name)) == len(damaged)
+            assert 1 <= found["orientation"] <= 8 and found["extras"] >= 0
+        except ValueError as error:
+            assert str(error).startswith("file: ")
+
+    for length in range(len(data)):
+        attempt(data[:length])
+    random = np.random.default_rng(0)
+    for _ in range(3000):
+        damaged = bytearray(data)
+        for at in random.integers(0, len(data), random.integers(1, 4)):
+            damaged[at] = random.integers(0, 256)
+        attempt(bytes(damaged))

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import dataclasses
 import json
 import tempfile
 from pathlib import Path
@@ -18,6 +19,7 @@ from blitzgs.config.files import (
     to_dict,
 )
 from blitzgs.config.ranges import CHOICES, RANGES, flat_fields, problems
+from blitzgs.config.recipes import recipe_path
 from blitzgs.config.schedule import Schedule
 from blitzgs.optim.table_adam import BETA1, BETA2, EPS
 
@@ -274,3 +276,22 @@ def test_the_papers_configuration_has_the_papers_values():
     )
     assert (loss.ssim, loss.scale) == (0.2, 10)
     assert not config.model.antialiased and config.model.sh_degree == 3
+
+
+@pytest.mark.parametrize("base", ["smoke", "smoke.yaml", "aerial_cpu", "aerial_cpu.yaml"])
+def test_a_base_may_be_a_recipe(tmp_path, base):
+    (tmp_path / "mine.yaml").write_text(f"base: {base}\nseed: 7\n")
+    name = base.removesuffix(".yaml")
+    expected = dataclasses.replace(load_config(recipe_path(name)), seed=7)
+    assert load_config(tmp_path / "mine.yaml") == expected
+    # A file beside it has priority.
+    (tmp_path / base).write_text("schedule: {batch_size: 9}\n")
+    assert load_config(tmp_path / "mine.yaml").schedule.batch_size == 9
+
+
+def test_a_base_that_is_nowhere_names_the_recipes(tmp_path):
+    (tmp_path / "mine.yaml").write_text("base: smok\n")
+    with pytest.raises(
+        ConfigError, match=r"base: smok: no such file in .*did you mean 'smoke'\? recipes are"
+    ):
+        load_config(tmp_path / "mine.yaml")

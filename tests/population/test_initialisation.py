@@ -107,3 +107,24 @@ def test_parts_of_the_first_gaussians_are_rows_of_the_whole_table():
         for name in whole:
             assert torch.equal(part[name], whole[name][rank::3]), name
     assert sum(len(part) for part in parts) == len(whole) == len(first)
+
+
+@pytest.mark.parametrize("most", [0, 1, 2, 40, 333, 10**6])
+def test_a_limit_keeps_the_coarsest_levels_and_a_random_part_of_the_next(most):
+    points, colors, centres = scene()
+    levels = measure_levels(points, centres, 2.0)
+    whole = octree_gaussians(points, colors, centres, levels, 0.5)
+    some = octree_gaussians(points, colors, centres, levels, 0.5, most=most, seed=3)
+    assert len(some) == (min(most, len(whole)) or len(whole)) and some.found == len(whole)
+    counts = [(whole.levels == level).sum().item() for level in range(levels.count)]
+    for level, count in enumerate(counts):
+        left = max(0, len(some) - sum(counts[:level]))
+        assert (some.levels == level).sum() == min(count, left)
+    # All of them are first Gaussians, with sizes that fit their own neighbours.
+    rows = {tuple(row) for row in whole.means.tolist()}
+    assert all(tuple(row) in rows for row in some.means.tolist())
+    if 1 < len(some) < len(whole):
+        assert some.log_scales.mean() > whole.log_scales.mean()
+        again = octree_gaussians(points, colors, centres, levels, 0.5, most=most, seed=3)
+        other = octree_gaussians(points, colors, centres, levels, 0.5, most=most, seed=4)
+        assert torch.equal(again.means, some.means) and not torch.equal(other.means, some.means)

@@ -134,6 +134,47 @@ def test_a_camera_that_cannot_be_rendered_is_refused(trained, change, message):
         model.camera(**fields | change)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": "64"}, r"width must be an integer, got '64' \(str\)"),
+        ({"height": None}, "height must be an integer, got None"),
+        ({"width": True}, "width must be an integer, got True"),
+        ({"K": "x"}, "K must be a matrix of numbers, got str"),
+        ({"world_to_camera": [[1, 2], [3]]}, "world_to_camera must be a matrix of numbers, got list"),
+    ],
+)
+def test_a_camera_of_wrong_types_names_the_argument(trained, change, message):
+    model = blitzgs.open_run(trained[1]).model()
+    with pytest.raises(TypeError, match=message):
+        model.camera(**({"K": np.eye(3), "world_to_camera": np.eye(4), "width": 48, "height": 32} | change))
+
+
+def test_a_model_renders_the_cameras_of_its_run_by_index(trained):
+    run = blitzgs.open_run(trained[1])
+    model, cameras = run.model(), run.cameras()
+    assert repr(cameras) == "RunCameras(8 cameras: 7 train, 1 test)"
+    for index in (cameras.test[0], np.int64(0), 7):
+        assert torch.equal(model.render(index), model.render(cameras.cameras[index]))
+    with pytest.raises(IndexError, match="camera 8: the run has the cameras 0 to 7"):
+        model.render(8)
+    for wrong in ("a", None, True, 1.5):
+        with pytest.raises(TypeError, match="camera must be a camera, such as run.cameras"):
+            model.render(wrong)
+    with pytest.raises(TypeError, match=r"got 0 \(int\)"):
+        dataclasses.replace(model, run=None).render(0)
+
+
+def test_too_large_an_image_is_said_to_lack_memory(trained):
+    run = blitzgs.open_run(trained[1])
+    camera = dataclasses.replace(run.cameras().cameras[0], width=1_000_000, height=60_000)
+    match = (
+        "not enough memory to render 1 view of 1,000,000 x 60,000 pixels with .* Gaussians: the pixels alone"
+    )
+    with pytest.raises(MemoryError, match=match):
+        run.model().render(camera)
+
+
 def test_render_and_export_need_no_photographs(copy, tmp_path):
     data, folder = copy
     shutil.rmtree(data)

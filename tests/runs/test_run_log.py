@@ -68,3 +68,25 @@ def test_other_ranks_show_nothing(monkeypatch, capsys):
         report(1, 2)
     log.close()
     assert not capsys.readouterr().out
+
+
+def test_what_is_shown_is_a_running_mean_and_the_held_out_figure(tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    log = RunLog(tmp_path, 40, 0, tensorboard=False)
+    log.scalars(1, {"loss": 0.5, "psnr": 20.0})
+    log.scalars(2, {"loss": 0.3, "psnr": 30.0})
+    log.event(2, "glance", {"psnr": 22.5, "views": 2})
+    for t in range(3, 30):
+        log.scalars(t, {"loss": 0.1, "psnr": 24.0})
+    log.event(30, "evaluation", {"psnr": 23.0, "split": "train"})
+    log.event(30, "note", {}, "bad \x1b[2J name")
+    log.close()
+    lines = capsys.readouterr().out.splitlines()
+    assert "loss 0.5000  train 20.00 dB" in lines[0] and "held-out" not in lines[1]
+    assert "loss 0.4000  train 25.00 dB" in lines[1]
+    assert "loss 0.1000  train 24.00 dB  held-out 22.50 dB" in lines[-2]
+    assert "bad \\x1b[2J name" in lines[-1]
+    assert [record["psnr"] for record in records(tmp_path)[:2]] == [
+        20.0,
+        30.0,
+    ]  # the file has each view's own

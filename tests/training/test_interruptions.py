@@ -5,6 +5,7 @@ import errno
 import itertools
 import json
 import os
+import shutil
 import signal
 import sys
 import time
@@ -18,9 +19,10 @@ from blitzgs.capture.images import PhotographError
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import checkpoint
 from blitzgs.runs import files as run_files
+from blitzgs.runs.folder import open_run
 from blitzgs.runs.guard import NonFiniteError
 from blitzgs.spawn.lineage_parts import read_lineage
-from blitzgs.training.agreement import MOST_STEPS, Agreement, SaveClock, StopRequest
+from blitzgs.training.agreement import MAX_STEPS, Agreement, SaveClock, StopRequest
 from blitzgs.training.events import save
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
@@ -162,7 +164,7 @@ def test_ranks_agree_after_the_same_step_and_slow_steps_do_not_wait(seconds, mos
 def _agreements_within(ranks, seconds, most, late):
     from blitzgs.training import agreement
 
-    agreement.MOST_SECONDS = most
+    agreement.MAX_SECONDS = most
     return _agreements(ranks, seconds, late)
 
 
@@ -185,7 +187,7 @@ def test_a_lost_photograph_ends_the_run_in_time(monkeypatch, late):
             now[0] += 1.0 if step < slow else 0.001
             if agreement.after(step, lost=step >= at).lost:
                 break
-        assert at <= step < at + MOST_STEPS + late
+        assert at <= step < at + MAX_STEPS + late
 
 
 # What is written a step later on CUDA.
@@ -304,6 +306,43 @@ def test_waiting_for_room_ends_when_asked(tmp_path, monkeypatch):
     fail_saves(monkeypatch, 9, lambda: os.kill(os.getpid(), signal.SIGTERM))
     monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
     with pytest.raises(checkpoint.CheckpointError, match="the disk is full"):
+        trainer(tmp_path).train()
+
+
+@pytest.mark.parametrize(
+    ("error", "elsewhere"),
+    [(errno.ENOTDIR, True), (errno.EACCES, True), (errno.EIO, True), (errno.EFBIG, False)],
+)
+def test_another_error_than_lack_of_space_saves_elsewhere_at_once(tmp_path, monkeypatch, error, elsewhere):
+    real = checkpoint.write_shard
+
+    def write_shard(path, *args):
+        if path.parent.parent.parent == tmp_path / "run" or not elsewhere:
+            raise OSError(error, os.strerror(error))
+        return real(path, *args)
+
+    monkeypatch.setattr(checkpoint, "write_shard", write_shard)
+    monkeypatch.setattr(save.time, "sleep", lambda seconds: pytest.fail("it waits"))
+    running = trainer(tmp_path / "run")
+    with pytest.raises(checkpoint.CheckpointError) as failure:
+        running.train()
+    message = str(failure.value)
+    assert os.strerror(error) in message and "free some space" not in message
+    saved = tmp_path / "run" / f"rescued_{running.state.run_id}"
+    assert (f"The model is saved in {saved}: continue with --resume --out" in message) == elsewhere
+    assert ("it is lost" in message) != elsewhere
+    if elsewhere:
+        assert run_files.restore(saved, Ranks()).progress.step == 100
+        assert open_run(saved).cameras().test == [3] and len(open_run(saved).model()) > 0
+
+
+def test_a_file_in_the_place_of_the_checkpoints_ends_the_run_with_the_model_saved(tmp_path, monkeypatch):
+    def replace_folder(trainer):
+        shutil.rmtree(tmp_path / "checkpoints")
+        (tmp_path / "checkpoints").touch()
+
+    at_step(monkeypatch, 50, replace_folder)
+    with pytest.raises(checkpoint.CheckpointError, match="The model is saved in .*rescued_"):
         trainer(tmp_path).train()
 
 

@@ -19,7 +19,8 @@ from blitzgs.population.importance import is_culled
 from blitzgs.runs import files as run_files
 from blitzgs.runs.evaluation import image_metrics
 from blitzgs.runs.lod import scene_gate
-from blitzgs.table.table import CULL, GaussianTable
+from blitzgs.table.layouts import CULL
+from blitzgs.table.table import GaussianTable
 from blitzgs.training.events import evaluate
 from blitzgs.training.step import Stepper
 from blitzgs.training.trainer import Trainer

@@ -57,6 +57,7 @@ class Capture:
     test: list[int]
     extent: float
     offset: np.ndarray = field(default_factory=lambda: np.array([10.0, 20.0, 30.0]))
+    root: Path = Path("/nowhere")
     apart: list[int] = field(default_factory=list)
 
     @property

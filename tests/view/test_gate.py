@@ -19,7 +19,8 @@ from blitzgs.ops.view_gate import gate_views_
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.importance import ViewBatch, is_culled, sweep
 from blitzgs.table.blocks import BlockIndex
-from blitzgs.table.table import CULL, GaussianTable
+from blitzgs.table.layouts import CULL, sectors_in
+from blitzgs.table.table import GaussianTable
 from blitzgs.training.batch import Batch
 from blitzgs.training.step import Stepper
 from blitzgs.view.gate import SAMPLE, LodGate, SceneGate, ViewGate, centres_of
@@ -377,9 +378,9 @@ def test_errors_name_the_value():
     with pytest.raises(RuntimeError, match="finer levels reach no farther, got 1 and 2 for the"):
         call([1.0, 2.0], 1)
     with pytest.raises(RuntimeError, match="2 views need as many columns of the cull matrix, got 3"):
-        call([1.0], 0, table.cull, [0, 1, 2])
+        call([1.0], 0, sectors_in(table.columns[CULL]), [0, 1, 2])
     with pytest.raises(RuntimeError, match="the cull matrix has 64 columns, got column 64"):
-        call([1.0], 0, table.cull, [0, 64])
+        call([1.0], 0, sectors_in(table.columns[CULL]), [0, 64])
     with pytest.raises(RuntimeError, match="columns need a cull matrix"):
         call([1.0], 0, None, [0, 1])
     many, _ = make_views(33)
@@ -395,5 +396,5 @@ def test_opcheck(device):
     torch.library.opcheck(
         torch.ops.blitzgs.gate_views_,
         (active.ids, active.views, active.length, table["means"], table["level"], viewmats, GATE.reach(), 5,
-         table.cull, list(COLUMNS)),
+         sectors_in(table.columns[CULL]), list(COLUMNS)),
     )  # fmt: skip

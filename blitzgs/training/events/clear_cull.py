@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from blitzgs.config.schedule import Event
-from blitzgs.table.table import CULL
+from blitzgs.table.layouts import CULL
 from blitzgs.training.state import TrainingState
 
 

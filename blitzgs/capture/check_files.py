@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks photographs and masks for damage before they are needed."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from blitzgs.capture.cameras import Camera
+from blitzgs.capture.image_files import check_photograph, decode_mask, read_whole
+
+_THREADS = 16
+
+
+def mask_error(error: Exception) -> ValueError:
+    """Return an error that says that the file is a mask."""
+    return ValueError(f"the mask {error}")
+
+
+def read_mask_file(path: Path) -> None:
+    """Decode a mask.
+
+    Raises:
+        ValueError: it is damaged; says that it is a mask.
+    """
+    try:
+        decode_mask(read_whole(path), str(path))
+    except ValueError as error:
+        raise mask_error(error) from error
+
+
+def damaged(files: Sequence[tuple[Path, Path | None]]) -> dict[int, str]:
+    """Return what is wrong with photographs and their masks, by index; those without damage are left out."""
+
+    def problem(pair: tuple[Path, Path | None]) -> str | None:
+        try:
+            check_photograph(pair[0])
+            if pair[1] is not None:
+                read_mask_file(pair[1])
+        except (OSError, ValueError) as error:
+            return str(error)
+        return None
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        return {i: text for i, text in enumerate(pool.map(problem, files)) if text is not None}
+
+
+class FileCheck:
+    """Checks the files of views one after the other in a thread of its own, while others are in use.
+
+    Attributes:
+        damage: what is wrong with the first damaged file that was found; None so far.
+    """
+
+    def __init__(
+        self, cameras: Sequence[Camera], order: Sequence[int], counted: Callable[[Camera], bool]
+    ) -> None:
+        """Start to check.
+
+        Args:
+            cameras: all views.
+            order: those to check, in this order.
+            counted: decodes a view's mask, and tells whether some pixel counts.
+        """
+        self.damage: str | None = None
+        self._cameras, self._order, self._counted = cameras, order, counted
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="blitzgs-check", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop the thread; files that were not checked yet stay unchecked."""
+        self._stop.set()
+        self._thread.join()
+
+    def wait(self) -> None:
+        """Wait until all files are checked or one is damaged."""
+        self._thread.join()
+
+    def _run(self) -> None:
+        blank = []
+        for index in self._order:
+            if self._stop.is_set():
+                return
+            camera = self._cameras[index]
+            try:
+                has_pixels = check_photograph(camera.image_path)
+                if camera.mask_path is not None:
+                    has_pixels = self._counted(camera) and has_pixels
+            except (OSError, ValueError) as error:
+                self.damage = str(error)
+                return
+            if not has_pixels:
+                blank.append(camera.name)
+        if blank:
+            warnings.warn(
+                f"{len(blank)} photographs have no pixel that counts, as they are transparent or masked "
+                f"everywhere (first: {blank[0]})",
+                stacklevel=1,
+            )

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds the masks of a capture's images: the mask that belongs to an image, and no other."""
+
+from __future__ import annotations
+
+import warnings
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path, PurePosixPath
+
+from blitzgs.capture.image_files import decode_mask, read_whole
+from blitzgs.capture.names import files_below, unified, what_is_at
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp", ".avif", ".jp2")
+# What programs call the mask of a.jpg, the names that are tried first first.
+_FORMS: tuple[str, ...] = ("{name}.png", "{stem}.png", "{name}", "{stem}_mask.png", "{stem}_mask{suffix}")
+_FORMS += ("{name}_mask.png", "{name}.mask.png", "{stem}.mask.png")
+# Masks are decoded when the capture is loaded to see what they exclude.
+_SAMPLED = 8
+
+
+def find_masks(
+    root: Path, masks: str | bool | None, names: Sequence[str], given: Sequence[Path | None]
+) -> list[Path | None]:
+    """Return the mask of each image, or None.
+
+    Args:
+        root: folder of the capture.
+        masks: folder of masks relative to it; None: `masks/` if it exists; True: `masks/`; False: no masks.
+        names: of the images, relative to their folder or to the capture.
+        given: the masks that the capture's file names.
+
+    Raises:
+        FileNotFoundError: there is no such folder, or a mask that the file names is missing.
+        ValueError: no file of the folder belongs to an image, or a file belongs to several.
+    """
+    if masks is False:
+        return [None] * len(names)
+    missing = [path for path in dict.fromkeys(given) if path is not None and not path.is_file()]
+    if missing:
+        kind = what_is_at(missing[0])
+        raise FileNotFoundError(
+            f"{len(missing)} masks are missing (first: {missing[0]}{f' is {kind}' if kind else ''}); put "
+            "them there, correct mask_path in transforms.json, or use --data.masks=false to train without"
+        )
+    folder = root / (masks if isinstance(masks, str) else "masks")
+    if not folder.is_dir():
+        if masks is not None:
+            raise FileNotFoundError(f"{folder}: no such folder of masks")
+        return list(given)
+    files = [name for name in files_below(folder) if PurePosixPath(name).suffix.lower() in _SUFFIXES]
+    owners = _owners(folder, files, [None if path else name for name, path in zip(names, given, strict=True)])
+    found = [
+        path if path is not None or index not in owners else folder / owners[index]
+        for index, path in enumerate(given)
+    ]
+    used = {path for path in found if path is not None}
+    unused = [name for name in files if folder / name not in used]
+    if files and not used:
+        raise ValueError(
+            f"none of the {len(files)} masks in {folder} belongs to an image: they are called like "
+            f"{unused[0]}, the images like {names[0]}; call the mask of {names[0]} "
+            f"{PurePosixPath(unified(names[0])).name}.png, or use --data.masks=false"
+        )
+    if unused:
+        warnings.warn(
+            f"{len(unused)} of {len(files)} masks in {folder} belong to no image (first: {unused[0]})",
+            stacklevel=3,
+        )
+    return found
+
+
+def _owners(folder: Path, files: Sequence[str], names: Sequence[str | None]) -> dict[int, str]:
+    """Return the file of each image that has one.
+
+    Every place that a mask of an image may have is a claim on the file there. A file belongs to the image
+    with the best claim; of two equally good ones neither may be right.
+
+    Raises:
+        ValueError: two images have equally good claims.
+    """
+    by_path: dict[str, list[str]] = defaultdict(list)
+    for file in files:
+        parts = PurePosixPath(unified(file).casefold()).parts
+        for begin in range(len(parts)):
+            by_path["/".join(parts[begin:])].append(file)
+    claims: dict[str, list[tuple[int, int]]] = defaultdict(list)  # by file: ranks and images
+    for index, name in enumerate(names):
+        if name is None:
+            continue
+        seen: set[str] = set()
+        for rank, place in enumerate(_places(name)):
+            for file in by_path.get(place.casefold(), ()):
+                # The folder of masks may have a folder in front of the whole name: half a rank worse.
+                exact = unified(file).casefold() == place.casefold()
+                if file not in seen and (exact or rank <= len(_FORMS)):
+                    seen.add(file)
+                    claims[file].append((2 * rank + (not exact), index))
+    owners: dict[int, tuple[int, str]] = {}
+    doubtful: list[tuple[str, list[int]]] = []
+    for file, claimed in claims.items():
+        best = min(rank for rank, _ in claimed)
+        images = [index for rank, index in claimed if rank == best]
+        if len(images) > 1:
+            doubtful.append((file, images))
+        elif images[0] not in owners or best < owners[images[0]][0]:
+            owners[images[0]] = (best, file)
+    doubtful = [(file, images) for file, images in doubtful if not all(image in owners for image in images)]
+    if doubtful:
+        file, images = doubtful[0]
+        first, second = (str(names[index]) for index in images[:2])
+        raise ValueError(
+            f"{folder}: {len(doubtful)} masks could belong to several images: {file} to {first} and {second}"
+            f"; put the mask of {first} at {first}.png in that folder, or use --data.masks=false"
+        )
+    return {index: file for index, (_, file) in owners.items()}
+
+
+def _places(name: str) -> Iterator[str]:
+    """Yield the paths, in the folder of masks, that the mask of an image may have, the best first.
+
+    Folders in front of the name may be missing there: those of a transforms.json begin with that of the
+    images. Of a name that is absolute or leads out of its folder, only the last part is used: the whole name,
+    joined to the folder of masks, could be the path of the photograph itself.
+    """
+    path = PurePosixPath(unified(name))
+    parts = path.parts[-1:] if path.is_absolute() or ".." in path.parts else path.parts
+    for begin in range(len(parts)):
+        # A PNG's own name is better than that stem's: a.png belongs to the image a.png before a.jpg.
+        for form in (_FORMS[0], "{name}" if path.suffix.lower() == ".png" else "", *_FORMS[1:]):
+            own = form.format(name=path.name, stem=path.stem, suffix=path.suffix)
+            yield "/".join((*parts[begin:-1], own))
+
+
+def excluded_share(masks: Sequence[Path | None]) -> float | None:
+    """Return the mean share of the pixels that masks exclude, of a few of them; None: there are no masks.
+
+    Warns if these exclude nothing, or everything. Damaged masks are left to whoever needs them.
+    """
+    paths = [path for path in dict.fromkeys(masks) if path is not None]
+    if not paths:
+        return None
+    sample = [paths[i * len(paths) // min(_SAMPLED, len(paths))] for i in range(min(_SAMPLED, len(paths)))]
+    with ThreadPoolExecutor(_SAMPLED) as pool:
+        shares = [share for share in pool.map(_share, sample) if share is not None]
+    if not shares:
+        return None
+    if max(shares) == 0:
+        warnings.warn(
+            f"the masks exclude nothing ({len(shares)} of {len(paths)} were looked at; first: {sample[0]}): "
+            "black or transparent pixels are excluded, all others count",
+            stacklevel=3,
+        )
+    elif min(shares) == 1:
+        warnings.warn(
+            f"the masks exclude every pixel ({len(shares)} of {len(paths)} were looked at; first: "
+            f"{sample[0]}): black or transparent pixels are excluded, and in lossy files (JPEG) dark ones "
+            "too; write masks as PNG with white where pixels count, or use --data.masks=false",
+            stacklevel=3,
+        )
+    return sum(shares) / len(shares)
+
+
+def _share(path: Path) -> float | None:
+    try:
+        return 1.0 - float(decode_mask(read_whole(path), str(path)).mean())
+    except (OSError, ValueError):
+        return None

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Columns that a table stores in another form than row by row, because kernels read them so."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from torch import Tensor
+
+from blitzgs.ops.blocks import BLOCK_ROWS
+from blitzgs.ops.cull_mask import SECTOR_WORDS, WORD_BITS, rows_of_sectors, sectors_of_rows
+
+# The cull matrix, from the first importance pass on: which views leave a row out.
+CULL = "cull"
+
+
+class Layout(Protocol):
+    """The stored form of a column."""
+
+    def stored(self, column: Tensor) -> Tensor:
+        """Return the stored form of a column [N, ...]."""
+
+    def rows(self, stored: Tensor, count: int) -> Tensor:
+        """Return the column [count, ...] of a stored form."""
+
+    def length(self, count: int) -> int:
+        """Return the length of the stored form of `count` rows."""
+
+
+class BitSectors:
+    """Bits [N, words] by blocks of rows, as `blitzgs.ops.cull_mask` has them: [256 ceil(N / 256), words]."""
+
+    def stored(self, column: Tensor) -> Tensor:
+        """See `Layout.stored`."""
+        return sectors_of_rows(column).view(-1, column.shape[1])
+
+    def rows(self, stored: Tensor, count: int) -> Tensor:
+        """See `Layout.rows`."""
+        return rows_of_sectors(sectors_in(stored), count)
+
+    def length(self, count: int) -> int:
+        """See `Layout.length`."""
+        return -(-count // BLOCK_ROWS) * BLOCK_ROWS
+
+
+def sectors_in(stored: Tensor) -> Tensor:
+    """View the stored form of `BitSectors` as the kernels take it, int32 [ceil(N / 256), columns, 8]."""
+    return stored.view(-1, WORD_BITS * stored.shape[1], SECTOR_WORDS)
+
+
+# All other columns are stored row by row.
+LAYOUTS: Mapping[str, Layout] = {CULL: BitSectors()}

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What masks exclude, by format and way of writing, and to which image a mask belongs."""
+
+import cv2
+import numpy as np
+import pytest
+
+from blitzgs.capture.capture import load_capture
+from blitzgs.capture.image_files import decode_mask
+from blitzgs.capture.images import ImageStore
+from blitzgs.capture.masks import find_masks
+from tests.capture.helpers import smooth_image, write_capture, write_image
+from tests.capture.image_bytes import png, tiff
+
+SHAPE = (48, 64)
+
+
+def scene():
+    """True where pixels count."""
+    counts = np.zeros(SHAPE, dtype=bool)
+    counts[:, 17:] = True
+    cv2.circle(view := counts.astype(np.uint8), (40, 24), 9, 0, -1)
+    return view > 0
+
+
+COUNTS = scene()
+
+
+def coded(suffix, pixels, *flags):
+    return cv2.imencode(suffix, pixels, list(flags))[1].tobytes()
+
+
+def grey(black, white, dtype=np.uint8):
+    return np.where(COUNTS, white, black).astype(dtype)
+
+
+def with_alpha(color, alpha, dtype=np.uint8):
+    alpha = np.broadcast_to(np.asarray(alpha), SHAPE).astype(dtype)
+    return np.dstack([np.broadcast_to(np.asarray(color), SHAPE).astype(dtype)] * 3 + [alpha])
+
+
+PALETTE = b"\0\0\0\x80\0\0\0\x04\0"
+WAYS = {
+    "black and white": coded(".png", grey(0, 255)),
+    "1 bit": png(COUNTS.astype(int), 0, 1),
+    "labels 0 and 1": coded(".png", grey(0, 1)),
+    "labels 0 and 3 of 16 bits": coded(".png", grey(0, 3, np.uint16)),
+    "labels 0, 1 and 2": coded(
+        ".png", np.where(COUNTS & (np.arange(64) > 40), 2, grey(0, 1)).astype(np.uint8)
+    ),
+    "16 bits": coded(".png", grey(0, 65535, np.uint16)),
+    "nearly black": coded(".png", grey(1, 255)),
+    "nearly black and nearly white": coded(".png", grey(6, 250)),
+    "nearly black of 16 bits": coded(".png", grey(300, 65000, np.uint16)),
+    "colours": coded(".png", np.dstack([grey(0, 0), grey(0, 0), grey(0, 90)])),
+    "palette": png(COUNTS.astype(int), 3, 2, palette=PALETTE),
+    "palette of dark colours": png(2 * COUNTS.astype(int), 3, 2, palette=PALETTE),
+    "palette with transparent colour": png(COUNTS.astype(int), 3, 2, b"\0\xff", b"\xff\xff\xff\xff\xff\xff"),
+    "grey with transparent value": png(grey(200, 255).astype(int), 0, 8, b"\0\xc8"),
+    "white, shape in alpha": coded(".png", with_alpha(255, grey(0, 255))),
+    "black, shape in alpha": coded(".png", with_alpha(0, grey(0, 255))),
+    "shape in both": coded(".png", with_alpha(grey(0, 255), grey(0, 255))),
+    "shape in colour, opaque": coded(".png", with_alpha(grey(0, 255), 255)),
+    "16 bits, shape in alpha": coded(".png", with_alpha(65535, grey(0, 65535, np.uint16), np.uint16)),
+    "grey and alpha": png(np.dstack([np.full(SHAPE, 255), grey(0, 255)]), 4, 8),
+    "TIFF": coded(".tiff", grey(0, 255)),
+    "TIFF of 16 bits, white is 0": tiff(grey(65535, 0, np.uint16)[..., None], photometric=0),
+    "TIFF of 8 bits, white is 0": tiff(grey(255, 0)[..., None], photometric=0),
+    "TIFF of floats": tiff(grey(0, 1, np.float32)[..., None]),
+    "TIFF, shape in alpha": tiff(with_alpha(255, grey(0, 255)), extra=2),
+    "TIFF, shape in associated alpha": tiff(with_alpha(grey(0, 255), grey(0, 255)), extra=1),
+    "lossless WebP": coded(".webp", grey(0, 255), cv2.IMWRITE_WEBP_QUALITY, 101),
+    "WebP": coded(".webp", grey(0, 255), cv2.IMWRITE_WEBP_QUALITY, 80),
+    "WebP, shape in alpha": coded(".webp", with_alpha(255, grey(0, 255)), cv2.IMWRITE_WEBP_QUALITY, 80),
+    "BMP": coded(".bmp", grey(0, 255)),
+    "JPEG 2000": coded(".jp2", grey(0, 255)),
+    "JPEG of quality 60": coded(".jpg", grey(0, 255), cv2.IMWRITE_JPEG_QUALITY, 60),
+    "JPEG of quality 90": coded(".jpg", grey(0, 255), cv2.IMWRITE_JPEG_QUALITY, 90),
+    "progressive JPEG": coded(".jpg", grey(0, 255), cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
+    "JPEG of grey": coded(".jpg", grey(0, 128), cv2.IMWRITE_JPEG_QUALITY, 90),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_every_way_to_write_a_mask(way):
+    np.testing.assert_array_equal(decode_mask(WAYS[way], "x"), COUNTS)
+
+
+def test_labels_of_all_brightnesses_count_whatever_they_are():
+    labels = np.arange(48 * 64).reshape(SHAPE) % 256
+    np.testing.assert_array_equal(decode_mask(coded(".png", labels.astype(np.uint8)), "x"), labels > 0)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "message"),
+    [
+        (np.full(SHAPE, 255), "the masks exclude nothing"),
+        (np.full(SHAPE, 3), "the masks exclude nothing"),
+        (np.full(SHAPE, 0), "the masks exclude every pixel"),
+    ],
+)
+def test_masks_without_effect_are_said(tmp_path, pixels, message):
+    root = write_capture(tmp_path, ["a.png", "b.png"])
+    (root / "masks").mkdir()
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(root / "masks" / name), pixels.astype(np.uint8))
+    with pytest.warns(UserWarning, match=message):
+        load_capture(root)
+
+
+def test_a_lossy_mask_of_labels_0_and_1_is_said_to_exclude_all(tmp_path):
+    root = write_capture(tmp_path, ["a.jpg"])
+    (root / "masks").mkdir()
+    cv2.imwrite(str(root / "masks" / "a.jpg"), grey(0, 1))
+    with pytest.warns(UserWarning, match="exclude every pixel.*lossy files.*as PNG"):
+        load_capture(root)
+
+
+def test_the_share_that_masks_exclude_is_known(tmp_path):
+    root = write_capture(tmp_path, ["a.png", "b.png", "c.png"])
+    (root / "masks").mkdir()
+    for name in ("a.png", "b.png"):
+        (root / "masks" / name).write_bytes(WAYS["shape in both"])
+    about = load_capture(root).about
+    assert about.with_mask == 2 and about.mask_share == pytest.approx(1 - COUNTS.mean())
+
+
+# Names of images, files below masks/, and for each image its file (None: it has none).
+OWNERS = [
+    (["a.jpg"], ["a.jpg.png"], ["a.jpg.png"]),
+    (["a.jpg"], ["a.png"], ["a.png"]),
+    (["a.jpg"], ["a.jpg"], ["a.jpg"]),
+    (["a.jpg"], ["a_mask.png"], ["a_mask.png"]),
+    (["a.jpg"], ["a_mask.jpg"], ["a_mask.jpg"]),
+    (["a.jpg"], ["a.jpg_mask.png"], ["a.jpg_mask.png"]),
+    (["a.jpg"], ["a.jpg.mask.png"], ["a.jpg.mask.png"]),
+    (["a.JPG"], ["A.png"], ["A.png"]),
+    (["a.jpg", "b.jpg"], ["b.png", "a.png"], ["a.png", "b.png"]),
+    (["a.jpg"], ["a.png", "a.jpg.png"], ["a.jpg.png"]),
+    # One stem, two images: each file belongs to the image that it is called after most exactly.
+    (["a.jpg", "a.png"], ["a.jpg.png", "a.png"], ["a.jpg.png", "a.png"]),
+    (["a.jpg", "a.png"], ["a.png.png"], [None, "a.png.png"]),
+    (["front/0.png", "back/0.png"], ["front/0.png", "back/0.png"], ["front/0.png", "back/0.png"]),
+    (["front/0.png", "back/0.png"], ["front/0.png"], ["front/0.png", None]),
+    (["back/0.png"], ["front/0.png", "back/1.png"], ValueError),
+    (
+        ["images/front/0.png", "images/back/0.png"],
+        ["front/0.png", "back/0.png"],
+        ["front/0.png", "back/0.png"],
+    ),
+    (["images\\front\\0.png"], ["front/0.png"], ["front/0.png"]),
+    (["front/0.png"], ["images/front/0.png"], ["images/front/0.png"]),
+    (["front/0.png"], ["0.png"], ["0.png"]),
+    (["front/0.png", "back/0.png"], ["0.png"], ValueError),
+    (["front/0.png", "back/0.png", "top/1.png"], ["0.png", "1.png"], ValueError),
+    (["a.jpg", "a.jpeg"], ["a.png"], ValueError),
+    (["b.jpg"], ["a.png"], ValueError),
+    (["a\u0308.jpg"], ["\xe4.png"], ["\xe4.png"]),
+]
+
+
+@pytest.mark.parametrize(("names", "files", "expected"), OWNERS)
+def test_a_mask_belongs_to_one_image(tmp_path, names, files, expected):
+    folder = tmp_path / "masks"
+    for file in files:
+        write_image(folder / file, np.zeros((4, 4, 3), dtype=np.uint8))
+    if expected is ValueError:
+        with pytest.raises(ValueError, match="could belong to several images|belongs to an image"):
+            find_masks(tmp_path, None, names, [None] * len(names))
+        return
+    found = find_masks(tmp_path, None, names, [None] * len(names))
+    assert found == [None if file is None else folder / file for file in expected]
+
+
+def test_a_mask_that_the_file_names_is_used_for_all_that_name_it(tmp_path):
+    path = tmp_path / "one.png"
+    write_image(path, np.zeros((4, 4, 3), dtype=np.uint8))
+    assert find_masks(tmp_path, None, ["a.png", "b.png"], [path, path]) == [path, path]
+    with pytest.raises(FileNotFoundError, match="1 masks are missing .first: .*no.png.*mask_path"):
+        find_masks(tmp_path, None, ["a.png"], [tmp_path / "no.png"])
+    (tmp_path / "no.png").symlink_to("elsewhere.png")
+    with pytest.raises(FileNotFoundError, match="no.png is a link to elsewhere.png, which does not exist"):
+        find_masks(tmp_path, None, ["a.png"], [tmp_path / "no.png"])
+
+
+def test_messages_about_masks_speak_of_masks(tmp_path):
+    root = write_capture(tmp_path, ["a.png"])
+    (root / "masks").mkdir()
+    path = root / "masks" / "a.png"
+    path.write_bytes(WAYS["black and white"][:-20])
+    store = ImageStore(load_capture(root))
+    with pytest.raises(ValueError, match=r"the mask .*masks/a.png: at byte \d+: truncated PNG"):
+        store.mask(0)
+
+
+def test_a_photograph_is_not_taken_for_its_own_mask(tmp_path):
+    """Absolute names and `..`, joined to the folder of masks, would lead to the photographs."""
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "capture" / "masks").mkdir(parents=True)
+    write_image(tmp_path / "photos" / "a.png", smooth_image(64, 48))
+    photo = str(tmp_path / "photos" / "a.png")
+    for name in (photo, "../../photos/a.png"):
+        assert find_masks(tmp_path / "capture", None, [name], [None]) == [None]
+    cv2.imwrite(str(tmp_path / "capture" / "masks" / "a.png"), np.ones((4, 4), dtype=np.uint8))
+    found = find_masks(tmp_path / "capture", None, [photo], [None])
+    assert found == [tmp_path / "capture" / "masks" / "a.png"]

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points of a capture and their colours, by the names and numbers in which programs write them."""
+
+import json
+import re
+
+import numpy as np
+import plyfile
+import pytest
+
+from blitzgs.capture import colmap
+from blitzgs.capture.capture import load_capture
+from blitzgs.formats.ply import read_point_cloud
+from tests.capture.helpers import smooth_image, write_capture, write_image
+
+COUNT = 50
+COLORS = np.random.default_rng(0).integers(0, 256, (COUNT, 3))
+POSITIONS = np.random.default_rng(1).uniform(-1, 1, (COUNT, 3))
+C0 = 0.28209479177387814
+
+
+def write_ply(path, names, values, kind, axes="xyz", positions=POSITIONS):
+    types = [(axis, "f4") for axis in axes] + [(name, kind) for name in names]
+    rows = np.zeros(len(positions), dtype=types)
+    for i, axis in enumerate(axes):
+        rows[axis] = positions[:, i]
+    for i, name in enumerate(names):
+        rows[name] = values[:, i]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("red", "green", "blue"),
+        ("Red", "Green", "Blue"),
+        ("RED", "GREEN", "BLUE"),
+        ("diffuse_red", "diffuse_green", "diffuse_blue"),
+        ("r", "g", "b"),
+        ("R", "G", "B"),
+        ("color_r", "color_g", "color_b"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["u1", "i4", "u2", "f4", "f8", "fraction"])
+def test_colours_by_name_and_kind_of_number(tmp_path, names, kind):
+    values = COLORS / 255 if kind == "fraction" else COLORS
+    path = write_ply(tmp_path / "a.ply", names, values, "f4" if kind == "fraction" else kind)
+    cloud = read_point_cloud(path)
+    np.testing.assert_array_equal(cloud.colors, COLORS)
+    assert cloud.colors_from == ", ".join(name.lower() for name in names)
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+@pytest.mark.parametrize(
+    ("change", "is_fraction"),
+    [
+        (1.0000001, True),
+        (1.04, True),
+        (-1e-7, True),
+        (1.9, True),
+        (4.0, True),
+        (255.0001, False),
+        (-0.4, False),
+    ],
+)
+def test_colours_that_overshoot_their_range(tmp_path, kind, change, is_fraction):
+    values = COLORS / 255 if is_fraction else COLORS.astype(float)
+    values[0, 0] = change
+    colors = read_point_cloud(write_ply(tmp_path / "a.ply", ("red", "green", "blue"), values, kind)).colors
+    np.testing.assert_array_equal(colors[1:], COLORS[1:])
+    assert colors[0, 0] == (255 if change > 1 else 0)
+
+
+@pytest.mark.parametrize("extra", [(), ("opacity", "scale_0", "rot_0", "f_rest_0")])
+def test_gaussians_have_the_colour_that_all_sides_show(tmp_path, extra):
+    names = ("f_dc_0", "f_dc_1", "f_dc_2", *extra)
+    values = np.zeros((COUNT, len(names)))
+    values[:, :3] = (COLORS / 255 - 0.5) / C0
+    cloud = read_point_cloud(write_ply(tmp_path / "a.ply", names, values, "f4"))
+    np.testing.assert_array_equal(cloud.colors, COLORS)
+    assert cloud.colors_from == "f_dc_0 to f_dc_2"
+    values[3, 1] = np.nan
+    with pytest.raises(ValueError, match="a.ply: a point has the colour nan"):
+        read_point_cloud(write_ply(tmp_path / "a.ply", names, values, "f4"))
+
+
+def test_coefficients_beyond_black_and_white_are_clipped(tmp_path):
+    values = np.tile([[-9.0, 0.0, 9.0]], (COUNT, 1))
+    cloud = read_point_cloud(write_ply(tmp_path / "a.ply", ("f_dc_0", "f_dc_1", "f_dc_2"), values, "f4"))
+    assert (cloud.colors == [0, 128, 255]).all()
+
+
+def test_capital_axes_are_read(tmp_path):
+    cloud = read_point_cloud(write_ply(tmp_path / "a.ply", (), COLORS, "u1", axes="XYZ"))
+    np.testing.assert_allclose(cloud.positions, POSITIONS, atol=1e-6)
+
+
+def transforms_capture(root, names=4, **fields):
+    """A transforms.json beside a COLMAP model of the same cameras in colmap/sparse/0."""
+    write_capture(root, [f"{i}.png" for i in range(names)])
+    (root / "colmap").mkdir()
+    (root / "sparse").rename(root / "colmap" / "sparse")
+    model = colmap.read_model(root / "colmap" / "sparse" / "0")
+    applied = np.eye(4)
+    applied[:3] = np.array(fields.get("applied_transform", applied[:3]))
+    frames = []
+    for name, world_to_camera in zip(model.images.names, colmap.world_to_camera(model.images), strict=True):
+        pose = applied @ np.linalg.inv(world_to_camera) @ np.diag([1, -1, -1, 1.0])
+        pose[:3, 3] *= fields.get("applied_scale", 1.0)
+        frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
+    content = {"w": 64, "h": 48, "fl_x": 51.2, **fields, "frames": frames}
+    (root / "transforms.json").write_text(json.dumps(content))
+    return model
+
+
+APPLIED = [[1, 0, 0, 0.5], [0, 0, 1, 0], [0, -1, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    "fields", [{}, {"applied_transform": APPLIED}, {"applied_transform": APPLIED, "applied_scale": 0.25}]
+)
+def test_the_points_of_colmap_beside_transforms_are_used_in_their_world(tmp_path, fields):
+    model = transforms_capture(tmp_path, **fields)
+    capture = load_capture(tmp_path)
+    matrix = np.array(fields.get("applied_transform", np.eye(4)[:3]))
+    expected = (model.points.positions @ matrix[:, :3].T + matrix[:, 3]) * fields.get("applied_scale", 1.0)
+    np.testing.assert_allclose(capture.points + capture.offset, expected, atol=1e-9)
+    np.testing.assert_array_equal(capture.colors, model.points.colors)
+    assert capture.about.points_from == "colmap/sparse/0" and capture.about.blind == 0
+
+
+def test_points_of_another_world_are_named_and_not_used(tmp_path):
+    transforms_capture(tmp_path, applied_transform=APPLIED)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    del content["applied_transform"]
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.warns(UserWarning) as said:
+        capture = load_capture(tmp_path)
+    text = " ".join(str(warning.message) for warning in said)
+    assert re.search("the 20 points of colmap/sparse/0 are not used: its cameras are elsewhere", text)
+    assert capture.about.random_points
+
+
+@pytest.mark.parametrize("name", ["sparse_pc.ply", "points3D.ply", "points3d.ply"])
+def test_clouds_beside_transforms_that_programs_write(tmp_path, name):
+    transforms_capture(tmp_path)
+    write_ply(tmp_path / name, ("red", "green", "blue"), COLORS, "u1")
+    capture = load_capture(tmp_path)
+    np.testing.assert_allclose(capture.points + capture.offset, POSITIONS, atol=1e-6)
+    np.testing.assert_array_equal(capture.colors, COLORS)
+    assert (capture.about.points_from, capture.about.colors_from) == (name, "red, green, blue")
+
+
+def test_any_other_cloud_beside_transforms_is_named(tmp_path):
+    transforms_capture(tmp_path)
+    (tmp_path / "colmap").rename(tmp_path / "other")
+    write_ply(tmp_path / "cloud.ply", ("red", "green", "blue"), COLORS, "u1")
+    with pytest.warns(UserWarning, match='cloud.ply beside it is not used.*"ply_file_path": "cloud.ply"'):
+        load_capture(tmp_path)
+
+
+def test_points_without_colours_are_said(tmp_path):
+    transforms_capture(tmp_path)
+    write_ply(tmp_path / "sparse_pc.ply", ("intensity",), COLORS, "f4")
+    with pytest.warns(UserWarning, match="no colours and start grey: the file has x, y, z, intensity"):
+        assert (load_capture(tmp_path).colors == 128).all()
+
+
+def test_a_file_of_points_that_is_missing_is_named(tmp_path):
+    transforms_capture(tmp_path, ply_file_path="lost.ply")
+    with pytest.raises(FileNotFoundError, match="lost.ply is missing"):
+        load_capture(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_a_colmap_model_with_its_points_in_a_ply(tmp_path, suffix):
+    root = write_capture(tmp_path, [f"{i}.png" for i in range(4)])
+    folder = root / "sparse" / "0"
+    model = colmap.read_model(folder, points2d=True, tracks=True)
+    if suffix == ".txt":
+        colmap.write_model(folder, model, text=True)
+        for path in folder.glob("*.bin"):
+            path.unlink()
+    (folder / f"points3D{suffix}").unlink()
+    write_ply(folder / "points3D.ply", ("red", "green", "blue"), COLORS, "u1")
+    capture = load_capture(root)
+    np.testing.assert_array_equal(capture.colors, COLORS)
+    assert capture.about.points_from == "sparse/0/points3D.ply" and capture.track_lengths is None
+
+
+def test_a_ply_beside_the_points_of_the_model_is_not_used(tmp_path):
+    """INRIA's code writes one there."""
+    root = write_capture(tmp_path, [f"{i}.png" for i in range(4)])
+    write_ply(root / "sparse" / "0" / "points3D.ply", ("red", "green", "blue"), COLORS, "u1")
+    assert len(load_capture(root).points) == 20
+    write_image(root / "images" / "0.png", smooth_image(48, 64))
