@@ -19,7 +19,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
-from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene, write_tiny_capture
 from tests.training.tiny_runs import events_of, read_log, steps_of
 
 ROOT = Path(__file__).parents[2]
@@ -307,7 +307,7 @@ def capture(tmp_path_factory):
 
 def train_flags(capture, folder, command="train"):
     settings = ["config=defaults", *OVERRIDES, *SETTINGS, "log.pictures=0"]
-    return [command, "--data", str(capture), "--out", str(folder), "--resume"] + [f"--{s}" for s in settings]
+    return [command, "--data", str(capture), "--out", str(folder), "--resume", *as_flags(*settings)]
 
 
 @pytest.fixture(scope="module")

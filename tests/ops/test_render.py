@@ -24,9 +24,10 @@ def render_rows(splats, tables, parts, totals=None, with_depth=False):
     geometry = (splats.means2d, splats.conics, splats.opacities, splats.depths)
     ids = (splats.camera_ids, splats.visible_ids, splats.splat_offsets)
     channels = None if parts else splats.depths[:, None].contiguous()
+    valid = slice(None) if totals is None else slice(int(totals[1]))  # the others are not initialised
     return torch.ops.blitzgs.render(
         *geometry, *ids, *shown, channels, with_depth, tables.gaussians, parts, *tables.cameras,
-        *tables.options, None, int(splats.tiles_touched.sum()), False, totals,
+        *tables.options, None, int(splats.tiles_touched[valid].sum()), False, totals,
     )  # fmt: skip
 
 

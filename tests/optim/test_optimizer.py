@@ -486,12 +486,13 @@ def test_full_tables_restart_and_still_equal_dense_adam(backend, monkeypatch):
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_growing_schedule_has_the_sums_of_one_known_in_advance(device):
     rates = torch.rand(400, 6, generator=torch.Generator().manual_seed(0)).to(device)
-    known = AdamSchedule(rates, 0.9, 0.999, 1e-8, dtype=torch.float64)
-    growing = GrowingSchedule((0.9, 0.999), 1e-8, torch.float64, torch.device(device), 0)
+    dtype = torch.float64 if device == "cpu" else torch.float32
+    known = AdamSchedule(rates, 0.9, 0.999, 1e-8, dtype=dtype)
+    growing = GrowingSchedule((0.9, 0.999), 1e-8, dtype, torch.device(device), 0)
     for step in range(1, 400):
         growing.add(*rates[step, 4:].tolist())
     assert growing.explicit_steps < 399
     ours, expected = (s.tables[0][:400, :24].view(400, 4, 6)[:, :, 4:] for s in (growing, known))
     assert torch.equal(growing.tables[1][1:400, 4:], rates[1:, 4:])
     # From steps long ago, rows no longer move in float64.
-    torch.testing.assert_close(ours, expected, rtol=1e-12, atol=0)
+    torch.testing.assert_close(ours, expected, rtol=1e-12 if device == "cpu" else 1e-5, atol=0)

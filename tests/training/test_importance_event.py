@@ -66,7 +66,6 @@ def test_how_many_gaussians_the_importance_passes_keep(whole_run):
     assert ((table[PHI] >= 0) & (table[PHI] < 1)).all()
     assert trainer.state.progress.milestones == {
         "initial": 400,
-        "found": 400,
         "before_pass_1": first["before"],
         "after_pass_1": first["gaussians"],
         "before_pass_2": second["before"],
