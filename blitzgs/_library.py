@@ -17,11 +17,13 @@ from typing import Any
 
 import torch
 
+from blitzgs._torch import below_autograd
+
+__all__ = ["below_autograd", "load_libraries", "schema_digest", "source_digest", "without_autograd"]
+
 # The list of ops in a checkout; it must be the one that the libraries were built with.
 REGISTRATION = Path(__file__).resolve().parents[1] / "csrc" / "registration.cpp"
 LIBRARY_DIR = Path(os.environ.get("BLITZGS_LIBRARY_DIR") or Path(__file__).parent / "_lib")
-# A context in which autograd records nothing, as in `torch.no_grad`, in less of the host's time.
-below_autograd = torch._C._AutoDispatchBelowAutograd
 
 
 def load_libraries() -> None:

@@ -85,6 +85,7 @@ TESTS = [
         "pool_ops.py::test_views_have_sizes_of_their_own[cuda]",
         "project.py::test_dense_gradients_equal_scattered_compact_ones[2-9-cuda-float32]",
         "take_rows.py::test_bits_and_unaligned_columns[cuda]",
+        "render.py::test_images_are_those_of_lists_and_compositing[True-cuda-float32]",
         "arrange_splats.py::test_columns_are_at_their_places_and_come_back[700-False-cuda]",
         "arrange_splats.py::test_entries_without_a_splat_have_the_values_of_their_gaussians[cuda]",
         "voxel_keys.py::test_matches_the_formula[cuda-dtype2]",

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 # gsplat tabulates the binomial coefficients up to this number, the largest number of parts of a Gaussian.
-MOST_PARTS = 51
+MAX_PARTS = 51
 
 
 @lru_cache(maxsize=4)
 def _series(device: torch.device) -> Tensor:
     """Return (-1)^(j-1) C(n, j) / sqrt(j) at row n, column j, float64 [52, 52]; 0 for j = 0 or j > n."""
-    table = torch.zeros(MOST_PARTS + 1, MOST_PARTS + 1, dtype=torch.float64)
-    for n in range(1, MOST_PARTS + 1):
+    table = torch.zeros(MAX_PARTS + 1, MAX_PARTS + 1, dtype=torch.float64)
+    for n in range(1, MAX_PARTS + 1):
         for j in range(1, n + 1):
             table[n, j] = (-1) ** (j - 1) * math.comb(n, j) / math.sqrt(j)
     return table.to(device)
@@ -44,10 +44,10 @@ def compute_relocation(
     Returns:
         (opacities [M], scales [M, 3]).
     """
-    parts = ratios.clamp(1, MOST_PARTS).long()
+    parts = ratios.clamp(1, MAX_PARTS).long()
     old = opacities.double()
     new = 1.0 - (1.0 - old) ** (1.0 / parts)
-    powers = new[:, None] ** torch.arange(MOST_PARTS + 1, device=new.device)
+    powers = new[:, None] ** torch.arange(MAX_PARTS + 1, device=new.device)
     denominator = (_series(new.device)[parts] * powers).sum(dim=1)
     factor = (old / denominator).to(scales.dtype)
     return new.to(opacities.dtype), scales * factor[:, None]

@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from blitzgs._torch import func_transforms_are_active
 from blitzgs.call.covariances import Decomposed, decompose
-from blitzgs.capture.cameras import MOST_SIDE
+from blitzgs.capture.cameras import MAX_SIDE
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -174,7 +175,7 @@ def check_options(
     """
     for name, size in (("width", width), ("height", height)):
         _check_whole(name, size)
-        if not 1 <= size <= MOST_SIDE:
+        if not 1 <= size <= MAX_SIDE:
             raise ValueError(f"{name} must be 1 to 2^20 px, got {size}")
     _check_whole("tile_size", tile_size)
     if not 1 <= tile_size <= 64:
@@ -230,7 +231,7 @@ def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]
         ValueError: an argument has another dtype, or is on another device, whose memory the kernels could not
             read.
     """
-    if torch._C._are_functorch_transforms_active():
+    if func_transforms_are_active():
         raise RuntimeError(
             "blitzgs does not support the transforms of torch.func (grad, vjp, jvp, jacrev, vmap, ...): use "
             "torch.autograd or backward(), and batch dimensions of the arguments in place of vmap"

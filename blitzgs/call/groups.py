@@ -12,9 +12,12 @@ from torch import Tensor
 from blitzgs.call.arguments import Gaussians, Scene
 from blitzgs.call.covariances import Decomposed, shaped_by
 from blitzgs.call.queued import Rendered, ShTables
-from blitzgs.ops.project import differentiable_splats, gaussian_tensors, project_splats
+from blitzgs.ops.project import differentiable_splats, project_splats
 from blitzgs.ops.project_gradient import TableRows
-from blitzgs.ops.projection_types import MOST_VIEWS, ProjectedSplats, ProjectionInputs, ProjectionOptions
+from blitzgs.ops.projection_types import MAX_VIEWS, ProjectedSplats, ProjectionInputs, ProjectionOptions
+
+# The tile size of the CUDA kernels. If the caller asks for another one, only meta's lists have it.
+CUDA_TILE_SIZE = 16
 
 
 class Group(NamedTuple):
@@ -51,7 +54,7 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
     """Divide the views into groups; one scene of up to 32 views with common colours is one group."""
     groups = []
     sh_per_view = gaussians.per_view and gaussians.sh_degree is not None
-    most = 1 if sh_per_view else MOST_VIEWS
+    most = 1 if sh_per_view else MAX_VIEWS
     for s, scene in enumerate(gaussians.scenes):
         # Do not split a single group: the split would add a node to autograd's graph.
         views = [(scene.viewmats, scene.Ks)]
@@ -60,9 +63,9 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
         sh = _sh_of_views(gaussians, scene, len(views))
         for part, (viewmats, Ks) in enumerate(views):
             means, quats, scales, opacities, *_ = scene
-            inputs = ProjectionInputs(
-                gaussian_tensors(means, quats, scales, opacities, sh[part]), (viewmats, Ks), options
-            )
+            harmonics = sh[part]
+            own = [means, quats, scales, opacities, *([] if harmonics is None else [harmonics])]
+            inputs = ProjectionInputs(own, (viewmats, Ks), options)
             groups.append(Group(inputs, s * gaussians.views + part * most, scene.covariances))
     return groups
 
@@ -145,3 +148,11 @@ def _splats_of_rows(group: Group) -> tuple[ProjectedSplats, TableRows]:
     indices = ids.long()[splats.visible_ids]
     rows = TableRows(group.inputs, splats.visible_ids, indices, sh.parts)
     return splats._replace(gaussian_ids=ids[splats.gaussian_ids], visible_ids=indices.int()), rows
+
+
+def groups_may_be_queued(groups: Sequence[Group]) -> bool:
+    """Tell whether the work of a call may be queued before the host knows the number of splats."""
+    if len(groups) > 1 or groups[0].covariances is not None:
+        return False
+    means, options = groups[0].inputs.gaussians[0], groups[0].inputs.options
+    return means.shape[0] > 0 and (not means.is_cuda or options.tile_size == CUDA_TILE_SIZE)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from blitzgs.call.arguments import check_options, check_tensors, gaussians_of
 from blitzgs.call.finite import warn_of_non_finite
-from blitzgs.call.images import CUDA_TILE_SIZE
+from blitzgs.call.groups import CUDA_TILE_SIZE
 from blitzgs.call.intrinsics import check_intrinsics
 from blitzgs.ops.importance import UNITS, splat_contributions
 from blitzgs.ops.intersect import TileGrid

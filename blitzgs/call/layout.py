@@ -9,6 +9,7 @@ splats in the order in which they are, and only gradients pass through the arran
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -67,3 +68,22 @@ class Layout:
     def gather(self, *arranged: Tensor) -> tuple[Tensor, ...]:
         """Gather the columns of the splats from arranged ones; the inverse of `arrange`."""
         return arranged if self.places is None else self.places.gather(arranged)
+
+    def rendered_columns(self, under: Tensor | None) -> dict[str, Tensor]:
+        """Arrange the columns that the image depends on.
+
+        Args:
+            under: opacities of the Gaussians, [..., N], where they have no splat; None: zero.
+        """
+        splats = self.splats
+        columns = (splats.means2d, splats.conics, splats.depths, splats.opacities)
+        means2d, conics, depths, opacities = self.arrange(*columns, under=under)
+        return {"means2d": means2d, "conics": conics, "opacities": opacities, "depths": depths}
+
+    def absgrad_teller(self, means2d: Tensor) -> Callable[[Tensor], None]:
+        """Return a function that sets `means2d.absgrad` to the absolute gradient of the splats, [P, 2]."""
+
+        def tell(gradient: Tensor) -> None:
+            means2d.absgrad = self.arrange(gradient)[0]  # type: ignore[attr-defined]
+
+        return tell

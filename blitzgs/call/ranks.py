@@ -19,6 +19,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from blitzgs.call.arguments import Gaussians
+from blitzgs.ops.derivatives import linear_map
 from blitzgs.ops.projection_types import ProjectedSplats
 
 
@@ -36,22 +37,28 @@ class Job(NamedTuple):
     views: int
 
 
-def gather_views(gaussians: Gaussians, same: Sequence[Any]) -> tuple[Gaussians, Job | None]:
+def gather_views(gaussians: Gaussians, absgrad: bool, same: Sequence[Any]) -> tuple[Gaussians, Job | None]:
     """Return this rank's Gaussians with the views of all ranks, M C, in the order of ranks.
 
     Collective.
 
     Args:
         gaussians: one scene, with the rank's own views.
+        absgrad: whether absolute gradients are asked for, which ranks do not exchange.
         same: values that must be equal on all ranks.
 
     Returns:
         The Gaussians, and the job; None if there is one rank.
 
     Raises:
-        ValueError: on every rank: the ranks differ in `same`, in their number of views, or in whether
+        ValueError: there are batch dimensions, colours per view or absolute gradients; or, on every rank: the
+            ranks differ in `same`, in their number of views, or in whether
             Gaussians or poses need gradients. Some ranks would then wait for others forever.
     """
+    if len(gaussians.lead) > 1 or gaussians.per_view or absgrad:
+        raise ValueError(
+            "distributed=True supports no batch dimensions, colours per view or absgrad, as gsplat's does not"
+        )
     if not dist.is_initialized() or dist.get_world_size() == 1:
         return gaussians, None
     job = Job(dist.get_rank(), dist.get_world_size(), gaussians.views)
@@ -60,7 +67,7 @@ def gather_views(gaussians: Gaussians, same: Sequence[Any]) -> tuple[Gaussians, 
     need = recorded and any(t is not None and t.requires_grad for t in inputs)
     need_poses = recorded and scene.viewmats.requires_grad
     _require_same((gaussians.views, *same, need, need_poses), scene.viewmats.device)
-    viewmats: Tensor = _GatherViews.apply(scene.viewmats, job)  # type: ignore[no-untyped-call]
+    viewmats = _all_poses(scene.viewmats, job)
     Ks = _gathered(scene.Ks.detach(), job)
     scene = scene._replace(viewmats=viewmats, Ks=Ks)
     gathered = replace(gaussians, scenes=(scene,), lead=(job.size * job.views,), given=gaussians.named)
@@ -104,7 +111,7 @@ def send_splats(splats: ProjectedSplats, channels: Tensor, job: Job) -> tuple[Pr
     widths = (2, 3, 1, 1, channels.shape[1])
     columns = (splats.means2d, splats.conics, splats.opacities[:, None], splats.depths[:, None], channels)
     table = torch.cat(columns, dim=1).index_select(0, order)
-    arrived: Tensor = _SendSplats.apply(table, *sizes)  # type: ignore[no-untyped-call]
+    arrived = _sent(table, *sizes)
     means2d, conics, opacities, depths, own_channels = arrived.split(widths, dim=1)
     own_views = _all_to_all((images % job.views).index_select(0, order), *sizes).int()
     return splats._replace(
@@ -128,30 +135,26 @@ def _gathered(values: Tensor, job: Job) -> Tensor:
     return torch.cat(parts)
 
 
-class _SendSplats(torch.autograd.Function):
-    """Sends splats to other ranks; the backward pass sends their gradients back."""
+def _sent(table: Tensor, sent: list[int], received: list[int]) -> Tensor:
+    """Send rows to other ranks; the backward pass sends their gradients back."""
 
-    @staticmethod
-    def forward(ctx: Any, table: Tensor, sent: list[int], received: list[int]) -> Tensor:
-        ctx.sizes = sent, received
-        return _all_to_all(table, sent, received)
+    def returned(_saved: Any, _needed: Any, v: Sequence[Tensor | None]) -> list[Tensor]:
+        # Every rank sends, also one whose rows have no gradient.
+        rows = table.new_zeros(sum(received), table.shape[1]) if v[0] is None else v[0]
+        return [_all_to_all(rows, received, sent)]
 
-    @staticmethod
-    def backward(ctx: Any, v_arrived: Tensor) -> Any:
-        sent, received = ctx.sizes
-        return _all_to_all(v_arrived, received, sent), None, None
+    (arrived,) = linear_map(lambda rows: (_all_to_all(rows, sent, received),), returned, [table])
+    return arrived
 
 
-class _GatherViews(torch.autograd.Function):
-    """Gathers the poses of all ranks; the gradient of a pose is the sum over all ranks."""
+def _all_poses(viewmats: Tensor, job: Job) -> Tensor:
+    """Gather the poses of all ranks; the gradient of a pose is the sum over all ranks."""
 
-    @staticmethod
-    def forward(ctx: Any, viewmats: Tensor, job: Job) -> Tensor:
-        ctx.job = job
-        return _gathered(viewmats, job)
-
-    @staticmethod
-    def backward(ctx: Any, v_viewmats: Tensor) -> Any:
-        job, total = ctx.job, v_viewmats.contiguous().clone()
+    def summed(_saved: Any, _needed: Any, v: Sequence[Tensor | None]) -> list[Tensor]:
+        total = v[0].contiguous().clone() if v[0] is not None else viewmats.new_zeros(shape)
         dist.all_reduce(total)
-        return total[job.rank * job.views :][: job.views], None
+        return [total[job.rank * job.views :][: job.views]]
+
+    shape = (job.size * job.views, 4, 4)
+    (gathered,) = linear_map(lambda poses: (_gathered(poses, job),), summed, [viewmats])
+    return gathered

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from blitzgs.call.arguments import (
     DEFAULT_TILE_SIZE,
-    Gaussians,
     background_rows,
     check_further,
     check_options,
@@ -17,8 +16,9 @@ from blitzgs.call.arguments import (
     gaussians_of,
     with_covariances,
 )
-from blitzgs.call.images import ImageOptions, render
+from blitzgs.call.images import render
 from blitzgs.call.intrinsics import check_intrinsics
+from blitzgs.call.queued import ImageOptions
 from blitzgs.call.ranks import gather_views
 from blitzgs.ops.projection_types import ProjectionOptions
 from blitzgs.util.memory import explaining_memory
@@ -168,16 +168,8 @@ def rasterization(
     image = ImageOptions(render_mode, background, packed, sparse_grad, absgrad)
     job = None
     if distributed:
-        _check_distributed(gaussians, absgrad)
         channels = None if gaussians.colors is None else gaussians.colors.shape[-1]
-        gaussians, job = gather_views(gaussians, (width, height, tile_size, render_mode, channels))
+        gaussians, job = gather_views(gaussians, absgrad, (width, height, tile_size, render_mode, channels))
     views = gaussians.views * len(gaussians.scenes)
     with explaining_memory(views, width, height, means.shape[-2], means.device):
         return render("rasterization", gaussians, project, image, job=job)
-
-
-def _check_distributed(gaussians: Gaussians, absgrad: bool) -> None:
-    if len(gaussians.lead) > 1 or gaussians.per_view or absgrad:
-        raise ValueError(
-            "distributed=True supports no batch dimensions, colours per view or absgrad, as gsplat's does not"
-        )

@@ -21,10 +21,10 @@ from blitzgs.call.arguments import (
     check_tensors,
     gaussians_of,
 )
-from blitzgs.call.groups import gathered_groups, groups_of
-from blitzgs.call.images import ImageOptions, may_queue, render
+from blitzgs.call.groups import gathered_groups, groups_may_be_queued, groups_of
+from blitzgs.call.images import render
 from blitzgs.call.intrinsics import check_intrinsics
-from blitzgs.call.queued import ShTables
+from blitzgs.call.queued import ImageOptions, ShTables
 from blitzgs.ops.projection_types import ProjectionOptions
 
 
@@ -157,7 +157,7 @@ def raw_rasterization(
 
     groups = groups_of(gaussians, project)
     tables = ShTables(harmonics if shaded else (), catch_up_sh)
-    if may_queue(groups):
+    if groups_may_be_queued(groups):
         return render("raw_rasterization", gaussians, project, image, tables=tables, groups=groups)
     # Several groups, no Gaussians, or another tile size: gather the Gaussians that any group sees.
     groups = gathered_groups(groups, tables)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from blitzgs.capture.undistort import Rectification
 
 # Longest side of an image in pixels, of which the kernels make tiles (checked_tile_grid of csrc/common/op.h).
-MOST_SIDE = 1 << 20
+MAX_SIDE = 1 << 20
 
 Float64 = npt.NDArray[np.float64]
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture.cameras import (
-    MOST_SIDE,
+    MAX_SIDE,
     Camera,
     Float64,
     camera_centres,
@@ -306,9 +306,9 @@ def _camera(
             f"{view.path} is {width} x {height}, which does not fit its camera of {view.lens.width} x "
             f"{view.lens.height}: the image was cropped or turned after the poses were found"
         )
-    if max(width, height) > MOST_SIDE:
+    if max(width, height) > MAX_SIDE:
         raise ValueError(
-            f"{view.path} is {width} x {height}: no side may be longer than {MOST_SIDE:,} pixels; put a "
+            f"{view.path} is {width} x {height}: no side may be longer than {MAX_SIDE:,} pixels; put a "
             "smaller copy in its place"
         )
     lens = view.lens.scaled(width, height)

@@ -28,7 +28,7 @@ _GAP, _GAP_WITHOUT_POINTS = 5.0, 20.0
 # its photograph would teach the model nothing but the colour of a few pixels.
 _LEAST_SHOWN = 0.05
 # An overview from afar is no wrong pose, but does not decide on lengths where it is one of few.
-_MOST_APART = 0.1
+_MAX_APART = 0.1
 # A fraction of the depth of the nearest points that views see. Gaussians grow between the points and the
 # cameras, and what is so near to a camera is a defect of the model.
 _NEAR_OF_DEPTH = 0.25
@@ -108,7 +108,7 @@ def find_apart(
     names = {stray.name for stray in strays}
     apart[[i for i in order[first:] if views[i].name in names]] = True
     overviews = [i for i in order[first:] if views[i].name not in names]
-    if len(overviews) <= _MOST_APART * len(views):
+    if len(overviews) <= _MAX_APART * len(views):
         apart[overviews] = True
     return apart, strays
 

@@ -64,7 +64,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     sample.add_argument(
         "--rows",
         type=int,
-        default=spawn_samples.MOST_ROWS,
+        default=spawn_samples.MAX_ROWS,
         metavar="N",
         help="approximate number of births in the file (default: %(default)s)",
     )

@@ -104,11 +104,11 @@ class LodConfig:
 
 
 # The largest factor by which `schedule.images_per_view` makes a run longer.
-MOST_STRETCH = 4.0
+MAX_STRETCH = 4.0
 
 # The limits of the `loss.opacity` that a run computes from `loss.opacity_total`: about the range that was
 # measured (docs/decisions/recipe.md).
-LEAST_OPACITY, MOST_OPACITY = 0.005, 0.05
+LEAST_OPACITY, MAX_OPACITY = 0.005, 0.05
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class ScheduleConfig:
         iterations: length of the run.
         scale: stretches or compresses the whole schedule without changing its shape.
         images_per_view: how often a new run sees each training view on average, at least: it multiplies
-            `scale` by the factor that is needed for this, from 1 to `MOST_STRETCH`. The run's own
+            `scale` by the factor that is needed for this, from 1 to `MAX_STRETCH`. The run's own
             configuration has the product in `scale`, and 0 here. With 0 or with `minutes` the length does not
             depend on the number of views.
         minutes: wall time of training that the schedule is fitted into (`blitzgs train --minutes`): the run
@@ -195,7 +195,7 @@ class LossConfig:
             Gaussians; here the term does not act on Gaussians that a step does not see).
         opacity_total: weight of the same mean beside the sum of the losses of all training views. A run
             minimises the mean of these losses, so a new run sets `opacity` to this weight divided by the
-            number of training views, from `LEAST_OPACITY` to `MOST_OPACITY`. The run's own configuration has
+            number of training views, from `LEAST_OPACITY` to `MAX_OPACITY`. The run's own configuration has
             the result in `opacity`, and 0 here. 0: `opacity` is the weight.
         scale: weight of the mean smallest axis of the visible Gaussians.
         scale_reference: that axis is measured in units of extent x scale_reference.

@@ -163,7 +163,7 @@ def _read(path: Path, seen: set[Path]) -> dict[str, Any]:
     return merged
 
 
-_MOST_DEPTH = 20
+_MAX_DEPTH = 20
 
 
 def _nest(names: list[str], value: Any) -> dict[str, Any]:
@@ -172,8 +172,8 @@ def _nest(names: list[str], value: Any) -> dict[str, Any]:
 
 def _merge(target: dict[str, Any], changes: dict[str, Any], where: str, depth: int = 0) -> None:
     # An anchor can make a section contain itself.
-    if depth > _MOST_DEPTH:
-        raise ConfigError(f"{where}: sections are nested more than {_MOST_DEPTH} deep")
+    if depth > _MAX_DEPTH:
+        raise ConfigError(f"{where}: sections are nested more than {_MAX_DEPTH} deep")
     for name, value in changes.items():
         if isinstance(value, dict):
             section = target.setdefault(name, {})

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, get_args
 
-from blitzgs.config.fields import MOST_STRETCH, Config, ScheduleConfig, ScoreRule, Transport
+from blitzgs.config.fields import MAX_STRETCH, Config, ScheduleConfig, ScoreRule, Transport
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Range:
 
 
 # Images of a whole run: its table of learning rates takes 48 bytes a step.
-MOST_IMAGES = 10_000_000
+MAX_IMAGES = 10_000_000
 SCALE = Range(1e-4, 1e4)
 _TIME = Range(0, 1e9)
 _EVERY = Range(1, 1e9)
@@ -167,11 +167,11 @@ def _problems_of_length(schedule: ScheduleConfig) -> Iterator[str]:
     factors = [factor for _, factor in schedule.pace]
     if wrong := [factor for factor in factors if factor not in SCALE]:
         yield f"schedule.pace: its factors must be {SCALE}, got {wrong[0]}"
-    stretch = MOST_STRETCH if schedule.images_per_view > 0 else 1.0
+    stretch = MAX_STRETCH if schedule.images_per_view > 0 else 1.0
     total = schedule.iterations * schedule.scale * stretch * max([1.0, *factors])
-    if not math.isnan(total) and total > MOST_IMAGES:
+    if not math.isnan(total) and total > MAX_IMAGES:
         yield (
-            f"schedule.iterations: times schedule.scale must be at most {MOST_IMAGES:,} images, got "
+            f"schedule.iterations: times schedule.scale must be at most {MAX_IMAGES:,} images, got "
             f"{total:,.0f}"
         )
     if schedule.minutes > 0 and schedule.scale != 1.0:

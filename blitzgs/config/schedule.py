@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from blitzgs.config.fields import MOST_STRETCH, OptimiserConfig, ScheduleConfig
+from blitzgs.config.fields import MAX_STRETCH, OptimiserConfig, ScheduleConfig
 from blitzgs.config.pace import Pace
 
 EventKind = Literal["densify", "reset_opacities", "pass_1", "pass_2", "clear_cull", "evaluate", "checkpoint"]
@@ -32,14 +32,14 @@ class Event:
 def stretched(config: ScheduleConfig, views: int) -> ScheduleConfig:
     """Return a schedule for a number of views: `scale` times what gives each view `images_per_view` images.
 
-    The factor is between 1 and `MOST_STRETCH`. The result has `images_per_view` 0, so that a second call
+    The factor is between 1 and `MAX_STRETCH`. The result has `images_per_view` 0, so that a second call
     changes nothing.
 
     Args:
         config: the schedule as configured.
         views: number of training views.
     """
-    factor = min(max(config.images_per_view * views / config.iterations, 1.0), MOST_STRETCH)
+    factor = min(max(config.images_per_view * views / config.iterations, 1.0), MAX_STRETCH)
     if config.minutes > 0:
         factor = 1.0  # The minutes decide how long the run is.
     return replace(config, scale=config.scale * factor, images_per_view=0.0)

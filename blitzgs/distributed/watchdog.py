@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 
 import torch
-from torch._C._distributed_c10d import PrefixStore, TCPStore
+from torch.distributed import PrefixStore, TCPStore  # type: ignore[attr-defined]
 
 EXIT_STUCK = 75  # EX_TEMPFAIL: a restart may help
 # How long a rank continues to wait after another rank has reported a failure.

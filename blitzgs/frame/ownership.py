@@ -25,7 +25,7 @@ from blitzgs.ops.tile_costs import divide_tiles, tile_costs
 # The sums of `divide_tiles` are exact from 8 on.
 TILE_COST = 8
 # Largest number of costs that are stored for a view, 16 KB; a view with fewer tiles has one for each tile.
-_MOST_NUMBERS = 8192
+_MAX_NUMBERS = 8192
 # Divisions use the costs of a batch only after this number of later batches. By then the host has read the
 # sums of the batch, with its losses. It therefore does not wait, and all ranks have the same costs.
 _DELAY = 2
@@ -46,7 +46,7 @@ class _ViewCost(NamedTuple):
 
 def _grain(tiles: int) -> int:
     """Return over how many tiles of a view one stored cost averages."""
-    return -(-tiles // _MOST_NUMBERS)
+    return -(-tiles // _MAX_NUMBERS)
 
 
 def _measured(sums: HostSum, keys: Sequence[Hashable], tiles: int, first: int) -> list[_ViewCost]:

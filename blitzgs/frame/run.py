@@ -4,16 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from blitzgs._library import below_autograd
-from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.protocol import Exchange, ExchangeResult, Mark, Transport, unmarked
 from blitzgs.ops.projection_types import ProjectionInputs, Sizes
 
+if TYPE_CHECKING:
+    from blitzgs.frame.tiles import TileAssignment
+
 # A failed attempt reports the sizes that it needs, and the next attempt uses them. More attempts than this
 # mean that the inputs change or that the program is wrong.
-MOST_ATTEMPTS = 4
+MAX_ATTEMPTS = 4
 
 Consumed = TypeVar("Consumed")
 
@@ -39,10 +41,10 @@ def run(
         The splats, cut to their numbers, and what `consume` returned for them.
 
     Raises:
-        RuntimeError: `MOST_ATTEMPTS` attempts did not suffice, each with the sizes that the last one
+        RuntimeError: `MAX_ATTEMPTS` attempts did not suffice, each with the sizes that the last one
             needed.
     """
-    for _ in range(MOST_ATTEMPTS):
+    for _ in range(MAX_ATTEMPTS):
         sizes = transport.capacity.sizes
         given = inputs(sizes)
         # Skip autograd: for an op with a registered gradient formula, its Python takes 20 us of host time.
@@ -54,6 +56,6 @@ def run(
         if result is not None:
             return result, consumed
     raise RuntimeError(
-        f"{MOST_ATTEMPTS} attempts have each needed more than the one before had asked for: the last had "
+        f"{MAX_ATTEMPTS} attempts have each needed more than the one before had asked for: the last had "
         f"{sizes} and needs {tuple(needed)}. The inputs must not change during a call"
     )

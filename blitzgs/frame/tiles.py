@@ -6,12 +6,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.group import Ranks
 from blitzgs.ops.intersect import pixels_of_tiles, tile_counts
+
+if TYPE_CHECKING:
+    from blitzgs.distributed.group import Ranks
 
 # The loss of an owned pixel reads pixels up to this distance: 5 px for its window, and 5 more for the
 # gradient.

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs.ops.derivatives import linear_map
 
 
 class Places(NamedTuple):
@@ -49,8 +50,15 @@ class Places(NamedTuple):
             return self._arranged_by_torch(columns, under)
         if not torch.is_grad_enabled():
             return tuple(torch.ops.blitzgs.arrange_splats(columns, self.indices, self.shape, under))
-        arranged: tuple[Tensor, ...] = _Arrange.apply(self, under, *columns)  # type: ignore[no-untyped-call]
-        return arranged
+        shape = self.shape
+        return linear_map(
+            lambda under, *columns: tuple(
+                torch.ops.blitzgs.arrange_splats(columns, self.indices, shape, under)
+            ),
+            lambda saved, needed, v: _gradients_of_arranged(Places(tuple(saved), shape), needed, v),
+            [under, *columns],
+            self.indices,
+        )
 
     def gather(self, arranged: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Return the columns of the splats, [P, ...], of arranged ones, [*shape, ...]."""
@@ -59,8 +67,13 @@ class Places(NamedTuple):
             return tuple(t.reshape(-1, *t.shape[first:]).index_select(0, places) for t in arranged)
         if not torch.is_grad_enabled():
             return tuple(torch.ops.blitzgs.splats_of_arranged(arranged, self.indices, self.shape))
-        columns: tuple[Tensor, ...] = _Gather.apply(self, *arranged)  # type: ignore[no-untyped-call]
-        return columns
+        shape = self.shape
+        return linear_map(
+            lambda *arranged: tuple(torch.ops.blitzgs.splats_of_arranged(arranged, self.indices, shape)),
+            lambda saved, _, v: _given(Places(tuple(saved), shape).arrange, v),
+            arranged,
+            self.indices,
+        )
 
     def _arranged_by_torch(self, columns: Sequence[Tensor], under: Tensor | None) -> tuple[Tensor, ...]:
         places, found = self.flat(), []
@@ -84,45 +97,15 @@ def _given(
     return [None if column is None else next(found) for column in columns]
 
 
-class _Arrange(torch.autograd.Function):
-    """`Places.arrange`; no two splats have the same place, so the gradient is gathered from the places."""
-
-    @staticmethod
-    def forward(ctx: Any, places: Places, under: Tensor | None, *columns: Tensor) -> tuple[Tensor, ...]:
-        _save(ctx, places)
-        return tuple(torch.ops.blitzgs.arrange_splats(columns, places.indices, places.shape, under))
-
-    @staticmethod
-    def backward(ctx: Any, *v_arranged: Tensor | None) -> Any:
-        places, v_under = _saved(ctx), None
-        v_columns = _given(places.gather, v_arranged)
-        v_last, v_of_splats = v_arranged[-1], v_columns[-1]
-        if ctx.needs_input_grad[1] and v_last is not None and v_of_splats is not None:
-            v_under = (v_last - places.arrange([v_of_splats])[0]).sum(dim=-2)
-        return None, v_under, *v_columns
-
-
-class _Gather(torch.autograd.Function):
-    """`Places.gather`, the inverse of `_Arrange`."""
-
-    @staticmethod
-    def forward(ctx: Any, places: Places, *arranged: Tensor) -> tuple[Tensor, ...]:
-        _save(ctx, places)
-        return tuple(torch.ops.blitzgs.splats_of_arranged(arranged, places.indices, places.shape))
-
-    @staticmethod
-    def backward(ctx: Any, *v_columns: Tensor | None) -> Any:
-        return None, *_given(_saved(ctx).arrange, v_columns)
-
-
-def _save(ctx: Any, places: Places) -> None:
-    ctx.save_for_backward(*places.indices)
-    ctx.shape = places.shape
-    ctx.set_materialize_grads(False)
-
-
-def _saved(ctx: Any) -> Places:
-    return Places(ctx.saved_tensors, ctx.shape)
+def _gradients_of_arranged(
+    places: Places, needed: Sequence[bool], v_arranged: Sequence[Tensor | None]
+) -> list[Tensor | None]:
+    """Return the gradients of `under` and of the columns; no two splats have the same place."""
+    v_under, v_columns = None, _given(places.gather, v_arranged)
+    v_last, v_of_splats = v_arranged[-1], v_columns[-1]
+    if needed[0] and v_last is not None and v_of_splats is not None:
+        v_under = (v_last - places.arrange([v_of_splats])[0]).sum(dim=-2)
+    return [v_under, *v_columns]
 
 
 @torch.library.register_fake("blitzgs::arrange_splats")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes second derivatives an error: the kernels implement first derivatives only."""
+"""Gradients of our own: linear maps with their adjoints, and second derivatives as an error."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
+
+from blitzgs._torch import refusing_derivatives
+
+# Maps saved tensors, which inputs need a gradient, and the gradients of the outputs to those of the inputs.
+Adjoint = Callable[[Sequence[Tensor], Sequence[bool], Sequence[Tensor | None]], Sequence[Tensor | None]]
 
 
 def first_only(
@@ -29,22 +34,49 @@ def first_only(
     with torch.no_grad():
         gradients = compute()
     wanted = [gradient for gradient in gradients if gradient is not None]
-    given = [tensor for tensor in inputs if tensor is not None]
-    marked = iter(_FirstOnly.apply(op, len(wanted), *wanted, *given))  # type: ignore[no-untyped-call]
+    given = [tensor for tensor in inputs if tensor is not None and tensor.requires_grad]
+    message = (
+        f"blitzgs: {op} has first derivatives only, and a second one was asked for (a Hessian, a gradient "
+        "penalty, or backward() through a gradient that was made with create_graph=True)"
+    )
+    marked = iter(refusing_derivatives(message, wanted, given))
     return tuple(None if gradient is None else next(marked) for gradient in gradients)
 
 
-class _FirstOnly(torch.autograd.Function):
-    """Returns its first `count` tensors; its backward pass raises an error."""
+def linear_map(
+    forward: Callable[..., tuple[Tensor, ...]],
+    adjoint: Adjoint,
+    inputs: Sequence[Tensor | None],
+    saved: Sequence[Tensor] = (),
+) -> tuple[Tensor, ...]:
+    """Apply a linear map to tensors, with the gradient that its adjoint gives.
+
+    Args:
+        forward: maps the inputs to the outputs; autograd records nothing of it.
+        adjoint: maps the gradients of the outputs, None for zero, to those of the inputs.
+        inputs: of `forward`.
+        saved: tensors without gradients for `adjoint`.
+    """
+    outputs: tuple[Tensor, ...] = _LinearMap.apply(forward, adjoint, saved, *inputs)  # type: ignore[no-untyped-call]
+    return outputs
+
+
+class _LinearMap(torch.autograd.Function):
+    """See `linear_map`."""
 
     @staticmethod
-    def forward(ctx: Any, op: str, count: int, *tensors: Tensor) -> tuple[Tensor, ...]:
-        ctx.op = op
-        return tuple(tensor.detach() for tensor in tensors[:count])
+    def forward(
+        ctx: Any,
+        forward: Callable[..., tuple[Tensor, ...]],
+        adjoint: Adjoint,
+        saved: Sequence[Tensor],
+        *inputs: Tensor | None,
+    ) -> tuple[Tensor, ...]:
+        ctx.adjoint = adjoint
+        ctx.save_for_backward(*saved)
+        ctx.set_materialize_grads(False)
+        return forward(*inputs)
 
     @staticmethod
-    def backward(ctx: Any, *_: Any) -> Any:
-        raise RuntimeError(
-            f"blitzgs: {ctx.op} has first derivatives only, and a second one was asked for (a Hessian, a "
-            "gradient penalty, or backward() through a gradient that was made with create_graph=True)"
-        )
+    def backward(ctx: Any, *v_outputs: Tensor | None) -> Any:
+        return None, None, None, *ctx.adjoint(ctx.saved_tensors, ctx.needs_input_grad[3:], v_outputs)

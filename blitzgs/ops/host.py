@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs._torch import current_stream_numbers
 
 
 class PinnedNumbers(NamedTuple):
@@ -97,7 +98,7 @@ def current_stream(device: torch.device) -> torch.cuda.Stream:
     A step asks several times, and torch's own function makes a new object each time.
     """
     number = -1 if device.index is None else device.index  # -1: the current device
-    return _stream(*torch._C._cuda_getCurrentStream(number))
+    return _stream(*current_stream_numbers(number))
 
 
 @lru_cache(maxsize=64)

@@ -145,29 +145,22 @@ class GrowingSchedule(AdamTables):
         self.explicit_steps = explicit_steps(*betas, dtype)
         self.begin = self.last = self.current = begin
         table = table_without_rates(self.LENGTH + 1, *betas, begin)
-        # The terms that a step with learning rate 1 adds to the rows of earlier steps, by order and group.
+        # The terms that a step with learning rate 1 adds to the rows of earlier steps, for each column of the
+        # table: whole rows are added, because they are contiguous.
         first, second = table[:, CORRECTION1], table[:, CORRECTION2]
-        shares = torch.stack([first * second ** (order - 1) for order in range(ORDERS)], dim=1)[..., None]
+        shares = torch.zeros_like(table)
+        decays = torch.zeros(self.explicit_steps, _COLUMNS, dtype=torch.float64, device="cpu")
         ratio, root = betas[0] / math.sqrt(betas[1]), math.sqrt(betas[1])
-        distances = np.arange(self.explicit_steps, 0, -1)[:, None]
-        decays = (ratio * root ** np.arange(ORDERS)) ** distances
-        self._shares, self._decays = shares.to(device), torch.from_numpy(decays[..., None]).to(device)
+        distances = torch.arange(self.explicit_steps, 0, -1, dtype=torch.float64, device="cpu")
+        for order in range(ORDERS):
+            columns = slice(order * GROUPS, (order + 1) * GROUPS)
+            shares[:, columns] = (first * second ** (order - 1))[:, None]
+            decays[:, columns] = ((ratio * root**order) ** distances)[:, None]
+        is_rest = torch.arange(_COLUMNS, device="cpu") % GROUPS == GROUPS - 1
+        self._shares, self._decays = shares.to(device), decays.to(device)
+        self._groups = [mask.to(device, torch.float64) for mask in (~is_rest, is_rest)]
         rates = torch.zeros(self.LENGTH + 1, GROUPS, dtype=torch.float32, device=device)
-        self._use([table.to(device), rates])
-
-    def _use(self, tables: list[Tensor]) -> None:
-        """Take the tables, and keep the views that `add` changes, to which it costs time to come again."""
-        self.tables = tables
-        # A parameter alone is in the column of SH, whose groups are the last two (`AdamState.alone`).
-        self._tails = tables[0].view(-1, ORDERS + 1, GROUPS)[:, :ORDERS, 4:]
-        self._rates = tables[1][:, 4:]
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in ("_tails", "_rates")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._use(self.tables)  # a pickled view would no longer be one
+        self.tables = [table.to(device), rates]
 
     @property
     def row(self) -> int:
@@ -184,17 +177,23 @@ class GrowingSchedule(AdamTables):
         Nothing is copied to the device.
         """
         self.last += 1
-        row = self.row
+        row, (table, rates) = self.row, self.tables
         reach = min(row, self.explicit_steps)
+        rate, rest = (float(np.float32(value)) for value in (rate, rest))  # rounded as in `rates`
         # narrow and select take less of the host's time than indexing.
-        tails, share = self._tails.narrow(0, row - reach, reach), self._shares.select(0, row)
-        decays = self._decays.narrow(0, self.explicit_steps - reach, reach)
-        rates = self._rates.select(0, row)
-        groups = ((0, 2, rate),) if rate == rest else ((0, 1, rate), (1, 1, rest))
-        for first, count, value in groups:
-            rounded = float(np.float32(value))  # as in the table of rates
-            tails.narrow(2, first, count).addcmul_(decays, share, value=rounded)
-            rates.narrow(0, first, count).fill_(rounded)
+        rows, own = table.narrow(0, row - reach, reach), rates.select(0, row)
+        decays, share = (
+            self._decays.narrow(0, self.explicit_steps - reach, reach),
+            self._shares.select(0, row),
+        )
+        own.fill_(rate)
+        if rate == rest:
+            rows.addcmul_(decays, share, value=rate)
+            return
+        # A parameter alone is in the column of SH, whose groups are the last two (`AdamState.alone`).
+        own.narrow(0, GROUPS - 1, 1).fill_(rest)
+        for group, value in zip(self._groups, (rate, rest), strict=True):
+            rows.addcmul_(decays, share * group, value=value)
 
 
 def lazy_adam_step_(

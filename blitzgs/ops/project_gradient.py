@@ -128,8 +128,11 @@ def _first_gradients(
     )  # fmt: skip
     found: list[Tensor | None] = gradients[: len(saved.gaussians)]
     if len(ctx.parts) > 1:
-        # Autograd would copy a gradient that is not contiguous, and its indices with it.
-        found[4:] = [part.contiguous() for part in gradients[4].split(ctx.parts, 1)]
+        # Autograd would copy a gradient that is not contiguous, and its indices with it. Torch adds to an
+        # empty sparse gradient in place, so parts share no memory.
+        found[4:] = [
+            part.clone(memory_format=torch.contiguous_format) for part in gradients[4].split(ctx.parts, 1)
+        ]
     if not dense:
         found = [gradient if wanted else None for gradient, wanted in zip(found, needed, strict=True)]
     if not dense and not complete:

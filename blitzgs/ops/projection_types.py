@@ -15,7 +15,7 @@ from torch import Tensor
 import blitzgs._library  # noqa: F401  (registers the ops)
 
 # Largest number of views of one launch (kMaxViews of csrc/common/kernel.h): an int32 has a bit for each.
-MOST_VIEWS = 32
+MAX_VIEWS = 32
 # Where the splats of the views begin in `ProjectionOutputs.totals` (kTotalViews of csrc/project/project.h).
 VIEW_TOTALS = 4
 

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from blitzgs._torch import raw_indices, raw_values
+
 
 def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
     """Return a sparse tensor of a table in which only the given rows are not zero.
@@ -60,7 +62,7 @@ def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         table: a tensor whose only sparse dimension is the first.
     """
-    rows = table._indices()[0]
+    rows = raw_indices(table)[0]
     if not table.is_coalesced() and not bool((rows[1:] > rows[:-1]).all()):
         table = table.coalesce()
-    return table._indices()[0], table._values()
+    return raw_indices(table)[0], raw_values(table)

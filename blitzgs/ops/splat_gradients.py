@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs._torch import base_of
 
 # Where the parts of a splat gradient begin in its floats (csrc/common/kernel.h), and how many these
 # are.
@@ -29,7 +30,7 @@ def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """View a table of splat gradients as columns.
 
     Args:
-        packed: [P, 12], of the op `rasterize_bwd_packed_`.
+        packed: [P, 12], as the op `rasterize_bwd` fills it.
 
     Returns:
         Gradients of means2d [P, 2], conics [P, 3], opacities [P] and colors [P, 3].
@@ -55,12 +56,12 @@ def packed_table(columns: Sequence[Tensor | None]) -> Tensor | None:
     """
     if columns[0] is None:
         return None
-    whole = columns[0]._base
+    whole = base_of(columns[0])
     if whole is None or whole.dim() != 2 or whole.shape[1] != SPLAT_GRADIENT or not whole.is_contiguous():
         return None
     first, count = whole.storage_offset(), columns[0].shape[0]
     for column, (begin, width, stride) in zip(columns, _COLUMNS, strict=True):
-        if column is None or column._base is not whole or column.storage_offset() != first + begin:
+        if column is None or base_of(column) is not whole or column.storage_offset() != first + begin:
             return None
         if column.shape != (count, *width) or column.stride() != stride:
             return None

@@ -24,7 +24,7 @@ from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable, opacity_logit
 
 # Largest number of copies of one Gaussian in one event, itself included; 3DGS-MCMC's code has the same limit.
-MOST_COPIES = 51
+MAX_COPIES = 51
 # Opacities are the weights of the draw, as integers in units of 2^-31, so that sums do not depend on the
 # order.
 _WEIGHT_BITS = 31
@@ -114,7 +114,7 @@ def shared(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, T
     Args:
         opacities: logits, [M].
         scales: logarithms, [M, 3].
-        copies: N, int64 [M], 1 to `MOST_COPIES`.
+        copies: N, int64 [M], 1 to `MAX_COPIES`.
 
     Returns:
         Logits and logarithms, float64; the sum alternates, and its terms exceed it by up to 10^5.
@@ -139,7 +139,7 @@ def draw(weights: Tensor, count: int, ids: Tensor, seed: int, time: int, ranks: 
     The expectation for each row is count w / sum(w), as in a multinomial draw. A row gets the integer part of
     this number for certain; the fractional parts are drawn without replacement (residual resampling, Liu and
     Chen 1998). This has the least variance, and exactly `count` draws in all, except that no row is drawn
-    `MOST_COPIES` times.
+    `MAX_COPIES` times.
 
     Args:
         weights: int64 [N_rank], 0 to 2^31, fewer than 2^31 over all ranks.
@@ -160,7 +160,7 @@ def draw(weights: Tensor, count: int, ids: Tensor, seed: int, time: int, ranks: 
     rest = count - int(ranks.all_reduce(whole.sum()))
     # Other draws use their event's time, which is >= 0, so a negative number gives separate keys.
     keys = sampling_keys((weights * count % total).float(), ids, seed, -1 - time)
-    return (whole + smallest(keys, ids, rest, ranks)).clamp(max=MOST_COPIES - 1)
+    return (whole + smallest(keys, ids, rest, ranks)).clamp(max=MAX_COPIES - 1)
 
 
 def _set_shares(table: GaussianTable, sources: Tensor, copies: Tensor, min_opacity: float) -> None:

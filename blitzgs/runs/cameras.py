@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.capture.cameras import MOST_SIDE
+from blitzgs.capture.cameras import MAX_SIDE
 from blitzgs.capture.capture import Capture
 from blitzgs.util.output import write_file
 from blitzgs.view.views import CameraLike
@@ -91,8 +91,8 @@ def checked_camera(
     if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-9):
         raise ValueError(f"the last row of world_to_camera must be 0, 0, 0, 1, got {pose[3].tolist()}")
     for argument, size in (("width", width), ("height", height)):
-        if not 1 <= size <= MOST_SIDE or size != int(size):
-            raise ValueError(f"{argument} must be an integer from 1 to {MOST_SIDE:,}, got {size}")
+        if not 1 <= size <= MAX_SIDE or size != int(size):
+            raise ValueError(f"{argument} must be an integer from 1 to {MAX_SIDE:,}, got {size}")
     return RunCamera(name, int(width), int(height), intrinsics, pose)
 
 

@@ -49,6 +49,7 @@ class Model:
         sh_degree: spherical-harmonics degree to evaluate.
         config: configuration of the run.
         images_seen: number of images that the model was trained on.
+        exposures: gain and bias of each training photograph, [T, 2, 3]; None if the run has none.
         run: the run, whose cameras `render` takes by their indices; None: it takes only cameras.
     """
 
@@ -63,6 +64,7 @@ class Model:
     sh_degree: int
     config: Config
     images_seen: int
+    exposures: Tensor | None = None
     run: RunFolder | None = None
 
     def __len__(self) -> int:
@@ -248,6 +250,7 @@ class RunFolder:
             sh_degree=found.progress.sh_degree,
             config=found.config,
             images_seen=found.progress.step * found.config.schedule.batch_size,
+            exposures=found.exposures,
             run=self,
         )
 

@@ -27,7 +27,7 @@ from blitzgs.util.terminal import printable
 LOG = "log.jsonl"
 BOARD = "tensorboard"
 # Largest number of records that are kept while the disk is full; then the oldest are dropped.
-_MOST_WAITING = 10_000
+_MAX_WAITING = 10_000
 
 # Least seconds between two moves of a terminal's bar and, without one, between two lines about long work.
 _BAR_SECONDS = 0.5
@@ -206,7 +206,7 @@ class _JsonLines:
 
     def __init__(self, path: Path, failures: _Failures) -> None:
         self._path, self._failures = path, failures
-        self._waiting: deque[bytes] = deque(maxlen=_MOST_WAITING)
+        self._waiting: deque[bytes] = deque(maxlen=_MAX_WAITING)
 
     def add(self, record: Mapping[str, Any]) -> None:
         self._waiting.append(json.dumps(record).encode() + b"\n")

@@ -22,7 +22,7 @@ from blitzgs.spawn.lineage_parts import read_lineage
 from blitzgs.util.output import write_file
 
 # Largest number of births that a fit takes from a scene, drawn evenly.
-MOST_ROWS = 4_000_000
+MAX_ROWS = 4_000_000
 XGBOOST_PARAMETERS = {
     "objective": "binary:logistic",
     "tree_method": "hist",
@@ -280,8 +280,8 @@ def _train(xgboost: ModuleType, runs: Sequence[Spawns], rows: Sequence[NDArray[n
     features, labels = [], []
     for run, mine in zip(runs, rows, strict=True):
         chosen = mine.nonzero()[0]
-        if len(chosen) > MOST_ROWS:
-            chosen = np.sort(generator.choice(chosen, MOST_ROWS, replace=False))
+        if len(chosen) > MAX_ROWS:
+            chosen = np.sort(generator.choice(chosen, MAX_ROWS, replace=False))
         features.append(run.features[chosen])
         labels.append(run.survived[chosen])
     data = xgboost.DMatrix(np.concatenate(features), np.concatenate(labels), feature_names=list(FEATURES))

@@ -38,7 +38,7 @@ from blitzgs.util.output import PARTIAL, write_file
 ABOUT = "about.json"
 # Number of rows, some 60 bytes each, that are kept on the device before they become parts. The remaining rows
 # are written at a checkpoint, which waits for them.
-_MOST_PENDING = 1 << 17
+_MAX_PENDING = 1 << 17
 
 
 class Cause(enum.IntEnum):
@@ -214,7 +214,7 @@ class Lineage:
     def _log(self, table: str, groups: tuple[Tensor, ...], step: int) -> None:
         self._pending[table].append(groups)
         self._rows += groups[0].shape[1]
-        if self._rows > _MOST_PENDING:
+        if self._rows > _MAX_PENDING:
             self.flush(step)
 
     def _count(self, ids: Tensor, births: bool) -> None:

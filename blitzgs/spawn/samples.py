@@ -19,14 +19,14 @@ from blitzgs.util.output import check_replaceable, new_file
 
 SUFFIX = ".parquet"
 # Number of rows of a sample; a row takes some 40 bytes.
-MOST_ROWS = 250_000
+MAX_ROWS = 250_000
 _ABOUT = b"blitzgs.spawns"
 # Seed of the draw of parents; no other draw uses it.
 _SEED = 0x5A3B1E
 _AXES = ("x", "y", "z")
 
 
-def write_sample(run: Spawns, path: Path, most: int = MOST_ROWS) -> float:
+def write_sample(run: Spawns, path: Path, most: int = MAX_ROWS) -> float:
     """Write the spawns of some parents, drawn by the hash of their ids, so that siblings stay together.
 
     Args:

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from blitzgs.ops.cull_mask import WORD_BITS
 from blitzgs.ops.pool import seen_blocks
-from blitzgs.ops.projection_types import MOST_VIEWS
+from blitzgs.ops.projection_types import MAX_VIEWS
 
-_MOST_WORDS = 1 << 26  # words of a mask that are processed together
+_MAX_WORDS = 1 << 26  # words of a mask that are processed together
 
 
 class Cameras(NamedTuple):
@@ -82,7 +82,7 @@ class BlockVisibility:
         """Return the first batch that may see each block; a number above all batches if none may."""
         seen = self._read()[blocks].astype(np.int64)
         first_view = np.frexp((seen & -seen).astype(np.float64))[1] - 1
-        return np.where(seen == 0, MOST_VIEWS, first_view // self._batch_size).astype(np.int64)
+        return np.where(seen == 0, MAX_VIEWS, first_view // self._batch_size).astype(np.int64)
 
 
 def culled_blocks(cull: Tensor) -> Tensor:
@@ -92,7 +92,7 @@ def culled_blocks(cull: Tensor) -> Tensor:
         cull: int32 [N, columns, 8], see `blitzgs.ops.cull_mask`; of whole blocks.
     """
     bits = torch.arange(WORD_BITS, device=cull.device)
-    length = max(1, _MOST_WORDS // max(1, cull[:1].numel()))
+    length = max(1, _MAX_WORDS // max(1, cull[:1].numel()))
     parts = [cull.new_empty(0, cull.shape[1] // WORD_BITS)]
     for some in cull.split(length):
         is_culled = (some == -1).all(2).view(len(some), cull.shape[1] // WORD_BITS, WORD_BITS)

@@ -23,8 +23,8 @@ from blitzgs.ops.host import HostCopy, to_device
 
 # The ranks agree at least this often: in steps, and in seconds as far as single steps allow. On GPUs they
 # learn the decision one step later.
-MOST_STEPS = 16
-MOST_SECONDS = 4.0
+MAX_STEPS = 16
+MAX_SECONDS = 4.0
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
@@ -139,7 +139,7 @@ class Agreement:
         """Collect the requests of all ranks after `step`."""
         now = time.monotonic()
         # The duration of a step is not known at first, so the ranks agree again after the next one.
-        seconds = MOST_SECONDS
+        seconds = MAX_SECONDS
         if self._last is not None and step > self._last[0]:
             seconds = (now - self._last[1]) / (step - self._last[0])
         requests = [self._stop.number, self._clock.is_due, seconds, lost, self._wants()]
@@ -151,7 +151,7 @@ class Agreement:
         with self._ranks.watchdog.waiting("agree"):
             number, due, slowest, any_lost, watched = requests.read().view(torch.float64).tolist()
         self._asked = None
-        interval = max(1, min(MOST_STEPS, int(MOST_SECONDS / max(slowest, 1e-9))))
+        interval = max(1, min(MAX_STEPS, int(MAX_SECONDS / max(slowest, 1e-9))))
         self._next, self._last = (asked // interval + 1) * interval, (step, time.monotonic())
         self._agreed_to_stop = number > 0
         return self._decision(int(number), due > 0, any_lost > 0, watched > 0)

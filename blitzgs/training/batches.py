@@ -24,7 +24,7 @@ from blitzgs.view.views import VIEW_NUMBERS, ViewSet, unpack_views
 # those of this number of later batches. Decoding one takes as long as several steps on a fast GPU.
 _DECODED_AHEAD = 4
 # A view of which masks exclude a larger share is counted in `BatchLoader.views_masked`.
-MOST_MASKED = 0.95
+MAX_MASKED = 0.95
 
 
 class _Plan(NamedTuple):
@@ -136,7 +136,7 @@ class BatchLoader:
             several). The rank cannot stop alone in the middle of a step, so it continues and treats all
             pixels of such photographs as masked. None: it has read all photographs.
         views_masked: number of views, among the `views_read`, of which a mask excludes more than
-            `MOST_MASKED`.
+            `MAX_MASKED`.
         waited: seconds that the caller has waited for batches so far.
     """
 
@@ -322,7 +322,7 @@ class BatchLoader:
         if index not in self._sample_counts:
             width, height = self._views.size([index])
             counted = width * height if mask is None else int((mask != 0).sum())
-            self.views_masked += counted < (1.0 - MOST_MASKED) * width * height
+            self.views_masked += counted < (1.0 - MAX_MASKED) * width * height
             self._sample_counts[index] = float(max(1, 3 * counted))
         return self._sample_counts[index]
 

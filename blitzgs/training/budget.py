@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from blitzgs.config.fields import ScheduleConfig
-from blitzgs.config.ranges import MOST_IMAGES, SCALE
+from blitzgs.config.ranges import MAX_IMAGES, SCALE
 from blitzgs.training.state import TrainingState
 
 # The first steps of a process are slow (memory, kernels, photographs), so they are not measured. Intervals
@@ -33,7 +33,7 @@ GROWTH = 2.0
 TOLERANCE = 0.005
 # One measurement may be distorted by a disk or another process, so it changes the pace by at most this
 # factor.
-MOST_CHANGE = 16.0
+MAX_CHANGE = 16.0
 # A plan is shown when the run's length has changed by more than this share of it.
 SHOWN_CHANGE = 0.1
 
@@ -97,13 +97,13 @@ class Budget:
         # Time that the rest of the run would take at a scale of 1.
         at_one = rest * cost * _growth(config, time)
         wanted = old if abs(at_one * old - left) <= TOLERANCE * self._seconds else left / at_one
-        most = min(SCALE.high, MOST_IMAGES / config.iterations, old * MOST_CHANGE)
-        new = min(max(wanted, SCALE.low, old / MOST_CHANGE), most)
+        most = min(SCALE.high, MAX_IMAGES / config.iterations, old * MAX_CHANGE)
+        new = min(max(wanted, SCALE.low, old / MAX_CHANGE), most)
         if new == wanted:
             self._interval *= 2
         steps_left = rest * new / config.batch_size
         self._interval = max(WARM_UP_STEPS, min(self._interval, int(steps_left * SHARE)))
-        following = step + self._interval if rest > LAST_SHARE * config.iterations else MOST_IMAGES
+        following = step + self._interval if rest > LAST_SHARE * config.iterations else MAX_IMAGES
         return Plan(following, None if new == old else new, 1 / cost, seconds + at_one * new)
 
     def _report(self, plan: Plan) -> None:

@@ -17,8 +17,8 @@ from blitzgs.training.state import TrainingState
 # The views are measured at most this often in a run, evenly.
 POINTS = 20
 # Largest share of the training time, and number of views at one point.
-MOST_SHARE = 0.008
-LEAST_VIEWS, MOST_VIEWS = 2, 16
+MAX_SHARE = 0.008
+LEAST_VIEWS, MAX_VIEWS = 2, 16
 # Assumed before the first measurement: the time of a view is that of this number of training images.
 FIRST_COST = 1.0
 
@@ -66,8 +66,8 @@ class Glances:
         """Return how many views may be measured now; 0 if too few."""
         progress = self._state.progress
         cost = self._cost or FIRST_COST * progress.seconds / max(1, self._state.images_seen)
-        left = MOST_SHARE * (progress.seconds - self._begin) - self._spent
-        count = min(MOST_VIEWS, len(self._order), math.floor(left / max(cost, 1e-9)))
+        left = MAX_SHARE * (progress.seconds - self._begin) - self._spent
+        count = min(MAX_VIEWS, len(self._order), math.floor(left / max(cost, 1e-9)))
         return count if count >= min(LEAST_VIEWS, len(self._order)) else 0
 
 

@@ -5,17 +5,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from blitzgs.config.fields import LEAST_OPACITY, MOST_OPACITY, LossConfig
-from blitzgs.frame.frame import Frame
+from blitzgs.config.fields import LEAST_OPACITY, MAX_OPACITY, LossConfig
 from blitzgs.frame.tiles import LOSS_HALO
 from blitzgs.ops.photometric import photometric_fwd_bwd
-from blitzgs.table.table import GaussianTable
-from blitzgs.training.batch import Batch
+
+if TYPE_CHECKING:
+    from blitzgs.frame.frame import Frame
+    from blitzgs.table.table import GaussianTable
+    from blitzgs.training.batch import Batch
 
 
 class LossTerms(NamedTuple):
@@ -40,7 +42,7 @@ class LossTerms(NamedTuple):
 def weighted(config: LossConfig, views: int) -> LossConfig:
     """Return the weights for a number of views: if `opacity_total` is set, `opacity` is its share for a view.
 
-    This share, `opacity_total` / `views`, is kept between `LEAST_OPACITY` and `MOST_OPACITY`. The result has
+    This share, `opacity_total` / `views`, is kept between `LEAST_OPACITY` and `MAX_OPACITY`. The result has
     `opacity_total` 0, so that a second call changes nothing.
 
     Args:
@@ -49,7 +51,7 @@ def weighted(config: LossConfig, views: int) -> LossConfig:
     """
     if config.opacity_total == 0:
         return config
-    opacity = min(max(config.opacity_total / max(views, 1), LEAST_OPACITY), MOST_OPACITY)
+    opacity = min(max(config.opacity_total / max(views, 1), LEAST_OPACITY), MAX_OPACITY)
     return replace(config, opacity=opacity, opacity_total=0.0)
 
 

@@ -15,7 +15,7 @@ from blitzgs.frame.frame import Frame, RenderOptions
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.transport import Mark, unmarked
 from blitzgs.ops.host import to_device
-from blitzgs.ops.projection_types import MOST_VIEWS
+from blitzgs.ops.projection_types import MAX_VIEWS
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.position_noise import PositionNoise
 from blitzgs.table.block_visibility import Cameras
@@ -52,7 +52,7 @@ class UpcomingCameras:
 
     def cameras(self, step: int, limits: tuple[float, float, float]) -> Cameras:
         """Return the views of a step (from 1) and of the following ones, at most 32 views."""
-        batches = [self._sampler.batch(step - 1 + ahead) for ahead in range(MOST_VIEWS // self.batch_size)]
+        batches = [self._sampler.batch(step - 1 + ahead) for ahead in range(MAX_VIEWS // self.batch_size)]
         # A view's index among the training views is also its column in the cull matrix.
         views = torch.tensor([view for batch in batches for view in batch])
         columns = to_device(views, self._columns[0].device)

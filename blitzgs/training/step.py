@@ -3,28 +3,32 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
-from blitzgs.config.fields import LossConfig
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import Frame, RenderOptions
-from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import Mark, open_transport, unmarked
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.projection_types import Sizes
 from blitzgs.ops.view_gate import gate_views_
-from blitzgs.optim.table_adam import TableAdam
-from blitzgs.population.position_noise import PositionNoise
 from blitzgs.table.blocks import BlockIndex
-from blitzgs.table.table import GaussianTable
-from blitzgs.training.batch import Batch
-from blitzgs.training.exposure import Exposures
 from blitzgs.training.loss import LossTerms, loss_terms
-from blitzgs.view.gate import ViewGate
-from blitzgs.view.visible import Scene
+
+if TYPE_CHECKING:
+    from blitzgs.config.fields import LossConfig
+    from blitzgs.frame.ownership import TileOwners
+    from blitzgs.optim.table_adam import TableAdam
+    from blitzgs.population.position_noise import PositionNoise
+    from blitzgs.table.table import GaussianTable
+    from blitzgs.training.batch import Batch
+    from blitzgs.training.exposure import Exposures
+    from blitzgs.view.gate import ViewGate
+    from blitzgs.view.visible import Scene
 
 
 class Stepper:

@@ -24,7 +24,7 @@ _BLUR = 5
 # Colours between these, of 255, have not been cut off.
 _DARKEST, _BRIGHTEST = 5, 250
 # Points of a photograph that are compared; more would change nothing.
-_MOST_POINTS = 2000
+_MAX_POINTS = 2000
 # Photographs that are decoded ahead.
 _AHEAD = 8
 # The points' colours and the gains are found in turns; each turn halves the error or better.
@@ -84,7 +84,7 @@ def _observed_points(capture: Capture) -> tuple[NDArray[np.float64], list[NDArra
         place = names[name]
         found = model.images.point3d_ids[offsets[place] : offsets[place + 1]]
         rows = order[np.searchsorted(ids, found[found >= 0], sorter=order).clip(max=len(ids) - 1)]
-        seen.append(rows[:: max(1, len(rows) // _MOST_POINTS)].astype(np.int64))
+        seen.append(rows[:: max(1, len(rows) // _MAX_POINTS)].astype(np.int64))
     return np.asarray(model.points.positions) - capture.offset, seen
 
 

@@ -30,8 +30,8 @@ from blitzgs.runs.watch import Watcher
 from blitzgs.spawn.rules import lineage_subject
 from blitzgs.table.pool import PoolError
 from blitzgs.training import view_level
-from blitzgs.training.agreement import MOST_STEPS, Agreement, StopRequest
-from blitzgs.training.batches import MOST_MASKED, BatchLoader
+from blitzgs.training.agreement import MAX_STEPS, Agreement, StopRequest
+from blitzgs.training.batches import MAX_MASKED, BatchLoader
 from blitzgs.training.budget import Budget
 from blitzgs.training.events import evaluate, events_left, handle_all, save
 from blitzgs.training.glances import Glances
@@ -194,7 +194,7 @@ class Trainer:
         lost = [f"rank {rank}: {reason}" for rank, reason in enumerate(reasons) if reason is not None]
         if lost:
             raise PhotographError(
-                f"{'; '.join(lost)}. The last steps, {MOST_STEPS + 1} at most, went without it"
+                f"{'; '.join(lost)}. The last steps, {MAX_STEPS + 1} at most, went without it"
             )
 
     def _stop(self, reason: str) -> None:
@@ -259,7 +259,7 @@ class Trainer:
         self._warned_of_masks = True
         if self.state.ranks.rank == 0:
             warnings.warn(
-                f"{masked} of the first {read} training views are masked by more than {MOST_MASKED:.0%}: "
+                f"{masked} of the first {read} training views are masked by more than {MAX_MASKED:.0%}: "
                 "black excludes a pixel and white counts. Invert the masks if they mean the opposite, or "
                 "train without them (--data.masks=false)",
                 stacklevel=2,

@@ -28,7 +28,7 @@ SAMPLE = 16_384
 # Key of the sample's random draws, so that they differ from other draws for the same ids.
 _SAMPLE_KEY = 0x1EAF
 # Largest number of distances that are in memory at once.
-_MOST_DISTANCES = 1 << 24
+_MAX_DISTANCES = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ class SceneGate:
             centres: positions of the cameras, float64 [V, 3].
         """
         counts = torch.zeros(len(centres), dtype=torch.int64, device=self._means.device)
-        length = max(1, _MOST_DISTANCES // max(1, len(self._means)))
+        length = max(1, _MAX_DISTANCES // max(1, len(self._means)))
         for begin in range(0, len(centres), length):
             some = centres[begin : begin + length].to(self._means.device)
             distances = torch.cdist(some, self._means, compute_mode="donot_use_mm_for_euclid_dist")

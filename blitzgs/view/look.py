@@ -12,7 +12,7 @@ import numpy.typing as npt
 Mode = Literal["RGB", "depth", "alpha", "count", "level"]
 MODES: tuple[Mode, ...] = get_args(Mode)
 # Pictures have at most this many pixels on a side.
-MOST_PIXELS = 8192
+MAX_PIXELS = 8192
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +59,8 @@ class Look:
         if self.mode not in MODES:
             raise ValueError(f"mode must be one of {', '.join(MODES)}, got {self.mode!r}")
         for name, size in (("width", self.width), ("height", self.height)):
-            if not 1 <= size <= MOST_PIXELS:
-                raise ValueError(f"{name} must be from 1 to {MOST_PIXELS}, got {size}")
+            if not 1 <= size <= MAX_PIXELS:
+                raise ValueError(f"{name} must be from 1 to {MAX_PIXELS}, got {size}")
         for name, matrix, shape in (("viewmat", self.viewmat, (4, 4)), ("K", self.K, (3, 3))):
             if matrix.shape != shape or not np.isfinite(matrix).all():
                 raise ValueError(f"{name} must be a finite matrix {shape}, got {matrix.tolist()}")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 # A curve is drawn with this many points at most.
-_MOST_POINTS = 300
+_MAX_POINTS = 300
 _SERIES = {
     "loss": ("Loss", "#4dabf7"),
     "psnr": ("PSNR, dB", "#69db7c"),
@@ -85,7 +85,7 @@ class Curves:
 
     def _data(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         points = self._points[name]
-        step = max(1, -(-len(points) // _MOST_POINTS))
+        step = max(1, -(-len(points) // _MAX_POINTS))
         some = points[::-step][::-1] or [(0, 0.0)]
         times, values = zip(*some, strict=True)
         return np.array(times, dtype=np.float64), np.array(values, dtype=np.float64)

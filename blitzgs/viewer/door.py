@@ -14,7 +14,7 @@ import ipaddress
 import threading
 from urllib.parse import urlsplit
 
-_MOST_HEAD = 32_768
+_MAX_HEAD = 32_768
 _HEAD_SECONDS = 15.0
 _CHUNK = 1 << 18
 
@@ -86,7 +86,7 @@ class Door:
                 OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, TimeoutError
             ):
                 head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_SECONDS)
-                answer, passed = self._judged(head[:_MOST_HEAD].decode("latin-1"))
+                answer, passed = self._judged(head[:_MAX_HEAD].decode("latin-1"))
                 if passed is None:
                     writer.write(answer)
                     await writer.drain()

@@ -31,6 +31,7 @@ class Exhibit:
         cameras: the capture's cameras.
         test: indices of those that are held out.
         photograph: returns the photograph of a camera, uint8 [H, W, 3]; None: there are none.
+        exposures: gain and bias of photographs by their cameras, float64 [2, 3]; empty: the model has none.
         paths: folder for camera paths and screenshots.
     """
 
@@ -47,4 +48,5 @@ class Exhibit:
     cameras: Sequence[CameraLike] = ()
     test: Sequence[int] = ()
     photograph: Callable[[int], npt.NDArray[np.uint8]] | None = None
+    exposures: dict[int, npt.NDArray[np.float64]] = field(default_factory=dict)
     paths: Path = field(default_factory=lambda: Path("paths"))

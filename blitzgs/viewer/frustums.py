@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import viser
 
 # More would slow the browser down; they are then evenly spaced among all.
-MOST_FRUSTUMS = 400
+MAX_FRUSTUMS = 400
 TRAIN_COLOUR, TEST_COLOUR = (64, 170, 255), (255, 150, 40)
 
 
@@ -37,7 +37,7 @@ class Frustums:
     ) -> None:
         """Add the frustums; `stand` is called with the number of the visitor who clicks, and the camera."""
         cameras, test = exhibit.cameras, set(exhibit.test)
-        step = max(1.0, len(cameras) / MOST_FRUSTUMS)
+        step = max(1.0, len(cameras) / MAX_FRUSTUMS)
         self.indices = sorted(
             {int(k * step) for k in range(math.ceil(len(cameras) / step))} & set(range(len(cameras)))
         )

@@ -82,6 +82,11 @@ class Panel:
             "Compare", compare.KINDS, initial_value="off", disabled=exhibit.photograph is None,
             hint="With the photograph, where you stand at its camera",
         )  # fmt: skip
+        exposure = gui.add_checkbox(
+            "Exposure", False, disabled=not exhibit.exposures,
+            hint="Where a photograph was trained on, show the render with its exposure",
+        )  # fmt: skip
+        exposure.on_update(lambda _: visitor.change(exposure=exposure.value))
         wipe = gui.add_slider("Wipe", min=0.0, max=1.0, step=0.01, initial_value=0.5)
 
         def stand(_: Any) -> None:

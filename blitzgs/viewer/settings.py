@@ -29,6 +29,7 @@ class Settings:
         far: None: the model's.
         comparison: one of `blitzgs.viewer.compare.KINDS`.
         wipe: share of the width that shows the photograph.
+        exposure: where a photograph was taken, show the render with its exposure, if the model has one.
         most_side: longest side in pixels of a picture at full quality.
         adapts: whether pictures are coarser while the camera moves.
     """
@@ -44,6 +45,7 @@ class Settings:
     far: float | None = None
     comparison: str = "off"
     wipe: float = 0.5
+    exposure: bool = False
     most_side: int = 1920
     adapts: bool = True
 

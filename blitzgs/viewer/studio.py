@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,9 +90,17 @@ def open_model(
         cameras=() if stored is None else stored.cameras,
         test=() if stored is None else stored.test,
         photograph=photograph if stored is not None else None,
+        exposures=_exposures(model.exposures, () if stored is None else stored.train),
         paths=paths or path / "paths",
     )
     return Opened(exhibit, subject, table, ranks)
+
+
+def _exposures(found: Tensor | None, train: Sequence[int]) -> dict[int, npt.NDArray[np.float64]]:
+    """Return the exposures of photographs by their cameras; empty if there are none, or those of others."""
+    if found is None or len(found) != len(train):
+        return {}
+    return dict(zip(train, found.double().cpu().numpy(), strict=True))
 
 
 def _open_ply(path: Path, ranks: Ranks, paths: Path) -> Opened:

@@ -43,6 +43,7 @@ class Ask:
         settings: the choices.
         camera: index of the photograph's camera to compare with; None: no comparison.
         columns: of the grid of images side by side.
+        exposure: gain and bias, float64 [2, 3], of the photograph whose exposure is shown, or None.
         is_sounding: the look is down from the camera, to find the ground.
     """
 
@@ -52,6 +53,7 @@ class Ask:
     settings: Settings
     camera: int | None = None
     columns: int = 1
+    exposure: npt.NDArray[np.float64] | None = None
     is_sounding: bool = False
 
 
@@ -257,6 +259,7 @@ class Visitor:
         version: int,
         settings: Settings,
     ) -> Ask:
+        exposure = self.exhibit.exposures.get(index) if settings.exposure and index is not None else None
         if settings.comparison == "off" or self.exhibit.photograph is None:
             index = None
         elif index is None:
@@ -272,7 +275,7 @@ class Visitor:
         else:
             K = intrinsics(w, h, stance.fov)  # noqa: N806
         look = settings.look(self.world.viewmat(stance), K, w, h)
-        return Ask(look, version, scale, settings, index, columns)
+        return Ask(look, version, scale, settings, index, columns, exposure)
 
     def _sounding(self, stance: Stance, version: int, settings: Settings) -> Ask:
         """Return a look straight down, to find the ground under a visitor who walks."""
@@ -296,6 +299,10 @@ class Visitor:
             else:
                 return None
         result, psnr = shaded(picture, ask.look.mode), None
+        if ask.exposure is not None and ask.look.mode == "RGB":
+            gain, bias = ask.exposure
+            exposed = np.clip(result.image * gain + 255 * bias + 0.5, 0, 255).astype(np.uint8)
+            result = Shaded(exposed)
         if ask.camera is not None and self.exhibit.photograph is not None:
             try:
                 photograph = self.exhibit.photograph(ask.camera)

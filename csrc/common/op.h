@@ -257,8 +257,8 @@ inline void check_tile_range(const char* op, std::int64_t begin, std::int64_t en
 inline TileGrid checked_tile_grid(const char* op, std::int64_t n_cameras, std::int64_t width,
                                   std::int64_t height, std::int64_t tile_size, std::int64_t tile_begin,
                                   std::int64_t tile_end) {
-  constexpr std::int64_t kMost = std::numeric_limits<std::int32_t>::max();
-  STD_TORCH_CHECK(n_cameras >= 0 && n_cameras <= kMost, "blitzgs::", op,
+  constexpr std::int64_t kMax = std::numeric_limits<std::int32_t>::max();
+  STD_TORCH_CHECK(n_cameras >= 0 && n_cameras <= kMax, "blitzgs::", op,
                   ": n_cameras must be at least 0, got ", n_cameras);
   STD_TORCH_CHECK(width > 0 && height > 0 && width <= (1 << 20) && height <= (1 << 20), "blitzgs::", op,
                   ": width and height must be in [1, 2^20], got ", width, " x ", height);

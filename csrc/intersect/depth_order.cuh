@@ -177,11 +177,11 @@ struct DepthDigits {
   std::uint32_t view_mask;
 
   __device__ DepthDigits(const DepthRange& range, int n_views) {
-    constexpr int kMost = kDepthPasses * kDepthBits;
+    constexpr int kMax = kDepthPasses * kDepthBits;
     const int depth_bits = 32 - __clz(range.high - range.low);
-    view_shift = min(depth_bits, kMost);
+    view_shift = min(depth_bits, kMax);
     dropped = depth_bits - view_shift;
-    const int view_bits = min(kMost - view_shift, 32 - __clz(n_views - 1));
+    const int view_bits = min(kMax - view_shift, 32 - __clz(n_views - 1));
     view_mask = (1u << view_bits) - 1;
     width = max(1, (view_shift + view_bits + kDepthPasses - 1) / kDepthPasses);
   }

@@ -129,9 +129,9 @@ const Keyed<KeyOf<T>>* sort_splats(const IntersectInput<T>& in, Workspace& works
 // The number of pieces is the number of threads, or fewer if one counter per tile and piece would take too
 // much memory.
 int choose_pieces(std::int64_t n_tiles) {
-  constexpr std::int64_t kMostCounts = 1 << 25;
+  constexpr std::int64_t kMaxCounts = 1 << 25;
   return static_cast<int>(
-      std::clamp<std::int64_t>(kMostCounts / std::max<std::int64_t>(n_tiles, 1), 1, num_threads()));
+      std::clamp<std::int64_t>(kMaxCounts / std::max<std::int64_t>(n_tiles, 1), 1, num_threads()));
 }
 
 }  // namespace

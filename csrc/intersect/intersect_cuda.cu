@@ -36,7 +36,7 @@ constexpr int kLargeBlocks = 4;  // blocks of emit_large_kernel per multiprocess
 // The digits by which entries are sorted by tile: as few passes as the number of tiles allows, and the fewest
 // bits per digit for this number of passes.
 struct TileDigits {
-  static constexpr int kBits = 8, kBins = 1 << kBits, kMost = 4;
+  static constexpr int kBits = 8, kBins = 1 << kBits, kMax = 4;
   int passes = 1, width = 1;
 
   explicit TileDigits(std::int64_t n_tiles) {
@@ -127,7 +127,7 @@ __global__ void __launch_bounds__(kThreads, 4)
                 const std::int64_t* n_splats, RunningSum running, const Entries<Key> entries,
                 std::int64_t* n_entries, std::int32_t* large_splats, std::int32_t* n_large) {
   __shared__ std::int64_t warp_sums[kThreads / 32];
-  __shared__ std::uint32_t counts[TileDigits::kMost * TileDigits::kBins];
+  __shared__ std::uint32_t counts[TileDigits::kMax * TileDigits::kBins];
   const int bins = entries.digits.passes * TileDigits::kBins;
   for (int bin = threadIdx.x; bin < bins; bin += kThreads) counts[bin] = 0;
   wait_for_earlier_kernels();
@@ -182,7 +182,7 @@ template <class Key>
 __global__ void __launch_bounds__(kThreads)
     emit_large_kernel(const Input in, const Touched* all_touched, const std::int32_t* large_splats,
                       const std::int32_t* n_large, const Entries<Key> entries) {
-  __shared__ std::uint32_t counts[TileDigits::kMost * TileDigits::kBins];
+  __shared__ std::uint32_t counts[TileDigits::kMax * TileDigits::kBins];
   const int bins = entries.digits.passes * TileDigits::kBins;
   for (int bin = threadIdx.x; bin < bins; bin += kThreads) counts[bin] = 0;
   wait_for_earlier_kernels();

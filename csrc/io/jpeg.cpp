@@ -20,11 +20,11 @@ constexpr std::uint8_t kSof0 = 0xc0, kSof2 = 0xc2, kDht = 0xc4, kRst0 = 0xd0, kS
 constexpr unsigned kHoleBytes = 64 + 8;
 
 // Limits the memory that a small file can ask for: 8 bytes for each block of all components.
-constexpr std::uint64_t kMostBlocks = 1 << 24;
-constexpr unsigned kMostComponents = 4;
+constexpr std::uint64_t kMaxBlocks = 1 << 24;
+constexpr unsigned kMaxComponents = 4;
 
 // More bytes than these after the last block of a scan are image data.
-constexpr std::size_t kMostForeignBytes = 4096;
+constexpr std::size_t kMaxForeignBytes = 4096;
 
 // The check of one file (jpeg.h).
 class Checker {
@@ -91,9 +91,9 @@ class Checker {
     progressive_ = marker == kSof2;
     height_ = payload[1] * 256u + payload[2];
     width_ = payload[3] * 256u + payload[4];
-    if (payload[5] > kMostComponents) {
+    if (payload[5] > kMaxComponents) {
       fail("damaged JPEG: it claims " + std::to_string(payload[5]) +
-           " components, and no picture has more than " + std::to_string(kMostComponents));
+           " components, and no picture has more than " + std::to_string(kMaxComponents));
     }
     components_.clear();
     h_max_ = v_max_ = 1;
@@ -111,7 +111,7 @@ class Checker {
     for (const Component& component : components_) blocks += count_blocks(component);
     // A height of 0 means that the height follows after the first scan. In such files only the markers are
     // checked.
-    walked_ = walked_ && width_ > 0 && height_ > 0 && blocks <= kMostBlocks;
+    walked_ = walked_ && width_ > 0 && height_ > 0 && blocks <= kMaxBlocks;
   }
 
   std::uint64_t count_blocks(const Component& component) const {
@@ -215,7 +215,7 @@ class Checker {
     const std::size_t begin = at_ - std::min(at_, std::size_t{(held_ - padding_) / 8});
     const bool is_scan_end = end + 1 < file_.size() && (file_[end + 1] < kRst0 || file_[end + 1] >= kSoi);
     const std::size_t foreign = end - begin;
-    if (!is_scan_end || foreign == 0 || foreign > kMostForeignBytes || are_blocks(blocks, band)) return;
+    if (!is_scan_end || foreign == 0 || foreign > kMaxForeignBytes || are_blocks(blocks, band)) return;
     at_ = end;
     held_ = padding_ = 0;
   }
@@ -232,7 +232,7 @@ class Checker {
     std::vector<Block> copies = blocks;
     for (Block& block : copies) block.component = &any;
     try {
-      for (std::size_t unit = 0; unit < 8 * kMostForeignBytes; ++unit) {
+      for (std::size_t unit = 0; unit < 8 * kMaxForeignBytes; ++unit) {
         rest.refill();
         const unsigned left = rest.held_ - rest.padding_;
         if (left < 8 && (left == 0 || rest.bits_ >> (64 - left) == (1u << left) - 1)) return unit > 0;

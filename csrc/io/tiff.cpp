@@ -14,7 +14,7 @@ constexpr unsigned kNewSubfileType = 254, kWidth = 256, kHeight = 257, kBits = 2
                    kSampleFormat = 339, kDngVersion = 50706;
 constexpr unsigned kWhiteIsZero = 0, kBlackIsZero = 1, kPalette = 3, kCmyk = 5, kOldJpeg = 6, kJpeg = 7;
 constexpr unsigned kLossyWebp = 50001, kJp2 = 34712;
-constexpr unsigned kMostEntries = 4096;
+constexpr unsigned kMaxEntries = 4096;
 
 struct Entry {
   unsigned tag = 0, type = 0;
@@ -34,7 +34,7 @@ class Directory {
     const unsigned count_bytes = big_ ? 8 : 2, entry_bytes = big_ ? 20 : 12;
     if (!has(start, count_bytes)) return;
     const std::uint64_t count = number(start, count_bytes);
-    if (count > kMostEntries) return;
+    if (count > kMaxEntries) return;
     for (std::uint64_t k = 0; k < count; ++k) {
       const std::uint64_t at = start + count_bytes + k * entry_bytes;
       if (!has(at, entry_bytes)) return;

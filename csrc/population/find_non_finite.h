@@ -8,7 +8,7 @@
 
 namespace blitzgs {
 
-constexpr int kMostCheckedColumns = 16;
+constexpr int kMaxCheckedColumns = 16;
 
 // values [length] of n columns. zero_is_bad: look for zeros instead.
 template <class T>
@@ -18,7 +18,7 @@ struct CheckedColumns {
     std::int64_t length;
     bool zero_is_bad;
   };
-  Column columns[kMostCheckedColumns];
+  Column columns[kMaxCheckedColumns];
   int n;
   std::int32_t* bad;
 };

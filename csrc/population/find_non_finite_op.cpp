@@ -22,9 +22,9 @@ Tensor find_non_finite(const std::vector<Tensor>& columns_in, const std::vector<
   backend::clear_flag(mutable_data<std::int32_t>(bad), scope.stream);
   dispatch_floating(columns[0], [&](auto zero) {
     using T = decltype(zero);
-    for (std::size_t first = 0; first < columns.size(); first += kMostCheckedColumns) {
+    for (std::size_t first = 0; first < columns.size(); first += kMaxCheckedColumns) {
       CheckedColumns<T> checked{{}, 0, mutable_data<std::int32_t>(bad)};
-      for (std::size_t c = first; c < columns.size() && checked.n < kMostCheckedColumns; ++c) {
+      for (std::size_t c = first; c < columns.size() && checked.n < kMaxCheckedColumns; ++c) {
         checked.columns[checked.n++] = {data<T>(columns[c]), columns[c].numel(), c >= columns_in.size()};
       }
       backend::check_columns(checked, scope.stream);

@@ -7,7 +7,7 @@ namespace blitzgs {
 namespace {
 
 constexpr const char* kOp = "tree_sums";
-constexpr std::int64_t kMostFeatures = 32;  // the features of a block's rows are in shared memory
+constexpr std::int64_t kMaxFeatures = 32;  // the features of a block's rows are in shared memory
 
 Tensor tree_sums(const Tensor& features_in, const Tensor& roots_in, const Tensor& nodes_in,
                  const Tensor& leaves_in, std::int64_t depth) {
@@ -20,8 +20,8 @@ Tensor tree_sums(const Tensor& features_in, const Tensor& roots_in, const Tensor
   check_dtype(kOp, "leaves", leaves_in, ScalarType::Long);
   check_shape(kOp, "leaves", leaves_in, {nodes_in.size(0)});
   const std::int64_t rows = features_in.size(0), n_features = features_in.size(1);
-  STD_TORCH_CHECK(n_features <= kMostFeatures, "blitzgs::", kOp, ": at most ", kMostFeatures,
-                  " features, got ", n_features);
+  STD_TORCH_CHECK(n_features <= kMaxFeatures, "blitzgs::", kOp, ": at most ", kMaxFeatures, " features, got ",
+                  n_features);
   STD_TORCH_CHECK(depth >= 0, "blitzgs::", kOp, ": depth must not be negative, got ", depth);
   const Tensor features = as_contiguous(features_in), roots = as_contiguous(roots_in);
   const Tensor nodes = as_contiguous(nodes_in), leaves = as_contiguous(leaves_in);

@@ -36,15 +36,15 @@ class SplatGradientReader {
 // (the stage) first. Splats that are consecutive here are consecutive in the table of each rank, too, so the
 // warp copies whole cache lines, and it issues all copies before it waits for the first. One lane per splat
 // would use only a third of the bandwidth of the links. If the splats do not fit into the stage (more than
-// 32 * kMostRuns splats, or too many splats that lie at several ranks), the lanes read them from the tables
+// 32 * kMaxRuns splats, or too many splats that lie at several ranks), the lanes read them from the tables
 // directly. Values that are the same for all lanes are kept in shared memory or computed again, because the
 // kernel has no registers left for them.
 template <>
 class SplatGradientReader<RankSplatGradients> {
   using Gradient = SplatGradient;
   static constexpr int kPieces = sizeof(Gradient) / 16;  // pieces of 16 bytes in the gradient of a splat
-  static constexpr int kMostRuns = 6;  // the stage of a warp holds up to this many runs of 32 splats
-  static constexpr int kSpare = 8;     // further slots of the stage, for splats that lie at several ranks
+  static constexpr int kMaxRuns = 6;  // the stage of a warp holds up to this many runs of 32 splats
+  static constexpr int kSpare = 8;    // further slots of the stage, for splats that lie at several ranks
 
   // The splats of one run of kPlaceSplats splats (places.h) that lie at one rank.
   struct Segment {
@@ -53,7 +53,7 @@ class SplatGradientReader<RankSplatGradients> {
     std::int32_t to;     // the slot of the first of them in the stage
   };
   __host__ __device__ static int runs_for(int n_views) {
-    return n_views < 1 ? 1 : n_views < kMostRuns ? n_views : kMostRuns;
+    return n_views < 1 ? 1 : n_views < kMaxRuns ? n_views : kMaxRuns;
   }
   __host__ __device__ static int warp_bytes(int n_runs, int n_ranks) {
     const int bytes = (32 * n_runs + kSpare + 1) * static_cast<int>(sizeof(Gradient)) + 32 * n_runs +

@@ -12,7 +12,7 @@ namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kWarps = kPrefilterThreads / 32, kMostWarpCandidates = kMostAtOnce / kWarps;
+constexpr int kWarps = kPrefilterThreads / 32, kMaxWarpCandidates = kMaxAtOnce / kWarps;
 constexpr int kBlocksPerMultiprocessor = 8;
 
 // Not inlined: the double-precision values in here would make the kernel's loop spill registers.
@@ -74,8 +74,8 @@ __global__ void __launch_bounds__(kPrefilterThreads, kBlocksPerMultiprocessor)
     prefilter_kernel(const Inputs in, const Prefiltered kept, const RunningSum before) {
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ Frustum frusta[kMaxViews];
-  __shared__ std::uint32_t listed_views[kWarps][kMostWarpCandidates];
-  __shared__ std::int32_t listed_ids[kWarps][kMostWarpCandidates];
+  __shared__ std::uint32_t listed_views[kWarps][kMaxWarpCandidates];
+  __shared__ std::int32_t listed_ids[kWarps][kMaxWarpCandidates];
   __shared__ int listed_by_warp[kWarps];
   const std::int64_t n_candidates = candidates_of(in);
   const int at_once = prefiltered_at_once(n_candidates), warp_candidates = at_once / kWarps;

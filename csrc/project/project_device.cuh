@@ -228,14 +228,14 @@ void dispatch_sh(const Inputs& in, const F& f) {
 // The rest of this file is shared by the three forward kernels (project.h).
 
 // A turn is the batch of candidates that a block of the prefilter takes at a time. A turn has between
-// kLeastAtOnce and kMostAtOnce candidates: the most that still give kTurnsWanted turns, which fill the
+// kLeastAtOnce and kMaxAtOnce candidates: the most that still give kTurnsWanted turns, which fill the
 // device.
 inline constexpr int kPrefilterThreads = 128, kPrefilterBatch = 4;
-inline constexpr int kLeastAtOnce = kPrefilterThreads * kPrefilterBatch, kMostAtOnce = 4 * kLeastAtOnce;
+inline constexpr int kLeastAtOnce = kPrefilterThreads * kPrefilterBatch, kMaxAtOnce = 4 * kLeastAtOnce;
 inline constexpr std::int64_t kTurnsWanted = 1 << 12;
 
 __host__ __device__ inline int prefiltered_at_once(std::int64_t candidates) {
-  int count = kMostAtOnce;
+  int count = kMaxAtOnce;
   while (count > kLeastAtOnce && candidates < kTurnsWanted * count) count /= 2;
   return count;
 }
@@ -243,16 +243,16 @@ __host__ __device__ inline int prefiltered_at_once(std::int64_t candidates) {
 // An upper bound on the number of turns for any number of candidates up to `candidates`.
 inline std::int64_t most_prefilter_turns(std::int64_t candidates) {
   const std::int64_t in_small = (candidates + kLeastAtOnce - 1) / kLeastAtOnce,
-                     in_large = (candidates + kMostAtOnce - 1) / kMostAtOnce;
+                     in_large = (candidates + kMaxAtOnce - 1) / kMaxAtOnce;
   return in_small < 2 * kTurnsWanted ? in_small : in_large > 2 * kTurnsWanted ? in_large : 2 * kTurnsWanted;
 }
 
-// A turn of write_splats: up to kSplatThreads Gaussians, one per thread, with at most kMostPairs pairs of a
+// A turn of write_splats: up to kSplatThreads Gaussians, one per thread, with at most kMaxPairs pairs of a
 // Gaussian and a view.
-inline constexpr int kSplatThreads = 128, kMostPairs = 512;
+inline constexpr int kSplatThreads = 128, kMaxPairs = 512;
 
 __host__ __device__ inline int projected_at_once(int n_views) {
-  return n_views > kMostPairs / kSplatThreads ? kMostPairs / n_views : kSplatThreads;
+  return n_views > kMaxPairs / kSplatThreads ? kMaxPairs / n_views : kSplatThreads;
 }
 
 // Allocates and clears the memory of a RunningSum or a TurnSums over this many turns.

@@ -48,12 +48,12 @@ constexpr std::uint16_t kNoSplat = 0xffff;
 
 // The splats of a turn in shared memory, by pair, until the block knows their positions in the output.
 struct Pending {
-  float2 means2d[kMostPairs];
-  float conics[3][kMostPairs], depths[kMostPairs], opacities[kMostPairs];
-  int2 radii[kMostPairs];
-  std::int32_t tiles[kMostPairs];
-  std::int64_t ranks[kMostPairs];
-  std::uint16_t pairs[kMostPairs];  // kMaxViews * (slot in the group) + view; kNoSplat: not a splat
+  float2 means2d[kMaxPairs];
+  float conics[3][kMaxPairs], depths[kMaxPairs], opacities[kMaxPairs];
+  int2 radii[kMaxPairs];
+  std::int32_t tiles[kMaxPairs];
+  std::int64_t ranks[kMaxPairs];
+  std::uint16_t pairs[kMaxPairs];  // kMaxViews * (slot in the group) + view; kNoSplat: not a splat
 };
 
 // Returns the number of tiles of a splat, sets *ranks to the ranks that composite some of them, and adds the

@@ -57,7 +57,7 @@ __device__ __forceinline__ void write_pixel(const ForwardArguments& args, const 
 
 // The most 16-byte zeros that a thread of forward_kernel writes. If there are too few tiles for this, a
 // memset clears the gradients.
-constexpr int kMostZeros = 16;
+constexpr int kMaxZeros = 16;
 constexpr int kQuads = kSplatGradient / 4;  // 16-byte zeros per splat
 
 // Sets this block's part of the splats' gradients to zero for the backward pass. Compositing is bound by
@@ -152,7 +152,7 @@ void zero_gradients(const RasterizeOutput<float>& out, std::int64_t n_splats, Cu
 
 void launch_forward(ForwardArguments args, CudaStream stream) {
   const auto tiles = static_cast<unsigned>(args.out.clear_rest ? args.grid.count() : args.order.n_tiles);
-  if (kQuads * args.zero_splats > tiles * std::int64_t{kMostZeros * Tile::kThreads}) {
+  if (kQuads * args.zero_splats > tiles * std::int64_t{kMaxZeros * Tile::kThreads}) {
     zero_gradients(args.out, args.zero_splats, stream);
     args.zero_splats = 0;
   }

@@ -11,7 +11,7 @@
 
 namespace blitzgs {
 
-constexpr int kMostGatheredColumns = 8;
+constexpr int kMaxGatheredColumns = 8;
 
 struct GatheredColumn {
   const std::uint32_t* from;
@@ -25,7 +25,7 @@ struct GatherRows {
   std::int64_t n;
   const std::int64_t* known;
   int n_columns;
-  GatheredColumn columns[kMostGatheredColumns];
+  GatheredColumn columns[kMaxGatheredColumns];
 };
 
 namespace BLITZGS_BACKEND {

@@ -41,8 +41,8 @@ std::vector<std::int64_t> shape_with(const Tensor& column, std::int64_t rows) {
 std::vector<Tensor> gathered_rows(const char* op, const std::vector<Tensor>& columns,
                                   const std::vector<Tensor>& joined, const Tensor& ids,
                                   const std::int64_t* known) {
-  STD_TORCH_CHECK(columns.size() + joined.size() <= kMostGatheredColumns, "blitzgs::", op, ": at most ",
-                  kMostGatheredColumns, " columns, got ", columns.size() + joined.size());
+  STD_TORCH_CHECK(columns.size() + joined.size() <= kMaxGatheredColumns, "blitzgs::", op, ": at most ",
+                  kMaxGatheredColumns, " columns, got ", columns.size() + joined.size());
   const std::int64_t n = ids.size(0);
   GatherRows gather{data<std::int32_t>(ids), n, known, 0, {}};
   std::vector<Tensor> held, found;

@@ -5,37 +5,22 @@
 //   cmake -S examples/cpp -B build-cpp -DBLITZGS_TORCH_DIR=<site-packages>/torch
 //   cmake --build build-cpp && ./build-cpp/render image.f32
 //
-// Linking libblitzgs_cpu.so registers the ops (csrc/registration.cpp lists them, with the groups of their
-// arguments). On a GPU it is libblitzgs_cuda.so, and the tensors live there.
+// Linking libblitzgs_cpu.so registers the ops; csrc/api/blitzgs.h has structs for their arguments and
+// results. On a GPU it is libblitzgs_cuda.so, and the tensors live there.
 #include <torch/csrc/stable/device.h>
-#include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
 
-#include <algorithm>
-#include <array>
 #include <cstdint>
 #include <cstdio>
 #include <fstream>
-#include <optional>
 #include <vector>
+
+#include "api/blitzgs.h"
 
 namespace {
 
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
-namespace abi = torch::stable::detail;
-
-constexpr std::int64_t kWidth = 128, kHeight = 96, kTileSize = 16, kViews = 1;
-
-// Calls an op that returns so many tensors.
-template <std::size_t Results, class... Arguments>
-std::array<Tensor, Results> call(const char* op, const Arguments&... arguments) {
-  std::array<StableIValue, std::max(sizeof...(Arguments), Results)> stack{abi::from(arguments)...};
-  TORCH_ERROR_CODE_CHECK(torch_call_dispatcher(op, "", stack.data(), TORCH_ABI_VERSION));
-  std::array<Tensor, Results> results;
-  for (std::size_t i = 0; i < Results; ++i) results[i] = abi::to<Tensor>(stack[i]);
-  return results;
-}
 
 // A view of numbers that live elsewhere.
 Tensor tensor_of(std::vector<float>& values, const std::vector<std::int64_t>& shape) {
@@ -60,29 +45,20 @@ int main(int argc, char** argv) {
   std::vector<float> viewmat{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
   std::vector<float> K{100, 0, 64, 0, 100, 48, 0, 0, 1};
 
-  const std::vector<Tensor> gaussians{tensor_of(means, {3, 3}), tensor_of(quats, {3, 4}),
-                                      tensor_of(scales, {3, 3}), tensor_of(opacities, {3}),
-                                      tensor_of(sh, {3, 1, 3})};
-  const std::vector<Tensor> cameras{tensor_of(viewmat, {1, 4, 4}), tensor_of(K, {1, 3, 3})};
-  const std::vector<std::int64_t> ints{kWidth,   kHeight, kTileSize, /*sh_degree=*/0, /*antialiased=*/0,
-                                       /*raw=*/0};
-  const std::vector<double> floats{/*near=*/0.01, /*far=*/1e10, /*eps2d=*/0.3, /*radius_clip=*/0.0};
-  const std::vector<Tensor> everywhere;  // no list of active Gaussians: all of them
-  const std::vector<std::int64_t> no_ranks, no_capacity;
-  const auto rows = call<14>("blitzgs::project_fwd", gaussians, cameras, everywhere, ints, floats, no_ranks,
-                             no_capacity, std::nullopt, std::nullopt);
-  const Tensor &camera_ids = rows[1], &visible_ids = rows[2], &means2d = rows[4], &conics = rows[5],
-               &depths = rows[6], &alphas = rows[7], &colors = rows[8];
+  const blitzgs::api::Gaussians gaussians{
+      .means = tensor_of(means, {3, 3}),
+      .quats = tensor_of(quats, {3, 4}),
+      .scales = tensor_of(scales, {3, 3}),
+      .opacities = tensor_of(opacities, {3}),
+      .sh = tensor_of(sh, {3, 1, 3}),
+  };
+  const blitzgs::api::Cameras cameras{.viewmats = tensor_of(viewmat, {1, 4, 4}),
+                                      .Ks = tensor_of(K, {1, 3, 3})};
+  const blitzgs::api::TileGrid grid{.n_cameras = 1, .width = 128, .height = 96};
+  const auto splats = blitzgs::api::project(gaussians, cameras, {.width = grid.width, .height = grid.height});
+  const auto lists = blitzgs::api::intersect(splats, grid);
+  const Tensor image = blitzgs::api::rasterize(splats, splats.colors, lists, grid).renders;
 
-  constexpr std::int64_t kFirstTile = 0, kAllTiles = -1, kCountThem = -1;
-  const std::vector<std::int64_t> grid{kViews, kWidth, kHeight, kTileSize, kFirstTile, kAllTiles};
-  const auto lists = call<2>("blitzgs::intersect", means2d, conics, alphas, depths, camera_ids, std::nullopt,
-                             grid, kCountThem, std::nullopt, /*unchecked=*/false);
-  const auto images =
-      call<7>("blitzgs::rasterize_fwd", means2d, conics, alphas, colors, std::nullopt, lists[0], lists[1],
-              grid, /*clear_rest=*/true, /*backward_follows=*/false, std::nullopt);
-
-  const Tensor& image = images[0];
   std::ofstream file(argv[1], std::ios::binary);
   file.write(static_cast<const char*>(image.const_data_ptr()), image.numel() * sizeof(float));
   file.close();
@@ -90,6 +66,6 @@ int main(int argc, char** argv) {
     std::fprintf(stderr, "%s cannot be written\n", argv[1]);
     return 1;
   }
-  std::printf("%lld of 3 Gaussians visible\n", static_cast<long long>(visible_ids.size(0)));
+  std::printf("%lld of 3 Gaussians visible\n", static_cast<long long>(splats.visible_ids.size(0)));
   return 0;
 }

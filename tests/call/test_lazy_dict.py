@@ -8,7 +8,7 @@ import pickle
 import pytest
 from torch.utils._pytree import tree_map
 
-from blitzgs.call.lazy_dict import LateMapping, Later, LazyDict
+from blitzgs.call.meta import LateMapping, Later, LazyDict
 
 PLAIN = {"image": 1, "ids": [2, 3], "mask": None}
 READERS = {
@@ -82,14 +82,6 @@ def test_values_may_be_replaced_and_deleted():
     assert values.pop("mask", None) is None and values.setdefault("mask", 6) == 6
     with pytest.raises(KeyError):
         values["radii"]
-
-
-def test_a_changed_value_is_computed_when_it_is_read():
-    values, computed = lazy()
-    values.change("ids", lambda ids: [*ids, 4])
-    values.change("image", lambda image: image + 1)
-    assert computed == []
-    assert values["ids"] == [2, 3, 4] and values["image"] == 2 and computed == ["ids"]
 
 
 LATE_READERS = (

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from blitzgs.frame.capacity import CapacityEstimate
-from blitzgs.frame.run import MOST_ATTEMPTS, run
+from blitzgs.frame.run import MAX_ATTEMPTS, run
 from blitzgs.ops.projection_types import Sizes
 
 
@@ -47,9 +47,9 @@ def test_the_next_attempt_gets_the_sizes_the_last_one_needed():
 
 def test_attempts_are_bounded_when_the_needed_size_grows():
     transport = NeedsMemory(lambda count: Sizes(1, 10**count, 1))
-    with pytest.raises(RuntimeError, match=f"{MOST_ATTEMPTS} attempts .* needs \\(1, 10000, 1, 0\\)"):
+    with pytest.raises(RuntimeError, match=f"{MAX_ATTEMPTS} attempts .* needs \\(1, 10000, 1, 0\\)"):
         run(transport, lambda sizes: None, None, lambda exchange: None)
-    assert len(transport.given) == MOST_ATTEMPTS
+    assert len(transport.given) == MAX_ATTEMPTS
 
 
 def test_an_attempt_that_fails_leaves_the_estimate():

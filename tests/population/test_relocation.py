@@ -11,7 +11,7 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.counter_random import hash_keys
 from blitzgs.population.density import DensityRules
-from blitzgs.population.relocation import MOST_COPIES, draw, relocate, shared
+from blitzgs.population.relocation import MAX_COPIES, draw, relocate, shared
 from blitzgs.spawn.lineage import Cause
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from tests.distributed.rank_harness import run_ranks
@@ -33,7 +33,7 @@ def by_the_double_sum(opacity: float, copies: int) -> tuple[float, float]:
     return new, opacity / float(total)
 
 
-@pytest.mark.parametrize("copies", [1, 2, 3, 7, 20, MOST_COPIES])
+@pytest.mark.parametrize("copies", [1, 2, 3, 7, 20, MAX_COPIES])
 def test_the_closed_form_is_the_paper_s_double_sum(copies):
     opacities = torch.tensor([0.006, 0.1, 0.5, 0.9, 0.99, 0.999999], dtype=torch.float64)
     scales = torch.randn(len(opacities), 3, dtype=torch.float64)
@@ -45,8 +45,8 @@ def test_the_closed_form_is_the_paper_s_double_sum(copies):
 
 
 def test_the_copies_of_other_rows_change_no_bit():
-    copies = torch.arange(1, MOST_COPIES + 1)
-    opacities, scales = torch.linspace(-6, 9, MOST_COPIES), torch.zeros(MOST_COPIES, 3)
+    copies = torch.arange(1, MAX_COPIES + 1)
+    opacities, scales = torch.linspace(-6, 9, MAX_COPIES), torch.zeros(MAX_COPIES, 3)
     together = shared(opacities, scales, copies)
     for i, count in enumerate(copies.tolist()):
         alone = shared(opacities, scales, torch.full_like(copies, count))
@@ -82,7 +82,7 @@ def test_draws_follow_the_weights_and_are_as_many_as_asked():
     assert draw(weights, 0, ids, SEED, 0, Ranks()).sum() == 0
     assert draw(torch.zeros_like(weights), 60, ids, SEED, 0, Ranks()).sum() == 0
     alone = draw(torch.tensor([5, 0]), 1000, torch.tensor([1, 2]), SEED, 0, Ranks())
-    assert alone.tolist() == [MOST_COPIES - 1, 0]
+    assert alone.tolist() == [MAX_COPIES - 1, 0]
 
 
 @pytest.mark.parametrize(("growth", "cap"), [(0.0, None), (0.05, None), (0.5, 450), (0.5, 100)])

@@ -69,7 +69,8 @@ def test_flights_cover_the_city_above_its_towers(name):
     assert len(views) == options.views and len({v.name for v in views}) == options.views
     assert flight_height(options) > 1.3 * tower_height(Plan(options))
     headings = set()
-    line = np.linspace(-0.5, 0.5, 9) * options.extent
+    # Without oblique views, the images end a little before the edge.
+    line = np.linspace(-0.5, 0.5, 9) * (1 if options.oblique > 0 else 0.9) * options.extent
     spots = np.stack([a.ravel() for a in np.meshgrid(line, line)], 1)
     seen = np.zeros(len(spots), int)
     for view in views:
@@ -83,8 +84,8 @@ def test_flights_cover_the_city_above_its_towers(name):
             headings.add(round(np.degrees(np.arctan2(*tilted)) / 90) % 4)
         pixels, depth = view.project(np.pad(spots, ((0, 0), (0, 1))))
         seen += (depth > 0) & ((pixels > 0) & (pixels < (view.width, view.height))).all(1)
-    assert headings == {0, 1, 2, 3}
-    assert seen.min() >= 4
+    assert headings == ({0, 1, 2, 3} if options.oblique > 0 else set())
+    assert seen.min() >= (4 if options.oblique > 0 else 1)
 
 
 def test_no_group_of_points_in_view_is_passed_over():

@@ -60,7 +60,7 @@ def test_the_share_of_the_time_is_small(tmp_path, monkeypatch, cost):
         now[0] += 1.0
         state.stepped(step, 0)
         watched.after(step, step + 1)
-    assert sum(spent) <= max(0.01 * 1000, glances.MOST_VIEWS * cost * 0.1) and spent
+    assert sum(spent) <= max(0.01 * 1000, glances.MAX_VIEWS * cost * 0.1) and spent
 
 
 def test_a_lost_held_out_photograph_ends_the_glances_alone(tmp_path, monkeypatch):

@@ -22,7 +22,7 @@ from blitzgs.runs import files as run_files
 from blitzgs.runs.folder import open_run
 from blitzgs.runs.guard import NonFiniteError
 from blitzgs.spawn.lineage_parts import read_lineage
-from blitzgs.training.agreement import MOST_STEPS, Agreement, SaveClock, StopRequest
+from blitzgs.training.agreement import MAX_STEPS, Agreement, SaveClock, StopRequest
 from blitzgs.training.events import save
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
@@ -164,7 +164,7 @@ def test_ranks_agree_after_the_same_step_and_slow_steps_do_not_wait(seconds, mos
 def _agreements_within(ranks, seconds, most, late):
     from blitzgs.training import agreement
 
-    agreement.MOST_SECONDS = most
+    agreement.MAX_SECONDS = most
     return _agreements(ranks, seconds, late)
 
 
@@ -187,7 +187,7 @@ def test_a_lost_photograph_ends_the_run_in_time(monkeypatch, late):
             now[0] += 1.0 if step < slow else 0.001
             if agreement.after(step, lost=step >= at).lost:
                 break
-        assert at <= step < at + MOST_STEPS + late
+        assert at <= step < at + MAX_STEPS + late
 
 
 # What is written a step later on CUDA.

@@ -33,7 +33,7 @@ COUNT = 2400
 # numbers is 4.4 times their deviation; the rest of the factor is for the rounding of gradients and moments.
 WALK, LARGEST = 2.0**-24, 8
 # Largest growth of the memory of host and GPU, in bytes, from a fifth of the run to its end.
-MOST_GROWTH = 8_000_000, 1_000_000
+MAX_GROWTH = 8_000_000, 1_000_000
 
 
 def carpet(count, seed):
@@ -181,4 +181,4 @@ def test_a_long_run_stays_with_dense_adam_and_needs_no_more_memory(tmp_path, dev
     difference = (shown[0] - shown[1]).abs()
     # A Gaussian whose alpha is close to the cut-off of 1/255 at a pixel may be in one picture alone.
     assert difference.max() < 1 / 255 and (difference > 1e-3).float().mean() < 1e-3
-    assert all(grown <= most for grown, most in zip(growth, MOST_GROWTH, strict=True))
+    assert all(grown <= most for grown, most in zip(growth, MAX_GROWTH, strict=True))

@@ -50,7 +50,7 @@ def test_check_prints_a_block_and_stops(data, capsys, tmp_path, monkeypatch):
     assert lines["photographs"] == "8 used: 7 to train, 1 held out"
     assert lines["held out"].startswith("every 8th view by name: 00.png")
     assert lines["sizes"] == f"{WIDTH} x {HEIGHT} pixels" and lines["masks"] == lines["alpha"] == "none"
-    assert lines["points"].startswith("400, mean colour") and "near plane" in lines["extent"]
+    assert lines["points"].startswith("400 of ") and "near plane" in lines["extent"]
     assert "Gaussians at most" in lines["training"] and "minutes" in lines["training"]
 
 

@@ -170,6 +170,13 @@ def test_photograph_and_render_are_compared(studio, browser):
     for kind in ("wipe", "side by side", "error"):
         assert np.abs(pictures[kind] - pictures["off"]).mean() > 1, kind
     visitor.change(comparison="off")
+    settled(studio)
+    before = picture(browser)
+    studio.page.exhibit.exposures[0] = np.array([[0.5, 0.5, 0.5], [0.0, 0.0, 0.0]])
+    visitor.change(exposure=True)
+    settled(studio)
+    assert picture(browser).mean() < before.mean()
+    visitor.change(exposure=False)
 
 
 @needs_chromium

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from torch import Tensor
 
 from blitzgs.frame.capacity import CapacityEstimate
-from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.protocol import Arrived, ExchangeResult, Mark, unmarked
 from blitzgs.ops.host import HostCopy
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes
+
+if TYPE_CHECKING:
+    from blitzgs.frame.tiles import TileAssignment
 
 
 class LocalTransport:

@@ -18,14 +18,16 @@ each have one transport; `way_back` returns the gradients for the latter two.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from torch import Tensor
 
-from blitzgs.frame.capacity import CapacityEstimate
-from blitzgs.frame.tiles import TileAssignment
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, Sizes, Splats
-from blitzgs.ops.splat_gradients import SplatGradients
+
+if TYPE_CHECKING:
+    from blitzgs.frame.capacity import CapacityEstimate
+    from blitzgs.frame.tiles import TileAssignment
+    from blitzgs.ops.splat_gradients import SplatGradients
 
 # Called at the end of each stage of a step with the stage's name, for benchmarks.
 Mark = Callable[[str], None]

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What BlitzGS uses of torch beyond its public interface, each behind one function.
+
+Every use must work with each version of torch that pyproject.toml admits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+# A context in which autograd records nothing, as in `torch.no_grad`, in less of the host's time.
+below_autograd = torch._C._AutoDispatchBelowAutograd
+
+
+def current_stream_numbers(device_index: int) -> tuple[int, int, int]:
+    """Return (id, device index, device type) of the current stream of a CUDA device; -1: the current one."""
+    numbers: tuple[int, int, int] = torch._C._cuda_getCurrentStream(device_index)
+    return numbers
+
+
+def saved_tensors_are_hooked() -> bool:
+    """Tell whether hooks on saved tensors are active, as in checkpointing."""
+    return torch._C._autograd._top_saved_tensors_default_hooks(True) is not None
+
+
+def func_transforms_are_active() -> bool:
+    """Tell whether the caller is inside a transform of `torch.func`."""
+    return bool(torch._C._are_functorch_transforms_active())
+
+
+def refusing_derivatives(
+    message: str, tensors: Sequence[Tensor], inputs: Sequence[Tensor]
+) -> tuple[Tensor, ...]:
+    """Return tensors that depend on `inputs` in autograd's graph, where a backward pass raises an error."""
+    refuse = torch._C._functions.DelayedError(message.encode(), len(tensors) + len(inputs))
+    return tuple(refuse(*tensors, *inputs)[: len(tensors)])
+
+
+def base_of(view: Tensor) -> Tensor | None:
+    """Return the tensor of which autograd knows `view` to be a view; None: of none."""
+    return view._base
+
+
+def raw_indices(table: Tensor) -> Tensor:
+    """Return the indices of a sparse tensor whether it is coalesced or not."""
+    return table._indices()
+
+
+def raw_values(table: Tensor) -> Tensor:
+    """Return the values of a sparse tensor whether it is coalesced or not."""
+    return table._values()
+
+
+def register_mapping(kind: type, copy: Callable[[dict[str, Any]], Any]) -> None:
+    """Let `tree_map` visit the values of a mapping; `copy` makes the results of a dict of them."""
+    pytree.register_pytree_node(
+        kind,
+        lambda values: (list(values.values()), list(values)),
+        lambda values, keys: copy(dict(zip(keys, values, strict=True))),
+    )
