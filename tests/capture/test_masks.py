@@ -204,3 +204,12 @@ def test_a_photograph_is_not_taken_for_its_own_mask(tmp_path):
     cv2.imwrite(str(tmp_path / "capture" / "masks" / "a.png"), np.ones((4, 4), dtype=np.uint8))
     found = find_masks(tmp_path / "capture", None, [photo], [None])
     assert found == [tmp_path / "capture" / "masks" / "a.png"]
+
+
+def test_labels_of_16_bits_are_not_black(tmp_path):
+    write_capture(tmp_path, ["v00.jpg"], width=64, height=48)
+    mask = np.zeros((48, 64), dtype=np.uint16)
+    mask[:, 17:] = 1
+    (tmp_path / "masks").mkdir()
+    cv2.imwrite(str(tmp_path / "masks" / "v00.png"), mask)
+    np.testing.assert_array_equal(ImageStore(load_capture(tmp_path)).mask(0).numpy(), mask)
