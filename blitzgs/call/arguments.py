@@ -147,11 +147,13 @@ def check_further(
         if name not in defaults:
             raise TypeError(f"{function}() got an unexpected keyword argument {name!r}")
         default = defaults[name]
-        # gsplat's RollingShutterType.GLOBAL, an enumeration that only gsplat has.
-        shutter_is_global = name == "rolling_shutter" and getattr(value, "name", value) == "GLOBAL"
+        # Defaults of types that only gsplat has: RollingShutterType.GLOBAL, and RendererConfig_MixedBatch().
+        foreign = name == "rolling_shutter" and getattr(value, "name", value) == "GLOBAL"
+        foreign |= name == "renderer_config" and type(value).__name__ == "RendererConfig_MixedBatch"
         is_default = value is default or (isinstance(value, str) and value == default)
-        if not (value is None or is_default or default is _ANY or shutter_is_global):
-            raise ValueError(f"blitzgs.{function} does not support {name}={value!r}; leave it out")
+        if not (value is None or is_default or default is _ANY or foreign):
+            shown = f"a tensor {list(value.shape)}" if isinstance(value, Tensor) else repr(value)
+            raise ValueError(f"blitzgs.{function} does not support {name}={shown}; leave it out")
 
 
 def check_options(

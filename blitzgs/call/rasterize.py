@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from blitzgs.call.arguments import (
@@ -22,6 +23,9 @@ from blitzgs.call.queued import ImageOptions
 from blitzgs.call.ranks import gather_views
 from blitzgs.ops.projection_types import ProjectionOptions
 from blitzgs.util.memory import explaining_memory
+
+# Colours of networks under autocast, and of SH tables in half precision.
+_HALF = (torch.float16, torch.bfloat16)
 
 
 def rasterization(
@@ -71,7 +75,8 @@ def rasterization(
         opacities: [..., N] in [0, 1] (after the sigmoid).
         colors: with `sh_degree`, SH coefficients [..., N, K, 3], or per view [..., C, N, K, 3], which is
             slower; otherwise values of 1 to 4096 channels (a rendered depth counts), [..., N, D] or per view
-            [..., C, N, D]. May be None for the render modes D and ED.
+            [..., C, N, D]. May be None for the render modes D and ED. float16 and bfloat16 are computed in
+            the dtype of `means`.
         viewmats: [..., C, 4, 4] world to camera, a rotation and a translation.
         Ks: [..., C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1, which is
             checked on the CPU. They get no gradient.
@@ -135,6 +140,8 @@ def rasterization(
         width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, render_mode,
         rasterize_mode, camera_model,
     )  # fmt: skip
+    if isinstance(colors, Tensor) and colors.dtype in _HALF and isinstance(means, Tensor):
+        colors = colors.to(means.dtype)
     required: dict[str, object] = {"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks}
     if covars is None:
         required |= {"quats": quats, "scales": scales}

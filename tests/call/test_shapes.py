@@ -240,6 +240,10 @@ class RollingShutterType(enum.Enum):
     GLOBAL = 4
 
 
+class RendererConfig_MixedBatch:  # noqa: N801
+    """As gsplat's main branch has it."""
+
+
 DEFAULTS = {
     "packed": True,
     "tile_size": None,
@@ -256,7 +260,24 @@ DEFAULTS = {
     "rolling_shutter": RollingShutterType.GLOBAL,
     "viewmats_rs": None,
     "extra_signals": None,
+    "renderer_config": RendererConfig_MixedBatch(),
 }
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_colours_in_half_precision_are_those_in_single(dtype):
+    scene = random_scene(n=40)
+    arguments = list(scene.arguments())
+    half = arguments[4].to(dtype).requires_grad_()
+    single = half.detach().float().requires_grad_()
+    images = []
+    for colors in (half, single):
+        arguments[4] = colors
+        renders = blitzgs.rasterization(*arguments, sh_degree=scene.sh_degree)[0]
+        renders.square().sum().backward()
+        images.append(renders)
+    assert torch.equal(*images)
+    assert torch.equal(half.grad, single.grad.to(dtype))
 
 
 def test_the_defaults_of_gsplat_are_accepted():
@@ -283,7 +304,7 @@ def test_an_argument_that_gsplat_has_not_is_refused(value):
             {"rolling_shutter": RollingShutterType.ROLLING_TOP_TO_BOTTOM},
             "does not support rolling_shutter=<RollingShutterType.ROLLING_TOP_TO_BOTTOM",
         ),
-        ({"radial_coeffs": torch.zeros(1)}, "does not support radial_coeffs="),
+        ({"radial_coeffs": torch.zeros(1)}, r"does not support radial_coeffs=a tensor \[1\]; leave it out"),
         ({"covars": torch.zeros(4, 6)}, r"covars must be \[..., N, 3, 3\] = \[4, 3, 3\], got \[4, 6\]"),
         ({"render_mode": "N"}, "render_mode must be one of"),
         ({"rasterize_mode": "fast"}, "rasterize_mode must be"),
@@ -372,7 +393,7 @@ def test_an_array_of_another_library_is_refused_by_name():
     ("changes", "error", "message"),
     [
         ({"Ks": torch.Tensor.double}, ValueError, "Ks is torch.float64 and means torch.float32; convert Ks"),
-        ({"colors": torch.Tensor.half}, ValueError, "colors is torch.float16 and means torch.float32"),
+        ({"colors": torch.Tensor.double}, ValueError, "colors is torch.float64 and means torch.float32"),
         ({"means": torch.Tensor.half}, TypeError, "means must be float32 or float64, got torch.float16"),
         ({"means": torch.Tensor.long}, TypeError, "means must be float32 or float64, got torch.int64"),
         ({"width": lambda _: 64.5}, TypeError, "width must be a whole number, got 64.5"),
