@@ -11,13 +11,10 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-
-from blitzgs.util.output import write_file
 
 Array = npt.NDArray[np.float64]
 # From a camera with the axes right, down, forward to one with right, up, backward.
@@ -150,12 +147,6 @@ def from_json(text: str) -> CameraPath:
         )
     except (LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
         raise ValueError(f"this is no camera path in the layout of nerfstudio: {error}") from error
-
-
-def save_path(file: Path, path: CameraPath) -> None:
-    """Write a path."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    write_file(file, to_json(path))
 
 
 def _rows(key: Keyframe) -> list[float]:
