@@ -63,3 +63,8 @@ def register_mapping(kind: type, copy: Callable[[dict[str, Any]], Any]) -> None:
         lambda values: (list(values.values()), list(values)),
         lambda values, keys: copy(dict(zip(keys, values, strict=True))),
     )
+
+
+def mark_coalesced(table: Tensor) -> None:
+    """Note on a sparse tensor that its indices ascend and are distinct."""
+    table._coalesced_(True)

@@ -25,7 +25,7 @@ class AdamState(NamedTuple):
     """The optimiser's state of a table of N rows, as the ops that move parameters take it.
 
     Attributes:
-        params: (means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3]).
+        params: (means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3]), or one parameter.
         exp_avgs: first moments, shaped like `params`.
         exp_avg_sqs: second moments, shaped like `params`.
         last_step: int32 [N], the step that each row's parameters stand at.
@@ -40,12 +40,11 @@ class AdamState(NamedTuple):
 
     @classmethod
     def alone(cls, param: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, *steps: Tensor) -> AdamState:
-        """Return the state of a single parameter [N, ...]: it takes the place of SH, without other columns.
+        """Return the state of a single parameter [N, ...], of any width.
 
         Its learning rates are those of SH: one for the first three values of a row, one for the rest.
         """
-        none = [param.new_empty(len(param), 0)] * 4
-        return cls([*none, param], [*none, exp_avg], [*none, exp_avg_sq], *steps)
+        return cls([param], [exp_avg], [exp_avg_sq], *steps)
 
     @property
     def tensors(self) -> list[Tensor]:
@@ -120,10 +119,8 @@ class AdamSchedule(AdamTables):
 class GrowingSchedule(AdamTables):
     """The tables of one parameter whose learning rates become known step by step.
 
-    A row without a gradient moves between step p and step s by a sum over the steps between them. Each new
-    step therefore adds its term to the table rows of earlier steps; those before the last `explicit_steps`
-    need no term, because moments of that age have decayed below rounding. The tables have a fixed length.
-    Their rows, and the optimiser's columns of steps, count from `begin`.
+    `lazy_adam_step_` enters the learning rates of each step. The tables have a fixed length. Their rows, and
+    the optimiser's columns of steps, count from `begin`.
 
     Attributes:
         begin: number of steps taken before the tables begin, with which all rows must be up to date.
@@ -144,23 +141,8 @@ class GrowingSchedule(AdamTables):
         self.betas, self.eps = betas, eps
         self.explicit_steps = explicit_steps(*betas, dtype)
         self.begin = self.last = self.current = begin
-        table = table_without_rates(self.LENGTH + 1, *betas, begin)
-        # The terms that a step with learning rate 1 adds to the rows of earlier steps, for each column of the
-        # table: whole rows are added, because they are contiguous.
-        first, second = table[:, CORRECTION1], table[:, CORRECTION2]
-        shares = torch.zeros_like(table)
-        decays = torch.zeros(self.explicit_steps, _COLUMNS, dtype=torch.float64, device="cpu")
-        ratio, root = betas[0] / math.sqrt(betas[1]), math.sqrt(betas[1])
-        distances = torch.arange(self.explicit_steps, 0, -1, dtype=torch.float64, device="cpu")
-        for order in range(ORDERS):
-            columns = slice(order * GROUPS, (order + 1) * GROUPS)
-            shares[:, columns] = (first * second ** (order - 1))[:, None]
-            decays[:, columns] = ((ratio * root**order) ** distances)[:, None]
-        is_rest = torch.arange(_COLUMNS, device="cpu") % GROUPS == GROUPS - 1
-        self._shares, self._decays = shares.to(device), decays.to(device)
-        self._groups = [mask.to(device, torch.float64) for mask in (~is_rest, is_rest)]
         rates = torch.zeros(self.LENGTH + 1, GROUPS, dtype=torch.float32, device=device)
-        self.tables = [table.to(device), rates]
+        self.tables = [table_without_rates(self.LENGTH + 1, *betas, begin).to(device), rates]
 
     @property
     def row(self) -> int:
@@ -171,38 +153,15 @@ class GrowingSchedule(AdamTables):
         """Tell whether no further step fits."""
         return self.row >= self.LENGTH
 
-    def add(self, rate: float, rest: float) -> None:
-        """Add a step, with learning rates of the first three values of a row and of the rest.
-
-        Nothing is copied to the device.
-        """
-        self.last += 1
-        row, (table, rates) = self.row, self.tables
-        reach = min(row, self.explicit_steps)
-        rate, rest = (float(np.float32(value)) for value in (rate, rest))  # rounded as in `rates`
-        # narrow and select take less of the host's time than indexing.
-        rows, own = table.narrow(0, row - reach, reach), rates.select(0, row)
-        decays, share = (
-            self._decays.narrow(0, self.explicit_steps - reach, reach),
-            self._shares.select(0, row),
-        )
-        own.fill_(rate)
-        if rate == rest:
-            rows.addcmul_(decays, share, value=rate)
-            return
-        # A parameter alone is in the column of SH, whose groups are the last two (`AdamState.alone`).
-        own.narrow(0, GROUPS - 1, 1).fill_(rest)
-        for group, value in zip(self._groups, (rate, rest), strict=True):
-            rows.addcmul_(decays, share * group, value=value)
-
 
 def lazy_adam_step_(
     state: AdamState,
     schedule: AdamTables,
     step: int,
     grads: Sequence[Tensor],
-    ids: Tensor,
+    ids: Tensor | None,
     current: bool = False,
+    rates: Sequence[float] = (),
 ) -> None:
     """Take Adam step ``step`` for the rows `ids`, in place, after the zero-gradient steps they skipped.
 
@@ -215,15 +174,17 @@ def lazy_adam_step_(
         schedule: of S steps, for the dtype of the parameters.
         step: 1 <= step <= S.
         grads: gradients of the listed rows, shaped like the parameters with U rows.
-        ids: int32 [U], the rows, each once.
+        ids: int32 [U], the rows, each once; None: all.
         current: the parameters of these rows are at ``step`` - 1, so that none has to catch up.
+        rates: for a `GrowingSchedule`, the learning rates of ``step`` to enter into its tables: of the first
+            three values of a row, and of the rest.
 
     Raises:
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
     with below_autograd():
         torch.ops.blitzgs.lazy_adam_step_(
-            state.tensors, schedule.tables, *schedule.constants(step), list(grads), ids, current
+            state.tensors, schedule.tables, *schedule.constants(step), list(grads), ids, current, list(rates)
         )
 
 

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
-from blitzgs._torch import raw_indices, raw_values
+from blitzgs._torch import mark_coalesced, raw_indices, raw_values
 
 
 def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
@@ -53,16 +54,41 @@ def full_gradients(
     ]
 
 
+class KeptMarks:
+    """Keeps the mark that a parameter's sparse gradient is coalesced, which autograd loses as it stores it.
+
+    Without the mark, an optimiser has to look at all rows, for which the host waits on CUDA.
+    """
+
+    def __init__(self) -> None:
+        self._parameters = WeakTensorKeyDictionary()
+
+    def of(self, param: Tensor) -> None:
+        """Keep the marks of the gradients that `param`, a leaf, will receive."""
+        if param in self._parameters or not (param.is_leaf and param.requires_grad):
+            return
+        arriving = [-1]
+
+        def look(gradient: Tensor) -> None:
+            whole = gradient.is_sparse and gradient.is_coalesced()
+            arriving[0] = gradient._nnz() if whole else -1
+
+        def mark(param: Tensor) -> None:
+            gradient = param.grad
+            # Torch appends the rows of a second gradient to those of the first.
+            if gradient is not None and gradient.is_sparse and gradient._nnz() == arriving[0]:
+                mark_coalesced(gradient)
+
+        param.register_hook(look)
+        param.register_post_accumulate_grad_hook(mark)
+        self._parameters[param] = True
+
+
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
     """Return the rows int64 [U], each once, and the values [U, ...] of a sparse tensor.
-
-    Autograd loses the mark that a gradient is coalesced. Rows that ascend are not sorted again: to look at
-    them costs far less, though on CUDA the host waits for it.
 
     Args:
         table: a tensor whose only sparse dimension is the first.
     """
-    rows = raw_indices(table)[0]
-    if not table.is_coalesced() and not bool((rows[1:] > rows[:-1]).all()):
-        table = table.coalesce()
+    table = table.coalesce()
     return raw_indices(table)[0], raw_values(table)

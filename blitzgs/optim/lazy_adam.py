@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from blitzgs.ops.lazy_adam import AdamState, GrowingSchedule, lazy_adam_catch_up_, lazy_adam_step_
-from blitzgs.ops.sparse_rows import distinct_rows
+from blitzgs.ops.sparse_rows import KeptMarks, distinct_rows
 from blitzgs.optim.lazy_adam_checks import (
     MOMENTS,
     check_group,
@@ -105,10 +105,12 @@ class LazyAdam(torch.optim.Optimizer):
             "differentiable": differentiable, "fused": fused,
             "decoupled_weight_decay": decoupled_weight_decay,
         }  # fmt: skip
+        self._marks = KeptMarks()
         super().__init__(params, defaults)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
+        self._marks = KeptMarks()
         for group in self.param_groups:
             group.setdefault(_SCHEDULES, {})
             for name, value in self.defaults.items():
@@ -150,24 +152,24 @@ class LazyAdam(torch.optim.Optimizer):
         """Take the step of one parameter."""
         gradient = param.grad
         assert gradient is not None
-        if not gradient.is_sparse:
-            rows, values = torch.arange(len(param), device=param.device), gradient
-        elif gradient.sparse_dim() == 1:
-            rows, values = distinct_rows(gradient)
-        else:
-            raise ValueError(
-                "LazyAdam: a sparse gradient must have whole rows (one sparse dimension), got "
-                f"{gradient.sparse_dim()} of them"
-            )
+        rows = None
+        if gradient.is_sparse:
+            if gradient.sparse_dim() != 1:
+                raise ValueError(
+                    "LazyAdam: a sparse gradient must have whole rows (one sparse dimension), got "
+                    f"{gradient.sparse_dim()} of them"
+                )
+            self._marks.of(param)
+            listed, gradient = distinct_rows(gradient)
+            rows = listed.int()
         state, schedule = self._tables_of(group, index, param)
         rate, rest = group["lr"], group["lr_rest"]
+        rates = (float(rate), float(rate if rest is None else rest))
         is_current = schedule.current == schedule.last
-        schedule.add(float(rate), float(rate if rest is None else rest))
+        schedule.last += 1
         state["step"] += 1
         if param.numel() > 0:
-            own = _alone(param, state)
-            gradients = [*own.params[:4], values]
-            lazy_adam_step_(own, schedule, schedule.row, gradients, rows.int(), is_current)
+            lazy_adam_step_(_alone(param, state), schedule, schedule.row, [gradient], rows, is_current, rates)
         # A backward pass that has saved the parameter must fail, as it does after a step of torch's Adam.
         torch.autograd.graph.increment_version(param)
 

@@ -275,7 +275,43 @@ BLITZGS_HD int adam_group(int column, std::int64_t element) {
   return column == 4 && element >= 3 ? 5 : column;
 }
 
+// Tables of a schedule whose learning rates become known step by step. The term of a step goes to the tails
+// of the explicit_steps rows before it; earlier rows need none, because moments of that age have decayed
+// below rounding.
+struct RatesArgs {
+  double* table;
+  float* lr_table;
+  std::int32_t step, explicit_steps;
+  double ratio, root;  // q_0 and sqrt(beta2)
+  float rate, rest;    // learning rates of the groups before SH rest, and of SH rest
+
+  BLITZGS_HD std::int32_t reach() const { return step < explicit_steps ? step : explicit_steps; }
+  BLITZGS_HD double ratio_of(int order) const { return ratio * std::pow(root, order); }
+};
+
+// Adds the term of a step to the tails of an order in the row `back` before it; power = ratio_of(order)^back.
+// The row before the step also notes the step's learning rates.
+BLITZGS_HD void enter_rate(const RatesArgs& args, std::int32_t back, int order, double power) {
+  const double* own = args.table + static_cast<std::int64_t>(args.step) * kAdamTable;
+  const double a = own[kCorrection2];
+  const double share = own[kCorrection1] *
+                       (order == 0   ? 1 / a
+                        : order == 1 ? 1
+                        : order == 2 ? a
+                                     : a * a) *
+                       power;
+  double* tails =
+      args.table + static_cast<std::int64_t>(args.step - back) * kAdamTable + kTails + order * kAdamGroups;
+  float* rates = args.lr_table + static_cast<std::int64_t>(args.step) * kAdamGroups;
+  for (int group = 0; group < kAdamGroups; ++group) {
+    const float rate = group == kAdamGroups - 1 ? args.rest : args.rate;
+    tails[group] += rate * share;
+    if (back == 1 && order == 0) rates[group] = rate;
+  }
+}
+
 namespace BLITZGS_BACKEND {
+void enter_rates(const RatesArgs& args, CudaStream);
 // With gradients: the listed rows catch up to step - 1 and take the step `step`; their parameters and moments
 // are then at `step`. Without gradients (column.grad null): the parameters of the listed rows catch up to
 // `step`.

@@ -79,6 +79,14 @@ void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream) {
   });
 }
 
+void enter_rates(const RatesArgs& args, CudaStream) {
+  for (int order = 0; order < kAdamOrders; ++order) {
+    const double ratio = args.ratio_of(order);
+    double power = 1;
+    for (std::int32_t back = 1; back <= args.reach(); ++back) enter_rate(args, back, order, power *= ratio);
+  }
+}
+
 template <class T>
 void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream) {
   parallel_for(0, n, 1024, [&](std::int64_t begin, std::int64_t end) {

@@ -34,6 +34,12 @@ __global__ void __launch_bounds__(kListThreads)
   if (from < n) rules[from] = final_pending_steps(args, static_cast<std::int32_t>(from));
 }
 
+__global__ void __launch_bounds__(kListThreads) enter_rates_kernel(const __grid_constant__ RatesArgs args) {
+  const int item = static_cast<int>(blockIdx.x * kListThreads + threadIdx.x);
+  const int back = item / kAdamOrders + 1, order = item % kAdamOrders;
+  if (back <= args.reach()) enter_rate(args, back, order, std::pow(args.ratio_of(order), back));
+}
+
 // Calls update<Column, Width>(local row, pack) for the packs that this thread handles in every Rows rows.
 // ShPacks: the packs in an SH row; 0: sh_packs is their number.
 template <int ShWidth, int ShPacks, int Rows, class F>
@@ -287,6 +293,11 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
   const auto kernel =
       select(args, step_kernel<4, 12, kRows>, step_kernel<1, kFewPacks, kMoreRows>, step_kernel<1, 0, kRows>);
   launch_early("lazy_adam step", kernel, {blocks_for(args.n, rows_per_block(args)), kThreads, stream}, args);
+}
+
+void enter_rates(const RatesArgs& args, CudaStream stream) {
+  enter_rates_kernel<<<blocks_for(args.reach() * kAdamOrders, kListThreads), kListThreads, 0, stream>>>(args);
+  check_launch("lazy_adam, learning rates");
 }
 
 template <class T>

@@ -6,9 +6,10 @@ namespace {
 
 void lazy_adam_step(const std::vector<Tensor>& state, const std::vector<Tensor>& tables, std::int64_t step,
                     std::int64_t explicit_steps, double beta1, double beta2, double eps,
-                    const std::vector<Tensor>& grads, const Tensor& ids, bool current) {
+                    const std::vector<Tensor>& grads, const std::optional<Tensor>& ids, bool current,
+                    const std::vector<double>& rates) {
   AdamTensors adam("lazy_adam_step_", state, tables, {step, explicit_steps, beta1, beta2, eps});
-  adam.step_rows(grads, ids, current);
+  adam.step_rows(grads, ids, current, rates);
 }
 
 void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<Tensor>& tables,

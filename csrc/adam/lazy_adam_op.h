@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The checked tensors of the optimiser's state and schedule, for all ops that move parameters.
 #pragma once
+#include <cmath>
 #include <optional>
 #include <utility>
 #include <vector>
@@ -14,7 +15,7 @@ inline constexpr const char* kAdamNames[kAdamColumns] = {"means", "quats", "scal
 
 // The number of tensors in a state: parameters, first and second moments of each column; last_step,
 // moment_step.
-inline constexpr std::size_t kAdamState = 3 * kAdamColumns + 2;
+inline constexpr std::size_t kAdamState = 3 * kAdamColumns + 2, kAloneState = 3 + 2;
 
 // What the ops that move parameters take beside tensors.
 struct AdamConstants {
@@ -23,10 +24,12 @@ struct AdamConstants {
 };
 
 // The optimiser's state of a table of Gaussians and its schedule. state: (params, exp_avgs, exp_avg_sqs,
-// last_step, moment_step), of which each of the first three is (means, quats, scales, opacities, sh); tables:
-// (table of lazy_adam.h, lr_table[, final_rules]). blitzgs/ops/lazy_adam.py builds these groups.
+// last_step, moment_step), of which each of the first three is (means, quats, scales, opacities, sh), or a
+// single parameter of any width, which takes the place of sh; tables: (table of lazy_adam.h, lr_table[,
+// final_rules]). blitzgs/ops/lazy_adam.py builds these groups.
 struct AdamTensors {
   const char* op;
+  bool alone;  // a single parameter
   std::vector<Tensor> params, exp_avgs, exp_avg_sqs;
   Tensor last_step, moment_step, table, lr_table;
   std::optional<Tensor> final_rules;
@@ -34,15 +37,16 @@ struct AdamTensors {
 
   AdamTensors(const char* op_name, const std::vector<Tensor>& state, const std::vector<Tensor>& tables,
               const AdamConstants& constants_in)
-      : op(op_name), constants(constants_in) {
-    STD_TORCH_CHECK(state.size() == kAdamState && (tables.size() == 2 || tables.size() == 3), "blitzgs::", op,
+      : op(op_name), alone(state.size() == kAloneState), constants(constants_in) {
+    STD_TORCH_CHECK((alone || state.size() == kAdamState) && (tables.size() == 2 || tables.size() == 3),
+                    "blitzgs::", op,
                     ": expected state (params, exp_avgs and exp_avg_sqs of means, quats, scales, opacities ",
-                    "and sh, last_step, moment_step) and tables (table, lr_table[, final_rules]); got ",
-                    state.size(), " and ", tables.size(), " entries");
+                    "and sh, or of one parameter, last_step, moment_step) and tables (table, lr_table[, ",
+                    "final_rules]); got ", state.size(), " and ", tables.size(), " entries");
     auto next = state.begin();
     for (std::vector<Tensor>* columns : {&params, &exp_avgs, &exp_avg_sqs}) {
-      columns->assign(next, next + kAdamColumns);
-      next += kAdamColumns;
+      columns->assign(next, next + count());
+      next += count();
     }
     last_step = *next++;
     moment_step = *next;
@@ -52,6 +56,10 @@ struct AdamTensors {
     check();
   }
 
+  // The number of columns that the state has, and the kernel's column of the first of them.
+  int count() const { return alone ? 1 : kAdamColumns; }
+  int first() const { return kAdamColumns - count(); }
+
   const Tensor& like() const { return params[0]; }
   std::int64_t rows() const { return like().size(0); }
 
@@ -60,9 +68,9 @@ struct AdamTensors {
   template <class T>
   AdamArgs<T> arguments(const std::int32_t* ids, std::int64_t n) {
     AdamArgs<T> args{};
-    for (int c = 0; c < kAdamColumns; ++c) {
-      args.columns[c] = {mutable_data<T>(params[c]), mutable_data<T>(exp_avgs[c]),
-                         mutable_data<T>(exp_avg_sqs[c]), nullptr, width(c)};
+    for (int c = 0; c < count(); ++c) {
+      args.columns[first() + c] = {mutable_data<T>(params[c]), mutable_data<T>(exp_avgs[c]),
+                                   mutable_data<T>(exp_avg_sqs[c]), nullptr, width(c)};
     }
     args.ids = ids;
     args.n = n;
@@ -84,29 +92,40 @@ struct AdamTensors {
     return args;
   }
 
-  // Takes the step for the rows `ids`, int32 [A], from a gradient [A, ...] for each column; those of empty
-  // columns are not read. current: the parameters of the rows stand at step - 1.
-  void step_rows(const std::vector<Tensor>& grads, const Tensor& ids, bool current) {
-    STD_TORCH_CHECK(grads.size() == kAdamColumns, "blitzgs::", op,
-                    ": grads must hold means, quats, scales, opacities, sh; got ", grads.size(), " tensors");
+  // Takes the step for the rows `ids`, int32 [A], or for all rows, from a gradient [A, ...] for each column.
+  // current: the parameters of the rows stand at step - 1. rates: empty, or the learning rates of the step,
+  // of the first three values of SH and of all others, which enter the tables (`RatesArgs`).
+  void step_rows(const std::vector<Tensor>& grads, const std::optional<Tensor>& ids, bool current,
+                 const std::vector<double>& rates) {
+    STD_TORCH_CHECK(std::ssize(grads) == count(), "blitzgs::", op, ": grads must hold ",
+                    alone ? "one" : "means, quats, scales, opacities, sh", "; got ", grads.size(),
+                    " tensors");
+    STD_TORCH_CHECK(rates.empty() || (rates.size() == 2 && !final_rules), "blitzgs::", op,
+                    ": rates must be empty or two numbers, for tables without final_rules");
     check_takes_step();
-    const Tensor list = checked(op, "ids", ids, ScalarType::Int, {-1});
-    const std::int64_t n = list.size(0);
+    const std::optional<Tensor> list = checked(op, "ids", ids, ScalarType::Int, {-1});
+    const std::int64_t n = list ? list->size(0) : rows();
     std::vector<Tensor> held;
-    for (int c = 0; c < kAdamColumns; ++c) {
+    for (int c = 0; c < count(); ++c) {
       const Tensor& grad = held.emplace_back(as_contiguous(grads[c]));
-      if (width(c) == 0) continue;
       check_dtype(op, "grads", grad, like().scalar_type());
       STD_TORCH_CHECK(grad.dim() >= 1 && grad.size(0) == n && grad.numel() == n * width(c), "blitzgs::", op,
-                      ": the gradient of ", kAdamNames[c], " must have ", n, " rows of ", width(c),
-                      " values, got ", shape_of(grad));
+                      ": the gradient of ", alone ? "the parameter" : kAdamNames[c], " must have ", n,
+                      " rows of ", width(c), " values, got ", shape_of(grad));
     }
     DeviceScope scope(like());
     dispatch_floating(like(), [&](auto zero) {
       using T = decltype(zero);
-      AdamArgs<T> args = arguments<T>(data<std::int32_t>(list), n);
-      for (int c = 0; c < kAdamColumns; ++c) args.columns[c].grad = data<T>(held[c]);
+      AdamArgs<T> args = arguments<T>(data_or_null<std::int32_t>(list), n);
+      for (int c = 0; c < count(); ++c) args.columns[first() + c].grad = data<T>(held[c]);
       args.current = current;
+      if (!rates.empty()) {
+        backend::enter_rates(
+            {mutable_data<double>(table), mutable_data<float>(lr_table), args.step, args.explicit_steps,
+             constants.beta1 / std::sqrt(constants.beta2), std::sqrt(constants.beta2),
+             static_cast<float>(rates[0]), static_cast<float>(rates[1])},
+            scope.stream);
+      }
       if (n > 0) backend::lazy_adam(args, scope.workspace, scope.stream);
     });
   }
@@ -120,15 +139,13 @@ struct AdamTensors {
  private:
   void check() const {
     check_floating(op, "means", like());
-    for (int c = 0; c < kAdamColumns; ++c) {
+    for (int c = 0; c < count(); ++c) {
       for (const Tensor* tensor : {&params[c], &exp_avgs[c], &exp_avg_sqs[c]}) check_column(*tensor, c);
     }
-    // A single parameter, of any width, is stepped as SH: the other columns are then empty.
-    const bool alone = params[0].numel() == 0;
     for (const auto& [c, values] : {std::pair{0, 3}, std::pair{1, 4}, std::pair{2, 3}, std::pair{3, 1}}) {
-      STD_TORCH_CHECK(params[c].numel() == (alone ? 0 : values * rows()), "blitzgs::", op, ": ",
-                      kAdamNames[c], " must have ", alone ? 0 : values, " values in each of ", rows(),
-                      " rows, got ", shape_of(params[c]));
+      STD_TORCH_CHECK(alone || params[c].numel() == values * rows(), "blitzgs::", op, ": ", kAdamNames[c],
+                      " must have ", values, " values in each of ", rows(), " rows, got ",
+                      shape_of(params[c]));
     }
     check_in_place(op, "last_step", last_step, ScalarType::Int, {rows()});
     check_in_place(op, "moment_step", moment_step, ScalarType::Int, {rows()});
@@ -140,7 +157,7 @@ struct AdamTensors {
   }
 
   void check_column(const Tensor& tensor, int column) const {
-    const char* name = kAdamNames[column];
+    const char* name = alone ? "the parameter" : kAdamNames[column];
     check_dtype(op, name, tensor, like().scalar_type());
     check_contiguous(op, name, tensor);
     STD_TORCH_CHECK(tensor.dim() >= 1 && tensor.size(0) == rows(), "blitzgs::", op, ": ", name, " must have ",

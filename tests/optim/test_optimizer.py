@@ -8,7 +8,7 @@ import pickle
 import pytest
 import torch
 
-from blitzgs.ops.lazy_adam import AdamSchedule, GrowingSchedule
+from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, GrowingSchedule, lazy_adam_step_
 from blitzgs.optim import LazyAdam
 from tests.helpers import BACKENDS, DEVICES, relative_error
 from tests.optim.adam_pair import BOUND, LR, AdamPair
@@ -489,10 +489,35 @@ def test_a_growing_schedule_has_the_sums_of_one_known_in_advance(device):
     dtype = torch.float64 if device == "cpu" else torch.float32
     known = AdamSchedule(rates, 0.9, 0.999, 1e-8, dtype=dtype)
     growing = GrowingSchedule((0.9, 0.999), 1e-8, dtype, torch.device(device), 0)
+    param = torch.zeros(1, 4, dtype=dtype, device=device)
+    steps = (torch.zeros(1, dtype=torch.int32, device=device) for _ in range(2))
+    state = AdamState.alone(param, param.clone(), param.clone(), *steps)
     for step in range(1, 400):
-        growing.add(*rates[step, 4:].tolist())
+        lazy_adam_step_(state, growing, step, [param.clone()], None, rates=rates[step, 4:].tolist())
     assert growing.explicit_steps < 399
     ours, expected = (s.tables[0][:400, :24].view(400, 4, 6)[:, :, 4:] for s in (growing, known))
     assert torch.equal(growing.tables[1][1:400, 4:], rates[1:, 4:])
     # From steps long ago, rows no longer move in float64.
     torch.testing.assert_close(ours, expected, rtol=1e-12 if device == "cpu" else 1e-5, atol=0)
+
+
+def sparse_gradient(rows: list[int]) -> torch.Tensor:
+    return torch.sparse_coo_tensor([rows], torch.ones(len(rows), 3), (8, 3), is_coalesced=True)
+
+
+def test_only_a_single_gradient_keeps_its_mark_and_all_equal_dense_adam():
+    """Two backward passes before a step give rows twice; a step must add them, whatever came before."""
+    lazy, dense = (torch.nn.Parameter(torch.zeros(8, 3)) for _ in range(2))
+    ours, torchs = LazyAdam([lazy], lr=0.1), torch.optim.Adam([dense], lr=0.1)
+    marked = []
+    for passes in ([[1, 4]], [[0, 4]], [[1, 4], [2, 4]], [[7]], [[], [3, 5]]):
+        lazy.grad, dense.grad = None, torch.zeros(8, 3)
+        for rows in passes:
+            dense.grad += sparse_gradient(rows).to_dense()
+            torch.autograd.backward(lazy, sparse_gradient(rows))
+        marked.append(lazy.grad.is_coalesced())
+        ours.step()
+        torchs.step()
+    assert marked[1:4] == [True, False, True]  # the first step sees the parameter for the first time
+    ours.catch_up()
+    torch.testing.assert_close(lazy, dense)
