@@ -126,7 +126,6 @@ class LazyAdam(torch.optim.Optimizer):
             del self.param_groups[-1]
             raise
 
-    @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """Take a step for the rows that have a gradient, which first catch up with the step before.
 
@@ -173,7 +172,6 @@ class LazyAdam(torch.optim.Optimizer):
         # A backward pass that has saved the parameter must fail, as it does after a step of torch's Adam.
         torch.autograd.graph.increment_version(param)
 
-    @torch.no_grad()
     def catch_up(
         self,
         params: Tensor | Iterable[Tensor] | None = None,
@@ -361,6 +359,7 @@ def _alone(param: Tensor, state: Mapping[str, Any]) -> AdamState:
     return AdamState.alone(param, *(state[name] for name in (*MOMENTS, *_STEPS)))
 
 
+@torch.no_grad()
 def _settle(param: Tensor, state: dict[str, Any], schedule: GrowingSchedule) -> None:
     """Bring all rows and their moments up to date, and leave the state of `torch.optim.Adam`."""
     if param.numel() > 0:
