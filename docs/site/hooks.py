@@ -125,6 +125,8 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     """Turn links of the repository into links of the site."""
     uri = page.file.src_uri
+    if uri.startswith("source/"):  # a word of the pages would find every header first
+        page.meta["search"] = {"exclude": True}
     if uri == "index.md":
         page.meta["hide"] = ["navigation"]
     return markdown if uri.startswith(("api/", "source/")) else with_links(markdown, origin(uri))

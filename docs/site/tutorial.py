@@ -41,6 +41,12 @@ def beside(images: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     return np.hstack(parts[:-1])
 
 
+def in_pairs(images: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Return two rows of two images, which a phone can show."""
+    rows = [beside(images[:2]), beside(images[2:])]
+    return np.vstack([rows[0], np.full((GAP, rows[0].shape[1], 3), 255, np.uint8), rows[1]])
+
+
 def save(name: str, image: NDArray[np.uint8]) -> None:
     """Write a picture of the docs."""
     cv2.imwrite(str(IMAGES / name), image, [cv2.IMWRITE_JPEG_QUALITY, 85])
@@ -55,11 +61,11 @@ def main() -> None:
         flag = f"--schedule.evaluate_every={EVALUATE_EVERY}"
         blitzgs("train", "--config", "smoke", "--data", str(capture), "--out", str(run), flag)
     photographs = sorted((capture / "images").iterdir())
-    save("tutorial_capture.jpg", beside([read(photographs[number]) for number in PHOTOGRAPHS]))
+    save("tutorial_capture.jpg", in_pairs([read(photographs[number]) for number in PHOTOGRAPHS]))
     panels = [read(found / VIEW) for found in sorted((run / "evaluation").glob("[0-9]*"))]
     width = panels[-1].shape[1] // 3  # render, photograph, error
     stages = [panel[:, :width] for panel in (panels[0], panels[2], panels[-1])]
-    save("tutorial_progress.jpg", beside([*stages, panels[-1][:, width : 2 * width]]))
+    save("tutorial_progress.jpg", in_pairs([*stages, panels[-1][:, width : 2 * width]]))
     save("tutorial_evaluation.jpg", panels[-1])
 
 
