@@ -164,7 +164,7 @@ def bench(name: str, folder: Path, end: float) -> dict[str, Any]:
     except subprocess.TimeoutExpired:
         return {"error": "took too long"}
     if done.returncode or not path.exists():
-        return {"error": (done.stderr.strip() or f"status {done.returncode}").splitlines()[-1]}
+        return {"error": (done.stderr.strip() or f"status {done.returncode}").splitlines()[-1][:300]}
     return json.loads(path.read_text())
 
 
@@ -250,20 +250,22 @@ def make_record(
             record.write()
     rooms = record.content["rooms"]
     for target in entries(tests):
-        if target.stem in rooms:
+        name = f"{target.parent.name}/{target.stem}"
+        if name in rooms:
             continue
         if time.monotonic() >= end:
             break
         outcome = run_pytest(target, mark, folder, min(end, time.monotonic() + longest))
-        rooms[target.stem] = asdict(outcome)
+        rooms[name] = asdict(outcome)
         record.write()
-        counts = ", ".join(f"{getattr(outcome, name)} {name}" for name in COUNTS)
-        print(f"{target.stem}: {counts} in {outcome.seconds:.0f} s ({outcome.state})", flush=True)
+        counts = ", ".join(f"{getattr(outcome, kind)} {kind}" for kind in COUNTS)
+        print(f"{name}: {counts} in {outcome.seconds:.0f} s ({outcome.state})", flush=True)
     else:
         record.content["complete"] = all(room["state"] != "cut off" for room in rooms.values())
         record.write()
     sums = record.content["tests"]
-    return record.content["complete"] and not sums["failed"] and not sums["errors"]
+    broken = any("error" in row for found in record.content["bench"].values() for row in found)
+    return record.content["complete"] and not (sums["failed"] or sums["errors"] or broken)
 
 
 def age(path: Path) -> str:

@@ -60,7 +60,10 @@ def test_counts_hold_although_a_file_is_not_collected_and_a_process_dies(tmp_pat
     assert "no sum" in problems.pop("tests.good.test_counts.test_fails")
     assert "status -6" in problems.pop("test_dies.py")
     assert "a_module_that_nobody_has" in problems.popitem()[1] and not problems
-    assert content["rooms"]["killed"]["state"] == "died" and content["rooms"]["test_alone"]["passed"] == 1
+    assert (
+        content["rooms"]["tests/killed"]["state"] == "died"
+        and content["rooms"]["tests/test_alone"]["passed"] == 1
+    )
     lines = report_tables.SECTIONS["gpu_record"].lines(content)
     assert "| tests | 3 passed, 1 failed, 2 errors, 1 skipped in " in "\n".join(lines)
     assert "**GPU tests: 3 passed, 3 failed**, 1 skipped (a card" in report_tables.badge_lines(content)[0]
@@ -73,7 +76,7 @@ def test_a_run_that_is_cut_off_keeps_its_results_and_goes_on(tmp_path, no_bench)
     record = gpu_record.Record(path, ABOUT, resume=False)
     assert not gpu_record.make_record(record, tests, "not other", tmp_path, time.monotonic() + 100, longest=8)
     content = json.loads(path.read_text())
-    assert not content["complete"] and content["rooms"]["b"]["state"] == "cut off"
+    assert not content["complete"] and content["rooms"]["tests/b"]["state"] == "cut off"
     assert content["tests"]["passed"] == 2 and content["tests"]["failed"] == 0
 
     write(tmp_path, {"b/test_b.py": slow.format(False)})
