@@ -10,7 +10,7 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu' 'examples/*.cpp')
 DEMO ?= runs/demo
 
-.PHONY: venv venv-test build io demo test browser test-python test-cxx test-cuda test-slow sanitize fuzz lint format clean
+.PHONY: venv venv-test build io demo test browser test-python test-cxx test-cuda gpu-record test-slow docs sanitize fuzz lint format clean
 
 venv: $(VENV)/.installed
 venv-test: $(VENV)/.installed-test
@@ -58,6 +58,7 @@ demo: venv build
 	@echo "Another run from the start:        make demo DEMO=runs/another"
 
 test: venv-test lint test-cxx browser test-python
+	$(RUN) $(PYTHON) benchmarks/gpu_record.py --age
 
 # The tests of pages drive a headless browser.
 browser:
@@ -88,6 +89,10 @@ test-cxx:
 test-cuda: venv-test build
 	$(RUN) $(PYTHON) -m pytest -v -rf --tb short -m cuda tests
 
+# Writes benchmarks/results/gpu_record.json, and with it the lines of README and docs.
+gpu-record: venv-test build
+	$(RUN) $(PYTHON) benchmarks/gpu_record.py; status=$$?; $(PYTHON) benchmarks/report.py && exit $$status
+
 test-slow: venv-test build
 	$(RUN) $(PYTHON) -m pytest -q -m slow --timeout 3600 tests
 
@@ -117,6 +122,12 @@ build-fuzz/%: $(FUZZ_SOURCES) $(wildcard csrc/io/*.h)
 	$(FUZZ_CXX) -std=c++20 -O2 -g -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all -Icsrc \
 	  -DBLITZGS_FUZZ=$* $(FUZZ_SOURCES) -o $@
 
+# The site in site/, to be opened without a server. It needs no network once the packages are installed.
+docs: venv
+	$(RUN) $(PYTHON) -c "import material, mkdocstrings, latex2mathml" 2>/dev/null \
+	  || $(RUN) $(PYTHON) -m pip install --quiet --no-build-isolation -e ".[docs]"
+	NO_MKDOCS_2_WARNING=1 $(RUN) $(PYTHON) -m mkdocs --quiet build --strict --clean
+
 lint:
 	$(RUN) ruff check .
 	$(RUN) ruff format --check .
@@ -132,4 +143,4 @@ format:
 	$(RUN) gersemi -i CMakeLists.txt cmake examples
 
 clean:
-	rm -rf build build-tests build-fuzz blitzgs/_lib runs
+	rm -rf build build-tests build-fuzz blitzgs/_lib runs site

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write the tables of docs/performance.md, docs/city.md and README.md from the results in benchmarks/results.
+"""Write the tables of `PAGES` from the results in benchmarks/results.
 
     python benchmarks/report.py           # writes the tables
     python benchmarks/report.py --check   # fails when a page differs from the results
@@ -24,7 +24,7 @@ from report_tables import SECTIONS, Json
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-PAGES = (ROOT / "docs" / "performance.md", ROOT / "docs" / "city.md", ROOT / "README.md")
+PAGES = (*(ROOT / "docs" / name for name in ("performance.md", "city.md", "hardware.md")), ROOT / "README.md")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end: \2 -->)", re.DOTALL)
 
 Results = dict[str, Json]
@@ -113,7 +113,7 @@ def section_lines(name: str, results: Results) -> list[str]:
         return ["Not measured yet. The commands that measure it:", "",
                 *(f"    {command}" for command in commands)]  # fmt: skip
     files = [results[file] for file in section.files]
-    return [*section.lines(*files), "", *machine_lines(files)]
+    return [*section.lines(*files), *(["", *machine_lines(files)] if section.origin else [])]
 
 
 def render_page(text: str, results: Results) -> str:

@@ -4,6 +4,7 @@
 # File in benchmarks/results (without .json) -> the command that writes it.
 PLAN = "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml"
 COMMANDS = {
+    "gpu_record": "make gpu-record",
     "render": "python benchmarks/bm_render.py",
     "step_1": "python benchmarks/bm_step.py --views 1",
     "step_4": "python benchmarks/bm_step.py --views 4",
@@ -37,9 +38,11 @@ GROUPS = (
     ("town_parts",),
     ("exchange", "city_ranks", "drop_in_full"),
     ("city",),
+    ("gpu_record",),
 )
-# bm_quality.py takes no --json: it collects all of its runs in one file.
-COPIED = {
+# After commands that take no --json: gpu_record.py writes its file itself, bm_quality.py collects all of its
+# runs in one file.
+COPIED = {"gpu_record": "python benchmarks/report.py"} | {
     name: f"cp runs/{name}/quality.json benchmarks/results/{name}.json"
     for name in ("quality", "compact", "town_parts")
 }

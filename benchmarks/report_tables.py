@@ -20,10 +20,12 @@ class Section:
     Attributes:
         files: names in `COMMANDS`.
         lines: takes the content of each file, in the order of `files`.
+        origin: whether lines with command, machine and commit follow.
     """
 
     files: tuple[str, ...]
     lines: Callable[..., list[str]]
+    origin: bool = True
 
 
 QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
@@ -252,7 +254,39 @@ def summary_lines(render: Json, step: Json, exchange: Json) -> list[str]:
     return table(["work", "BlitzGS", "compared with", "times as fast, or as small"], rows)
 
 
+def badge_lines(record: Json) -> list[str]:
+    """Return one line: what the tests on a GPU said, of which commit and where."""
+    tests, about = record["tests"], record["environment"]
+    failed = tests["failed"] + tests["errors"]
+    cut = "" if record["complete"] else ", cut off before the end"
+    return [
+        f"**GPU tests: {tests['passed']} passed, {failed} failed**, {tests['skipped']} skipped{cut} "
+        f"({about['device']}, torch {about['torch']}, commit {record['commit']}, {record['date']})"
+    ]
+
+
+def record_lines(record: Json) -> list[str]:
+    """Tabulate the last run of all tests on a GPU, and its small bench."""
+    tests, about = record["tests"], record["environment"]
+    rows = [
+        ["card", f"{about['device']}, {about['memory_gb']:g} GB, one of {about['gpus']}"],
+        ["versions", f"driver {about['driver']}, CUDA {about['cuda']}, torch {about['torch']}, "
+                     f"Python {about['python']}"],
+        ["date, commit", f"{record['date']}, {record['commit']}"],
+        ["tests", f"{tests['passed']} passed, {tests['failed']} failed, {tests['errors']} errors, "
+                  f"{tests['skipped']} skipped in {tests['seconds']:.0f} s"],
+        *(["failed", f"`{problem['name']}`"] for problem in tests["problems"]),
+        *([row["work"], row.get("error") or f"{ms(row['ms'])} ms, {row['peak_gb']:.2f} GB"]
+          for found in record["bench"].values() for row in found),
+    ]  # fmt: skip
+    if not record["complete"]:
+        rows.append(["complete", "no: the run was cut off"])
+    return table(["", "last run on a GPU"], rows)
+
+
 SECTIONS = {
+    "gpu_badge": Section(("gpu_record",), badge_lines, origin=False),
+    "gpu_record": Section(("gpu_record",), record_lines, origin=False),
     "render": Section(("render",), render_lines),
     "stages": Section(("render",), stage_lines),
     "call": Section(("render",), call_lines),

@@ -203,6 +203,29 @@ def test_commands_are_used_rightly(name, tmp_path, monkeypatch, capsys):
             check_script(rest)
 
 
+def test_the_paper_page_names_existing_ops_for_every_equation():
+    page = text_of(ROOT / "docs/paper.md")
+    known = set(re.findall(r'm\.def\(\s*"(\w+)', (ROOT / "csrc/registration.cpp").read_text()))
+    # A name without a dot is an op; the others are checked as modules and their members.
+    named = set(re.findall(r"`(\w+)`", page))
+    assert len(named) > 20 and named <= known, named - known
+    rows = {cells[0]: cells for line in page.split("\n") if (cells := line.strip("| ").split(" | "))[-1:]}
+    for number in range(1, 10):
+        _, formula, symbols, files = rows[f"Eq. {number}"]
+        assert "$" in formula and "`" in symbols and "](../" in files
+
+
+def test_every_message_of_the_troubleshooting_page_is_in_the_sources():
+    files = [*(ROOT / "blitzgs").rglob("*.py"), *(ROOT / "csrc").rglob("*.cpp")]
+    # Neighbouring literals are one text.
+    sources = [re.sub(r'"\s*\n\s*f?"', "", path.read_text()) for path in files]
+    rows = [line.split(" | ") for line in text_of(ROOT / "docs/guide/troubleshooting.md").split("\n")]
+    fragments = [part for row in rows if len(row) == 3 for part in re.findall(r"`([^`]+)`", row[0])]
+    assert len(fragments) > 30
+    for fragment in fragments:
+        assert any(fragment in source for source in sources), f"no message contains {fragment!r}"
+
+
 def test_the_python_example_of_the_readme_runs(tmp_path, monkeypatch):
     example = next(block for block in code_blocks(ROOT / "README.md", ["python"]) if "open_run" in block)
     monkeypatch.chdir(tmp_path)

@@ -37,12 +37,12 @@ def contributions(
     """Return the weight and the number of pixels of each Gaussian in each view (BlitzGS, section 3.2).
 
     Both are summed over the pixels p of a view at which the renderer composites the Gaussian; alpha and the
-    transmittance T are the renderer's::
+    transmittance T are the renderer's:
 
         weight = sum of alpha_p T_p;    pixels = their number
 
     Each alpha T enters as an integer number of 2^-32, so the sums are exact: on one device the result has the
-    same bits in every run. The arguments are those of :func:`blitzgs.rasterization`. Not differentiable.
+    same bits in every run. The arguments are those of `blitzgs.rasterization`. Not differentiable.
 
     Args:
         means: [N, 3], float32, or (CPU) float64; the other tensors share its dtype and device.

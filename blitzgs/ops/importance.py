@@ -30,7 +30,7 @@ def splat_contributions(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Sum alpha T over the pixels at which each splat is composited, and count these pixels.
 
-    Alpha and T have the same bits as in :func:`blitzgs.ops.rasterize.rasterize`. The sums are integers, so
+    Alpha and T have the same bits as in `blitzgs.ops.rasterize.rasterize`. The sums are integers, so
     they do not depend on the order of addition, and the sums of disjoint tile ranges add up to the sum of all
     tiles.
 
@@ -38,7 +38,7 @@ def splat_contributions(
         means2d: [P, 2], pixels, float32 or (CPU) float64.
         conics: inverse 2D covariances (a, b, c) [P, 3].
         splat_opacities: [P].
-        isect_splats: int32 [I], from :func:`blitzgs.ops.intersect.intersect`.
+        isect_splats: int32 [I], from `blitzgs.ops.intersect.intersect`.
         tile_offsets: int64 [B * T + 1], likewise.
         n_cameras: number of views B.
         width: of every view, pixels.

@@ -77,7 +77,7 @@ def rasterize(
 ) -> tuple[Tensor, Tensor]:
     """Composite the splats of each tile's list into images.
 
-    Per pixel, in list order, with d from the splat's mean to the pixel centre (i + 0.5, j + 0.5)::
+    Per pixel, in list order, with d from the splat's mean to the pixel centre (i + 0.5, j + 0.5):
 
         alpha = min(0.99, opacity * exp(-(a dx^2 + 2 b dx dy + c dy^2) / 2)), skipped below 1/255
         the pixel ends before T (1 - alpha) would fall below 1e-4
@@ -93,7 +93,7 @@ def rasterize(
         conics: inverse 2D covariances (a, b, c) [P, 3].
         splat_opacities: [P].
         colors: [P, D], D from 1 to 4096.
-        isect_splats: int32 [I], from :func:`blitzgs.ops.intersect.intersect`.
+        isect_splats: int32 [I], from `blitzgs.ops.intersect.intersect`.
         tile_offsets: int64 [B * T + 1], from the same call.
         n_cameras: number of views B.
         width: of every view, pixels.

@@ -51,7 +51,7 @@ class LazyAdam(torch.optim.Optimizer):
     float32. A parameter of SH coefficients may give its first coefficient (three values a row) another
     learning rate than the rest: see `lr_rest`.
 
-    Example::
+    For example:
 
         optimizer = LazyAdam([
             {"params": [means], "lr": 1.6e-4, "name": "means"},

@@ -4,7 +4,7 @@
 For view v and Gaussian i, w is the sum of alpha T over the pixels at which the renderer composites i, a
 is their number, c_rad tells whether the box around its alpha >= 1/255 overlaps the image, and c_vis
 whether it is in the smallest set, by descending w (ties by id), that holds 99 % of the view's total.
-Then::
+Then:
 
     score_i = sum over v with a > 0 of w / (a + SCORE_EPS)^p, p = 1 for "density", 1/2 "root", 0 "weight"
             = sum over v and these pixels of (alpha T)^2 for "energy"

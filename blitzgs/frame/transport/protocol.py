@@ -3,7 +3,7 @@
 
 Every rank projects the Gaussians that it owns. Each splat (a Gaussian in a view) is then sent to the ranks
 that composite tiles which it touches, and its gradient is returned (BlitzGS, section 3.1). The calls of one
-frame, on every rank::
+frame, on every rank:
 
     exchange = transport.project_and_send(inputs, assignment, sizes, mark)
     exchange.arrived, exchange.gradient_table                # for compositing
