@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.compat import inria
 from tests.compat.inria_formulas import camera, covariances, render
-from tests.helpers import relative_error
+from tests.helpers import DEVICES, relative_error
 
 WIDTH, HEIGHT, COUNT = 34, 27, 28
 
@@ -133,6 +133,28 @@ def test_the_depth_of_the_forks():
     given = without(leaves(4), "colors_precomp")
     given["rotations"] = (given["rotations"] * 0.9).detach().requires_grad_()
     compare(settings(), given, of_scales(), rasterizer=inria.DepthGaussianRasterizer)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("length", [1.0, 1.15])
+def test_float32_on_each_device(device, length):
+    """Both ways, that of normalised rotations and that of others, against float64."""
+    results = []
+    for dtype, place in ((torch.float64, "cpu"), (torch.float32, device)):
+        given = without(leaves(8), "colors_precomp")
+        given["rotations"] = given["rotations"] * length
+        given = {name: value.detach().to(place, dtype).requires_grad_() for name, value in given.items()}
+        moved = {
+            n: v.to(place, dtype) for n, v in settings()._asdict().items() if isinstance(v, torch.Tensor)
+        }
+        screen, densify = (torch.zeros_like(given["means3D"], requires_grad=True) for _ in range(2))
+        image, radii, inverse = inria.GaussianRasterizer(settings(antialiasing=True, **moved))(
+            means2D=screen, means2D_densify=densify, **given
+        )
+        (image.square().sum() + inverse.sum()).backward()
+        results.append([image, inverse, radii, *(v.grad for v in (screen, densify, *given.values()))])
+    for expected, actual in zip(*results, strict=True):
+        assert relative_error(actual, expected) < 1e-4
 
 
 def test_precomputed_covariances():
