@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from blitzgs.runs.folder import open_run
     from blitzgs.table.blocks import morton_order
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "contributions",
     "l1_ssim",

@@ -81,9 +81,9 @@ class Model:
     def densify(self, most: int, threshold: float = 2e-4, min_opacity: float = 0.005) -> None:
         """Clone small and split large Gaussians whose gradient is large; prune transparent ones."""
         self.optimizer.catch_up()
-        wanted = self.gradients / self.seen.clamp(min=1) > threshold
-        if int(wanted.sum()) + len(wanted) > most:
-            wanted.zero_()
+        mean = self.gradients / self.seen.clamp(min=1)
+        best = mean.topk(min(len(mean), max(0, most - len(mean)))).indices  # each of them adds one Gaussian
+        wanted = torch.zeros_like(mean, dtype=torch.bool).index_fill(0, best, True) & (mean > threshold)
         split = wanted & (self.params["scales"].amax(dim=1).exp() > 0.01 * self.extent)
         added = torch.cat([(wanted & ~split).nonzero(), split.nonzero(), split.nonzero()])[:, 0]
         new = {name: p[added].clone() for name, p in self.params.items()}
@@ -121,7 +121,7 @@ def main(arguments: list[str] | None = None) -> Model:
     parser.add_argument("--out", required=True, help="PLY file to write")
     parser.add_argument("--steps", type=int, default=7000)
     parser.add_argument("--downscale", type=float, default=1)
-    parser.add_argument("--most", type=int, default=3_000_000, help="number of Gaussians to stop adding at")
+    parser.add_argument("--most", type=int, default=3_000_000, help="largest number of Gaussians")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     options = parser.parse_args(arguments)
     capture, device = load_capture(options.data, downscale=options.downscale), torch.device(options.device)

@@ -239,7 +239,12 @@ def _shrink(children: dict[str, Tensor], seed: int, time: int) -> None:
 
 def rotations(quats: Tensor) -> Tensor:
     """Normalise quaternions (w, x, y, z) [M, 4] and return their rotation matrices [M, 3, 3]."""
-    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True).clamp(min=1e-30)).unbind(1)
+    return quaternion_matrices(quats / quats.norm(dim=1, keepdim=True).clamp(min=1e-30))
+
+
+def quaternion_matrices(quats: Tensor) -> Tensor:
+    """Return the matrices [M, 3, 3] of quaternions [M, 4], rotations if the quaternions have length 1."""
+    w, x, y, z = quats.unbind(1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),

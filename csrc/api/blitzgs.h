@@ -69,8 +69,24 @@ struct TileLists {
 };
 
 struct Images {
-  Tensor renders;         // [B, H, W, D]
-  Tensor transmittances;  // [B, H, W]; alpha is 1 - transmittance
+  Tensor renders;                              // [B, H, W, D]
+  Tensor transmittances;                       // [B, H, W]; alpha is 1 - transmittance
+  Tensor last_ids, packed_splats, tile_order;  // what the backward pass reads
+};
+
+struct SplatGradients {
+  Tensor means2d;           // [P, 2]
+  Tensor conics;            // [P, 3]
+  Tensor opacities;         // [P]
+  Tensor colors;            // [P, D]
+  Tensor means2d_absolute;  // [P, 2], sums of absolute values over pixels; [0, 2] without them
+};
+
+// The gradients of the U Gaussians visible_ids of the splats, or of all N.
+struct GaussianGradients {
+  Tensor means, quats, scales, opacities;
+  Tensor sh;        // [U, K, 3]; empty without sh
+  Tensor viewmats;  // [B, 4, 4]; empty unless asked for
 };
 
 namespace detail {
@@ -120,7 +136,44 @@ inline Images rasterize(const Splats& s, const Tensor& colors, const TileLists& 
                            lists.isect_splats, lists.tile_offsets, grid.n_cameras, grid.width, grid.height,
                            grid.tile_size, grid.tile_begin, grid.tile_end, /*clear_rest=*/true,
                            /*backward_follows=*/false, /*n_splats=*/none);
-  return {r[0], r[1]};
+  return {r[0], r[1], r[2], r[4], r[5]};
+}
+
+// The gradients of the splats from that of the images, v_renders [B, H, W, D]. The arguments are those of
+// `rasterize`.
+inline SplatGradients rasterize_backward(const Splats& s, const Tensor& colors, const TileLists& lists,
+                                         const TileGrid& grid, const Images& images, const Tensor& v_renders,
+                                         const std::optional<Tensor>& backgrounds = std::nullopt,
+                                         bool absolute = false) {
+  const std::optional<Tensor> none;
+  const std::vector<Tensor> splats{s.means2d, s.conics, s.opacities, colors};
+  const std::vector<Tensor> listed{lists.isect_splats, lists.tile_offsets};
+  const std::vector<Tensor> composited{images.transmittances, images.last_ids, images.packed_splats,
+                                       images.tile_order};
+  auto r = detail::call<5>("blitzgs::rasterize_bwd", splats, backgrounds, listed, composited, v_renders,
+                           /*v_alphas=*/none, grid.n_cameras, grid.width, grid.height, grid.tile_size,
+                           grid.tile_begin, grid.tile_end, absolute, /*deterministic=*/false,
+                           /*gradients=*/none);
+  return {r[0], r[1], r[2], r[3], r[4]};
+}
+
+// The gradients of the Gaussians from those of their splats. The other arguments are those of `project`.
+inline GaussianGradients project_backward(const Gaussians& g, const Cameras& cameras, const ProjectOptions& o,
+                                          const Splats& s, const SplatGradients& v, bool of_viewmats = false,
+                                          bool of_all = false) {
+  std::vector<Tensor> gaussians{g.means, g.quats, g.scales, g.opacities};
+  std::vector<Tensor> v_splats{v.means2d, v.conics, v.opacities};
+  if (g.sh) {
+    gaussians.push_back(*g.sh);
+    v_splats.push_back(v.colors);
+  }
+  const std::optional<Tensor> none;
+  auto r = detail::call<6>(
+      "blitzgs::project_bwd", gaussians, cameras.viewmats, cameras.Ks, /*scale_reg=*/none,
+      /*opacity_reg=*/none, s.camera_ids, s.visible_ids, s.splat_offsets, /*level=*/none, o.width, o.height,
+      o.tile_size, o.sh_degree, o.near_plane, o.far_plane, o.eps2d, o.radius_clip, o.antialiased, o.raw,
+      o.fade, v_splats, /*v_depths=*/none, of_viewmats, of_all);
+  return {r[0], r[1], r[2], r[3], r[4], r[5]};
 }
 
 }  // namespace blitzgs::api
