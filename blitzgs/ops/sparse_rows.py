@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from blitzgs._torch import raw_indices, raw_values
+from blitzgs.ops.derivatives import linear_map
 
 
 def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
@@ -51,6 +53,24 @@ def full_gradients(
         else gradient.new_zeros(shape).index_copy_(0, ids, gradient)
         for gradient, shape, is_sparse in zip(gradients, shapes, sparse, strict=True)
     ]
+
+
+def of_shape(table: Tensor, shape: Sequence[int]) -> Tensor:
+    """Return a table with rows of another shape and as many values, whose gradient may be sparse.
+
+    Args:
+        table: [N, ...].
+        shape: (N, ...).
+    """
+
+    def back(_saved: Any, _needed: Any, v: Sequence[Tensor | None]) -> list[Tensor | None]:
+        if v[0] is None or not v[0].is_sparse:
+            return [None if v[0] is None else v[0].reshape(table.shape)]
+        values = raw_values(v[0])
+        return [sparse_rows(raw_indices(v[0])[0], values.reshape(len(values), *table.shape[1:]), table.shape)]
+
+    (reshaped,) = linear_map(lambda rows: (rows.reshape(tuple(shape)),), back, [table])
+    return reshaped
 
 
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
