@@ -65,9 +65,12 @@ def not_compiled(function: _F) -> _F:
     `torch.compiler.disable` does the same, but imports torch's compiler, which takes seconds.
     """
 
+    message = f"blitzgs.{function.__name__} runs between two graphs, so fullgraph=True is not possible"
+
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         if torch.compiler.is_compiling():
+            torch._dynamo.graph_break(msg=message)
             return torch.compiler.disable(function)(*args, **kwargs)
         return function(*args, **kwargs)
 

@@ -131,10 +131,9 @@ def raw_rasterization(
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     harmonics = [sh0] if shN is None else [sh0, shN]
     shaded = "RGB" in render_mode
-    if sparse_grad and torch.is_grad_enabled():
-        _check_leaves(tensors | {"shN": shN} if shaded else {n: t for n, t in tensors.items() if n != "sh0"})
-    # Optimisers know the parameters themselves, so these are caught up, not their other shapes.
-    params, sh_params = (means, quats, scales, opacities), tuple(harmonics)
+    # The parameters themselves, not their other shapes: optimisers know these.
+    params = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    sh_params = {"sh0": sh0} if shN is None else {"sh0": sh0, "shN": shN}
     if opacities.dim() == 2 and opacities.shape[1] == 1:
         tensors["opacities"] = opacities = of_shape(opacities, opacities.shape[:1])
     if sh0.dim() == 2 and sh0.shape[1] == 3:
@@ -145,9 +144,11 @@ def raw_rasterization(
         width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, True
     )
     whole = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, "D", raw=True)
+    if sparse_grad and torch.is_grad_enabled():
+        _check_leaves(params | sh_params if shaded else params)
     lazy = _lazy(optimizers)
     for optimizer in lazy:
-        optimizer.catch_up(params)
+        optimizer.catch_up(params.values())
     given = {**tensors, "viewmats": viewmats, "Ks": Ks, "shN": shN}
     if not shaded:
         del given["sh0"], given["shN"]
@@ -160,7 +161,7 @@ def raw_rasterization(
 
     def catch_up_sh(rows: Tensor, count: Tensor | None) -> None:
         for optimizer in lazy:
-            optimizer.catch_up(sh_params, rows, count)
+            optimizer.catch_up(sh_params.values(), rows, count)
 
     groups = groups_of(gaussians, project)
     tables = ShTables(harmonics if shaded else (), catch_up_sh)
@@ -171,10 +172,10 @@ def raw_rasterization(
     return render("raw_rasterization", gaussians, project, image, groups=groups)
 
 
-def _check_leaves(params: Mapping[str, Tensor | None]) -> None:
+def _check_leaves(params: Mapping[str, Tensor]) -> None:
     """Check that parameters with gradients are leaves: few operations accept a sparse gradient."""
     for name, param in params.items():
-        if param is not None and param.requires_grad and not param.is_leaf:
+        if param.requires_grad and not param.is_leaf:
             raise ValueError(
                 f"{name} is not a leaf, and its gradient would be sparse: pass the parameter itself, or "
                 "sparse_grad=False"
