@@ -64,7 +64,6 @@ def not_compiled(function: _F) -> _F:
 
     `torch.compiler.disable` does the same, but imports torch's compiler, which takes seconds.
     """
-
     message = f"blitzgs.{function.__name__} runs between two graphs, so fullgraph=True is not possible"
 
     @functools.wraps(function)
