@@ -15,28 +15,40 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 if TYPE_CHECKING:
     from blitzgs import optim
     from blitzgs.call import contributions, rasterization, raw_rasterization
+    from blitzgs.call.gaussians import knn, position_noise, quat_scale_to_covar_preci, relocate
     from blitzgs.call.losses import l1_ssim
+    from blitzgs.ops.harmonics import spherical_harmonics
     from blitzgs.runs.folder import open_run
     from blitzgs.table.blocks import morton_order
 
 __version__ = "0.2.0"
 __all__ = [
     "contributions",
+    "knn",
     "l1_ssim",
     "morton_order",
     "open_run",
     "optim",
+    "position_noise",
+    "quat_scale_to_covar_preci",
     "rasterization",
     "raw_rasterization",
+    "relocate",
+    "spherical_harmonics",
 ]
 
 _MODULES = {
     "contributions": "blitzgs.call",
+    "knn": "blitzgs.call.gaussians",
     "l1_ssim": "blitzgs.call.losses",
     "morton_order": "blitzgs.table.blocks",
     "open_run": "blitzgs.runs.folder",
+    "position_noise": "blitzgs.call.gaussians",
+    "quat_scale_to_covar_preci": "blitzgs.call.gaussians",
     "rasterization": "blitzgs.call",
     "raw_rasterization": "blitzgs.call",
+    "relocate": "blitzgs.call.gaussians",
+    "spherical_harmonics": "blitzgs.ops.harmonics",
 }
 
 

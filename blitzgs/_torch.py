@@ -6,12 +6,15 @@ Every use must work with each version of torch that pyproject.toml admits.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
+
+_F = TypeVar("_F", bound=Callable[..., Any])
 
 # A context in which autograd records nothing, as in `torch.no_grad`, in less of the host's time.
 below_autograd = torch._C._AutoDispatchBelowAutograd
@@ -54,6 +57,23 @@ def raw_indices(table: Tensor) -> Tensor:
 def raw_values(table: Tensor) -> Tensor:
     """Return the values of a sparse tensor whether it is coalesced or not."""
     return table._values()
+
+
+def not_compiled(function: _F) -> _F:
+    """Return a function that runs as it is where `torch.compile` meets it, between two graphs.
+
+    `torch.compiler.disable` does the same, but imports torch's compiler, which takes seconds.
+    """
+    message = f"blitzgs.{function.__name__} runs between two graphs, so fullgraph=True is not possible"
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        if torch.compiler.is_compiling():
+            torch._dynamo.graph_break(msg=message)
+            return torch.compiler.disable(function)(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return call  # type: ignore[return-value]
 
 
 def register_mapping(kind: type, copy: Callable[[dict[str, Any]], Any]) -> None:

@@ -15,10 +15,12 @@ from torch import Tensor
 from blitzgs._torch import func_transforms_are_active
 from blitzgs.call.covariances import Decomposed, decompose
 from blitzgs.capture.cameras import MAX_SIDE
+from blitzgs.ops.harmonics import MAX_SH_DEGREE, colors_of_views
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
-MAX_SH_DEGREE = 3
+# What the kernels evaluate; torch evaluates other SH before them.
+KERNEL_SH_DEGREE, KERNEL_SH_CHANNELS = 3, 3
 DEFAULT_TILE_SIZE = 16
 # What the kernels can composite (csrc/rasterize/rasterize_op.cpp).
 _MAX_CHANNELS = 4096
@@ -273,8 +275,8 @@ def gaussians_of(
         quats: [..., N, 4].
         scales: [..., N, 3].
         opacities: [..., N].
-        colors: with `sh_degree` [..., N, K, 3] or per view [..., C, N, K, 3], otherwise [..., N, D] or per
-            view [..., C, N, D].
+        colors: with `sh_degree` [..., N, K, D], per view [..., C, N, K, D], or [N, K, D] for all scenes;
+            otherwise [..., N, D] or per view [..., C, N, D].
         viewmats: [..., C, 4, 4].
         Ks: [..., C, 3, 3].
         sh_degree: degree to evaluate; None when `colors` holds values.
@@ -299,13 +301,22 @@ def gaussians_of(
     with_colors = "RGB" in render_mode
     if colors is None and with_colors:
         raise ValueError("colors may be None for the render modes D and ED alone")
+    if colors is not None and sh_degree is not None and batch and colors.dim() == 3:
+        colors = colors.expand(*batch, *colors.shape)  # gsplat main's form: the same SH in all scenes
     per_view = colors is not None and _per_view(colors, batch, C, N, sh_degree)
     colors = colors if with_colors else None
     most = _MAX_CHANNELS - (render_mode != "RGB")  # the depth is a channel too
     if colors is not None and not 1 <= colors.shape[-1] <= most:
         raise ValueError(f"colors must have 1 to {most} channels, got {colors.shape[-1]}")
-    whole = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
     degree = sh_degree if with_colors else None
+    if (
+        colors is not None
+        and degree is not None
+        and (degree > KERNEL_SH_DEGREE or colors.shape[-1] != KERNEL_SH_CHANNELS)
+    ):
+        colors = colors_of_views(degree, means, viewmats, colors, per_view)
+        per_view, degree = True, None
+    whole = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
     return Gaussians(_scenes(whole, batch), colors, opacities, degree, per_view, (*batch, C), raw)
 
 
@@ -351,8 +362,8 @@ def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree:
     wanted = "[..., N, D] or [..., C, N, D]"
     shape = tuple(colors.shape[:-1])
     if sh_degree is not None:
-        wanted = "SH coefficients [..., N, K, 3] or [..., C, N, K, 3] when sh_degree is given"
-        shape = tuple(colors.shape[:-2]) if colors.dim() > 2 and colors.shape[-1] == 3 else ()
+        wanted = "SH coefficients [..., N, K, D], [..., C, N, K, D] or [N, K, D] when sh_degree is given"
+        shape = tuple(colors.shape[:-2])
     if shape not in ((*batch, N), (*batch, C, N)) or colors.dim() < 2:
         raise ValueError(
             f"colors must be {wanted}, here with {[*batch]} before N = {N}, C = {C}, got {list(colors.shape)}"

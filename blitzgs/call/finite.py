@@ -13,6 +13,7 @@ from torch import Tensor
 
 from blitzgs._library import below_autograd
 from blitzgs.call.arguments import Gaussians
+from blitzgs.call.intrinsics import WRAPPED
 from blitzgs.call.layout import Layout
 from blitzgs.ops.host import HostCopy
 
@@ -120,7 +121,7 @@ def watch_for_non_finite(
             return
     if names := ", ".join(non_finite(gaussians)):
         ending = "are not rendered. meta['non_finite'] has their indices."
-        _warn(function, names, ending, stacklevel=5)
+        _warn(function, names, ending, stacklevel=5 + WRAPPED.get(function, 0))
 
 
 def warn_of_non_finite(gaussians: Gaussians, function: str, stacklevel: int) -> None:

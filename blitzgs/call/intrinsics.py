@@ -12,6 +12,8 @@ from torch import Tensor
 
 # Relative to the focal length: below the rounding of float32, and far below a pixel.
 _LEAST_SKEW = 1e-6
+# Calls between a public function and its caller, for warnings: `blitzgs._torch.not_compiled`.
+WRAPPED = {"raw_rasterization": 1}
 
 
 def check_intrinsics(function: str, Ks: Tensor) -> None:  # noqa: N803
@@ -54,5 +56,5 @@ def _warn_of_gradient(function: str) -> None:
     warnings.warn(
         f"blitzgs.{function}: Ks requires a gradient and gets none, as in gsplat; pass Ks.detach()",
         RuntimeWarning,
-        stacklevel=4,
+        stacklevel=4 + WRAPPED.get(function, 0),
     )

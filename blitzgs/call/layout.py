@@ -81,9 +81,11 @@ class Layout:
         return {"means2d": means2d, "conics": conics, "opacities": opacities, "depths": depths}
 
     def absgrad_teller(self, means2d: Tensor) -> Callable[[Tensor], None]:
-        """Return a function that sets `means2d.absgrad` to the absolute gradient of the splats, [P, 2]."""
+        """Set `means2d.absgrad` to 0; return a function that fills it with the splats' gradients, [P, 2]."""
+        absgrad = torch.zeros_like(means2d)
+        means2d.absgrad = absgrad  # type: ignore[attr-defined]
 
         def tell(gradient: Tensor) -> None:
-            means2d.absgrad = self.arrange(gradient)[0]  # type: ignore[attr-defined]
+            absgrad.copy_(self.arrange(gradient)[0])
 
         return tell

@@ -11,32 +11,44 @@ from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
 from blitzgs.ops.derivatives import first_only
-from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_loss, pixel_counts
+from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_loss, pixel_counts, ssim
+
+PADDINGS = ("same", "valid")
+_REACH = 5  # of the window, px
 
 
 def l1_ssim(
-    renders: Tensor, targets: Tensor, masks: Tensor | None = None, ssim_weight: float = 0.2
+    renders: Tensor,
+    targets: Tensor,
+    masks: Tensor | None = None,
+    ssim_weight: float = 0.2,
+    padding: str = "same",
 ) -> Tensor:
     """Return ``(1 - w) mean |x - y| + w (1 - mean SSIM)``, the mean over views (Kerbl et al. 2023, eq. 7).
 
-    SSIM has an 11 x 11 Gaussian window of sigma 1.5, C1 = 0.01^2, C2 = 0.03^2 and zero padding (Wang et al.
-    2004). One pass over the images computes the loss and its gradient. Differentiable, once, in `renders`.
+    SSIM has an 11 x 11 Gaussian window of sigma 1.5, C1 = 0.01^2 and C2 = 0.03^2 (Wang et al. 2004). With
+    zero padding, one pass over the images computes the loss and its gradient. Differentiable, once, in
+    `renders`.
 
     Args:
         renders: x [..., H, W, 3], float32 (CPU also float64), nominal range [0, 1]: what
             `blitzgs.rasterization` returns.
         targets: y of the same shape, uint8 (value / 255) or the dtype of `renders`. They get no gradient.
-        masks: [..., H, W], bool or uint8, 0 = excluded; SSIM windows centred at other pixels still read such
-            a pixel. A view whose pixels are all excluded has loss 0.
+        masks: [..., H, W], bool or uint8, 0 = excluded from the means. SSIM windows centred at other pixels
+            still read an excluded pixel, so do not set it to zero in `renders` alone: the windows around it
+            would then compare zeros with the photograph. A view whose pixels are all excluded has loss 0.
         ssim_weight: w in [0, 1].
+        padding: "same": the mean SSIM is that of all pixels, whose windows read zeros beyond the image (3DGS,
+            INRIA's code). "valid": that of the pixels whose windows are inside the image (gsplat's trainer);
+            needs more passes over the images, and a view needs at least 11 x 11 pixels.
 
     Returns:
         A scalar, dtype of `renders`; 0 without views or pixels.
 
     Raises:
         TypeError: an argument is not a tensor, or has a dtype that is not listed above.
-        ValueError: shapes or devices do not fit, the weight is outside [0, 1], or the targets require a
-            gradient.
+        ValueError: shapes or devices do not fit, the weight is outside [0, 1], the padding unknown or the
+            image too small for it, or the targets require a gradient.
         RuntimeError: float64 images are on a GPU.
         NotImplementedError: the images have forward-mode derivatives.
     """
@@ -54,18 +66,37 @@ def l1_ssim(
         raise ValueError(f"ssim_weight must be in [0, 1], got {ssim_weight}")
     if targets.requires_grad and torch.is_grad_enabled():
         raise ValueError("targets require a gradient, which l1_ssim does not compute; pass targets.detach()")
+    if padding not in PADDINGS:
+        raise ValueError(f"padding must be 'same' or 'valid', got {padding!r}")
+    if padding == "valid" and min(renders.shape[-3:-1]) <= 2 * _REACH:
+        raise ValueError(
+            f"padding='valid' needs images of at least 11 x 11 px, got {list(renders.shape)}; use 'same'"
+        )
     if renders.numel() == 0:
         return renders.sum()  # zero with a gradient; the mean over no views is NaN
     x, y = renders, targets
     if renders.dim() != 4:  # else leave the images as they are: a view would be a node of autograd's graph
         x, y = renders.reshape(-1, *renders.shape[-3:]), targets.reshape(-1, *targets.shape[-3:])
         masks = None if masks is None else masks.reshape(-1, *masks.shape[-2:])
+    if padding == "valid":
+        return _valid(x, y, masks, ssim_weight)
     if torch.compiler.is_compiling() or not (
         torch.is_grad_enabled() and renders.requires_grad or _has_tangent(renders) or _has_tangent(targets)
     ):
         return photometric_loss(x, y, masks, ssim_weight).mean()
     loss: Tensor = _L1Ssim.apply(x, y, masks, ssim_weight)  # type: ignore[no-untyped-call]
     return loss
+
+
+def _valid(x: Tensor, y: Tensor, masks: Tensor | None, weight: float) -> Tensor:
+    """Return the loss of views [B, H, W, 3] whose SSIM is that of the windows inside the image."""
+    shown = x.new_ones(x.shape[:-1], dtype=torch.bool) if masks is None else masks != 0
+    inside = torch.zeros_like(shown)
+    inside[:, _REACH:-_REACH, _REACH:-_REACH] = shown[:, _REACH:-_REACH, _REACH:-_REACH]
+    photographs = y.to(x.dtype) / 255 if y.dtype == torch.uint8 else y
+    l1 = ((x - photographs).abs() * shown.unsqueeze(-1)).sum((1, 2, 3)) / pixel_counts(x, shown).clamp_min(1)
+    dissimilarity = torch.where(inside.any(2).any(1), 1 - ssim(x, y, inside), 0)
+    return ((1 - weight) * l1 + weight * dissimilarity).mean()
 
 
 def _check_types(renders: object, targets: object, masks: object) -> None:

@@ -73,10 +73,11 @@ def rasterization(
         scales: [..., N, 3] standard deviations (after the exponential); their signs do not matter. Not read,
             and may be None, with `covars`.
         opacities: [..., N] in [0, 1] (after the sigmoid).
-        colors: with `sh_degree`, SH coefficients [..., N, K, 3], or per view [..., C, N, K, 3], which is
-            slower; otherwise values of 1 to 4096 channels (a rendered depth counts), [..., N, D] or per view
-            [..., C, N, D]. May be None for the render modes D and ED. float16 and bfloat16 are computed in
-            the dtype of `means`.
+        colors: with `sh_degree`, SH coefficients [..., N, K, D]; or [N, K, D] for all scenes of a batch; or
+            per view [..., C, N, K, D], which is slower. Otherwise values [..., N, D] or per view [..., C, N,
+            D]. 1 to 4096 channels D (a rendered depth counts). SH of degree 4, or of other than 3 channels,
+            are evaluated for all Gaussians and count as colours per view. May be None for the render modes D
+            and ED. float16 and bfloat16 are computed in the dtype of `means`.
         viewmats: [..., C, 4, 4] world to camera, a rotation and a translation.
         Ks: [..., C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1, which is
             checked on the CPU. They get no gradient.
@@ -84,9 +85,9 @@ def rasterization(
         height: image height in px.
         near_plane: Gaussians have z > near_plane, world units; less than far_plane.
         far_plane: Gaussians have z <= far_plane, world units.
-        radius_clip: drop splats that reach no further than this, px, at least 0.
+        radius_clip: drop splats whose radii in meta are both at most this, px, at least 0.
         eps2d: variance added to both screen axes, px^2, at least 0.
-        sh_degree: degree to evaluate, 0 to 3; None when `colors` holds values.
+        sh_degree: degree to evaluate, 0 to 4; None when `colors` holds values.
         packed: whether meta's per-splat tensors hold only what is visible ([nnz, ...]) or all
             ([..., C, N, ...], zero where invisible). The image is the same.
         tile_size: edge of a tile in px, 1 to 64; None: 16. The image is the same, on CUDA to rounding; 16 is
@@ -95,9 +96,12 @@ def rasterization(
         render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
         sparse_grad: whether means, quats and scales, and with `sh_degree` also opacities and colors (not
             per view) that are leaves, get sparse gradients, which have only the visible Gaussians. Dense
-            gradients cost a pass over all N. Not with covars or batch dimensions.
-        absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
-        rasterize_mode: "classic" or "antialiased".
+            gradients cost a pass over all N. Not with covars or batch dimensions, nor in a module of torch's
+            DistributedDataParallel, which takes dense gradients alone.
+        absgrad: whether backward also fills `meta["means2d"].absgrad`, which is zero before, with the sums of
+            absolute pixel gradients.
+        rasterize_mode: "classic" or "antialiased". The factor on the opacity has no lower limit, as in gsplat
+            1.5.3; gsplat's main branch limits it to 0.005, so that tiny Gaussians do not vanish.
         channel_chunk: accepted and not needed: all channels are rendered in one pass.
         distributed: whether Gaussians and views are divided among the ranks of the process group. Each rank
             passes its own Gaussians and views, the same number of views as the others, and gets the images of

@@ -10,9 +10,10 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from blitzgs._torch import not_compiled
 from blitzgs.call.arguments import (
     DEFAULT_TILE_SIZE,
-    MAX_SH_DEGREE,
+    KERNEL_SH_DEGREE,
     RAW_DEFAULTS,
     Gaussians,
     background_rows,
@@ -26,6 +27,7 @@ from blitzgs.call.images import render
 from blitzgs.call.intrinsics import check_intrinsics
 from blitzgs.call.queued import ImageOptions, ShTables
 from blitzgs.ops.projection_types import ProjectionOptions
+from blitzgs.ops.sparse_rows import of_shape
 
 
 class CatchesUp(Protocol):
@@ -40,6 +42,7 @@ class CatchesUp(Protocol):
         """Apply the pending steps of rows of parameters, see `blitzgs.optim.LazyAdam.catch_up`."""
 
 
+@not_compiled
 def raw_rasterization(
     means: Tensor,
     quats: Tensor,
@@ -70,14 +73,14 @@ def raw_rasterization(
     The result is that of `blitzgs.rasterization` with `exp(scales)`, `sigmoid(opacities)` and `cat([sh0,
     shN], 1)`, but none of these tensors is made: the function first finds the visible Gaussians, and only
     gathers, activates and renders these. Gradients are sparse and have only the visible Gaussians, so the
-    parameters must be leaves, or `sparse_grad` False.
+    parameters must be leaves, or `sparse_grad` False. `torch.compile` runs it as it is, between two graphs.
 
     Args:
         means: [N, 3] in world units, float32, or float64 on the CPU.
         quats: [N, 4] (w, x, y, z), of any length; zero counts as the identity, with the gradient zero.
         scales: [N, 3] logarithms of standard deviations.
-        opacities: [N] logits.
-        sh0: [N, 1, 3], the first SH coefficient; or all of them, [N, K, 3], with shN None.
+        opacities: [N] or [N, 1] logits.
+        sh0: [N, 1, 3] or [N, 3], the first SH coefficient; or all of them, [N, K, 3], with shN None.
         shN: [N, K - 1, 3], the other SH coefficients.
         viewmats: [C, 4, 4] world to camera, a rotation and a translation.
         Ks: [C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1, which is
@@ -86,15 +89,15 @@ def raw_rasterization(
         height: image height in px.
         near_plane: Gaussians have z > near_plane, world units; less than far_plane.
         far_plane: Gaussians have z <= far_plane, world units.
-        radius_clip: drop splats that reach no further than this, px, at least 0.
+        radius_clip: drop splats whose radii in meta are both at most this, px, at least 0.
         eps2d: variance added to both screen axes, px^2, at least 0.
         sh_degree: degree to evaluate, 0 to 3; None: the highest degree that the coefficients have.
         tile_size: edge of a tile in px, 1 to 64; None: 16. The image is the same, on CUDA to rounding.
         backgrounds: [C, D] behind everything; None for zero. Depth channels have none.
         render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
         sparse_grad: False: dense gradients, for parameters that are not leaves (`means + offsets`), and for
-            optimisers and gradient clipping that take no others.
-        absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
+            optimisers, gradient clipping and torch's DistributedDataParallel, which take no others.
+        absgrad: as in `blitzgs.rasterization`.
         rasterize_mode: "classic" or "antialiased".
         optimizers: the parameters' optimisers: one, a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
             among them catches up the rows that this call reads: the geometry of all Gaussians, and the SH of
@@ -128,19 +131,24 @@ def raw_rasterization(
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     harmonics = [sh0] if shN is None else [sh0, shN]
     shaded = "RGB" in render_mode
+    # The parameters themselves, not their other shapes: optimisers know these.
+    params = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    sh_params = {"sh0": sh0} if shN is None else {"sh0": sh0, "shN": shN}
+    if opacities.dim() == 2 and opacities.shape[1] == 1:
+        tensors["opacities"] = opacities = of_shape(opacities, opacities.shape[:1])
+    if sh0.dim() == 2 and sh0.shape[1] == 3:
+        tensors["sh0"] = sh0 = harmonics[0] = of_shape(sh0, (len(sh0), 1, 3))
     sh_degree = _checked_degree(harmonics, len(means), sh_degree, shaded)
     antialiased = rasterize_mode == "antialiased"
     project = ProjectionOptions(
         width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, True
     )
-    geometry = (means, quats, scales, opacities)
     whole = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, "D", raw=True)
     if sparse_grad and torch.is_grad_enabled():
-        sh = {"sh0": sh0, "shN": shN} if shaded else {}
-        _check_leaves({"means": means, "quats": quats, "scales": scales, "opacities": opacities, **sh})
+        _check_leaves(params | sh_params if shaded else params)
     lazy = _lazy(optimizers)
     for optimizer in lazy:
-        optimizer.catch_up(geometry)
+        optimizer.catch_up(params.values())
     given = {**tensors, "viewmats": viewmats, "Ks": Ks, "shN": shN}
     if not shaded:
         del given["sh0"], given["shN"]
@@ -153,7 +161,7 @@ def raw_rasterization(
 
     def catch_up_sh(rows: Tensor, count: Tensor | None) -> None:
         for optimizer in lazy:
-            optimizer.catch_up(harmonics, rows, count)
+            optimizer.catch_up(sh_params.values(), rows, count)
 
     groups = groups_of(gaussians, project)
     tables = ShTables(harmonics if shaded else (), catch_up_sh)
@@ -164,10 +172,10 @@ def raw_rasterization(
     return render("raw_rasterization", gaussians, project, image, groups=groups)
 
 
-def _check_leaves(params: Mapping[str, Tensor | None]) -> None:
+def _check_leaves(params: Mapping[str, Tensor]) -> None:
     """Check that parameters with gradients are leaves: few operations accept a sparse gradient."""
     for name, param in params.items():
-        if param is not None and param.requires_grad and not param.is_leaf:
+        if param.requires_grad and not param.is_leaf:
             raise ValueError(
                 f"{name} is not a leaf, and its gradient would be sparse: pass the parameter itself, or "
                 "sparse_grad=False"
@@ -195,9 +203,11 @@ def _checked_degree(harmonics: list[Tensor], count: int, degree: int | None, sha
     given = sum(part.shape[1] for part in harmonics)
     if degree is None:
         degree = math.isqrt(given) - 1
-        if shaded and not 0 <= degree <= MAX_SH_DEGREE:
+        if shaded and not 0 <= degree <= KERNEL_SH_DEGREE:
             raise ValueError(f"sh_degree=None needs 1 to 24 SH coefficients, got {given}")
         return degree
+    if degree > KERNEL_SH_DEGREE:
+        raise ValueError(f"raw_rasterization takes sh_degree 0 to 3, got {degree}; use rasterization")
     if shaded and (degree + 1) ** 2 > given:
         raise ValueError(f"sh_degree {degree} needs {(degree + 1) ** 2} SH coefficients, got {given}")
     return degree

@@ -198,16 +198,14 @@ def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = 
     Args:
         img1: [B, 3, H, W], float32 (CPU also float64).
         img2: of the same shape.
-        padding: only "same", zero padding.
+        padding: "same", zero padding, or "valid".
         train: accepted, without effect.
 
     Raises:
         ValueError: wrong shapes, or another padding.
     """
-    if padding != "same":
-        raise ValueError(f"fused_ssim: padding must be 'same', got {padding!r}")
     x, y = (image.permute(0, 2, 3, 1).contiguous() for image in (img1, img2))
-    return 1 - l1_ssim(x, y, ssim_weight=1.0)
+    return 1 - l1_ssim(x, y, ssim_weight=1.0, padding=padding)
 
 
 def _project(

@@ -28,11 +28,23 @@ def first_only(
         op: name of the op, for the error.
         compute: returns gradients of the op's inputs; autograd records nothing of it.
         inputs: tensors that the gradients depend on: the op's inputs and the gradients of its outputs.
+
+    Raises:
+        RuntimeError: the backward pass runs under vmap.
     """
-    if not torch.is_grad_enabled():
-        return compute()
-    with torch.no_grad():
-        gradients = compute()
+    recorded = torch.is_grad_enabled()
+    try:
+        with torch.no_grad():
+            gradients = compute()
+    except RuntimeError as error:
+        if "Batching rule not implemented" not in str(error):  # torch's words; its mode is not public
+            raise
+        raise RuntimeError(
+            f"blitzgs: {op} has no gradients under vmap (is_grads_batched=True, or a vectorised Jacobian): "
+            "call torch.autograd.grad once for each gradient, with retain_graph=True"
+        ) from error
+    if not recorded:
+        return gradients
     wanted = [gradient for gradient in gradients if gradient is not None]
     given = [tensor for tensor in inputs if tensor is not None and tensor.requires_grad]
     message = (

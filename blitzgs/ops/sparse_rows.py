@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from blitzgs._torch import mark_coalesced, raw_indices, raw_values
+from blitzgs.ops.derivatives import linear_map
 
 
 def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
@@ -82,6 +84,24 @@ class KeptMarks:
         param.register_hook(look)
         param.register_post_accumulate_grad_hook(mark)
         self._parameters[param] = True
+
+
+def of_shape(table: Tensor, shape: Sequence[int]) -> Tensor:
+    """Return a table with rows of another shape and as many values, whose gradient may be sparse.
+
+    Args:
+        table: [N, ...].
+        shape: (N, ...).
+    """
+
+    def back(_saved: Any, _needed: Any, v: Sequence[Tensor | None]) -> list[Tensor | None]:
+        if v[0] is None or not v[0].is_sparse:
+            return [None if v[0] is None else v[0].reshape(table.shape)]
+        values = raw_values(v[0])
+        return [sparse_rows(raw_indices(v[0])[0], values.reshape(len(values), *table.shape[1:]), table.shape)]
+
+    (reshaped,) = linear_map(lambda rows: (rows.reshape(tuple(shape)),), back, [table])
+    return reshaped
 
 
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,7 @@ from torch.nn.functional import softplus
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import sampling_keys, smallest
+from blitzgs.ops.relocation import MAX_COPIES, overlap
 from blitzgs.population.density import (
     CHILDREN_OF_A_SPLIT,
     DensityReport,
@@ -23,8 +24,6 @@ from blitzgs.spawn.lineage import Births, Cause, Lineage
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable, opacity_logit
 
-# Largest number of copies of one Gaussian in one event, itself included; 3DGS-MCMC's code has the same limit.
-MAX_COPIES = 51
 # Opacities are the weights of the draw, as integers in units of 2^-31, so that sums do not depend on the
 # order.
 _WEIGHT_BITS = 31
@@ -107,9 +106,9 @@ def shared(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, T
     Gaussian:
 
         o' = 1 - (1 - o)^(1/N),
-        s' = s o / sum_{i=1}^{N} sum_{k=0}^{i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k + 1)
+        s' = s o / overlap(o', N)
 
-    (Kheradmand et al. 2024, eq. 9). The sum over i of C(i-1, k) is C(N, k+1), which leaves one sum.
+    (Kheradmand et al. 2024, eq. 9; `blitzgs.ops.relocation.overlap`).
 
     Args:
         opacities: logits, [M].
@@ -117,19 +116,12 @@ def shared(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, T
         copies: N, int64 [M], 1 to `MAX_COPIES`.
 
     Returns:
-        Logits and logarithms, float64; the sum alternates, and its terms exceed it by up to 10^5.
+        Logits and logarithms, float64.
     """
-    logits, n = opacities.double(), copies.double()
+    logits = opacities.double()
     # -log(1 - o') = -log(1 - o) / N
-    depth = softplus(logits) / n
-    opacity = -torch.expm1(-depth)
-    term, total = torch.full_like(n, -1.0), torch.zeros_like(n)
-    # Terms with k > N are zero. Few rows have many copies, so reading the largest N saves most of the terms.
-    most = int(copies.max()) if copies.shape[0] > 0 else 0
-    for k in range(1, most + 1):
-        term = term * (n - (k - 1)) / k * -opacity
-        total += term / math.sqrt(k)
-    factor = torch.nn.functional.logsigmoid(logits) - total.log()
+    depth = softplus(logits) / copies.double()
+    factor = torch.nn.functional.logsigmoid(logits) - overlap(-torch.expm1(-depth), copies).log()
     return depth.expm1().log(), scales.double() + factor[:, None]
 
 

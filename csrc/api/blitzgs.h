@@ -37,7 +37,7 @@ struct ProjectOptions {
   std::int64_t sh_degree = 0;
   double near_plane = 0.01, far_plane = 1e10;  // world units
   double eps2d = 0.3;                          // variance added to both screen axes, pixels squared
-  double radius_clip = 0;                      // splats that reach no further are dropped, pixels
+  double radius_clip = 0;                      // splats whose radii are at most this are dropped, px
   bool antialiased = false;
   bool raw = false;          // whether scales and opacities are before their activation
   std::vector<double> fade;  // empty: opacities do not fade with octree levels

@@ -4,13 +4,13 @@
 // math/projection.h the equations (EWA).
 //
 // A splat exists iff near < z <= far, its opacity (compensated when antialiased) is >= 1/255, the box around
-// alpha >= 1/255 overlaps the image and reaches beyond radius_clip, its view is in the candidate's mask, and
-// its geometry is finite. A parameter that is NaN therefore hides its own Gaussian and changes nothing else,
-// and so does an infinite one, except for limits that have a meaning: a scale of 0 and an opacity of 1. With
-// radius_clip = 0 no dropped splat could have changed a pixel. A splat whose colour is not finite exists but
-// is hidden: its opacity, colour, radii and tiles_touched are 0, so the rasteriser skips it. (Colours do not
-// decide which splats exist, because SH rows are most of the bytes of a Gaussian and are read once, for
-// existing splats only.)
+// alpha >= 1/255 overlaps the image, its larger radius (rounded up) exceeds radius_clip, its view is in the
+// candidate's mask, and its geometry is finite. A parameter that is NaN therefore hides its own Gaussian and
+// changes nothing else, and so does an infinite one, except for limits that have a meaning: a scale of 0 and
+// an opacity of 1. With radius_clip = 0 no dropped splat could have changed a pixel. A splat whose colour is
+// not finite exists but is hidden: its opacity, colour, radii and tiles_touched are 0, so the rasteriser
+// skips it. (Colours do not decide which splats exist, because SH rows are most of the bytes of a Gaussian
+// and are read once, for existing splats only.)
 //
 // Splats are ordered by (Gaussian, view). Every value of a splat depends on its Gaussian and view alone, so
 // splats are bit-identical however Gaussians are divided among calls. The cost is O(candidates * B + splats),

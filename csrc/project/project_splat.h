@@ -98,6 +98,11 @@ BLITZGS_HD T level_weight(const Camera<T>& camera, const ActivatedGaussian<T>& g
   return smaller(larger(slope - slope * gaussian.inverse_reach2 * dot(offset, offset), T(0)), T(1));
 }
 
+template <class T>
+BLITZGS_HD std::int32_t pixel_radius(T extent) {
+  return static_cast<std::int32_t>(std::ceil(smaller(extent, T(1 << 30))));
+}
+
 // Projects a Gaussian into a view (docs/image.md, section 2). Returns false if the splat does not exist, by
 // the rules at the top of project.h.
 template <class T>
@@ -115,9 +120,9 @@ BLITZGS_HD bool project_splat(const Camera<T>& camera, const ActivatedGaussian<T
   if (sigmas < T(0) || !is_finite(footprint.conic[0] + footprint.conic[1] + footprint.conic[2])) return false;
   splat->extent[0] = sigmas * std::sqrt(footprint.cov_xx);
   splat->extent[1] = sigmas * std::sqrt(footprint.cov_yy);
-  if (options.radius_clip > T(0) && !(larger(splat->extent[0], splat->extent[1]) > options.radius_clip)) {
-    return false;
-  }
+  // As in gsplat, the rounded radius counts, the one that callers see.
+  const T extent = larger(splat->extent[0], splat->extent[1]);
+  if (options.radius_clip > T(0) && !(T(pixel_radius(extent)) > options.radius_clip)) return false;
   // The factor 1.0001 makes sure that an extent that was rounded down loses no pixel at the border.
   return touches_image(splat->mean2d, T(1.0001) * splat->extent[0], T(1.0001) * splat->extent[1], options);
 }
@@ -144,11 +149,6 @@ BLITZGS_HD std::int32_t splat_tiles(const Splat<T>& splat, int view, const Proje
                     });
   *ranks = wanted;
   return count;
-}
-
-template <class T>
-BLITZGS_HD std::int32_t pixel_radius(T extent) {
-  return static_cast<std::int32_t>(std::ceil(smaller(extent, T(1 << 30))));
 }
 
 // View direction of the SH colour: normalise(mean - camera centre). Returns 1 / distance (0 at the centre).

@@ -8,6 +8,7 @@ import pytest
 import torch
 import torch.utils.checkpoint
 
+import blitzgs
 from blitzgs.call.intrinsics import _warn_of_gradient
 from blitzgs.ops.photometric import photometric_loss
 from blitzgs.reference.gaussians import covariance_factors
@@ -294,6 +295,33 @@ def test_a_second_derivative_of_a_compiled_call_is_refused(device):
     with pytest.raises(RuntimeError, match="create_graph=False|double backward"):
         (gradient,) = torch.autograd.grad(image.sum(), leaves.means, create_graph=True)
         gradient.sum().backward()
+
+
+def test_raw_rasterization_runs_between_two_graphs():
+    torch._dynamo.reset()
+    scene = random_scene(n=20)
+
+    def loss(means):
+        image, _, _ = blitzgs.raw_rasterization(
+            means + 0, scene.quats, scene.scales.log(), scene.opacities.logit(), scene.colors, None,
+            scene.viewmats, scene.Ks, scene.width, scene.height, sparse_grad=False,
+        )  # fmt: skip
+        return image.sin().sum()
+
+    means = scene.means.clone().requires_grad_()
+    compiled = torch.compile(loss, backend="aot_eager")
+    found, wanted = (torch.autograd.grad(call(means), means)[0] for call in (compiled, loss))
+    assert relative_error(found, wanted) < 1e-6
+    torch._dynamo.reset()
+    with pytest.raises(Exception, match="blitzgs.raw_rasterization runs between two graphs"):
+        torch.compile(loss, fullgraph=True, backend="aot_eager")(means)
+
+
+def test_gradients_under_vmap_are_refused_by_name():
+    leaves = random_scene(n=20).leaves()
+    image = rasterize_scene(leaves)[0]
+    with pytest.raises(RuntimeError, match="rasterize has no gradients under vmap .* call torch"):
+        torch.autograd.grad(image, leaves.colors, torch.rand(3, *image.shape), is_grads_batched=True)
 
 
 @pytest.mark.parametrize("options", [{"absgrad": True}, {"sparse_grad": True}], ids=str)

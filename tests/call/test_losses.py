@@ -41,6 +41,68 @@ def test_loss_and_gradient(backend, masked, weight):
     assert relative_error(blitzgs.l1_ssim(renders, targets, masks, weight), results[0][0]) < bound
 
 
+def by_definition(x, y, masks, weight, padding):
+    """The loss in float64, with torch's convolution."""
+    taps = torch.exp(-((torch.arange(11.0, dtype=torch.float64) - 5) ** 2) / 4.5)
+    taps = taps / taps.sum()
+    window = (taps[:, None] * taps).expand(3, 1, 11, 11)
+    x, y = x.movedim(-1, 1).double(), y.movedim(-1, 1).double()
+
+    def mean(images):
+        return torch.nn.functional.conv2d(images, window, padding=5 if padding == "same" else 0, groups=3)
+
+    mx, my = mean(x), mean(y)
+    vx, vy, vxy = mean(x * x) - mx * mx, mean(y * y) - my * my, mean(x * y) - mx * my
+    ssim = (2 * mx * my + 1e-4) * (2 * vxy + 9e-4) / ((mx * mx + my * my + 1e-4) * (vx + vy + 9e-4))
+    inner = masks if padding == "same" else masks[:, 5:-5, 5:-5]
+    losses = []
+    for b in range(len(x)):
+        l1 = (x[b] - y[b]).abs()[:, masks[b]].mean() if masks[b].any() else 0
+        structure = 1 - ssim[b][:, inner[b]].mean() if inner[b].any() else 0
+        losses.append((1 - weight) * l1 + weight * structure)
+    return sum(losses) / len(losses)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("padding", ["same", "valid"])
+def test_paddings_are_those_of_the_definition(backend, masked, padding):
+    renders, targets, masks = images(*backend, 3)
+    masks[1] = masks[1] & False if masked else True
+    results = []
+    for loss_of in (blitzgs.l1_ssim, by_definition):
+        x = renders.clone().requires_grad_()
+        own = loss_of is blitzgs.l1_ssim
+        y = targets if own else targets / 255
+        m = torch.ones_like(masks) if not masked else masks
+        loss = loss_of(x, y, None if own and not masked else m, 0.3, padding)
+        loss.backward()
+        results.append((loss.detach(), x.grad))
+    bound = 1e-7 if renders.dtype == torch.float64 else 1e-4  # targets / 255 is float32
+    for actual, expected in zip(*results, strict=True):
+        assert relative_error(actual, expected) < bound
+
+
+def test_valid_padding_is_that_of_gsplat_s_trainer():
+    """In gsplat's main branch, `gsplat.losses.torch_ssim_loss` is a convolution without padding."""
+    x, targets, _ = images("cpu", torch.float64, 1)
+    y = targets.double() / 255
+    whole, inner = (blitzgs.l1_ssim(x, y, None, 1.0, padding) for padding in ("same", "valid"))
+    ones = torch.ones(x.shape[:-1], dtype=torch.bool)
+    assert relative_error(inner, by_definition(x, y, ones, 1.0, "valid")) < 1e-12
+    assert relative_error(inner, whole) > 1e-4
+
+
+def test_zeroed_renders_under_a_mask_raise_the_loss():
+    """The mask suffices; a trainer that also zeroes its render compares zeros with the photograph."""
+    x, targets, masks = images("cpu", torch.float64, 1)
+    y = targets.double() / 255
+    x = (y + 0.05 * (x - 0.5)).clamp(0, 1)
+    masks = masks[:, ::7, ::7].repeat_interleave(7, 1).repeat_interleave(7, 2)[:, : x.shape[1], : x.shape[2]]
+    zeroed = x * masks[..., None]
+    assert blitzgs.l1_ssim(zeroed, y, masks) > 1.5 * blitzgs.l1_ssim(x, y, masks)
+
+
 def test_leading_dimensions_and_floating_targets():
     renders, targets, masks = images("cpu", torch.float64, 2, 2)
     expected = blitzgs.l1_ssim(renders.flatten(0, 1), targets.flatten(0, 1), masks.flatten(0, 1))

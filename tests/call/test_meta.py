@@ -19,6 +19,7 @@ def _first_calls():
 def test_absgrad_and_the_gradient_of_means2d(packed):
     scene = random_scene(n=25, cameras=1, width=12, height=9, dtype=torch.float64).leaves()
     renders, _, meta = rasterize_scene(scene, packed=packed, absgrad=True)
+    assert torch.equal(meta["means2d"].absgrad, torch.zeros_like(meta["means2d"]))  # as in gsplat
     meta["means2d"].retain_grad()
     reference = reference_images(scene)[0]
     weights = torch.randn(9, 12, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))

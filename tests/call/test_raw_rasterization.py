@@ -44,6 +44,32 @@ def raw(p, scene, **options):
     )
 
 
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("sparse_grad", [True, False])
+@pytest.mark.parametrize("cameras", [1, 40])
+def test_parameters_of_nerfstudio_and_inria_are_taken_as_they_are(device, sparse_grad, cameras):
+    scene = spread(random_scene(n=80, cameras=cameras, width=24, height=20, device=device))
+    runs = []
+    for other in (False, True):
+        p = raw_parameters(scene)
+        if other:  # opacities [N, 1], features_dc [N, 3]
+            p["opacities"] = p["opacities"].detach()[:, None].requires_grad_()
+            p["sh0"] = p["sh0"].detach()[:, 0].requires_grad_()
+        optimizer = LazyAdam([{"params": [value], "lr": 0.01, "name": name} for name, value in p.items()])
+        for _ in range(3):
+            image = raw(p, scene, sparse_grad=sparse_grad, optimizers=optimizer)[0]
+            optimizer.zero_grad()
+            image.square().sum().backward()
+            for value in p.values():
+                assert value.is_leaf and value.grad.shape == value.shape
+                assert value.grad.is_sparse == sparse_grad
+            optimizer.step()
+        optimizer.catch_up()
+        runs.append([image, *p.values()])
+    for actual, expected in zip(*reversed(runs), strict=True):
+        assert torch.equal(actual.detach().reshape(expected.shape), expected.detach())
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(
     "options", [{}, {"render_mode": "RGB+ED"}, {"rasterize_mode": "antialiased"}], ids=str
@@ -244,6 +270,8 @@ def test_wrong_shapes_are_refused_by_name():
         raw({**p, "quats": p["quats"].detach().numpy()}, scene)
     with pytest.raises(ValueError, match="sh_degree 3 needs 16 SH coefficients, got 4"):
         raw({**p, "shN": p["shN"][:, :3]}, scene, sh_degree=3)
+    with pytest.raises(ValueError, match="raw_rasterization takes sh_degree 0 to 3, got 4"):
+        raw(p, scene, sh_degree=4)
 
 
 def test_sparse_gradients_need_leaves():

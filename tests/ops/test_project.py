@@ -312,10 +312,12 @@ def test_near_plane_behind_and_opacity_below_the_cut():
     assert project_scene(scene, near_plane=near, far_plane=0.999).visible_ids.tolist() == [3]
 
 
-def test_radius_clip_drops_small_splats_only():
+@pytest.mark.parametrize("above", [-0.5, 0.0, 0.5])
+def test_radius_clip_drops_small_splats_only(above):
+    """As gsplat's kernels, it compares the radii after they are rounded up."""
     scene = random_scene(n=200, cameras=1)
     splats = project_scene(scene)
-    clip = splats.radii.max(dim=1).values.median().item()
+    clip = splats.radii.max(dim=1).values.median().item() + above
     kept = project_scene(scene, radius_clip=clip)
     assert set(kept.gaussian_ids.tolist()) == set(
         splats.gaussian_ids[splats.radii.max(dim=1).values > clip].tolist()

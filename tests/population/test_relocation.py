@@ -10,8 +10,9 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.counter_random import hash_keys
+from blitzgs.ops.relocation import MAX_COPIES
 from blitzgs.population.density import DensityRules
-from blitzgs.population.relocation import MAX_COPIES, draw, relocate, shared
+from blitzgs.population.relocation import draw, relocate, shared
 from blitzgs.spawn.lineage import Cause
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from tests.distributed.rank_harness import run_ranks

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The public functions of Gaussians without a view, against float64 definitions and gsplat's torch code."""
+
+import math
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+import blitzgs
+from tests.helpers import BACKENDS, DEVICES, relative_error
+
+
+def shapes(*lead, dtype=torch.float64, device="cpu"):
+    generator = torch.Generator().manual_seed(0)
+    quats = 3 * torch.randn(*lead, 4, generator=generator, dtype=torch.float64)
+    scales = 0.1 + torch.rand(*lead, 3, generator=generator, dtype=torch.float64)
+    return quats.to(device, dtype), scales.to(device, dtype)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("triu", [False, True])
+def test_covariances_and_their_inverses(backend, triu):
+    device, dtype = backend
+    quats, scales = shapes(2, 7, dtype=dtype, device=device)
+    covars, precis = blitzgs.quat_scale_to_covar_preci(quats, scales, triu=triu)
+    matrices = Rotation.from_quat(quats.double().cpu().reshape(-1, 4).numpy(), scalar_first=True).as_matrix()
+    rotations = torch.from_numpy(matrices).view(2, 7, 3, 3)
+    bound = 1e-13 if dtype == torch.float64 else 1e-5
+    for actual, power in ((covars, 2), (precis, -2)):
+        expected = rotations @ torch.diag_embed(scales.double().cpu() ** power) @ rotations.mT
+        if triu:
+            expected = expected[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        assert actual.dtype == dtype and relative_error(actual, expected) < bound
+
+
+def test_covariances_are_gsplats_with_gradients():
+    impl = pytest.importorskip("gsplat.cuda._torch_impl")
+    quats, scales = (t.requires_grad_() for t in shapes(4))
+    for triu in (False, True):
+        expected = impl._quat_scale_to_covar_preci(quats, scales, True, True, triu)
+        actual = blitzgs.quat_scale_to_covar_preci(quats, scales, triu=triu)
+        for own, theirs in zip(actual, expected, strict=True):
+            assert relative_error(own, theirs) < 1e-12
+    assert torch.autograd.gradcheck(blitzgs.quat_scale_to_covar_preci, (quats, scales))
+    assert blitzgs.quat_scale_to_covar_preci(quats, scales, False, False) == (None, None)
+    with pytest.raises(ValueError, match=r"quats must be \[..., 4\] and scales \[..., 3\], got \[4, 3\]"):
+        blitzgs.quat_scale_to_covar_preci(scales, scales)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("min_opacity", [0.0, 0.005])
+def test_relocation_is_the_paper_s_double_sum(backend, min_opacity):
+    device, dtype = backend
+    opacities = torch.tensor([0.006, 0.1, 0.5, 0.9, 0.99, 0.5, 1.0], device=device, dtype=dtype)
+    ratios = torch.tensor([3, 2, 1, 20, 51, 99, 4], device=device)
+    scales = torch.rand(len(opacities), 3, device=device, dtype=dtype)
+    own, sizes = blitzgs.relocate(opacities, scales, ratios, min_opacity)
+    bound = 1e-7 if dtype == torch.float64 else 1e-5
+    for i, (o, n) in enumerate(zip(opacities.tolist(), ratios.clamp(max=51).tolist(), strict=True)):
+        new = max(1 - (1 - o) ** (1 / n), min_opacity)
+        terms = (
+            math.comb(j - 1, k) * (-1) ** k / math.sqrt(k + 1) * new ** (k + 1)
+            for j in range(1, n + 1)
+            for k in range(j)
+        )
+        assert math.isclose(own[i].item(), new, rel_tol=bound)
+        assert relative_error(sizes[i], scales[i] * (o / math.fsum(terms))) < bound
+    assert own.dtype == dtype and ratios.max() == 99
+    with pytest.raises(ValueError, match=r"opacities and ratios must be \[N\]"):
+        blitzgs.relocate(opacities[:, None], scales, ratios)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_noise_has_the_covariance_of_the_paper(device):
+    n, scaler, threshold = 40_000, 2.5, 0.01
+    quats, scales = (t[:1].expand(n, -1).contiguous() for t in shapes(1, dtype=torch.float32, device=device))
+    opacity = 0.02
+    logits = torch.full((n, 1), math.log(opacity / (1 - opacity)), device=device)
+    options = {"seed": 5, "step": 7, "threshold": threshold}
+    noise = blitzgs.position_noise(quats, scales.log(), logits, scaler, **options)
+    assert torch.equal(noise, blitzgs.position_noise(quats, scales.log(), logits[:, 0], scaler, **options))
+    assert not torch.equal(
+        noise, blitzgs.position_noise(quats, scales.log(), logits, scaler, **{**options, "step": 8})
+    )
+    covars, precis = blitzgs.quat_scale_to_covar_preci(quats[:1].double(), scales[:1].double())
+    share = scaler / (1 + math.exp(-100 * (threshold - opacity)))
+    normal = noise.double() @ precis[0] / share
+    assert (normal.mean(0).abs() < 5 / math.sqrt(n)).all()
+    assert relative_error(normal.T @ normal / n, torch.eye(3)) < 0.04
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_neighbours(backend):
+    device, dtype = backend
+    points = torch.randn(200, 3, generator=torch.Generator().manual_seed(0)).to(device, dtype)
+    points[7] = points[9]
+    distances = torch.cdist(points.double(), points.double(), compute_mode="donot_use_mm_for_euclid_dist")
+    distances.fill_diagonal_(math.inf)
+    expected = distances.sort(dim=1).values[:, :3]
+    assert relative_error(blitzgs.knn(points, 3), expected) < 1e-6
