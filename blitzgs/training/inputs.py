@@ -80,7 +80,8 @@ def open_capture(
 def _damaged_of_share(ranks: Ranks, files: Sequence[tuple[Path, Path | None]]) -> dict[int, str]:
     """Find damaged files; the ranks of a host, which may have its own copies, divide them. Collective."""
     begin, step = ranks.rank % ranks.local_world_size, ranks.local_world_size
-    own = {begin + step * index: text for index, text in damaged(files[begin::step]).items()}
+    with ranks.watchdog.working("reading all photographs"):
+        own = {begin + step * index: text for index, text in damaged(files[begin::step]).items()}
     return dict(sorted(item for found in ranks.all_gather_object(own) for item in found.items()))
 
 
