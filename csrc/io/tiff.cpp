@@ -10,8 +10,8 @@ namespace blitzgs::io {
 namespace {
 
 constexpr unsigned kNewSubfileType = 254, kWidth = 256, kHeight = 257, kBits = 258, kCompression = 259,
-                   kPhotometric = 262, kOrientation = 274, kBands = 277, kPlanar = 284, kSubIfds = 330, kExtraSamples = 338,
-                   kSampleFormat = 339, kDngVersion = 50706;
+                   kPhotometric = 262, kOrientation = 274, kBands = 277, kPlanar = 284, kSubIfds = 330,
+                   kExtraSamples = 338, kSampleFormat = 339, kDngVersion = 50706;
 constexpr unsigned kWhiteIsZero = 0, kBlackIsZero = 1, kPalette = 3, kCmyk = 5, kOldJpeg = 6, kJpeg = 7;
 constexpr unsigned kLossyWebp = 50001, kJp2 = 34712;
 constexpr unsigned kMaxEntries = 4096;
