@@ -15,7 +15,6 @@ from blitzgs._library import below_autograd
 from blitzgs.call.arguments import Gaussians
 from blitzgs.call.intrinsics import WRAPPED
 from blitzgs.call.layout import Layout
-from blitzgs.ops.host import HostCopy
 
 # On CUDA, the first of this many calls of a size checks all arguments: the check is a pass over all
 # Gaussians, and their values that are not finite stay so. Cameras differ from call to call, so every call
@@ -79,15 +78,6 @@ def _rows_not_finite(values: Tensor) -> Tensor:
     rows = bad.nonzero()[:, 0]
     bad[rows] = ~flat[rows].isfinite().all(dim=1)  # the sum of finite values may overflow
     return bad
-
-
-def find_bad_cameras(gaussians: Gaussians) -> HostCopy:
-    """Start to look for views whose cameras are not finite; the copy reads 0 if all are finite, int64 [1]."""
-    named = gaussians.named
-    with below_autograd():
-        return HostCopy(
-            torch.ops.blitzgs.find_non_finite([*named["viewmats"], *named["Ks"]], []).view(1).long()
-        )
 
 
 def watch_for_non_finite(

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from blitzgs.call.arguments import Gaussians, Scene
-from blitzgs.call.finite import find_bad_cameras, watch_for_non_finite
+from blitzgs.call.finite import watch_for_non_finite
 from blitzgs.call.groups import Group, groups_may_be_queued, groups_of, project_groups
+from blitzgs.call.intrinsics import CamerasOnHost, check_intrinsics
 from blitzgs.call.layout import Layout
 from blitzgs.call.lists import lists_of
 from blitzgs.call.meta import make_meta
@@ -53,11 +54,11 @@ def render(
             colours = [_nan_or_zero(scene) for scene in gaussians.scenes]
             shown = _without_non_finite(gaussians, colours)
         groups = groups_of(shown, project)
-    ready, bad_cameras = None, None
+    ready, cameras = None, None
     if job is None and not compiling and groups_may_be_queued(groups):
         ready = queued(groups[0].inputs, gaussians, image, tables)
-    elif not compiling and gaussians.opacities.is_cuda:
-        bad_cameras = find_bad_cameras(gaussians)
+    elif not compiling:
+        cameras = CamerasOnHost(gaussians)
     splats = project_groups(groups, image.sparse_grad, ready)
     layout = Layout(splats, gaussians.lead, gaussians.count, image.packed)
     # As in gsplat, Gaussians without a splat have their own opacity.
@@ -88,10 +89,12 @@ def render(
         composited=None if ready is None else ready.composited, through=through,
     )  # fmt: skip
     if not compiling:
-        # A view with a bad camera sees no Gaussian. Reading `bad_cameras` does not wait: the host has waited
-        # for the projection, which was queued after the check of the cameras.
-        suspects_cameras = ready is not None and ready.has_blank_view
-        suspects_cameras |= bad_cameras is not None and bool(bad_cameras.read()[0])
+        # A view with a bad camera sees no Gaussian. Reading `cameras` does not wait: the host has waited for
+        # the projection, which was queued after their copy.
+        suspects_cameras = not cameras.are_finite() if cameras is not None else False
+        if ready is not None and ready.has_blank_view:
+            check_intrinsics(gaussians.named["Ks"])
+            suspects_cameras = True
         watch_for_non_finite(gaussians, layout, function, colours, suspects_cameras)
     size = (*lead, project.height, project.width)
     alphas = alphas.unsqueeze(-1)

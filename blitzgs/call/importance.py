@@ -9,7 +9,7 @@ from torch import Tensor
 from blitzgs.call.arguments import check_options, check_tensors, gaussians_of
 from blitzgs.call.finite import warn_of_non_finite
 from blitzgs.call.groups import CUDA_TILE_SIZE
-from blitzgs.call.intrinsics import check_intrinsics
+from blitzgs.call.intrinsics import check_intrinsics, warn_of_gradient
 from blitzgs.ops.importance import UNITS, splat_contributions
 from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.project import project_splats
@@ -50,7 +50,7 @@ def contributions(
         scales: [N, 3] standard deviations (after the exponential).
         opacities: [N] in [0, 1] (after the sigmoid).
         viewmats: [C, 4, 4] world to camera, a rotation and a translation; any number of views.
-        Ks: [C, 3, 3] intrinsics in px.
+        Ks: [C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1.
         width: of every view, px.
         height: of every view, px.
         near_plane: Gaussians have z > near_plane, world units.
@@ -79,11 +79,12 @@ def contributions(
     )
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {})
-    check_intrinsics("contributions", Ks)
+    warn_of_gradient("contributions", Ks)
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     gaussians = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, "D")
     warn_of_non_finite(gaussians, "contributions", stacklevel=4)  # torch.no_grad is one more call
+    check_intrinsics([Ks])
     shape = (len(viewmats), len(means))
     weights = torch.zeros(shape, dtype=torch.float64, device=means.device)
     pixels = torch.zeros(shape, dtype=torch.int64, device=means.device)

@@ -4,40 +4,58 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
-# Relative to the focal length: below the rounding of float32, and far below a pixel.
+from blitzgs.call.arguments import Gaussians
+from blitzgs.ops.host import HostCopy, to_host
+
+# Relative to the focal length: below the rounding of float32, and far below a pixel; as in the projection.
 _LEAST_SKEW = 1e-6
 # Calls between a public function and its caller, for warnings: `blitzgs._torch.not_compiled`.
 WRAPPED = {"raw_rasterization": 1}
 
 
-def check_intrinsics(function: str, Ks: Tensor) -> None:  # noqa: N803
-    """Refuse intrinsics on the CPU that the pinhole projection does not have, and warn of a gradient.
-
-    On CUDA the values would have to be waited for, so they are not looked at, as in gsplat.
+def warn_of_gradient(function: str, Ks: Tensor) -> None:  # noqa: N803
+    """Warn, once, if intrinsics require a gradient: they get none, as in gsplat.
 
     Args:
         function: name of the public function.
         Ks: [..., 3, 3].
+    """
+    if Ks.requires_grad and not torch.compiler.is_compiling() and torch.is_grad_enabled():
+        _warn_of_gradient(function)
+
+
+@cache
+def _warn_of_gradient(function: str) -> None:
+    warnings.warn(
+        f"blitzgs.{function}: Ks requires a gradient and gets none, as in gsplat; pass Ks.detach()",
+        RuntimeWarning,
+        stacklevel=4 + WRAPPED.get(function, 0),
+    )
+
+
+def check_intrinsics(Ks: Sequence[Tensor]) -> None:  # noqa: N803
+    """Refuse intrinsics that the pinhole projection does not have; waits for the device.
+
+    The projection renders nothing with them, so that calls look only where a view shows nothing.
+
+    Args:
+        Ks: [C, 3, 3] of each scene.
 
     Raises:
-        ValueError: a matrix on the CPU has a skew, or another last row than 0, 0, 1.
+        ValueError: a matrix has a skew, or another last row than 0, 0, 1.
     """
-    if torch.compiler.is_compiling():
-        return
-    if Ks.requires_grad and torch.is_grad_enabled():
-        # There is none, as in gsplat.
-        _warn_of_gradient(function)
-    # Subclasses such as fake tensors have no values; the shapes are checked with the others.
-    if Ks.device.type != "cpu" or type(Ks) is not Tensor or Ks.dim() < 3 or Ks.shape[-2:] != (3, 3):
-        return
-    # In NumPy, which makes no operation of PyTorch out of each comparison.
-    rows = Ks.numpy(force=True).reshape(-1, 9)  # with a gradient or a negative bit too
+    _check_rows(np.concatenate([to_host(matrices.detach()).numpy().reshape(-1, 9) for matrices in Ks]))
+
+
+def _check_rows(rows: npt.NDArray[np.floating]) -> None:
     # Comparisons with NaN are false: what is not finite is warned of elsewhere.
     with np.errstate(invalid="ignore"):
         wrong = (abs(rows[:, [1, 3]]) > _LEAST_SKEW * abs(rows[:, :1])).any(axis=1)
@@ -51,10 +69,22 @@ def check_intrinsics(function: str, Ks: Tensor) -> None:  # noqa: N803
         )
 
 
-@cache
-def _warn_of_gradient(function: str) -> None:
-    warnings.warn(
-        f"blitzgs.{function}: Ks requires a gradient and gets none, as in gsplat; pass Ks.detach()",
-        RuntimeWarning,
-        stacklevel=4 + WRAPPED.get(function, 0),
-    )
+class CamerasOnHost:
+    """Copies cameras to the host while the device works; for calls that do not learn what each view sees."""
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        """Start to copy the cameras of a call."""
+        named = gaussians.named
+        matrices = [t.detach().reshape(-1) for name in ("Ks", "viewmats") for t in named[name]]
+        self._n_intrinsics = sum(t.numel() for t in named["Ks"])
+        self._copy = HostCopy(torch.cat(matrices).double().view(torch.int64))
+
+    def are_finite(self) -> bool:
+        """Tell whether all cameras are finite; waits for the copy.
+
+        Raises:
+            ValueError: see `check_intrinsics`.
+        """
+        values = self._copy.read().view(torch.float64).numpy()
+        _check_rows(values[: self._n_intrinsics].reshape(-1, 9))
+        return bool(np.isfinite(values).all())

@@ -18,7 +18,7 @@ from blitzgs.call.arguments import (
     with_covariances,
 )
 from blitzgs.call.images import render
-from blitzgs.call.intrinsics import check_intrinsics
+from blitzgs.call.intrinsics import warn_of_gradient
 from blitzgs.call.queued import ImageOptions
 from blitzgs.call.ranks import gather_views
 from blitzgs.ops.projection_types import ProjectionOptions
@@ -79,8 +79,8 @@ def rasterization(
             are evaluated for all Gaussians and count as colours per view. May be None for the render modes D
             and ED. float16 and bfloat16 are computed in the dtype of `means`.
         viewmats: [..., C, 4, 4] world to camera, a rotation and a translation.
-        Ks: [..., C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1, which is
-            checked on the CPU. They get no gradient.
+        Ks: [..., C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1. They get no
+            gradient. Others are refused; under `torch.compile` nothing is rendered with them.
         width: image width in px.
         height: image height in px.
         near_plane: Gaussians have z > near_plane, world units; less than far_plane.
@@ -150,7 +150,7 @@ def rasterization(
     if covars is None:
         required |= {"quats": quats, "scales": scales}
     check_tensors(required, {"colors": colors, "backgrounds": backgrounds, "covars": covars})
-    check_intrinsics("rasterization", Ks)
+    warn_of_gradient("rasterization", Ks)
     if covars is not None:
         # Placeholders, which the decomposition of the covariances replaces.
         quats, scales = (means.new_zeros(()).expand(*means.shape[:-1], length) for length in (4, 3))

@@ -24,7 +24,7 @@ from blitzgs.call.arguments import (
 )
 from blitzgs.call.groups import gathered_groups, groups_may_be_queued, groups_of
 from blitzgs.call.images import render
-from blitzgs.call.intrinsics import check_intrinsics
+from blitzgs.call.intrinsics import warn_of_gradient
 from blitzgs.call.queued import ImageOptions, ShTables
 from blitzgs.ops.projection_types import ProjectionOptions
 from blitzgs.ops.sparse_rows import of_shape
@@ -83,8 +83,8 @@ def raw_rasterization(
         sh0: [N, 1, 3] or [N, 3], the first SH coefficient; or all of them, [N, K, 3], with shN None.
         shN: [N, K - 1, 3], the other SH coefficients.
         viewmats: [C, 4, 4] world to camera, a rotation and a translation.
-        Ks: [C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1, which is
-            checked on the CPU. They get no gradient.
+        Ks: [C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1. They get no gradient.
+            Others are refused; under `torch.compile` nothing is rendered with them.
         width: image width in px.
         height: image height in px.
         near_plane: Gaussians have z > near_plane, world units; less than far_plane.
@@ -126,7 +126,7 @@ def raw_rasterization(
     )  # fmt: skip
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {"shN": shN, "backgrounds": backgrounds})
-    check_intrinsics("raw_rasterization", Ks)
+    warn_of_gradient("raw_rasterization", Ks)
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     harmonics = [sh0] if shN is None else [sh0, shN]

@@ -25,7 +25,7 @@ from blitzgs.capture.cameras import (
     same_shape,
     scaled_matrix,
 )
-from blitzgs.capture.check_files import damaged
+from blitzgs.capture.check_files import FindDamage, damaged
 from blitzgs.capture.files import MissingImagesError as MissingImagesError
 from blitzgs.capture.files import existing
 from blitzgs.capture.image_files import ImageHeader, read_header
@@ -129,6 +129,7 @@ def load_capture(
     sparse: str = "largest",
     stray_cameras: str = "drop",
     inside_only: bool = False,
+    find_damage: FindDamage = damaged,
 ) -> Capture:
     """Load a capture without decoding its images.
 
@@ -155,6 +156,8 @@ def load_capture(
             them; no length is measured by them either way.
         inside_only: refuse names that lead outside the capture, for captures that somebody else has made;
             otherwise they are read with a warning.
+        find_damage: see `check_files.damaged`; called with `allow_missing` only. The ranks of a job divide
+            the files among them.
 
     Raises:
         FileNotFoundError: the folder has no capture, or images are missing on disk (`MissingImagesError`).
@@ -189,7 +192,7 @@ def load_capture(
     _check_inside(root, views, points, images, masks, inside_only)
     kept = existing([v.name for v in views], [v.path for v in views], root, images, allow_missing)
     missing = len(views) - len(kept)
-    kept, found, damage = _with_files(views, kept, root, masks, allow_missing)
+    kept, found, damage = _with_files(views, kept, root, masks, find_damage if allow_missing else None)
     kept = without_strays(views, kept, strays, keep=stray_cameras == "keep")
     place = {index: position for position, index in enumerate(kept)}
     views = [replace(views[index], mask_path=found[index]) for index in kept]
@@ -253,12 +256,17 @@ def load_capture(
 
 
 def _with_files(
-    views: Sequence[SourceView], kept: list[int], root: Path, masks: str | bool | None, allow: bool
+    views: Sequence[SourceView],
+    kept: list[int],
+    root: Path,
+    masks: str | bool | None,
+    find_damage: FindDamage | None,
 ) -> tuple[list[int], dict[int, Path | None], dict[int, str]]:
     """Return the views that are left, the mask of each, and what is wrong with those that are left out."""
     some = [views[index] for index in kept]
     found = find_masks(root, masks, [view.name for view in some], [view.mask_path for view in some])
-    damage = damaged([(view.path, mask) for view, mask in zip(some, found, strict=True)]) if allow else {}
+    files = [(view.path, mask) for view, mask in zip(some, found, strict=True)]
+    damage = {} if find_damage is None else find_damage(files)
     if damage:
         warnings.warn(
             f"{len(damage)} of {len(some)} images or their masks are damaged; dropped (first: "

@@ -13,6 +13,8 @@ from blitzgs.capture.cameras import Camera
 from blitzgs.capture.image_files import check_photograph, decode_mask, read_whole
 
 _THREADS = 16
+# Returns what is wrong with photographs and their masks, as `damaged` does.
+FindDamage = Callable[[Sequence[tuple[Path, Path | None]]], dict[int, str]]
 
 
 def mask_error(error: Exception) -> ValueError:

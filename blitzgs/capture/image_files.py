@@ -26,11 +26,13 @@ UInt8 = npt.NDArray[np.uint8]
 _HEADER_BYTES = 1 << 16
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _HEADERS_WITH_SIZE = ("JPEG", "PNG", "TIFF")
+_LFS_START = b"version https://git-lfs.github.com/spec/"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _TURNS: dict[int, tuple[int, ...]] = {3: (cv2.ROTATE_180,), 6: (cv2.ROTATE_90_CLOCKWISE,)}
 _TURNS[8] = (cv2.ROTATE_90_COUNTERCLOCKWISE,)
 # Formats without a mark by which their content would tell them.
 _FORMATS_BY_SUFFIX = {".tga": "TGA", ".pcx": "PCX", ".svg": "SVG", ".eps": "EPS", ".psd": "Photoshop"}
+_FORMATS_BY_SUFFIX |= {".ico": "ICO", ".sgi": "SGI", ".xbm": "XBM", ".xcf": "GIMP"}
 _FORMATS_BY_SUFFIX |= dict.fromkeys((".raw", ".nef", ".arw", ".cr2", ".orf", ".rw2", ".pef"), "camera raw")
 _CONVERT = "convert it to PNG or JPEG"
 # A mask of black and white: how far, of the whole range, its black and white may be from 0 and 1.
@@ -77,6 +79,10 @@ def read_header(path: Path) -> ImageHeader:
 
 def _describe(data: bytes, name: str) -> dict[str, Any]:
     """Return what the header of a file says (csrc/io/image_header.h)."""
+    if not data:
+        raise ValueError(f"{name}: the file is empty; copy it again")
+    if data.startswith(_LFS_START):
+        raise ValueError(f"{name}: a pointer of Git LFS, not the file itself; fetch it with git lfs pull")
     found: dict[str, Any] = native_io().read_image_header(data, os.fsencode(name))
     suffix = Path(name).suffix.lower()
     if not found["format"] and suffix in _FORMATS_BY_SUFFIX:
@@ -103,12 +109,20 @@ def _check_supported(header: dict[str, Any], name: str) -> None:
         reason = f"grey {kind} with an alpha channel; {_CONVERT}"
     elif kind == "TIFF" and colors == 4 and (bits != 8 or bands > 4):
         reason = f"CMYK {kind} of {bits} bits and {bands} bands; {_CONVERT}"
+    elif alpha and _is_misread(header):
+        reason = f"{kind} of 16 bits with an alpha channel and separate bands; {_CONVERT}"
     elif kind == "TIFF" and alpha and bits not in (8, 16):
         reason = f"{kind} of {bits} bits with an alpha channel; {_CONVERT}"
     elif kind == "JPEG" and bits != 8:
         reason = f"JPEG of {bits} bits; convert it to JPEG of 8 bits"
     if reason is not None:
         raise ValueError(f"{name}: not supported: {reason}")
+
+
+def _is_misread(header: dict[str, Any]) -> bool:
+    """Tell whether OpenCV takes the bands of a TIFF, each stored on its own, for those of one pixel."""
+    bands = header["colors"] + header["extras"] + bool(header["alpha"])
+    return bool(header["is_planar"]) and header["bits"] == 16 and bands > 1
 
 
 _quiet_lock = threading.Lock()
@@ -253,6 +267,8 @@ def decode_mask(data: bytes, name: str) -> UInt8:
     header = _describe(data, name)
     if not header["supported"]:
         raise ValueError(f"{name}: not supported: {header['format']}; {_CONVERT}")
+    if _is_misread(header):
+        raise ValueError(f"{name}: not supported: TIFF of 16 bits with separate bands; {_CONVERT}")
     # Labels may be small numbers of 16 bits or dark colours: a conversion to 8 bits or to grey would make
     # them black.
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION

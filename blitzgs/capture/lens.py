@@ -126,6 +126,8 @@ def check_lens(lens: Lens) -> str:
         raise ValueError(f"the principal point {cx:g}, {cy:g} is far outside the image, {where}")
     if not 1 / 1.5 <= fx / fy <= 1.5:
         return f"focal lengths {fx:g} and {fy:g} {where}"
+    if max(abs(cx), abs(cy)) <= 1 and min(lens.width, lens.height) > 8:
+        return f"principal point {cx:g}, {cy:g} at the corner {where} (it is given in pixels)"
     if not (0 <= cx <= lens.width and 0 <= cy <= lens.height):
         return f"principal point {cx:g}, {cy:g} outside an image of {lens.width} x {lens.height} pixels"
     return ""

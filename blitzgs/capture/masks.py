@@ -7,6 +7,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 from pathlib import Path, PurePosixPath
 
 from blitzgs.capture.image_files import decode_mask, read_whole
@@ -16,6 +17,9 @@ _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp", 
 # What programs call the mask of a.jpg, the names that are tried first first.
 _FORMS: tuple[str, ...] = ("{name}.png", "{stem}.png", "{name}", "{stem}_mask.png", "{stem}_mask{suffix}")
 _FORMS += ("{name}_mask.png", "{name}.mask.png", "{stem}.mask.png")
+# These with another suffix, after all others.
+_FORMS_OF_ANY_SUFFIX = ("{name}", "{stem}", "{stem}_mask")
+_FORMS_OF_A_PLACE = len(_FORMS) + 1 + len(_FORMS_OF_ANY_SUFFIX) * len(_SUFFIXES[1:])
 # Masks are decoded when the capture is loaded to see what they exclude.
 _SAMPLED = 8
 
@@ -94,7 +98,7 @@ def _owners(folder: Path, files: Sequence[str], names: Sequence[str | None]) -> 
             for file in by_path.get(place.casefold(), ()):
                 # The folder of masks may have a folder in front of the whole name: half a rank worse.
                 exact = unified(file).casefold() == place.casefold()
-                if file not in seen and (exact or rank <= len(_FORMS)):
+                if file not in seen and (exact or rank < _FORMS_OF_A_PLACE):
                     seen.add(file)
                     claims[file].append((2 * rank + (not exact), index))
     owners: dict[int, tuple[int, str]] = {}
@@ -131,6 +135,8 @@ def _places(name: str) -> Iterator[str]:
         for form in (_FORMS[0], "{name}" if path.suffix.lower() == ".png" else "", *_FORMS[1:]):
             own = form.format(name=path.name, stem=path.stem, suffix=path.suffix)
             yield "/".join((*parts[begin:-1], own))
+        for form, suffix in product(_FORMS_OF_ANY_SUFFIX, _SUFFIXES[1:]):
+            yield "/".join((*parts[begin:-1], form.format(name=path.name, stem=path.stem) + suffix))
 
 
 def excluded_share(masks: Sequence[Path | None]) -> float | None:

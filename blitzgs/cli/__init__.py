@@ -71,7 +71,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     with surviving_output() as outputs:
-        status = _run(given)
+        try:
+            status = _run(given)
+        except SystemExit as ending:  # argparse's, after a help or a wrong usage
+            raise SystemExit(_report_lost(given, outputs) or ending.code) from None
         return _report_lost(given, outputs) or status
 
 
@@ -181,7 +184,7 @@ def _message(error: BaseException) -> str:
 
 
 # Commands whose result is what they print.
-_PRINTING = ("eval", "--show-config", "--help", "--help-fields", "-h", "--version")
+_PRINTING = ("eval", "--show-config", "--check", "--help", "--help-fields", "-h", "--version")
 
 
 def _report_lost(given: list[str], outputs: dict[str, Output]) -> int:
@@ -199,5 +202,6 @@ def _report_lost(given: list[str], outputs: dict[str, Output]) -> int:
             file=sys.stderr,
         )
     return int(
-        any(output.name == "standard output" for output in lost) and any(text in _PRINTING for text in given)
+        any(output.name == "standard output" for output in lost)
+        and any(text.partition("=")[0] in _PRINTING for text in given)
     )

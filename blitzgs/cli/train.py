@@ -19,7 +19,7 @@ from rich.table import Table
 
 from blitzgs.cli.arguments import Commands, add_command, add_device, named_path
 from blitzgs.cli.live import add_live_page, check_live_page, live_page
-from blitzgs.config.describe import describe, describe_all
+from blitzgs.config.describe import describe, describe_all, describe_page
 from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, load_config, to_dict
 from blitzgs.config.recipes import default_recipe, recipe_path
@@ -72,7 +72,11 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         help="show this help, or explain a field or section of the configuration, and stop",
     )
     parser.add_argument(
-        "--help-fields", nargs=0, action=_Help, help="explain all fields of the configuration and stop"
+        "--help-fields",
+        nargs="?",
+        choices=("text", "markdown"),
+        action=_Help,
+        help="explain all fields of the configuration, as text or as a page, and stop",
     )
     parser.add_argument(
         "--config",
@@ -122,7 +126,7 @@ class _Help(argparse.Action):
     ) -> None:
         """Print the help; exit with status 2 if there is no such field."""
         if option_string == "--help-fields":
-            print(printable(describe_all()))
+            print(describe_page() if values == "markdown" else printable(describe_all()))
         elif isinstance(values, str):
             try:
                 print(printable(describe(values)))

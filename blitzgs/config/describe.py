@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Describes the fields of the configuration for `--help FIELD`, from the docstrings of their sections."""
+"""Describes the fields of the configuration, from the docstrings of their sections.
+
+For `--help FIELD`, `--help-fields` and docs/configuration.md.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +22,11 @@ from blitzgs.config.fields import Config
 from blitzgs.config.ranges import RANGES
 
 _WIDTH = 100
+_PAGE_HEAD = """# Configuration
+
+Every field is a flag of `blitzgs train` (`--data.downscale=2`) and a line of a recipe, which overrides these
+defaults; with `--show-config` it prints the result. `--help data.downscale` has the range and the details of
+a field, and `--help-fields=markdown` made this page."""
 _KINDS = {int: "integer", float: "number", bool: "true or false", str: "text", type(None): "null"}
 
 
@@ -50,6 +58,32 @@ def describe_all() -> str:
     return "\n\n\n".join(_section(name) for name in _sections())
 
 
+def describe_page() -> str:
+    """Return docs/configuration.md: the first sentence about every field, in a table for each section."""
+    parts = [_PAGE_HEAD]
+    for section in _sections():
+        kind = _kind_of(section)
+        if section:
+            parts.append(f"## {section}\n\n{_about(kind).partition(chr(10))[0]}")
+        rows = ["field|default|meaning", "---|---|---"]
+        for names, meaning in _entries(kind).items():
+            fields = ", ".join(f"`{_joined(section, name)}`" for name in names)
+            defaults = ", ".join(f"`{_default(kind, name)}`" for name in names)
+            rows.append(f"{fields}|{defaults}|{_first_clause(meaning)}")
+        parts.append("\n".join(rows))
+    return "\n\n".join(parts)
+
+
+def _first_clause(text: str) -> str:
+    """Return a text up to the first semicolon or full stop outside of parentheses."""
+    depth = 0
+    for place, sign in enumerate(text):
+        depth += (sign == "(") - (sign == ")")
+        if depth == 0 and re.match(r";|\.(?= [A-Z0-9]|$)", text[place:]):
+            return text[:place]
+    return text
+
+
 def _sections() -> dict[str, list[str]]:
     """Return the names of the fields of each section; "" has those without a section."""
     hints = typing.get_type_hints(Config)
@@ -72,24 +106,29 @@ def _joined(section: str, field: str) -> str:
 
 def _section(name: str) -> str:
     """Return the description of a section and of all of its fields."""
-    about = (inspect.getdoc(_kind_of(name)) or "").partition("\nAttributes:")[0].strip()
+    about = _about(_kind_of(name))
     parts = [f"{name}: {about}" if name else about]
     return "\n\n".join([*parts, *(_field(name, field) for field in _sections()[name])])
+
+
+def _about(kind: type) -> str:
+    """Return what the docstring of a section says before its fields."""
+    return (inspect.getdoc(kind) or "").partition("\nAttributes:")[0].strip()
 
 
 def _field(section: str, field: str) -> str:
     """Return a line with kind, default and allowed values, and the meaning below it."""
     kind, name = _kind_of(section), _joined(section, field)
-    default = (
-        yaml.safe_dump(_plain(getattr(kind(), field)), default_flow_style=True).split("\n...")[0].strip()
-    )
     allowed = f", {RANGES[name]}" if name in RANGES else ""
-    head = f"--{name}={default}   ({_type(typing.get_type_hints(kind)[field])}{allowed})"
+    head = f"--{name}={_default(kind, field)}   ({_type(typing.get_type_hints(kind)[field])}{allowed})"
     return f"{head}\n{textwrap.indent(textwrap.fill(_meanings(kind)[field], _WIDTH), '    ')}"
 
 
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
+def _default(kind: type, field: str) -> str:
+    """Return the default of a field as YAML."""
+    value = getattr(kind(), field)
+    plain = list(value) if isinstance(value, tuple) else value
+    return yaml.safe_dump(plain, default_flow_style=True).split("\n...")[0].strip()
 
 
 def _type(hint: Any) -> str:
@@ -103,14 +142,19 @@ def _type(hint: Any) -> str:
 
 
 def _meanings(kind: type) -> dict[str, str]:
-    """Return the meaning of each field, from the part "Attributes:" of a docstring."""
+    """Return the meaning of each field; those that share one begin with all their names."""
+    return {
+        name: (f"({', '.join(names)}) " if len(names) > 1 else "") + meaning
+        for names, meaning in _entries(kind).items()
+        for name in names
+    }
+
+
+def _entries(kind: type) -> dict[tuple[str, ...], str]:
+    """Return the meaning of the fields that share one, from the part "Attributes:" of a docstring."""
     text = (inspect.getdoc(kind) or "").partition("Attributes:\n")[2]
-    entries = re.split(r"^    (?=\S)", text, flags=re.MULTILINE)
-    meanings: dict[str, str] = {}
-    for entry in filter(str.strip, entries):
+    entries: dict[tuple[str, ...], str] = {}
+    for entry in filter(str.strip, re.split(r"^    (?=\S)", text, flags=re.MULTILINE)):
         names, _, meaning = entry.partition(":")
-        shared = [name.strip() for name in names.split(",")]
-        for name in shared:
-            others = f"({names.strip()}) " if len(shared) > 1 else ""
-            meanings[name] = others + " ".join(meaning.split())
-    return meanings
+        entries[tuple(name.strip() for name in names.split(","))] = " ".join(meaning.split())
+    return entries

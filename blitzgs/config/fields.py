@@ -122,7 +122,7 @@ class ScheduleConfig:
             `scale` by the factor that is needed for this, from 1 to `MAX_STRETCH`. The run's own
             configuration has the product in `scale`, and 0 here. With 0 or with `minutes` the length does not
             depend on the number of views.
-        minutes: wall time of training that the schedule is fitted into (`blitzgs train --minutes`): the run
+        minutes: wall time of training that the schedule is fitted into (`--minutes`): the run
             measures its speed and changes its pace; `scale` stays 1. 0: no limit.
         pace: pairs (image of the run, factor): from that image on, `scale` is multiplied by the factor. A run
             with `minutes` writes its changes of pace here; a run without `minutes` repeats them.
@@ -230,9 +230,9 @@ class PopulationConfig:
         min_opacity: Gaussians of lower opacity are pruned.
         reset_opacity: cap of the opacities at each `schedule.reset_every`.
         opacity_decay: share of its opacity that every Gaussian loses at each density event.
-        prune_screen_radius: pixels; Gaussians with a larger radius are pruned after
+        prune_screen_radius: Gaussians with a larger radius, in pixels, are pruned after
             `schedule.size_prune_after`.
-        prune_world_scale: relative to extent; Gaussians with a larger axis are pruned after the same time.
+        prune_world_scale: Gaussians with a larger axis, relative to extent, are pruned after the same time.
         max_gaussians: largest population. The initial Gaussians are thinned to it (whole octree levels are
             kept, from the coarsest on, and a random part of the next); later the candidates with the largest
             gradients are densified first. 0: no limit.
@@ -257,8 +257,8 @@ class PopulationConfig:
             "random" to withhold as many at random, which a gate has to surpass; null: none.
         gate_rate: share of the candidates, clones and splits apart, that the gate withholds at each density
             event from `schedule.gate_from` on.
-        gate_rule: "rank" (BlitzGS): the gate withholds the candidates of lowest rank; "sample": those that it
-            lets pass are drawn in proportion to their odds to survive.
+        gate_rule: "rank" (BlitzGS): the gate withholds the candidates of lowest rank, or "sample": those that
+            it lets pass are drawn in proportion to their odds to survive.
         lineage: log every birth and death as Parquet files in the run's folder `lineage` (needs pyarrow).
         pixels_per_gaussian: limits the population to the pixels of all training photographs divided by this.
             0: no limit.

@@ -61,7 +61,8 @@ def project(
         opacities: [N] logits, or opacities in [0, 1] when not `raw`.
         sh: [N, K, 3] SH coefficients with K >= (sh_degree + 1)^2, coefficient 0 the DC, or None.
         viewmats: [B, 4, 4] world to camera, a rotation and a translation; B <= 32.
-        Ks: [B, 3, 3] pinhole intrinsics in px (no skew).
+        Ks: [B, 3, 3] pinhole intrinsics in px; a view with a skew, or another last row than 0, 0, 1, sees
+            nothing.
         width: image width in px.
         height: image height in px.
         active_ids: int32 [A], the rows to consider, ascending; None: all rows.

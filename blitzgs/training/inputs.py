@@ -7,11 +7,14 @@ import contextlib
 import hashlib
 import os
 import socket
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import blitzgs
 from blitzgs.capture.capture import Capture, MissingImagesError, load_capture
+from blitzgs.capture.check_files import damaged
 from blitzgs.capture.fingerprint import capture_fingerprint
 from blitzgs.capture.images import ImageStore, decoded_shapes
 from blitzgs.capture.shared_images import SharedImages, size_of
@@ -60,6 +63,7 @@ def open_capture(
             inside_only=data.inside_only,
             sparse=data.sparse,
             stray_cameras=data.stray_cameras,
+            find_damage=partial(_damaged_of_share, ranks),
         )
     except MissingImagesError as error:
         raise MissingImagesError(f"{error} ({remedy})") from error
@@ -71,6 +75,14 @@ def open_capture(
     return capture, ImageStore(
         capture, left // ranks.local_world_size, threads, background=background, shared=shared
     )
+
+
+def _damaged_of_share(ranks: Ranks, files: Sequence[tuple[Path, Path | None]]) -> dict[int, str]:
+    """Find damaged files; the ranks of a host, which may have its own copies, divide them. Collective."""
+    begin, step = ranks.rank % ranks.local_world_size, ranks.local_world_size
+    with ranks.watchdog.working("reading all photographs"):
+        own = {begin + step * index: text for index, text in damaged(files[begin::step]).items()}
+    return dict(sorted(item for found in ranks.all_gather_object(own) for item in found.items()))
 
 
 def _share_decoded(capture: Capture, budget: int, ranks: Ranks) -> tuple[SharedImages | None, int]:

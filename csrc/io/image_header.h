@@ -35,6 +35,7 @@ struct ImageHeader {
   Samples samples = Samples::kUnsigned;
   Alpha alpha = Alpha::kNone;
   std::optional<unsigned> transparent_grey;  // pixels of this value are transparent (PNG)
+  bool is_planar = false;                    // each band is stored on its own (TIFF)
   bool is_white_zero = false;                // 0 is white (TIFF)
   bool is_lossy = false;                     // its compression changes pixels: black is only nearly black
 };

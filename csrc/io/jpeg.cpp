@@ -349,14 +349,16 @@ class Checker {
   }
 
   // Checks the end of a scan or restart interval. Fewer than eight bits may be left, and after them zero
-  // bytes, which some cameras append.
+  // bytes, which some cameras append; they write no progressive files, where many zeros are lost scans.
   void end_of_interval() {
     unsigned left = held_ - padding_;
     bits_ <<= left % 8;
     for (left -= left % 8; left > 0; left -= 8, bits_ <<= 8) {
       if (bits_ >> 56) fail("damaged JPEG: image data go on after the last block");
     }
+    const std::size_t end = at_;
     while (at_ < file_.size() && file_[at_] == 0) ++at_;
+    if (progressive_ && at_ - end > kMaxForeignBytes) fail("damaged JPEG: a hole of zeros");
     if (at_ + 1 < file_.size() && (file_[at_] != 0xff || file_[at_ + 1] == 0)) {
       fail("damaged JPEG: image data go on after the last block");
     }

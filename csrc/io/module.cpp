@@ -238,7 +238,7 @@ py::dict read_image_header(const py::bytes& data, const std::string& name) {
                   "samples"_a = kSamples[static_cast<int>(header.samples)],
                   "alpha"_a = kAlpha[static_cast<int>(header.alpha)],
                   "transparent_grey"_a = header.transparent_grey, "is_white_zero"_a = header.is_white_zero,
-                  "is_lossy"_a = header.is_lossy);
+                  "is_planar"_a = header.is_planar, "is_lossy"_a = header.is_lossy);
 }
 
 py::bytes tiff_as_stored(const py::bytes& data, const std::string& name) {

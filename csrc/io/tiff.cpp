@@ -10,8 +10,8 @@ namespace blitzgs::io {
 namespace {
 
 constexpr unsigned kNewSubfileType = 254, kWidth = 256, kHeight = 257, kBits = 258, kCompression = 259,
-                   kPhotometric = 262, kOrientation = 274, kBands = 277, kSubIfds = 330, kExtraSamples = 338,
-                   kSampleFormat = 339, kDngVersion = 50706;
+                   kPhotometric = 262, kOrientation = 274, kBands = 277, kPlanar = 284, kSubIfds = 330,
+                   kExtraSamples = 338, kSampleFormat = 339, kDngVersion = 50706;
 constexpr unsigned kWhiteIsZero = 0, kBlackIsZero = 1, kPalette = 3, kCmyk = 5, kOldJpeg = 6, kJpeg = 7;
 constexpr unsigned kLossyWebp = 50001, kJp2 = 34712;
 constexpr unsigned kMaxEntries = 4096;
@@ -151,6 +151,7 @@ ImageHeader read_tiff_header(ImageBytes file, const std::string& name) {
   const std::uint64_t photometric = directory.value(kPhotometric, kBlackIsZero);
   const bool is_one = photometric == kWhiteIsZero || photometric == kBlackIsZero || photometric == kPalette;
   header.is_white_zero = photometric == kWhiteIsZero;
+  header.is_planar = directory.value(kPlanar, 1) == 2;
   const auto bands = static_cast<unsigned>(std::min<std::uint64_t>(directory.value(kBands, 1), 65535));
   header.colors = is_one ? 1 : photometric == kCmyk ? 4 : 3;
   if (bands < header.colors) throw FormatError(name, "damaged TIFF: it has too few bands for its colours");

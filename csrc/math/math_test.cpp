@@ -293,6 +293,27 @@ TEST_CASE("the frustum never drops a splat that exists") {
   REQUIRE(spared > 5000);
 }
 
+TEST_CASE("a camera with a skew or another scale than 1 sees nothing") {
+  const float viewmat[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 3, 0, 0, 0, 1};
+  const float p[11] = {0.1f, 0.2f, -0.3f, 1, 0, 0, 0, 0.1f, 0.1f, 0.1f, 0.5f};
+  const ProjectOptions<float> options{64, 48, 16, 0, 1, 0.01f, 1e10f, 0.3f, 0.0f, false, false};
+  const auto gaussian = activate_gaussian(load3(p), p + 3, load3(p + 7), p[10]);
+  const auto is_seen = [&](int entry, float value) {
+    float K[9] = {100, 0, 40, 0, 110, 30, 0, 0, 1};
+    K[entry] += value;
+    Splat<float> splat{};
+    return project_splat(make_camera(viewmat, K, 64, 48), gaussian, options, &splat);
+  };
+  for (const int entry : {1, 3, 6, 7, 8}) {
+    INFO("entry " << entry);
+    REQUIRE(is_seen(entry, 0.0f));
+    REQUIRE(is_seen(entry, 5e-7f));
+    REQUIRE_FALSE(is_seen(entry, 0.01f));
+    REQUIRE_FALSE(is_seen(entry, -0.01f));
+    REQUIRE_FALSE(is_seen(entry, std::numeric_limits<float>::quiet_NaN()));
+  }
+}
+
 TEST_CASE("nothing that is not finite becomes a splat") {
   const float bad[] = {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()};
   const Camera<float> camera = test_camera<float>();

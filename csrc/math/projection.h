@@ -9,6 +9,9 @@
 // determinant |m0 x m1|^2 + eps tr(M M^T) + eps^2 is then a sum of non-negative terms, while the usual
 // ac - b^2 cancels for elongated splats.
 #pragma once
+#include <cmath>
+#include <limits>
+
 #include "math/gaussian.h"
 
 namespace blitzgs {
@@ -23,7 +26,10 @@ struct Camera {
 };
 
 // viewmat [4, 4] and K [3, 3] row-major. The slopes leave 0.15 of the image size beyond each border, which is
-// 1.3 tan(fov / 2) for a centred principal point. The centre assumes a rotation: c = -W^T t.
+// 1.3 tan(fov / 2) for a centred principal point. The centre assumes a rotation: c = -W^T t. A skew, or
+// another last row of K than 0, 0, 1, beyond rounding has no place in the projection: such a camera sees
+// nothing, as one that is not finite. Whoever finds the view empty looks at its camera, which costs the
+// others no look.
 template <class T>
 BLITZGS_HD Camera<T> make_camera(const T* viewmat, const T* K, int width, int height) {
   Camera<T> camera;
@@ -33,7 +39,10 @@ BLITZGS_HD Camera<T> make_camera(const T* viewmat, const T* K, int width, int he
   camera.translation = {viewmat[3], viewmat[7], viewmat[11]};
   const Vec3<T>& t = camera.translation;
   camera.centre = T(-1) * (t.x * camera.row_x + t.y * camera.row_y + t.z * camera.row_z);
-  camera.fx = K[0];
+  const T rounding = T(1e-6), most = rounding * std::fabs(K[0]);
+  const bool is_pinhole = std::fabs(K[1]) <= most && std::fabs(K[3]) <= most && std::fabs(K[6]) <= rounding &&
+                          std::fabs(K[7]) <= rounding && std::fabs(K[8] - T(1)) <= rounding;
+  camera.fx = is_pinhole ? K[0] : std::numeric_limits<T>::quiet_NaN();
   camera.fy = K[4];
   camera.cx = K[2];
   camera.cy = K[5];

@@ -376,7 +376,7 @@ def test_real_captures_load_and_decode(name, views, test, downscale):
     assert inside.sum() > 1000
 
 
-@pytest.mark.parametrize("name", ["mask_of_v00.png", "v00.tif"])
+@pytest.mark.parametrize("name", ["mask_of_v00.png", "v00x.tif"])
 def test_masks_that_belong_to_no_image_are_not_ignored(tmp_path, name):
     root = write_capture(tmp_path, NAMES)
     (root / "masks").mkdir()

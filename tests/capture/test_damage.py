@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from blitzgs.capture.capture import load_capture
-from blitzgs.capture.image_files import decode_rgb, read_header, read_whole
+from blitzgs.capture.check_files import read_mask_file
+from blitzgs.capture.image_files import (
+    check_photograph,
+    decode_mask,
+    decode_rgb,
+    read_header,
+    read_whole,
+)
 from blitzgs.capture.images import ImageStore
 from tests.capture.helpers import smooth_image, write_capture, write_image
 from tests.capture.image_bytes import tiff
@@ -46,6 +53,13 @@ KINDS = [
     ("a.hdr", cv2.imencode(".hdr", np.ones((48, 64, 3), np.float32))[1].tobytes(), "Radiance HDR"),
     ("a.pfm", cv2.imencode(".pfm", np.ones((48, 64, 3), np.float32))[1].tobytes(), "PFM"),
     ("a.pdf", b"%PDF-1.4" + bytes(60), "PDF"),
+    ("a.ico", bytes(60), "ICO"),
+    ("a.sgi", b"\x01\xda" + bytes(60), "SGI"),
+    (
+        "a.tif",
+        tiff(np.ones((48, 64, 4), dtype=np.uint16), 2, t284=2),
+        "TIFF of 16 bits with an alpha",
+    ),
 ]
 
 
@@ -61,6 +75,39 @@ def test_what_is_not_supported_is_called_so_at_load(tmp_path, name, data, kind, 
         load_capture(root)
     assert "damaged" not in str(caught.value)
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "the file is empty; copy it again"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "a pointer of Git LFS.*git lfs pull"),
+    ],
+)
+def test_files_without_an_image_are_called_what_they_are(tmp_path, data, message):
+    for name in ("a.png", "a.jpg", "a.tif"):
+        (tmp_path / name).write_bytes(data)
+        for reads in (read_header, check_photograph, read_mask_file):
+            with pytest.raises(ValueError, match=f"{name}: {message}"):
+                reads(tmp_path / name)
+
+
+def test_a_mask_in_separate_bands_of_16_bits_is_refused():
+    data = tiff(np.ones((8, 8, 3), dtype=np.uint16), t284=2)
+    with pytest.raises(ValueError, match="m.tif: not supported: TIFF of 16 bits with separate bands"):
+        decode_mask(data, "m.tif")
+
+
+@pytest.mark.parametrize("kept", [0.2, 0.5, 0.8])
+def test_scans_of_a_progressive_jpeg_that_became_zeros_are_damage(tmp_path, kept):
+    pixels = np.random.default_rng(0).integers(0, 256, (200, 300, 3)).astype(np.uint8)
+    data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    length = int(kept * len(data))
+    (tmp_path / "a.jpg").write_bytes(data[:length] + bytes(len(data) - length - 2) + data[-2:])
+    with pytest.raises(ValueError, match="a.jpg: at byte .*damaged JPEG"):
+        read_whole(tmp_path / "a.jpg")
+    (tmp_path / "a.jpg").write_bytes(data[:-2] + bytes(100) + data[-2:])
+    read_whole(tmp_path / "a.jpg")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".webp", ".jpg", ".jp2", ".bmp"])

@@ -137,6 +137,16 @@ OWNERS = [
     (["a.JPG"], ["A.png"], ["A.png"]),
     (["a.jpg", "b.jpg"], ["b.png", "a.png"], ["a.png", "b.png"]),
     (["a.jpg"], ["a.png", "a.jpg.png"], ["a.jpg.png"]),
+    # Another suffix, where one image fits.
+    (["a.png"], ["a.tif"], ["a.tif"]),
+    (["DJI_1.JPG"], ["dji_1.jpeg"], ["dji_1.jpeg"]),
+    (["DJI_1.JPG"], ["DJI_1.JPG.bmp"], ["DJI_1.JPG.bmp"]),
+    (["a.jpg"], ["a_mask.webp"], ["a_mask.webp"]),
+    (["front/0.jpg", "back/0.jpg"], ["front/0.tif", "back/0.gif"], ["front/0.tif", "back/0.gif"]),
+    (["images/front/0.jpg"], ["front/0.tif"], ["front/0.tif"]),
+    (["a.png"], ["a.tif", "a.png"], ["a.png"]),
+    (["a.jpg", "a.png"], ["a.tif"], ValueError),
+    (["front/0.jpg", "back/0.jpg"], ["0.tif"], ValueError),
     # One stem, two images: each file belongs to the image that it is called after most exactly.
     (["a.jpg", "a.png"], ["a.jpg.png", "a.png"], ["a.jpg.png", "a.png"]),
     (["a.jpg", "a.png"], ["a.png.png"], [None, "a.png.png"]),

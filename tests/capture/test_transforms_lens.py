@@ -280,4 +280,5 @@ def test_a_lens_that_no_camera_has_is_refused(params, message):
 def test_an_unusual_lens_is_named():
     assert check_lens(Lens("PINHOLE", W, H, (60.0, 60.0, 32.0, 24.0))) == ""
     assert "focal lengths 60 and 120" in check_lens(Lens("PINHOLE", W, H, (60.0, 120.0, 32.0, 24.0)))
+    assert "0.5, 0.5 at the corner" in check_lens(Lens("PINHOLE", W, H, (60.0, 60.0, 0.5, 0.5)))
     assert "principal point -3, 24 outside" in check_lens(Lens("PINHOLE", W, H, (60.0, 60.0, -3.0, 24.0)))

@@ -63,6 +63,9 @@ def test_a_training_outlives_its_output(capture, tmp_path, redirection, message,
         ("train --show-config --config smoke", "| true", 0),
         ("train --show-config --config smoke", ">/dev/full", 1),
         ("train --help-fields", "| true", 0),
+        ("train --help-fields", ">/dev/full", 1),
+        ("train --help-fields=markdown", ">/dev/full", 1),
+        ("--version", ">/dev/full", 1),
     ],
 )
 def test_every_command_outlives_its_output(trained, tmp_path, command, redirection, status):

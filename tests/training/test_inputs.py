@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run opens its capture with the memory for images that the configuration and the host allow."""
 
+from typing import ClassVar
+
+import cv2
+import numpy as np
 import pytest
 
 from blitzgs.distributed.group import Ranks
@@ -43,3 +47,26 @@ def test_ranks_whose_photographs_do_not_fit_get_a_hint(tmp_path, monkeypatch):
     assert "--data.cache_bytes=1_000_000_000," in hint  # rounded up to whole gigabytes
     monkeypatch.setattr(inputs, "_host_memory", lambda: 4 * size - 4)
     assert inputs.sharing_hint(capture, 2 * size - 2, 2) is None
+
+
+def test_the_ranks_of_a_host_divide_the_search_for_damage(tmp_path):
+    """Two hosts of two ranks: one rank of each host reads a file, and all ranks know what is wrong."""
+    files = [(tmp_path / f"{index}.png", None) for index in range(5)]
+    for index, (path, _) in enumerate(files):
+        path.write_bytes(
+            b"damaged" if index in (1, 4) else cv2.imencode(".png", np.ones((8, 8)))[1].tobytes()
+        )
+
+    class Rank(Ranks):
+        found: ClassVar = []
+
+        def all_gather_object(self, value):
+            self.found.append(value)
+            return self.found
+
+    results = [
+        inputs._damaged_of_share(Rank(rank=rank, world_size=4, local_world_size=2), files)
+        for rank in range(4)
+    ]
+    assert [list(found) for found in Rank.found] == [[4], [1], [4], [1]]
+    assert list(results[-1]) == [1, 4] and "1.png" in results[-1][1]
