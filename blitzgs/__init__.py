@@ -15,6 +15,11 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 if TYPE_CHECKING:
     from blitzgs import optim
     from blitzgs.call import contributions, rasterization, raw_rasterization
+    from blitzgs.call.contributors import (
+        rasterize_contributing_gaussian_ids,
+        rasterize_num_contributing_gaussians,
+        rasterize_top_contributing_gaussian_ids,
+    )
     from blitzgs.call.losses import l1_ssim
     from blitzgs.runs.folder import open_run
     from blitzgs.table.blocks import morton_order
@@ -27,6 +32,9 @@ __all__ = [
     "open_run",
     "optim",
     "rasterization",
+    "rasterize_contributing_gaussian_ids",
+    "rasterize_num_contributing_gaussians",
+    "rasterize_top_contributing_gaussian_ids",
     "raw_rasterization",
 ]
 
@@ -36,6 +44,9 @@ _MODULES = {
     "morton_order": "blitzgs.table.blocks",
     "open_run": "blitzgs.runs.folder",
     "rasterization": "blitzgs.call",
+    "rasterize_contributing_gaussian_ids": "blitzgs.call.contributors",
+    "rasterize_num_contributing_gaussians": "blitzgs.call.contributors",
+    "rasterize_top_contributing_gaussian_ids": "blitzgs.call.contributors",
     "raw_rasterization": "blitzgs.call",
 }
 

@@ -21,10 +21,11 @@ from blitzgs.call.arguments import (
     check_tensors,
     gaussians_of,
 )
+from blitzgs.call.channels import ImageOptions
 from blitzgs.call.groups import gathered_groups, groups_may_be_queued, groups_of
 from blitzgs.call.images import render
 from blitzgs.call.intrinsics import check_intrinsics
-from blitzgs.call.queued import ImageOptions, ShTables
+from blitzgs.call.queued import ShTables
 from blitzgs.ops.projection_types import ProjectionOptions
 
 

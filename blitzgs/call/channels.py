@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The channels that an image composites: colours, extra signals, normals and depth, in this order."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding, normalize
+
+from blitzgs.call.arguments import Gaussians
+from blitzgs.call.pixels import Pixels
+from blitzgs.call.signals import NORMAL_CHANNELS
+from blitzgs.ops.projection_types import ProjectedSplats
+
+
+class ImageOptions(NamedTuple):
+    """The options of compositing and of `meta`; see `blitzgs.rasterization`.
+
+    Attributes:
+        render_mode: which channels are rendered.
+        backgrounds: [I, channels] or None.
+        packed: whether `meta` has only the visible splats, or else an entry for every Gaussian and view.
+        sparse_grad: whether gradients are sparse.
+        absgrad: whether the backward pass also returns absolute gradients.
+        normals: whether normals are rendered.
+        median: whether the median depth is.
+        pixels: the pixels that are rendered; None: all.
+    """
+
+    render_mode: str
+    backgrounds: Tensor | None
+    packed: bool
+    sparse_grad: bool
+    absgrad: bool
+    normals: bool = False
+    median: bool = False
+    pixels: Pixels | None = None
+
+
+def channels_of(
+    splats: ProjectedSplats, gaussians: Gaussians, image: ImageOptions, with_spare: bool = False
+) -> Tensor:
+    """Return the channels to composite, [P, channels].
+
+    Args:
+        splats: the P splats.
+        gaussians: the Gaussians, with colours and extra signals.
+        image: which channels are rendered.
+        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
+    """
+    parts = []
+    if gaussians.sh_degree is not None:
+        parts.append(splats.colors)
+    elif gaussians.colors is not None:
+        values = gaussians.colors.reshape(-1, gaussians.colors.shape[-1])
+        parts.append(values.index_select(0, _rows(splats, gaussians, gaussians.per_view, with_spare)))
+    if gaussians.signals is not None:
+        parts.append(_signals(splats, gaussians, with_spare))
+    if image.normals:
+        parts.append(_normals(splats, gaussians, image.sparse_grad, with_spare))
+    if image.render_mode != "RGB":
+        parts.append(splats.depths[:, None])
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
+
+
+def split_channels(
+    renders: Tensor, gaussians: Gaussians, image: ImageOptions
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Divide an image into colours with depth, and what `meta` has: extra signals and normals, by key."""
+    widths = {
+        "render_extra_signals": 0 if gaussians.signals is None else gaussians.signals.channels,
+        "normals": NORMAL_CHANNELS if image.normals else 0,
+    }
+    if not any(widths.values()):
+        return renders, {}
+    begin = 0 if gaussians.colors is None else gaussians.colors.shape[-1]
+    rest, beside = [renders[..., :begin]], {}
+    for key, width in widths.items():
+        if width:
+            beside[key] = renders[..., begin : begin + width].contiguous()
+        begin += width
+    # A copy: the caller may change one image in place, and view it in any shape.
+    return torch.cat([*rest, renders[..., begin:]], dim=-1), beside
+
+
+def _signals(splats: ProjectedSplats, gaussians: Gaussians, with_spare: bool) -> Tensor:
+    """Return the extra signals of P splats, [P, E].
+
+    SH are evaluated as colours are, along the direction from the camera centre, but not clamped:
+    sum of Y_k(direction) c_k, plus 0.5. Differentiable in the signals and, for SH, in means and viewmats.
+
+    Args:
+        splats: the splats.
+        gaussians: with signals.
+        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
+    """
+    signals = gaussians.signals
+    assert signals is not None
+    rows = _rows(splats, gaussians, signals.per_view, with_spare)
+    if signals.sh_degree is None:
+        return signals.values.reshape(-1, signals.channels).index_select(0, rows)
+    used = (signals.sh_degree + 1) ** 2
+    table = signals.values.reshape(-1, *signals.values.shape[-2:])[:, :used]
+    means = _joined([scene.means for scene in gaussians.scenes]).index_select(0, rows)
+    directions = normalize(means - _centres(splats, gaussians, with_spare), dim=1)
+    basis = _sh_basis(directions, signals.sh_degree)
+    return (basis[:, :, None] * table.index_select(0, rows)).sum(dim=1) + 0.5
+
+
+def _normals(splats: ProjectedSplats, gaussians: Gaussians, sparse_grad: bool, with_spare: bool) -> Tensor:
+    """Return the normals of P splats, [P, 3], unit vectors in world coordinates.
+
+    The normal is gsplat's: the third axis of the Gaussian, turned so that it faces the camera centre.
+    Differentiable in quats.
+
+    Args:
+        splats: the splats.
+        gaussians: the Gaussians, with rotations of any length.
+        sparse_grad: whether the gradient of quats is sparse.
+        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
+    """
+    rows = _rows(splats, gaussians, False, with_spare)
+    quats = embedding(rows, _joined([scene.quats for scene in gaussians.scenes]), sparse=sparse_grad)
+    largest = quats.detach().abs().amax(dim=1, keepdim=True)
+    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    # Scaled first, so that no square overflows.
+    scaled = torch.where(largest == 0, identity, quats / torch.where(largest == 0, 1, largest))
+    w, x, y, z = normalize(scaled, dim=1).unbind(dim=1)
+    axes = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=1)
+    with torch.no_grad():
+        means = _joined([scene.means for scene in gaussians.scenes]).index_select(0, rows)
+        rays = means - _centres(splats, gaussians, with_spare)
+        signs = torch.where((axes * rays).sum(dim=1, keepdim=True) > 0, -1.0, 1.0).to(axes.dtype)
+    return axes * signs
+
+
+def _rows(splats: ProjectedSplats, gaussians: Gaussians, per_view: bool, with_spare: bool) -> Tensor:
+    """Return the row of each splat in a table of all scenes, [S N, ...] or per view [S C N, ...]."""
+    rows = splats.gaussian_ids
+    if len(gaussians.scenes) > 1 or per_view:
+        images = splats.camera_ids.long()
+        rows = (images if per_view else images // gaussians.views) * gaussians.count + rows
+    if with_spare:
+        length = len(gaussians.scenes) * gaussians.count * (gaussians.views if per_view else 1)
+        rows = rows.clamp(0, length - 1)
+    return rows
+
+
+def _sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """Return the (degree + 1)^2 real SH [P, K] of 3DGS (Kerbl et al. 2023) at unit directions [P, 3]."""
+    x, y, z = directions.unbind(dim=1)
+    basis = [torch.full_like(x, 0.28209479177387814)]
+    if degree > 0:
+        basis += [-0.48860251190292 * y, 0.48860251190292 * z, -0.48860251190292 * x]
+    if degree > 1:
+        basis += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.9461746957575601 * z * z - 0.31539156525252005,
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (x * x - y * y),
+        ]
+    if degree > 2:
+        basis += [
+            -0.5900435899266435 * y * (3 * x * x - y * y),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (5 * z * z - 1),
+            0.3731763325901154 * z * (5 * z * z - 3),
+            -0.4570457994644658 * x * (5 * z * z - 1),
+            1.445305721320277 * z * (x * x - y * y),
+            -0.5900435899266435 * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(basis, dim=1)
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def _centres(splats: ProjectedSplats, gaussians: Gaussians, with_spare: bool) -> Tensor:
+    """Return the camera centre of each splat's view, -R^T t, [P, 3]."""
+    viewmats = _joined([scene.viewmats for scene in gaussians.scenes])
+    centres = -(viewmats[:, :3, :3] * viewmats[:, :3, 3:]).sum(dim=1)
+    images = splats.camera_ids
+    return centres.index_select(0, images.clamp(0, len(viewmats) - 1) if with_spare else images)
