@@ -41,7 +41,7 @@ GSPLAT_DEFAULTS: dict[str, Any] = {
     "renderer_config": None,
 }
 _ANY = object()  # in place of a default: no value changes the result
-# The same for `blitzgs.raw_rasterization`, which has fewer of gsplat's arguments.
+# The same for `blitzgs.raw_rasterization`, which has fewer of the arguments.
 RAW_DEFAULTS: dict[str, Any] = {
     **GSPLAT_DEFAULTS,
     "packed": True,
@@ -51,6 +51,9 @@ RAW_DEFAULTS: dict[str, Any] = {
     "return_normals": False,
     "extra_signals": None,
     "extra_signals_sh_degree": None,
+    "return_median": False,
+    "pixels": None,
+    "image_ids": None,
     "channel_chunk": _ANY,
     "segmented": _ANY,
 }

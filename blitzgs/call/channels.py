@@ -69,20 +69,20 @@ def split_channels(
     renders: Tensor, gaussians: Gaussians, image: ImageOptions
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Divide an image into colours with depth, and what `meta` has: extra signals and normals, by key."""
+    if gaussians.signals is None and not image.normals:
+        return renders, {}
     widths = {
         "render_extra_signals": 0 if gaussians.signals is None else gaussians.signals.channels,
         "normals": NORMAL_CHANNELS if image.normals else 0,
     }
-    if not any(widths.values()):
-        return renders, {}
     begin = 0 if gaussians.colors is None else gaussians.colors.shape[-1]
-    rest, beside = [renders[..., :begin]], {}
+    colours, beside = renders[..., :begin], {}
     for key, width in widths.items():
         if width:
             beside[key] = renders[..., begin : begin + width].contiguous()
         begin += width
     # A copy: the caller may change one image in place, and view it in any shape.
-    return torch.cat([*rest, renders[..., begin:]], dim=-1), beside
+    return torch.cat([colours, renders[..., begin:]], dim=-1), beside
 
 
 def _signals(splats: ProjectedSplats, gaussians: Gaussians, with_spare: bool) -> Tensor:

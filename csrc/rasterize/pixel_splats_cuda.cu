@@ -63,6 +63,7 @@ __global__ void __launch_bounds__(Tile::kThreads) pixel_splats_kernel(const Pixe
     for (int i = 0; i < quads && !__all_sync(kFullWarp, state.done()); ++i) {
       const QuadOffsets offsets(list[i]);
       const QuadAlphas alpha = state.alphas(entries, offsets, pixel);
+#pragma unroll
       for (int k = 0; k < 4; ++k) {
         const float before = state.transmittance;
         const float weight = state.composite(alpha.at[k]);
