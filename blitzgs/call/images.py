@@ -126,11 +126,9 @@ def _median_depths(splats: ProjectedSplats, lists: Lists, images: int, pixels: P
         width=lists.width, height=lists.height, tile_size=lists.tile_size,
         pixels=None if pixels is None else pixels.numbers,
     )  # fmt: skip
-    medians = found.medians
-    if len(splats.depths) == 0:
-        depths = splats.depths.new_zeros(len(medians))
-    else:
-        depths = splats.depths.index_select(0, medians.clamp(min=0)).masked_fill(medians < 0, 0)
+    # Before the first splat stands the depth of a pixel without splats.
+    table = torch.cat([splats.depths.new_zeros(1), splats.depths])
+    depths = table.index_select(0, found.medians + 1)
     return depths.view(-1, 1) if pixels is not None else depths.view(images, lists.height, lists.width, 1)
 
 

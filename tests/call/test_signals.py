@@ -2,16 +2,18 @@
 """Extra signals, normals and median depths of `blitzgs.rasterization` are those of the definition."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
+import torch.utils.checkpoint
 
 import blitzgs
 from blitzgs.reference import render
 from blitzgs.reference.compositing import composited_weights
 from blitzgs.reference.contributors import median_splats
 from blitzgs.reference.gaussians import normals, sh_colors, sh_values
-from tests.helpers import BACKENDS, image_error, random_scene, rasterize_scene, relative_error
+from tests.helpers import BACKENDS, DEVICES, image_error, random_scene, rasterize_scene, relative_error
 
 E = 5
 # Largest error against float64, by dtype, of images and of gradients.
@@ -133,6 +135,38 @@ def test_gradcheck():
 
     inputs = (scene.means, scene.quats, signals_of(scene, degree=1)[:, :4])
     torch.autograd.gradcheck(images, [t.clone().requires_grad_() for t in inputs], atol=1e-5, fast_mode=True)
+
+
+def around(function):
+    return partial(torch.utils.checkpoint.checkpoint, function, use_reentrant=False)
+
+
+def compiled(function):
+    torch._dynamo.reset()
+    return torch.compile(function, fullgraph=True, backend="aot_eager")
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("transform", [around, compiled])
+def test_checkpointing_and_compiling_change_nothing(device, transform):
+    scene = random_scene(n=40, device=device)
+    results = []
+    for wrapped in (lambda function: function, transform):
+        leaves = scene.leaves()
+        extra = signals_of(scene, degree=1).requires_grad_()
+
+        def images(means, quats, extra):
+            found, _, meta = images_of(
+                replace(scene, means=means, quats=quats), extra_signals=extra, extra_signals_sh_degree=1
+            )
+            return torch.cat([found, meta["render_median"]], dim=-1)
+
+        image = wrapped(images)(leaves.means, leaves.quats, extra)
+        image.square().sum().backward()
+        results.append([image.detach(), leaves.means.grad, leaves.quats.grad, extra.grad])
+    assert torch.equal(results[0][0], results[1][0])
+    for expected, actual in zip(*results, strict=True):
+        assert relative_error(actual, expected) < 1e-5
 
 
 def test_sparse_gradients_of_rotations_stay_sparse():
