@@ -386,33 +386,6 @@ def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree:
     return shape != (*batch, N)
 
 
-def background_rows(
-    backgrounds: Tensor | None, gaussians: Gaussians, render_mode: str, normals: bool = False
-) -> Tensor | None:
-    """Return the background of each image, [I, channels], from `backgrounds`, [..., C, D] or [..., C, D + E].
-
-    Args:
-        backgrounds: of the colours and, as in gsplat, of the E extra signals if there are any; None: zero.
-        gaussians: the Gaussians, with their extra signals.
-        render_mode: which channels are rendered.
-        normals: whether normals are.
-
-    Raises:
-        ValueError: the shape does not fit.
-    """
-    if backgrounds is None or "RGB" not in render_mode:
-        return None
-    assert gaussians.colors is not None
-    channels = given = gaussians.colors.shape[-1]
-    if gaussians.signals is not None:
-        channels += gaussians.signals.channels
-        given = channels if backgrounds.shape[-1:] == (channels,) else given
-    _require("backgrounds", backgrounds, (*gaussians.lead, given), "[..., C, D]")
-    rows = backgrounds.reshape(gaussians.images, given)
-    dark = channels - given + (NORMAL_CHANNELS if normals else 0) + (render_mode != "RGB")
-    return torch.cat([rows, rows.new_zeros(len(rows), dark)], dim=1) if dark else rows
-
-
 def _require(name: str, tensor: Tensor, shape: tuple[int, ...], described: str) -> None:
     if tensor.shape != shape:
         raise ValueError(f"{name} must be {described} = {[*shape]}, got {list(tensor.shape)}")

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from blitzgs.call.arguments import (
     DEFAULT_TILE_SIZE,
-    background_rows,
     check_further,
     check_options,
     check_tensors,
@@ -18,7 +17,7 @@ from blitzgs.call.arguments import (
     with_covariances,
     with_signals,
 )
-from blitzgs.call.channels import ImageOptions
+from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.images import render
 from blitzgs.call.intrinsics import check_intrinsics
 from blitzgs.call.pixels import checked_pixels

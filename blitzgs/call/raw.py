@@ -15,13 +15,12 @@ from blitzgs.call.arguments import (
     MAX_SH_DEGREE,
     RAW_DEFAULTS,
     Gaussians,
-    background_rows,
     check_further,
     check_options,
     check_tensors,
     gaussians_of,
 )
-from blitzgs.call.channels import ImageOptions
+from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.groups import gathered_groups, groups_may_be_queued, groups_of
 from blitzgs.call.images import render
 from blitzgs.call.intrinsics import check_intrinsics
