@@ -153,11 +153,12 @@ def _normals(splats: ProjectedSplats, gaussians: Gaussians, sparse_grad: bool, w
     rows = _rows(splats, gaussians, False, with_spare)
     quats = embedding(rows, _joined([scene.quats for scene in gaussians.scenes]), sparse=sparse_grad)
     largest = quats.detach().abs().amax(dim=1, keepdim=True)
-    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
-    # Scaled first, so that no square overflows.
-    scaled = torch.where(largest == 0, identity, quats / torch.where(largest == 0, 1, largest))
-    w, x, y, z = normalize(scaled, dim=1).unbind(dim=1)
-    axes = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=1)
+    zero = largest == 0  # the identity, with the gradient zero
+    # Scaled first, so that no square overflows. No tensor is made of numbers: the device would wait for it.
+    w, x, y, z = (quats / largest.masked_fill(zero, 1)).masked_fill(zero, 0).unbind(dim=1)
+    w = w + zero[:, 0]
+    axes = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z], dim=1)
+    axes = axes / (w * w + x * x + y * y + z * z)[:, None]
     with torch.no_grad():
         means = _joined([scene.means for scene in gaussians.scenes]).index_select(0, rows)
         rays = means - _centres(splats, gaussians, with_spare)
