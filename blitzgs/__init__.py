@@ -15,6 +15,11 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 if TYPE_CHECKING:
     from blitzgs import optim
     from blitzgs.call import contributions, rasterization, raw_rasterization
+    from blitzgs.call.contributors import (
+        rasterize_contributing_gaussian_ids,
+        rasterize_num_contributing_gaussians,
+        rasterize_top_contributing_gaussian_ids,
+    )
     from blitzgs.call.gaussians import knn, position_noise, quat_scale_to_covar_preci, relocate
     from blitzgs.call.losses import l1_ssim
     from blitzgs.ops.harmonics import spherical_harmonics
@@ -32,6 +37,9 @@ __all__ = [
     "position_noise",
     "quat_scale_to_covar_preci",
     "rasterization",
+    "rasterize_contributing_gaussian_ids",
+    "rasterize_num_contributing_gaussians",
+    "rasterize_top_contributing_gaussian_ids",
     "raw_rasterization",
     "relocate",
     "spherical_harmonics",
@@ -46,6 +54,9 @@ _MODULES = {
     "position_noise": "blitzgs.call.gaussians",
     "quat_scale_to_covar_preci": "blitzgs.call.gaussians",
     "rasterization": "blitzgs.call",
+    "rasterize_contributing_gaussian_ids": "blitzgs.call.contributors",
+    "rasterize_num_contributing_gaussians": "blitzgs.call.contributors",
+    "rasterize_top_contributing_gaussian_ids": "blitzgs.call.contributors",
     "raw_rasterization": "blitzgs.call",
     "relocate": "blitzgs.call.gaussians",
     "spherical_harmonics": "blitzgs.ops.harmonics",

@@ -161,6 +161,13 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "tile_end, "
       "Tensor? n_splats=None, bool squares=False) -> (Tensor weights, Tensor pixels, Tensor squares)");
 
+  // For each pixel, or each row that slots name: the final T, the number of composited splats, the one in the
+  // middle of the light, and the strongest with their weights alpha T.
+  m.def(
+      "pixel_splats(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor isect_splats, "
+      "Tensor tile_offsets, Tensor? slots, int n_rows, int n_cameras, int width, int height, int tile_size, "
+      "int strongest) -> (Tensor transmittances, Tensor counts, Tensor medians, Tensor ids, Tensor weights)");
+
   // For each segment, the fewest items that hold a share of its weight. Runs the steps `first_step` to
   // `last_step` - 1 of the search; between calls the sums may be added up over ranks.
   m.def(

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from blitzgs._torch import func_transforms_are_active
 from blitzgs.call.covariances import Decomposed, decompose
+from blitzgs.call.signals import NORMAL_CHANNELS, Signals, checked_signals
 from blitzgs.capture.cameras import MAX_SIDE
 from blitzgs.ops.harmonics import MAX_SH_DEGREE, colors_of_views
 
@@ -28,7 +29,6 @@ _MAX_CHANNELS = 4096
 GSPLAT_DEFAULTS: dict[str, Any] = {
     "with_ut": False,
     "with_eval3d": False,
-    "return_normals": False,
     "global_z_order": True,
     "rays": None,
     "radial_coeffs": None,
@@ -40,18 +40,22 @@ GSPLAT_DEFAULTS: dict[str, Any] = {
     "rolling_shutter": None,
     "viewmats_rs": None,
     "ut_params": None,
-    "extra_signals": None,
-    "extra_signals_sh_degree": None,
     "renderer_config": None,
 }
 _ANY = object()  # in place of a default: no value changes the result
-# The same for `blitzgs.raw_rasterization`, which has fewer of gsplat's arguments.
+# The same for `blitzgs.raw_rasterization`, which has fewer of the arguments.
 RAW_DEFAULTS: dict[str, Any] = {
     **GSPLAT_DEFAULTS,
     "packed": True,
     "distributed": False,
     "camera_model": "pinhole",
     "covars": None,
+    "return_normals": False,
+    "extra_signals": None,
+    "extra_signals_sh_degree": None,
+    "return_median": False,
+    "pixels": None,
+    "image_ids": None,
     "channel_chunk": _ANY,
     "segmented": _ANY,
 }
@@ -68,6 +72,7 @@ class Scene(NamedTuple):
         colors: SH [N, K, 3] or [C, N, K, 3], values [N, D] or [C, N, D]; None: depth alone.
         viewmats: [C, 4, 4].
         Ks: [C, 3, 3].
+        extra_signals: values [N, E] or [C, N, E], or SH [N, K, E], see `Signals`; None: none.
         covariances: covariances given instead of quats and scales; quats and scales then are their
             decomposition.
     """
@@ -79,6 +84,7 @@ class Scene(NamedTuple):
     colors: Tensor | None
     viewmats: Tensor
     Ks: Tensor
+    extra_signals: Tensor | None = None
     covariances: Decomposed | None = None
 
 
@@ -96,6 +102,7 @@ class Gaussians:
         lead: the batch dimensions, and C.
         raw: whether scales and opacities are before their activation.
         given: the arguments that `named` returns, if they are not the tensors of the scenes.
+        signals: the extra signals; None: none.
     """
 
     scenes: tuple[Scene, ...]
@@ -106,6 +113,7 @@ class Gaussians:
     lead: tuple[int, ...]
     raw: bool
     given: Mapping[str, tuple[Tensor, ...]] | None = None
+    signals: Signals | None = None
 
     @property
     def named(self) -> Mapping[str, tuple[Tensor, ...]]:
@@ -357,6 +365,20 @@ def with_covariances(gaussians: Gaussians, covars: Tensor) -> Gaussians:
     return replace(gaussians, scenes=tuple(scenes), given=named)
 
 
+def with_signals(gaussians: Gaussians, extra_signals: Tensor, sh_degree: int | None) -> Gaussians:
+    """Return Gaussians with extra signals; the arguments and errors are those of `checked_signals`."""
+    batch = gaussians.lead[:-1]
+    colours = 0 if gaussians.colors is None else gaussians.colors.shape[-1]
+    most = _MAX_CHANNELS - NORMAL_CHANNELS - 1 - colours
+    if extra_signals.shape[-1:].numel() > most:
+        raise ValueError(f"extra_signals must have 1 to {most} channels, got {extra_signals.shape[-1]}")
+    signals = checked_signals(extra_signals, sh_degree, batch, gaussians.views, gaussians.count)
+    values, count = signals.values, len(gaussians.scenes)
+    own = values.reshape(count, *values.shape[len(batch) :]).unbind(0) if batch else (values,)
+    scenes = tuple(s._replace(extra_signals=part) for s, part in zip(gaussians.scenes, own, strict=True))
+    return replace(gaussians, scenes=scenes, signals=signals)
+
+
 def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree: int | None) -> bool:
     """Check the shape of colours; return whether each view has its own."""
     wanted = "[..., N, D] or [..., C, N, D]"
@@ -373,23 +395,6 @@ def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree:
             f"sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} SH coefficients, got {colors.shape[-2]}"
         )
     return shape != (*batch, N)
-
-
-def background_rows(backgrounds: Tensor | None, gaussians: Gaussians, render_mode: str) -> Tensor | None:
-    """Return the background of each image, [I, D + depth], from `backgrounds`, [..., C, D].
-
-    Raises:
-        ValueError: the shape does not fit.
-    """
-    if backgrounds is None or "RGB" not in render_mode:
-        return None
-    assert gaussians.colors is not None
-    channels = gaussians.colors.shape[-1]
-    _require("backgrounds", backgrounds, (*gaussians.lead, channels), "[..., C, D]")
-    rows = backgrounds.reshape(gaussians.images, channels)
-    if render_mode == "RGB":
-        return rows
-    return torch.cat([rows, torch.zeros_like(rows[:, :1])], dim=1)
 
 
 def _require(name: str, tensor: Tensor, shape: tuple[int, ...], described: str) -> None:

@@ -21,6 +21,7 @@ from blitzgs.call.layout import Layout
 # looks for bad ones.
 EVERY_CUDA_CALLS = 32
 COLOURS = ("colors", "sh0", "shN")
+SIGNALS = "extra_signals"
 
 
 @torch.no_grad()
@@ -44,7 +45,9 @@ def non_finite(gaussians: Gaussians) -> dict[str, Tensor]:
         if finite:
             continue
         # Of colours per view, a Gaussian's are those of all views.
-        rows = [t.movedim(1, 0) for t in tensors] if name == "colors" and gaussians.per_view else tensors
+        signals = gaussians.signals is not None and gaussians.signals.per_view
+        per_view = {"colors": gaussians.per_view, SIGNALS: signals}
+        rows = [t.movedim(1, 0) for t in tensors] if per_view.get(name) else tensors
         bad = torch.cat([_rows_not_finite(t) for t in rows]).nonzero()[:, 0]
         if len(bad):
             found[name] = bad
@@ -61,6 +64,9 @@ def _evaluated(gaussians: Gaussians) -> Mapping[str, Sequence[Tensor]]:
                 count = min(left, named[name][0].shape[-2])
                 named[name] = [part.narrow(-2, 0, count) for part in named[name]]
                 left -= count
+    if gaussians.signals is not None and gaussians.signals.sh_degree is not None:
+        used = (gaussians.signals.sh_degree + 1) ** 2
+        named[SIGNALS] = [part.narrow(-2, 0, used) for part in named[SIGNALS]]
     return named
 
 
@@ -92,7 +98,8 @@ def watch_for_non_finite(
         gaussians: the arguments of a call.
         layout: its splats.
         function: name of the public function.
-        colours: a value for each Gaussian, NaN if its colours are values that are not finite.
+        colours: a value for each Gaussian, NaN if its colours are values that are not finite, or its extra
+            signals are not.
         suspects_cameras: whether a camera may be not finite.
     """
     named = gaussians.named
@@ -102,7 +109,8 @@ def watch_for_non_finite(
             return
         columns, opacities = [*named["viewmats"], *named["Ks"]], []
     else:
-        columns = [*(t for name, given in named.items() if name not in COLOURS for t in given), *colours]
+        checked = (t for name, given in named.items() if name not in (*COLOURS, SIGNALS) for t in given)
+        columns = [*checked, *colours]
         # Splats whose SH are not finite have no opacity, and no other splat is below 1/255.
         opacities = [layout.splats.opacities]
     # One pass over the columns tells whether a closer check is needed.

@@ -12,15 +12,19 @@ import torch
 from torch import Tensor
 
 from blitzgs.call.arguments import Gaussians, Scene
+from blitzgs.call.channels import ImageOptions, channels_of, split_channels
 from blitzgs.call.finite import watch_for_non_finite
 from blitzgs.call.groups import Group, groups_may_be_queued, groups_of, project_groups
 from blitzgs.call.intrinsics import CamerasOnHost, check_intrinsics
 from blitzgs.call.layout import Layout
-from blitzgs.call.lists import lists_of
+from blitzgs.call.lists import Lists, lists_of, lists_of_pixels
 from blitzgs.call.meta import make_meta
-from blitzgs.call.queued import ImageOptions, ShTables, channels_of, queued
+from blitzgs.call.pixels import Pixels
+from blitzgs.call.queued import ShTables, queued
 from blitzgs.call.ranks import Job, send_splats
-from blitzgs.ops.projection_types import ProjectionOptions
+from blitzgs.call.signals import Signals
+from blitzgs.ops.pixel_splats import pixel_splats
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import Through, rasterize
 
 _CHANNELS_AT_A_TIME = 64
@@ -50,12 +54,13 @@ def render(
     colours: list[Tensor] = []
     if groups is None:
         shown = gaussians
-        if gaussians.colors is not None and gaussians.sh_degree is None:
-            colours = [_nan_or_zero(scene) for scene in gaussians.scenes]
+        valued = gaussians.colors is not None and gaussians.sh_degree is None
+        if valued or gaussians.signals is not None:
+            colours = [_nan_or_zero(scene, valued, gaussians.signals) for scene in gaussians.scenes]
             shown = _without_non_finite(gaussians, colours)
         groups = groups_of(shown, project)
     ready, cameras = None, None
-    if job is None and not compiling and groups_may_be_queued(groups):
+    if job is None and not compiling and image.pixels is None and groups_may_be_queued(groups):
         ready = queued(groups[0].inputs, gaussians, image, tables)
     elif not compiling:
         cameras = CamerasOnHost(gaussians)
@@ -71,16 +76,19 @@ def render(
             rendered = splats._replace(**dict(zip(arranged, columns, strict=True)))
         else:
             through = Through(layout.places, [arranged[name] for name in ("means2d", "conics", "opacities")])
-            if image.render_mode != "RGB":
+            if image.render_mode != "RGB" or image.median:
                 rendered = splats._replace(depths=layout.gather(arranged["depths"])[0])
-    channels, lead = channels_of(rendered, gaussians, image.render_mode), gaussians.lead
+    channels, lead = channels_of(rendered, gaussians, image), gaussians.lead
     if job is not None:
         (rendered, channels), lead = send_splats(rendered, channels, job), (job.views,)
     # The projection counts the tiles of the splats that it returns. Ranks exchange splats, and the conics of
     # covariances differ from the projection's by rounding, so their tiles have to be counted again.
     uncounted = compiling or job is not None or ready is not None or groups[0].covariances is not None
     count = -1 if uncounted else int(splats.counts[2])
-    lists, composited_lists = lists_of(rendered, math.prod(lead), project, ready, count)
+    if image.pixels is None:
+        lists, composited_lists = lists_of(rendered, math.prod(lead), project, ready, count)
+    else:
+        lists, composited_lists = lists_of_pixels(rendered, math.prod(lead), project, image.pixels)
     renders, alphas = rasterize(
         rendered.means2d, rendered.conics, rendered.opacities, channels,
         composited_lists.splats, composited_lists.offsets, n_cameras=math.prod(lead), width=project.width,
@@ -96,26 +104,63 @@ def render(
             check_intrinsics(gaussians.named["Ks"])
             suspects_cameras = True
         watch_for_non_finite(gaussians, layout, function, colours, suspects_cameras)
-    size = (*lead, project.height, project.width)
-    alphas = alphas.unsqueeze(-1)
+    size, alphas = (*lead, project.height, project.width), alphas.unsqueeze(-1)
+    if image.pixels is not None:
+        renders, alphas = (t.flatten(0, 2).index_select(0, image.pixels.numbers) for t in (renders, alphas))
+    renders, beside = split_channels(renders, gaussians, image)
+    if image.median:
+        beside["render_median"] = _median_depths(rendered, composited_lists, math.prod(lead), image.pixels)
     if image.render_mode.endswith("ED"):
         # Autograd saves the divisor. It is a copy, so that the caller may change alphas in place.
         covered = alphas.clone().clamp_(min=1e-10)
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / covered], dim=-1)
-    if len(lead) > 1:
+    if len(lead) > 1 and image.pixels is None:
         renders, alphas = renders.view(*size, renders.shape[-1]), alphas.view(*size, 1)
+        beside = {key: values.view(*size, values.shape[-1]) for key, values in beside.items()}
     meta = make_meta(gaussians, layout, arranged, lists, lead, None if job is None else rendered)
+    meta.update(beside)
     return renders, alphas, meta
 
 
-def _nan_or_zero(scene: Scene) -> Tensor:
-    """Return [N]: NaN for a Gaussian with a colour, in some view, that is not finite, 0 for all others."""
-    assert scene.colors is not None
-    # Zero times a number is zero unless the number is NaN or infinite. The product of a few channels at a
-    # time needs little memory.
-    parts = [(part * 0).sum(dim=-1) for part in scene.colors.detach().split(_CHANNELS_AT_A_TIME, dim=-1)]
-    total = parts[0] if len(parts) == 1 else torch.stack(parts).sum(dim=0)
-    return total if total.dim() == 1 else total.sum(dim=0)
+def _median_depths(splats: ProjectedSplats, lists: Lists, images: int, pixels: Pixels | None) -> Tensor:
+    """Return the depth of the splat at which half the light of each pixel is gone, [I, H, W, 1] or [M, 1]."""
+    found = pixel_splats(
+        splats.means2d, splats.conics, splats.opacities, lists.splats, lists.offsets, n_cameras=images,
+        width=lists.width, height=lists.height, tile_size=lists.tile_size,
+        pixels=None if pixels is None else pixels.numbers,
+    )  # fmt: skip
+    # Before the first splat stands the depth of a pixel without splats.
+    table = torch.cat([splats.depths.new_zeros(1), splats.depths])
+    depths = table.index_select(0, found.medians + 1)
+    return depths.view(-1, 1) if pixels is not None else depths.view(images, lists.height, lists.width, 1)
+
+
+def _nan_or_zero(scene: Scene, valued: bool, signals: Signals | None) -> Tensor:
+    """Return [N]: NaN for a Gaussian with a colour or signal, in some view, that is not finite, 0 for others.
+
+    Args:
+        scene: the scene.
+        valued: whether its colours are values.
+        signals: describes its extra signals.
+    """
+    tables = []
+    if valued:
+        assert scene.colors is not None
+        tables.append(scene.colors)
+    if signals is not None:
+        assert scene.extra_signals is not None
+        values = scene.extra_signals
+        if signals.sh_degree is not None:
+            values = values[:, : (signals.sh_degree + 1) ** 2].flatten(1)
+        tables.append(values)
+    totals = []
+    for table in tables:
+        # Zero times a number is zero unless the number is NaN or infinite. The product of a few channels at a
+        # time needs little memory.
+        parts = [(part * 0).sum(dim=-1) for part in table.detach().split(_CHANNELS_AT_A_TIME, dim=-1)]
+        total = parts[0] if len(parts) == 1 else torch.stack(parts).sum(dim=0)
+        totals.append(total if total.dim() == 1 else total.sum(dim=0))
+    return totals[0] if len(totals) == 1 else totals[0] + totals[1]
 
 
 def _without_non_finite(gaussians: Gaussians, colours: Sequence[Tensor]) -> Gaussians:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.call.groups import CUDA_TILE_SIZE
+from blitzgs.call.pixels import Pixels
 from blitzgs.call.queued import Rendered
 from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
@@ -80,3 +81,63 @@ def lists_of(
     if not splats.means2d.is_cuda or tile_size == CUDA_TILE_SIZE:
         return lists, lists
     return lists, listed_by(CUDA_TILE_SIZE, -1)
+
+
+def lists_of_pixels(
+    splats: ProjectedSplats, images: int, project: ProjectionOptions, pixels: Pixels
+) -> tuple[Lists, Lists]:
+    """Return the tile lists for meta, and those to composite; they are empty but in tiles that have a pixel.
+
+    These tiles have the same lists as in the whole image, so their pixels have the same bits.
+
+    Args:
+        splats: the splats of all images.
+        images: number of images I.
+        project: the size of the images, and the caller's tile size.
+        pixels: the pixels.
+    """
+    lists = _lists_by(project.tile_size, splats, images, project, pixels)
+    if not splats.means2d.is_cuda or project.tile_size == CUDA_TILE_SIZE:
+        return lists, lists
+    return lists, _lists_by(CUDA_TILE_SIZE, splats, images, project, pixels)
+
+
+def _lists_by(
+    edge: int, splats: ProjectedSplats, images: int, project: ProjectionOptions, pixels: Pixels
+) -> Lists:
+    rows, columns = -(-project.height // edge), -(-project.width // edge)
+    wanted = torch.zeros(images, rows, columns, dtype=torch.bool, device=splats.means2d.device)
+    wanted[pixels.images, pixels.rows // edge, pixels.columns // edge] = True
+    near = _splats_near(splats, wanted, edge)
+    own = [t.detach().index_select(0, near) for t in (splats.means2d, splats.conics, splats.opacities)]
+    depths, camera_ids = (t.detach().index_select(0, near) for t in (splats.depths, splats.camera_ids))
+    listed, offsets = torch.ops.blitzgs.intersect(
+        *own, depths, camera_ids, None, *TileGrid(images, project.width, project.height, edge), -1, None, True
+    )
+    lengths, count = offsets.diff(), int(offsets[-1])
+    kept = wanted.view(-1).repeat_interleave(lengths, output_size=count)
+    ends = (lengths * wanted.view(-1)).cumsum(0)
+    return Lists(
+        near.index_select(0, listed[:count][kept]).int(),
+        torch.cat([ends.new_zeros(1), ends]),
+        project.width,
+        project.height,
+        edge,
+    )
+
+
+def _splats_near(splats: ProjectedSplats, wanted: Tensor, edge: int) -> Tensor:
+    """Return the splats whose box overlaps a wanted tile, int64 [Q], in their order."""
+    images, rows, columns = wanted.shape
+    # Sums over all tiles above and left give the number of wanted tiles in a box from its corners.
+    sums = torch.zeros(images, rows + 1, columns + 1, dtype=torch.int64, device=wanted.device)
+    sums[:, 1:, 1:] = wanted.long().cumsum(1).cumsum(2)
+    reach = splats.radii + 1
+    most = torch.tensor([columns, rows], device=wanted.device)
+    means = splats.means2d.detach()
+    low = ((means - reach) / edge).floor().clamp(min=0).minimum(most).long()
+    high = (((means + reach) / edge).floor() + 1).clamp(min=0).minimum(most).long()
+    image = splats.camera_ids.long()
+    (x0, y0), (x1, y1) = low.unbind(1), high.unbind(1)
+    count = sums[image, y1, x1] - sums[image, y0, x1] - sums[image, y1, x0] + sums[image, y0, x0]
+    return count.nonzero()[:, 0]

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from blitzgs._torch import saved_tensors_are_hooked
 from blitzgs.call.arguments import Gaussians
+from blitzgs.call.channels import ImageOptions, channels_of
 from blitzgs.frame.capacity import NoEstimate
 from blitzgs.frame.run import run
 from blitzgs.frame.transport.local import LocalExchange, LocalTransport
@@ -22,24 +23,6 @@ from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectedSplats, Projectio
 _EXACT = LocalTransport(NoEstimate())
 # What the op `render` returns before the colours and rows.
 _LISTS, _IMAGES = 2, 8
-
-
-class ImageOptions(NamedTuple):
-    """The options of compositing and of `meta`; see `blitzgs.rasterization`.
-
-    Attributes:
-        render_mode: which channels are rendered.
-        backgrounds: [I, channels] or None.
-        packed: whether `meta` has only the visible splats, or else an entry for every Gaussian and view.
-        sparse_grad: whether gradients are sparse.
-        absgrad: whether the backward pass also returns absolute gradients.
-    """
-
-    render_mode: str
-    backgrounds: Tensor | None
-    packed: bool
-    sparse_grad: bool
-    absgrad: bool
 
 
 class Rendered(NamedTuple):
@@ -141,46 +124,19 @@ def queued(
     # Hooks on saved tensors (checkpointing) need the same shapes each time, without spare capacity.
     hooked = saved_tensors_are_hooked()
     exact = hooked or not inputs.gaussians[0].is_cuda
-    read = [*inputs.gaussians, *inputs.cameras, gaussians.colors, *(() if tables is None else tables.parts)]
+    signals = None if gaussians.signals is None else gaussians.signals.values
+    read = [*inputs.gaussians, *inputs.cameras, gaussians.colors, signals]
+    read += () if tables is None else tables.parts
     differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in read)
     return render_queued(
         inputs,
-        lambda splats: channels_of(splats, gaussians, image.render_mode, with_spare=not exact),
+        lambda splats: channels_of(splats, gaussians, image, with_spare=not exact),
         image.render_mode != "RGB",
         image.backgrounds,
         differentiable and not image.absgrad,
         exact,
         tables,
     )
-
-
-def channels_of(
-    splats: ProjectedSplats, gaussians: Gaussians, render_mode: str, with_spare: bool = False
-) -> Tensor:
-    """Return the channels to composite, [P, D].
-
-    Args:
-        splats: the P splats.
-        gaussians: the Gaussians, with colours.
-        render_mode: which channels are rendered.
-        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
-    """
-    if gaussians.colors is None:
-        return splats.depths[:, None]
-    if gaussians.sh_degree is not None:
-        return _with_depth(splats.colors, splats, render_mode)
-    values = gaussians.colors.reshape(-1, gaussians.colors.shape[-1])
-    rows = splats.gaussian_ids
-    if len(gaussians.scenes) > 1 or gaussians.per_view:
-        images = splats.camera_ids.long()
-        rows = (images if gaussians.per_view else images // gaussians.views) * gaussians.count + rows
-    if with_spare:
-        rows = rows.clamp(0, len(values) - 1)
-    return _with_depth(values.index_select(0, rows), splats, render_mode)
-
-
-def _with_depth(values: Tensor, splats: ProjectedSplats, render_mode: str) -> Tensor:
-    return values if render_mode == "RGB" else torch.cat([values, splats.depths[:, None]], dim=1)
 
 
 @lru_cache(maxsize=16)

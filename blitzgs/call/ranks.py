@@ -55,16 +55,18 @@ def gather_views(gaussians: Gaussians, absgrad: bool, same: Sequence[Any]) -> tu
             ranks differ in `same`, in their number of views, or in whether
             Gaussians or poses need gradients. Some ranks would then wait for others forever.
     """
-    if len(gaussians.lead) > 1 or gaussians.per_view or absgrad:
+    per_view = gaussians.per_view or (gaussians.signals is not None and gaussians.signals.per_view)
+    if len(gaussians.lead) > 1 or per_view or absgrad:
         raise ValueError(
-            "distributed=True supports no batch dimensions, colours per view or absgrad, as gsplat's does not"
+            "distributed=True supports no batch dimensions, colours or extra signals per view, or absgrad, "
+            "as gsplat's does not"
         )
     if not dist.is_initialized() or dist.get_world_size() == 1:
         return gaussians, None
     job = Job(dist.get_rank(), dist.get_world_size(), gaussians.views)
     scene, recorded = gaussians.scenes[0], torch.is_grad_enabled()
-    *inputs, _, _ = scene  # without Ks and covariances
-    need = recorded and any(t is not None and t.requires_grad for t in inputs)
+    inputs = scene._replace(Ks=scene.means, covariances=None)  # Ks get no gradient
+    need = recorded and any(t is not None and t.requires_grad for t in inputs[:-1])
     need_poses = recorded and scene.viewmats.requires_grad
     _require_same((gaussians.views, *same, need, need_poses), scene.viewmats.device)
     viewmats = _all_poses(scene.viewmats, job)

@@ -10,16 +10,17 @@ from torch import Tensor
 
 from blitzgs.call.arguments import (
     DEFAULT_TILE_SIZE,
-    background_rows,
     check_further,
     check_options,
     check_tensors,
     gaussians_of,
     with_covariances,
+    with_signals,
 )
+from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.images import render
 from blitzgs.call.intrinsics import warn_of_gradient
-from blitzgs.call.queued import ImageOptions
+from blitzgs.call.pixels import checked_pixels
 from blitzgs.call.ranks import gather_views
 from blitzgs.ops.projection_types import ProjectionOptions
 from blitzgs.util.memory import explaining_memory
@@ -55,6 +56,13 @@ def rasterization(
     camera_model: str = "pinhole",
     segmented: bool = False,
     covars: Tensor | None = None,
+    *,
+    return_normals: bool = False,
+    extra_signals: Tensor | None = None,
+    extra_signals_sh_degree: int | None = None,
+    return_median: bool = False,
+    pixels: Tensor | None = None,
+    image_ids: Tensor | None = None,
     **further: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole views; the argument names, shapes and meta keys are gsplat's.
@@ -92,7 +100,8 @@ def rasterization(
             ([..., C, N, ...], zero where invisible). The image is the same.
         tile_size: edge of a tile in px, 1 to 64; None: 16. The image is the same, on CUDA to rounding; 16 is
             fastest there.
-        backgrounds: [..., C, D] behind everything; None for zero. Depth channels have none.
+        backgrounds: [..., C, D] behind everything, or [..., C, D + E] with extra signals; None for zero.
+            Depth and normals have none.
         render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
         sparse_grad: whether means, quats and scales, and with `sh_degree` also opacities and colors (not
             per view) that are leaves, get sparse gradients, which have only the visible Gaussians. Dense
@@ -112,6 +121,21 @@ def rasterization(
         segmented: accepted and not needed: it selects a sort in gsplat, never the result.
         covars: [..., N, 3, 3] covariances instead of quats and scales; only their upper triangles are read.
             They are decomposed, which costs more than the rest of the call; quats and scales are faster.
+        return_normals: whether to render normals into `meta["normals"]`, [..., C, H, W, 3]: the sum of
+            alpha T times the third axis of each Gaussian in world coordinates, turned to face the camera
+            centre. gsplat turns it per pixel, and has it with `with_eval3d` alone. Not with covars.
+        extra_signals: values to composite beside the colours, [..., N, E] or per view [..., C, N, E], into
+            `meta["render_extra_signals"]`, [..., C, H, W, E].
+        extra_signals_sh_degree: if given, 0 to 3, `extra_signals` are SH coefficients [N, K, E] or
+            [..., N, K, E]; the value is that of colours, but not clamped at zero.
+        return_median: whether to find the median depth, `meta["render_median"]`, [..., C, H, W, 1]: the z of
+            the Gaussian that takes the transmittance to 0.5 or below, or of the last one where none does, or
+            0 where there are none (as gsplat's 2DGS defines it). Its gradient is that of this z.
+        pixels: integers [M, 2], (row, column): render only these pixels. The images are [M, D], alphas [M, 1]
+            and other images [M, ...] too. The pixels have the bits of the whole image; only tiles that have
+            one get lists and are composited, but buffers are as large as for the whole images.
+        image_ids: integers [M], the image of each of the pixels, counted through all batch dimensions; None:
+            there is one image.
         further: gsplat's arguments that are not supported; only their default values are accepted.
 
     Returns:
@@ -146,10 +170,18 @@ def rasterization(
     )  # fmt: skip
     if isinstance(colors, Tensor) and colors.dtype in _HALF and isinstance(means, Tensor):
         colors = colors.to(means.dtype)
+    if isinstance(extra_signals, Tensor) and extra_signals.dtype in _HALF and isinstance(means, Tensor):
+        extra_signals = extra_signals.to(means.dtype)
     required: dict[str, object] = {"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks}
     if covars is None:
         required |= {"quats": quats, "scales": scales}
-    check_tensors(required, {"colors": colors, "backgrounds": backgrounds, "covars": covars})
+    optional = {
+        "colors": colors,
+        "backgrounds": backgrounds,
+        "covars": covars,
+        "extra_signals": extra_signals,
+    }
+    check_tensors(required, optional)
     warn_of_gradient("rasterization", Ks)
     if covars is not None:
         # Placeholders, which the decomposition of the covariances replaces.
@@ -160,6 +192,12 @@ def rasterization(
         raise ValueError("sparse_grad does not support batch dimensions; leave one of them out")
     if sparse_grad and covars is not None:
         raise ValueError("sparse_grad does not support covars; leave one of them out")
+    if return_normals and covars is not None:
+        raise ValueError("return_normals does not support covars, whose axes have no order; leave one out")
+    if extra_signals is not None:
+        gaussians = with_signals(gaussians, extra_signals, extra_signals_sh_degree)
+    elif extra_signals_sh_degree is not None:
+        raise ValueError("extra_signals_sh_degree needs extra_signals; give both")
     if covars is not None:
         gaussians = with_covariances(gaussians, covars)
     antialiased = rasterize_mode == "antialiased"
@@ -175,12 +213,23 @@ def rasterization(
         antialiased,
         False,
     )
-    background = background_rows(backgrounds, gaussians, render_mode)
-    image = ImageOptions(render_mode, background, packed, sparse_grad, absgrad)
+    background = background_rows(backgrounds, gaussians, render_mode, return_normals)
+    listed = None
+    if pixels is not None:
+        if distributed or torch.compiler.is_compiling():
+            raise ValueError("pixels support neither distributed=True nor torch.compile; leave one out")
+        listed = checked_pixels(pixels, image_ids, gaussians.images, width, height)
+    elif image_ids is not None:
+        raise ValueError("image_ids need pixels; give both")
+    image = ImageOptions(
+        render_mode, background, packed, sparse_grad, absgrad, return_normals, return_median, listed
+    )
     job = None
     if distributed:
         channels = None if gaussians.colors is None else gaussians.colors.shape[-1]
-        gaussians, job = gather_views(gaussians, absgrad, (width, height, tile_size, render_mode, channels))
+        signals = None if gaussians.signals is None else gaussians.signals.channels
+        same = (width, height, tile_size, render_mode, channels, signals, return_normals)
+        gaussians, job = gather_views(gaussians, absgrad, same)
     views = gaussians.views * len(gaussians.scenes)
     with explaining_memory(views, width, height, means.shape[-2], means.device):
         return render("rasterization", gaussians, project, image, job=job)

@@ -16,16 +16,16 @@ from blitzgs.call.arguments import (
     KERNEL_SH_DEGREE,
     RAW_DEFAULTS,
     Gaussians,
-    background_rows,
     check_further,
     check_options,
     check_tensors,
     gaussians_of,
 )
+from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.groups import gathered_groups, groups_may_be_queued, groups_of
 from blitzgs.call.images import render
 from blitzgs.call.intrinsics import warn_of_gradient
-from blitzgs.call.queued import ImageOptions, ShTables
+from blitzgs.call.queued import ShTables
 from blitzgs.ops.projection_types import ProjectionOptions
 from blitzgs.ops.sparse_rows import of_shape
 

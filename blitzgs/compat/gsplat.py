@@ -13,8 +13,9 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from blitzgs.ops.position_noise import position_noise_
+from blitzgs.ops.relocation import MAX_COPIES
 from blitzgs.population.density import CHILDREN_OF_A_SPLIT, SPLIT_SHRINK, rotations
-from blitzgs.population.relocation import MAX_COPIES, shared
+from blitzgs.population.relocation import shared
 
 Params = MutableMapping[str, Parameter]
 Optimizers = Mapping[str, torch.optim.Optimizer]

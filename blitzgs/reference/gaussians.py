@@ -54,8 +54,20 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(basis, dim=1)
 
 
-def sh_colors(means: Tensor, sh: Tensor, camera_centre: Tensor, degree: int) -> Tensor:
-    """Return max(SH(direction) + 0.5, 0) [N, 3], the direction from the camera centre to each mean."""
+def sh_values(means: Tensor, sh: Tensor, camera_centre: Tensor, degree: int) -> Tensor:
+    """Return SH(direction) + 0.5 [N, D], the direction from the camera centre to each mean."""
     directions = torch.nn.functional.normalize(means - camera_centre, dim=1)
     basis = sh_basis(directions, degree)
-    return (torch.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]]) + 0.5).clamp(min=0)
+    return torch.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]]) + 0.5
+
+
+def normals(means: Tensor, quats: Tensor, camera_centre: Tensor) -> Tensor:
+    """Return the third axes of Gaussians [N, 3] in the world, turned to face the camera centre."""
+    axes = rotation_matrices(quats)[:, :, 2]
+    away = ((means - camera_centre) * axes).sum(dim=1, keepdim=True) > 0
+    return torch.where(away, -axes, axes)
+
+
+def sh_colors(means: Tensor, sh: Tensor, camera_centre: Tensor, degree: int) -> Tensor:
+    """Return max(SH(direction) + 0.5, 0) [N, 3]."""
+    return sh_values(means, sh, camera_centre, degree).clamp(min=0)

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Compositing one tile on the CPU, front to back (docs/image.md, sections 3 and 5). A sink takes the weights
-// alpha T: ColorSink makes the image, ContributionSink the contributions of splats. Compiled twice, plain and
-// with AVX2; see tile_kernels.h.
+// alpha T: ColorSink makes the image, ContributionSink the contributions of splats, PixelSink those of
+// pixels. Compiled twice, plain and with AVX2; see tile_kernels.h.
 #pragma once
 #include <algorithm>
 #include <atomic>
@@ -260,6 +260,67 @@ void contribute_tile(const TileJob<typename Lanes::Scalar>& tile, const Contribu
   ForwardState<T> state = start_forward<0>(tile);
   ContributionSink<Lanes, T> sink{sums};
   composite_list<Lanes>(tile, state, sink);
+}
+
+// Writes the splats of the pixels (pixel_splats.h).
+template <class Lanes, class T>
+struct PixelSink {
+  const TileJob<T>& tile;
+  const ForwardState<T>& state;
+  const PixelSplats<T>& out;
+  std::int32_t id = 0;
+
+  void begin(std::int32_t index) { id = index; }
+  void add(Lanes share, int pixel) const {
+    alignas(64) T shares[kLanes];
+    share.store(shares);
+    const int y = pixel / state.layout.stride, x = pixel % state.layout.stride;
+    for (int i = 0; i < kLanes; ++i) {
+      if (!(shares[i] > T(0))) continue;
+      const std::int64_t row =
+          row_of(out, tile.first_pixel + static_cast<std::int64_t>(y) * tile.image_width + x + i);
+      if (row < 0) continue;
+      // The transmittance is still that in front of the splat.
+      if (state.transmittance[pixel + i] > T(kMedianTransmittance)) out.medians[row] = id;
+      const std::int32_t count = out.counts[row]++;
+      if (out.strongest > 0) {
+        const std::int64_t first = row * out.strongest;
+        keep_strongest(out.ids + first, out.weights + first, out.strongest, count, id, shares[i]);
+      }
+    }
+  }
+  void end(std::int32_t) const {}
+};
+
+// Composites one tile without colours and writes the splats of its pixels.
+template <class Lanes>
+void list_tile_splats(const TileJob<typename Lanes::Scalar>& tile,
+                      const PixelSplats<typename Lanes::Scalar>& out) {
+  using T = typename Lanes::Scalar;
+  ForwardState<T> state = start_forward<0>(tile);
+  const auto for_rows = [&](auto&& write) {
+    for (int y = 0; y < tile.height; ++y) {
+      for (int x = 0; x < tile.width; ++x) {
+        const std::int64_t row =
+            row_of(out, tile.first_pixel + static_cast<std::int64_t>(y) * tile.image_width + x);
+        if (row >= 0) write(row, y * state.layout.stride + x);
+      }
+    }
+  };
+  for_rows([&](std::int64_t row, int) {
+    out.counts[row] = 0;
+    out.medians[row] = -1;
+  });
+  PixelSink<Lanes, T> sink{tile, state, out};
+  composite_list<Lanes>(tile, state, sink);
+  for_rows([&](std::int64_t row, int pixel) {
+    const T running = state.transmittance[pixel];
+    out.transmittances[row] = running > T(0) ? running : state.ended[pixel];
+    for (std::int64_t k = out.counts[row]; k < out.strongest; ++k) {
+      out.ids[row * out.strongest + k] = -1;
+      out.weights[row * out.strongest + k] = T(0);
+    }
+  });
 }
 
 }  // namespace

@@ -165,15 +165,15 @@ TileKernels<typename Lanes::Scalar> select_kernels(int n_channels, bool absgrad)
     case 3:
       return {forward_tile<Lanes, 3>,
               absgrad ? backward_tile<Lanes, 3, true> : backward_tile<Lanes, 3, false>,
-              contribute_tile<Lanes>};
+              contribute_tile<Lanes>, list_tile_splats<Lanes>};
     case 4:
       return {forward_tile<Lanes, 4>,
               absgrad ? backward_tile<Lanes, 4, true> : backward_tile<Lanes, 4, false>,
-              contribute_tile<Lanes>};
+              contribute_tile<Lanes>, list_tile_splats<Lanes>};
     default:
       return {forward_tile<Lanes, 0>,
               absgrad ? backward_tile<Lanes, 0, true> : backward_tile<Lanes, 0, false>,
-              contribute_tile<Lanes>};
+              contribute_tile<Lanes>, list_tile_splats<Lanes>};
   }
 }
 

@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "importance/importance.h"
+#include "rasterize/pixel_splats.h"
 #include "rasterize/rasterize.h"
 
 namespace blitzgs::cpu {
@@ -74,6 +75,7 @@ struct TileKernels {
   std::int32_t (*forward)(const TileJob<T>&);                      // returns the entries processed
   void (*backward)(const TileJob<T>&, T* partials);                // writes n_entries partial gradients
   void (*contribute)(const TileJob<T>&, const ContributionSums&);  // adds to the sums of all tiles
+  void (*list_splats)(const TileJob<T>&, const PixelSplats<T>&);   // writes the rows of the tile's pixels
 };
 
 // Defined in rasterize_avx2.cpp; call only where the processor has AVX2 and FMA.

@@ -18,6 +18,7 @@ OPTIONS = [
     {"rasterize_mode": "antialiased", "sparse_grad": True},
     {"sh_degree": None, "render_mode": "RGB+D"},
     {"render_mode": "D"},
+    {"extra_signals_sh_degree": 1, "return_normals": True, "return_median": True},
 ]
 
 
@@ -44,6 +45,15 @@ def weights_for(scene, channels):
     return torch.randn(shape, generator=generator, dtype=torch.float64)
 
 
+def rendered(scene, **options):
+    """Images with what stands beside the colours, alphas, and meta."""
+    if "extra_signals_sh_degree" not in options:
+        return rasterize_scene(scene, **options)
+    renders, alphas, meta = rasterize_scene(scene, **options, extra_signals=scene.colors)
+    beside = [meta[key] for key in ("render_extra_signals", "normals", "render_median")]
+    return torch.cat([renders, *beside], dim=-1), alphas, meta
+
+
 def render_parts(ranks):
     return [render_part(ranks, options) for options in OPTIONS]
 
@@ -53,7 +63,7 @@ def render_part(ranks, options):
     part = part_of(scene, ranks.rank, ranks.world_size, ranks.device.type)
     backgrounds = torch.full((VIEWS, part.colors.shape[-1]), 0.3, device=ranks.device)
     for _ in range(2):
-        renders, alphas, meta = rasterize_scene(part, distributed=True, backgrounds=backgrounds, **options)
+        renders, alphas, meta = rendered(part, distributed=True, backgrounds=backgrounds, **options)
     meta["means2d"].retain_grad()
     weights = weights_for(scene, renders.shape[-1])[VIEWS * ranks.rank :][:VIEWS]
     ((renders.double().cpu() * weights).sum() + alphas.double().cpu().sum()).backward()
@@ -74,7 +84,7 @@ def require_whole(parts, options, world_size, device):
     """Check that several ranks and one rank give the same images and gradients with these options."""
     whole = whole_scene(world_size, options).leaves()
     backgrounds = torch.full((VIEWS * world_size, whole.colors.shape[-1]), 0.3)
-    renders, alphas, meta = rasterize_scene(whole, backgrounds=backgrounds, **options)
+    renders, alphas, meta = rendered(whole, backgrounds=backgrounds, **options)
     weights = weights_for(whole, renders.shape[-1])
     ((renders.double() * weights).sum() + alphas.double().sum()).backward()
     images, coverage = (torch.cat([part[k] for part in parts]) for k in range(2))
@@ -117,8 +127,12 @@ def test_one_process_without_a_group_is_one_rank():
 
 @pytest.mark.parametrize(
     "options",
-    [{"absgrad": True}, {"sh_degree": None, "colors": torch.rand(2, 20, 3)}],
-    ids=["absgrad", "colors"],
+    [
+        {"absgrad": True},
+        {"sh_degree": None, "colors": torch.rand(2, 20, 3)},
+        {"extra_signals": torch.rand(2, 20, 3)},
+    ],
+    ids=["absgrad", "colors", "signals"],
 )
 def test_unsupported_distributed_options_are_refused(options):
     arguments = {**vars(random_scene(n=20)), **options}

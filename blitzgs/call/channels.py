@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The channels that an image composites: colours, extra signals, normals and depth, in this order."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding
+
+from blitzgs.call.arguments import Gaussians
+from blitzgs.call.pixels import Pixels
+from blitzgs.call.signals import NORMAL_CHANNELS
+from blitzgs.ops.harmonics import spherical_harmonics
+from blitzgs.ops.projection_types import ProjectedSplats
+
+
+class ImageOptions(NamedTuple):
+    """The options of compositing and of `meta`; see `blitzgs.rasterization`.
+
+    Attributes:
+        render_mode: which channels are rendered.
+        backgrounds: [I, channels] or None.
+        packed: whether `meta` has only the visible splats, or else an entry for every Gaussian and view.
+        sparse_grad: whether gradients are sparse.
+        absgrad: whether the backward pass also returns absolute gradients.
+        normals: whether normals are rendered.
+        median: whether the median depth is.
+        pixels: the pixels that are rendered; None: all.
+    """
+
+    render_mode: str
+    backgrounds: Tensor | None
+    packed: bool
+    sparse_grad: bool
+    absgrad: bool
+    normals: bool = False
+    median: bool = False
+    pixels: Pixels | None = None
+
+
+def background_rows(
+    backgrounds: Tensor | None, gaussians: Gaussians, render_mode: str, normals: bool = False
+) -> Tensor | None:
+    """Return the background of each image, [I, channels], from `backgrounds`, [..., C, D] or [..., C, D + E].
+
+    Args:
+        backgrounds: of the colours and, as in gsplat, of the E extra signals if there are any; None: zero.
+        gaussians: the Gaussians, with their extra signals.
+        render_mode: which channels are rendered.
+        normals: whether normals are.
+
+    Raises:
+        ValueError: the shape does not fit.
+    """
+    if backgrounds is None or "RGB" not in render_mode:
+        return None
+    assert gaussians.colors is not None
+    channels = given = gaussians.colors.shape[-1]
+    if gaussians.signals is not None:
+        channels += gaussians.signals.channels
+        given = channels if backgrounds.shape[-1:] == (channels,) else given
+    wanted = (*gaussians.lead, given)
+    if backgrounds.shape != wanted:
+        raise ValueError(f"backgrounds must be [..., C, D] = {[*wanted]}, got {[*backgrounds.shape]}")
+    rows = backgrounds.reshape(gaussians.images, given)
+    dark = channels - given + (NORMAL_CHANNELS if normals else 0) + (render_mode != "RGB")
+    return torch.cat([rows, rows.new_zeros(len(rows), dark)], dim=1) if dark else rows
+
+
+def channels_of(
+    splats: ProjectedSplats, gaussians: Gaussians, image: ImageOptions, with_spare: bool = False
+) -> Tensor:
+    """Return the channels to composite, [P, channels].
+
+    Args:
+        splats: the P splats.
+        gaussians: the Gaussians, with colours and extra signals.
+        image: which channels are rendered.
+        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
+    """
+    parts = []
+    if gaussians.sh_degree is not None:
+        parts.append(splats.colors)
+    elif gaussians.colors is not None:
+        values = gaussians.colors.reshape(-1, gaussians.colors.shape[-1])
+        parts.append(values.index_select(0, _rows(splats, gaussians, gaussians.per_view, with_spare)))
+    if gaussians.signals is not None:
+        parts.append(_signals(splats, gaussians, with_spare))
+    if image.normals:
+        parts.append(_normals(splats, gaussians, image.sparse_grad, with_spare))
+    if image.render_mode != "RGB":
+        parts.append(splats.depths[:, None])
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
+
+
+def split_channels(
+    renders: Tensor, gaussians: Gaussians, image: ImageOptions
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Divide an image into colours with depth, and what `meta` has: extra signals and normals, by key."""
+    if gaussians.signals is None and not image.normals:
+        return renders, {}
+    widths = {
+        "render_extra_signals": 0 if gaussians.signals is None else gaussians.signals.channels,
+        "normals": NORMAL_CHANNELS if image.normals else 0,
+    }
+    begin = 0 if gaussians.colors is None else gaussians.colors.shape[-1]
+    colours, beside = renders[..., :begin], {}
+    for key, width in widths.items():
+        if width:
+            beside[key] = renders[..., begin : begin + width].contiguous()
+        begin += width
+    # A copy: the caller may change one image in place, and view it in any shape.
+    return torch.cat([colours, renders[..., begin:]], dim=-1), beside
+
+
+def _signals(splats: ProjectedSplats, gaussians: Gaussians, with_spare: bool) -> Tensor:
+    """Return the extra signals of P splats, [P, E].
+
+    SH are evaluated as colours are, along the direction from the camera centre, but not clamped:
+    sum of Y_k(direction) c_k, plus 0.5. Differentiable in the signals and, for SH, in means and viewmats.
+
+    Args:
+        splats: the splats.
+        gaussians: with signals.
+        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
+    """
+    signals = gaussians.signals
+    assert signals is not None
+    rows = _rows(splats, gaussians, signals.per_view, with_spare)
+    if signals.sh_degree is None:
+        return signals.values.reshape(-1, signals.channels).index_select(0, rows)
+    used = (signals.sh_degree + 1) ** 2
+    table = signals.values.reshape(-1, *signals.values.shape[-2:])[:, :used]
+    means = _joined([scene.means for scene in gaussians.scenes]).index_select(0, rows)
+    directions = means - _centres(splats, gaussians, with_spare)
+    return spherical_harmonics(signals.sh_degree, directions, table.index_select(0, rows)) + 0.5
+
+
+def _normals(splats: ProjectedSplats, gaussians: Gaussians, sparse_grad: bool, with_spare: bool) -> Tensor:
+    """Return the normals of P splats, [P, 3], unit vectors in world coordinates.
+
+    The normal is gsplat's: the third axis of the Gaussian, turned so that it faces the camera centre.
+    Differentiable in quats.
+
+    Args:
+        splats: the splats.
+        gaussians: the Gaussians, with rotations of any length.
+        sparse_grad: whether the gradient of quats is sparse.
+        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
+    """
+    rows = _rows(splats, gaussians, False, with_spare)
+    quats = embedding(rows, _joined([scene.quats for scene in gaussians.scenes]), sparse=sparse_grad)
+    largest = quats.detach().abs().amax(dim=1, keepdim=True)
+    zero = largest == 0  # the identity, with the gradient zero
+    # Scaled first, so that no square overflows. No tensor is made of numbers: the device would wait for it.
+    w, x, y, z = (quats / largest.masked_fill(zero, 1)).masked_fill(zero, 0).unbind(dim=1)
+    w = w + zero[:, 0]
+    axes = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z], dim=1)
+    axes = axes / (w * w + x * x + y * y + z * z)[:, None]
+    with torch.no_grad():
+        means = _joined([scene.means for scene in gaussians.scenes]).index_select(0, rows)
+        rays = means - _centres(splats, gaussians, with_spare)
+        signs = torch.where((axes * rays).sum(dim=1, keepdim=True) > 0, -1.0, 1.0).to(axes.dtype)
+    return axes * signs
+
+
+def _rows(splats: ProjectedSplats, gaussians: Gaussians, per_view: bool, with_spare: bool) -> Tensor:
+    """Return the row of each splat in a table of all scenes, [S N, ...] or per view [S C N, ...]."""
+    rows = splats.gaussian_ids
+    if len(gaussians.scenes) > 1 or per_view:
+        images = splats.camera_ids.long()
+        rows = (images if per_view else images // gaussians.views) * gaussians.count + rows
+    if with_spare:
+        length = len(gaussians.scenes) * gaussians.count * (gaussians.views if per_view else 1)
+        rows = rows.clamp(0, length - 1)
+    return rows
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def _centres(splats: ProjectedSplats, gaussians: Gaussians, with_spare: bool) -> Tensor:
+    """Return the camera centre of each splat's view, -R^T t, [P, 3]."""
+    viewmats = _joined([scene.viewmats for scene in gaussians.scenes])
+    centres = -(viewmats[:, :3, :3] * viewmats[:, :3, 3:]).sum(dim=1)
+    images = splats.camera_ids
+    return centres.index_select(0, images.clamp(0, len(viewmats) - 1) if with_spare else images)

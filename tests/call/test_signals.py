@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Extra signals, normals and median depths of `blitzgs.rasterization` are those of the definition."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+import torch.utils.checkpoint
+
+import blitzgs
+from blitzgs.reference import render
+from blitzgs.reference.compositing import composited_weights
+from blitzgs.reference.contributors import median_splats
+from blitzgs.reference.gaussians import normals, sh_colors, sh_values
+from tests.helpers import BACKENDS, DEVICES, image_error, random_scene, rasterize_scene, relative_error
+
+E = 5
+# Largest error against float64, by dtype, of images and of gradients.
+MOST = {torch.float64: (1e-9, 1e-7), torch.float32: (2e-4, 2e-3)}
+
+
+def signals_of(scene, per_view=False, degree=None):
+    shape = (len(scene.means), E) if degree is None else (len(scene.means), 16, E)
+    shape = (len(scene.viewmats), *shape) if per_view else shape
+    generator = torch.Generator().manual_seed(5)
+    return torch.randn(shape, generator=generator, dtype=torch.float64).to(scene.means)
+
+
+def definition(scene, signals, degree, view):
+    """Colours, extra signals and normals of one view, [H, W, 3 + E + 3], depths [H, W, 1], by definition."""
+    s = scene.to(torch.float64)
+    viewmat = s.viewmats[view]
+    centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    signals = signals.double().cpu()
+    own = signals if degree is None else sh_values(s.means, signals, centre, degree)
+    own = own[view] if own.dim() == 3 else own
+    values = torch.cat([sh_colors(s.means, s.colors, centre, 3), own, normals(s.means, s.quats, centre)], 1)
+    image = render(
+        s.means, s.quats, s.scales, s.opacities, values, viewmat, s.Ks[view], s.width, s.height,
+        render_mode="RGB+ED",
+    )  # fmt: skip
+    splats = image.splats
+    geometry = (splats.means2d, splats.conics, splats.opacities, splats.depths)
+    weights, _ = composited_weights(*geometry, s.width, s.height)
+    median = median_splats(weights)
+    depths = splats.depths[median.clamp(min=0)].masked_fill(median < 0, 0)
+    # A pixel whose transmittance is close to 0.5 may have either of two neighbouring splats.
+    before = 1 - (weights.cumsum(0) - weights)
+    return image, depths[..., None], image.cut | ((before - 0.5).abs() < 1e-4).any(dim=0)
+
+
+def images_of(scene, **options):
+    image, alphas, meta = rasterize_scene(
+        scene, render_mode="RGB+ED", return_normals=True, return_median=True, **options
+    )
+    parts = [image[..., :3], meta["render_extra_signals"], meta["normals"], image[..., 3:]]
+    return torch.cat(parts, dim=-1), alphas, meta
+
+
+@pytest.mark.parametrize("degree,per_view", [(None, False), (None, True), (2, False)])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_images_and_gradients_are_those_of_the_definition(backend, degree, per_view):
+    device, dtype = backend
+    scene = random_scene(cameras=2, seed=3).to(dtype, device)
+    scene.quats[:4] = 0  # the identity
+    scene.quats[4:8] *= 1e18
+    scene = scene.leaves()
+    extra = signals_of(scene, per_view, degree).requires_grad_()
+    ours, _, meta = images_of(scene, extra_signals=extra, extra_signals_sh_degree=degree)
+    exact = replace(scene.to(torch.float64)).leaves()
+    exact_extra = extra.detach().double().cpu().requires_grad_()
+    loss, expected_loss = 0, 0
+    for view in range(2):
+        image, median, cut = definition(exact, exact_extra, degree, view)
+        assert image_error(ours[view], image.image, cut) < MOST[dtype][0]
+        assert image_error(meta["render_median"][view], median, cut) < MOST[dtype][0]
+        assert (median > 0).any() and image.image[..., 8:11].abs().max() > 0.3
+        v = torch.rand(*cut.shape, 13, generator=torch.Generator().manual_seed(view), dtype=torch.float64)
+        v = v * ~cut[..., None]
+        expected_loss = expected_loss + (torch.cat([image.image, median], -1) * v).sum()
+        got = torch.cat([ours[view], meta["render_median"][view]], -1)
+        loss = loss + (got * v.to(device, dtype)).sum()
+    expected_loss.backward()
+    loss.backward()
+    assert relative_error(extra.grad, exact_extra.grad) < MOST[dtype][1]
+    for name in ("means", "quats", "scales", "opacities", "colors", "viewmats"):
+        error = relative_error(getattr(scene, name).grad, getattr(exact, name).grad)
+        assert error < MOST[dtype][1], name
+
+
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_colours_keep_their_bits_and_layouts_agree(backend, packed):
+    scene = random_scene().to(backend[1], backend[0])
+    for mode in ("RGB", "RGB+D", "RGB+ED", "ED"):
+        alone, alphas, _ = rasterize_scene(scene, render_mode=mode)
+        for _ in range(2):  # on CUDA the second call is queued
+            image, also, meta = rasterize_scene(
+                scene, render_mode=mode, extra_signals=signals_of(scene), return_normals=True,
+                return_median=True, packed=packed,
+            )  # fmt: skip
+            assert torch.equal(image, alone) and torch.equal(also, alphas)
+            assert meta["render_extra_signals"].shape == (2, 32, 40, E)
+            assert meta["render_extra_signals"].is_contiguous()
+            assert meta["normals"].shape == (2, 32, 40, 3) and meta["render_median"].shape == (2, 32, 40, 1)
+
+
+def test_batches_are_scenes_one_by_one():
+    scene = random_scene(n=30, dtype=torch.float64)
+    both = [torch.stack([t, t.flip(0)]) for t in scene.arguments()[:5]]
+    cameras = [t.expand(2, *t.shape) for t in (scene.viewmats, scene.Ks)]
+    sh = signals_of(scene, degree=2)  # shared by the scenes, as gsplat has it
+    values = torch.stack([signals_of(scene), signals_of(scene).flip(0)])
+    options = {"return_normals": True, "return_median": True, "sh_degree": 3}
+    for extra, degree in ((values, None), (sh, 1)):
+        _, _, meta = blitzgs.rasterization(
+            *both, *cameras, 40, 32, extra_signals=extra, extra_signals_sh_degree=degree, **options
+        )
+        for number in range(2):
+            own = extra if degree is not None else extra[number]
+            _, _, one = blitzgs.rasterization(
+                *(t[number] for t in both), scene.viewmats, scene.Ks, 40, 32, extra_signals=own,
+                extra_signals_sh_degree=degree, **options,
+            )  # fmt: skip
+            for key in ("render_extra_signals", "normals", "render_median"):
+                assert torch.equal(meta[key][number], one[key]), key
+
+
+def test_gradcheck():
+    scene = random_scene(n=5, cameras=1, width=6, height=5, seed=2, dtype=torch.float64, scale=0.4)
+
+    def images(means, quats, extra):
+        found, _, meta = images_of(
+            replace(scene, means=means, quats=quats), extra_signals=extra, extra_signals_sh_degree=1
+        )
+        return found, meta["render_median"]
+
+    inputs = (scene.means, scene.quats, signals_of(scene, degree=1)[:, :4])
+    torch.autograd.gradcheck(images, [t.clone().requires_grad_() for t in inputs], atol=1e-5, fast_mode=True)
+
+
+def around(function):
+    return partial(torch.utils.checkpoint.checkpoint, function, use_reentrant=False)
+
+
+def compiled(function):
+    torch._dynamo.reset()
+    return torch.compile(function, fullgraph=True, backend="aot_eager")
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("transform", [around, compiled])
+def test_checkpointing_and_compiling_change_nothing(device, transform):
+    scene = random_scene(n=40, device=device)
+    results = []
+    for wrapped in (lambda function: function, transform):
+        leaves = scene.leaves()
+        extra = signals_of(scene, degree=1).requires_grad_()
+
+        def images(means, quats, extra):
+            found, _, meta = images_of(
+                replace(scene, means=means, quats=quats), extra_signals=extra, extra_signals_sh_degree=1
+            )
+            return torch.cat([found, meta["render_median"]], dim=-1)
+
+        image = wrapped(images)(leaves.means, leaves.quats, extra)
+        image.square().sum().backward()
+        results.append([image.detach(), leaves.means.grad, leaves.quats.grad, extra.grad])
+    assert torch.equal(results[0][0], results[1][0])
+    for expected, actual in zip(*results, strict=True):
+        assert relative_error(actual, expected) < 1e-5
+
+
+def test_sparse_gradients_of_rotations_stay_sparse():
+    gradients = []
+    for sparse in (False, True):
+        scene = random_scene(dtype=torch.float64).leaves()
+        _, _, meta = rasterize_scene(
+            scene, return_normals=True, extra_signals=signals_of(scene), sparse_grad=sparse
+        )
+        (meta["normals"].square().sum() + meta["render_extra_signals"].square().sum()).backward()
+        assert scene.quats.grad.is_sparse == scene.means.grad.is_sparse == sparse
+        gradients.append([t.grad.to_dense() for t in (scene.means, scene.quats, scene.scales)])
+    for dense, sparse in zip(*gradients, strict=True):
+        assert relative_error(sparse, dense) < 1e-12
+
+
+def test_backgrounds_are_behind_the_colours_and_if_given_behind_the_signals():
+    scene = random_scene(n=8, dtype=torch.float64)
+    extra, rows = signals_of(scene), torch.rand(2, 3 + E, dtype=torch.float64)
+    options = {"extra_signals": extra, "render_mode": "RGB+D", "return_normals": True}
+    dark, alphas, plain = rasterize_scene(scene, **options)
+    rest = (1 - alphas) * rows[:, None, None]
+    for given in (3, 3 + E):
+        image, _, meta = rasterize_scene(scene, **options, backgrounds=rows[:, :given])
+        assert relative_error(image[..., :3], dark[..., :3] + rest[..., :3]) < 1e-12
+        behind = rest[..., 3:] if given > 3 else 0
+        assert relative_error(meta["render_extra_signals"], plain["render_extra_signals"] + behind) < 1e-12
+        assert torch.equal(image[..., 3], dark[..., 3]) and torch.equal(meta["normals"], plain["normals"])
+
+
+@pytest.mark.parametrize("degree", [None, 1])
+def test_gaussians_with_signals_that_are_not_finite_are_not_rendered(degree):
+    scene = random_scene(dtype=torch.float64)
+    extra = signals_of(scene, degree=degree)
+    extra[7, ..., 2] = float("nan")
+    if degree == 1:
+        extra[9, 15] = float("inf")  # above the degree
+    options = {"extra_signals": extra, "extra_signals_sh_degree": degree, "return_normals": True}
+    with pytest.warns(RuntimeWarning, match="extra_signals"):
+        image, _, meta = rasterize_scene(scene, **options)
+    assert meta["non_finite"]["extra_signals"].tolist() == [7]
+    kept = [i for i in range(60) if i != 7]
+    rest = replace(
+        scene, **{k: getattr(scene, k)[kept] for k in ("means", "quats", "scales", "opacities", "colors")}
+    )
+    expected, _, other = rasterize_scene(rest, **{**options, "extra_signals": extra[kept]})
+    assert torch.equal(image, expected)
+    assert torch.equal(meta["render_extra_signals"], other["render_extra_signals"])
+
+
+def test_half_precision_signals_are_computed_in_full_precision():
+    scene = random_scene()
+    extra = signals_of(scene).bfloat16()
+    _, _, half = rasterize_scene(scene, extra_signals=extra)
+    _, _, full = rasterize_scene(scene, extra_signals=extra.float())
+    assert torch.equal(half["render_extra_signals"], full["render_extra_signals"])
+
+
+@pytest.mark.parametrize(
+    "options,message",
+    [
+        ({"extra_signals": torch.zeros(59, 2)}, r"extra_signals must be \[..., N, E\]"),
+        ({"extra_signals": torch.zeros(60, 0)}, "extra_signals must be"),
+        ({"extra_signals": torch.zeros(60, 4090)}, "extra_signals must have 1 to 4089 channels, got 4090"),
+        ({"extra_signals": torch.zeros(60, 3, 2), "extra_signals_sh_degree": 1}, "K of at least 4"),
+        ({"extra_signals": torch.zeros(60, 16, 2), "extra_signals_sh_degree": 4}, "0 to 3, got 4"),
+        ({"return_normals": True, "covars": torch.eye(3).expand(60, 3, 3)}, "does not support covars"),
+        ({"extra_signals_sh_degree": 1}, "extra_signals_sh_degree needs extra_signals"),
+    ],
+)
+def test_wrong_arguments_are_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        rasterize_scene(random_scene(), **options)
