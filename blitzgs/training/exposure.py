@@ -115,6 +115,11 @@ class Exposures:
             found = found.to(self.measured.device)
             self.measured, self.counts = found[:, :-1].reshape(-1, 2, 3).clone(), found[:, -1].clone()
 
+    def values(self) -> list[list[list[float]]]:
+        """Return `effective` as numbers, in the order of the training views."""
+        found: list[list[list[float]]] = self.effective().cpu().numpy().round(5).tolist()
+        return found
+
     def describe(self) -> dict[str, float]:
         """Return figures for the summary: spread and range of the gains in use, mean of the channels."""
         gains = self.effective()[:, 0].mean(1)

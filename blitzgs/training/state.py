@@ -134,6 +134,20 @@ class TrainingState:
         finally:
             self._started += self.clock() - paused
 
+    @contextlib.contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time inside this context to `progress.stages`."""
+        begin = self.clock()
+        try:
+            yield
+        finally:
+            self.add_stage(name, self.clock() - begin)
+
+    def add_stage(self, name: str, seconds: float) -> None:
+        """Add seconds to a kind of work in `progress.stages`."""
+        stages = self.progress.stages
+        self.progress = replace(self.progress, stages=stages | {name: stages.get(name, 0.0) + seconds})
+
     def change_pace(self, factor: float) -> None:
         """Multiply `schedule.scale` by `factor` from now on; every rank calls this."""
         schedule = self.config.schedule

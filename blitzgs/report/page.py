@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Puts data, styles and scripts into one HTML file that needs no network.
+
+Whatever comes from a run's files is passed to the script as JSON, which makes text of it: names of
+photographs and warnings may hold anything.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+import re
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from blitzgs.util.output import write_file
+
+MAX_BYTES = 10_000_000
+_MARK = '<meta name="generator" content="blitzgs">'
+
+
+def page(
+    title: str, scripts: tuple[str, ...], data: Mapping[str, Any], look: Mapping[str, str] | None = None
+) -> str:
+    """Return a page.
+
+    Args:
+        title: of the browser's tab.
+        scripts: names of files in `assets`, in their order.
+        data: what the scripts read; numbers that JSON lacks become null.
+        look: "html", a page with the model in 3D, and "note", a sentence about it; None: there is none.
+    """
+    assets = files("blitzgs.report") / "assets"
+    values = {
+        "@TITLE@": html.escape(title.encode("utf-8", "replace").decode()),
+        "@STYLE@": (assets / "style.css").read_text(encoding="utf-8"),
+        "@SCRIPT@": "\n".join((assets / name).read_text(encoding="utf-8") for name in scripts),
+        "@DATA@": _json(data),
+        "@LOOK@": _json(look),
+    }
+    # Split first, so that nothing in a value is taken for a place.
+    parts = re.split("(@[A-Z]+@)", (assets / "page.html").read_text(encoding="utf-8"))
+    return "".join(values.get(part, part) for part in parts)
+
+
+def fitted(
+    title: str, scripts: tuple[str, ...], data: dict[str, Any], look: Mapping[str, str] | None = None
+) -> str:
+    """Return a page of at most `MAX_BYTES`: the look in 3D is left out first, then pictures, and it says so.
+
+    Raises:
+        ValueError: the page is larger without either.
+    """
+    pictures, notes = list(data["pictures"]), list(data["left_out"])
+    while True:
+        left = [*notes]
+        if len(pictures) < len(data["pictures"]):
+            left.append(
+                f"{len(data['pictures']) - len(pictures)} pictures are left out to keep this file small."
+            )
+        text = page(title, scripts, data | {"pictures": pictures, "left_out": left}, look)
+        size = len(text.encode())
+        if size <= MAX_BYTES:
+            return text
+        if look is not None:
+            look = None
+            notes.append("The model in 3D is left out to keep this file small.")
+        elif pictures:
+            pictures = pictures[: len(pictures) * 3 // 4]
+        else:
+            raise ValueError(
+                f"the page would have {size / 1e6:.1f} MB without any picture, more than {MAX_BYTES / 1e6:g}"
+            )
+
+
+def write_page(path: Path, text: str) -> None:
+    """Write a page; replace only one that this function has written.
+
+    Raises:
+        FileExistsError: the file is another one.
+        OSError: it cannot be written.
+    """
+    if path.is_file():
+        with path.open(encoding="utf-8", errors="replace") as file:
+            if _MARK not in file.read(1000):
+                raise FileExistsError(f"{path} exists and is no page of blitzgs: choose another --out")
+    write_file(path, text, sync=False)
+
+
+def _json(value: object) -> str:
+    # "<" cannot end the script element that holds the text.
+    return json.dumps(_finite(value), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(name): _finite(part) for name, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(part) for part in value]
+    return value
