@@ -43,7 +43,7 @@ COMMANDS = {
     "view": ("blitzgs.cli.view", "look at a model in the browser"),
     "report": ("blitzgs.cli.report", "write the report of a run"),
     "compare": ("blitzgs.cli.compare", "put runs side by side"),
-    "export": ("blitzgs.cli.export", "write the model of a run as a PLY file for viewers"),
+    "export": ("blitzgs.cli.export", "write a model as a PLY file for viewers, or as one HTML file to send"),
     "gate": ("blitzgs.cli.gate", "fit and evaluate spawn gates, which make smaller models"),
     "synth": (
         "blitzgs.cli.synth",

@@ -52,6 +52,11 @@ def add_run(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_model(parser: argparse.ArgumentParser) -> None:
+    """Add the argument MODEL: the folder of a run, a checkpoint in it, or a PLY file."""
+    parser.add_argument("model", type=named_path, metavar="MODEL", help="run, checkpoint or PLY file")
+
+
 def add_capture(parser: argparse.ArgumentParser) -> None:
     """Add the flag --data, the present folder of a run's capture."""
     parser.add_argument(

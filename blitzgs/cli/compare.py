@@ -7,6 +7,7 @@ import argparse
 from pathlib import Path
 
 from blitzgs.cli.arguments import Commands, add_command, named_path
+from blitzgs.util.terminal import printable
 
 HELP = """\
 Put runs side by side in one HTML file that needs no network: their figures, differences of configuration,
@@ -35,5 +36,5 @@ def run(args: argparse.Namespace) -> int:
     from blitzgs.report.page import write_page
 
     write_page(args.out, compare(args.folders))
-    print(args.out)
+    print(printable(str(args.out)))
     return 0

@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 import argparse
+import sys
 
 from blitzgs.cli.arguments import Commands, add_command, add_run, named_path
+from blitzgs.runs.files import check_is_run
+from blitzgs.util.terminal import printable
 
 HELP = """\
 Write the report of a run as one HTML file that needs no network: metrics of each held-out view, best and
@@ -24,7 +27,14 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the report; returns the exit status."""
+    from blitzgs.report.look import look_of
     from blitzgs.report.report import write_report
 
-    print(write_report(args.folder, out=args.out))
+    look = None
+    try:
+        look = look_of(args.folder)
+    except (OSError, ValueError, RuntimeError) as error:
+        check_is_run(args.folder)
+        print(printable(f"the report goes without the model in 3D: {error}"), file=sys.stderr)
+    print(printable(str(write_report(args.folder, look, args.out))))
     return 0

@@ -16,10 +16,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from blitzgs.formats.web_page import check_replaces_page
 from blitzgs.util.output import write_file
 
 MAX_BYTES = 10_000_000
-_MARK = '<meta name="generator" content="blitzgs">'
 
 
 def page(
@@ -77,16 +77,13 @@ def fitted(
 
 
 def write_page(path: Path, text: str) -> None:
-    """Write a page; replace only one that this function has written.
+    """Write a page.
 
     Raises:
-        FileExistsError: the file is another one.
+        FileExistsError: the file exists and is no page of ours.
         OSError: it cannot be written.
     """
-    if path.is_file():
-        with path.open(encoding="utf-8", errors="replace") as file:
-            if _MARK not in file.read(1000):
-                raise FileExistsError(f"{path} exists and is no page of blitzgs: choose another --out")
+    check_replaces_page(path)
     write_file(path, text, sync=False)
 
 
