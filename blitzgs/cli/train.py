@@ -51,10 +51,11 @@ Times in the configuration count the images that were trained on. --schedule.sca
 schedule half as long; with --minutes=M the run measures its speed and chooses this factor itself.
 
 RUN gets config.yaml, cameras.json, log.jsonl, checkpoints/, evaluation/, summary.json, trajectory.svg and
-report.html, exposures.json with model.exposure, and tensorboard/ if TensorBoard is installed. A checkpoint is written every 10 minutes (log.checkpoint_seconds)
-and when the run is interrupted (Ctrl-C, SIGTERM or SIGHUP). The same command with --resume continues from the
-newest checkpoint; without any checkpoint it starts a new run and says so. With --resume and without --config,
-the run's own configuration is used. --extend trains a finished run longer.
+report.html (open it in a browser), exposures.json with model.exposure, and tensorboard/ if TensorBoard is
+installed. A checkpoint is written every 10 minutes (log.checkpoint_seconds) and when the run is interrupted
+(Ctrl-C, SIGTERM or SIGHUP). The same command with --resume continues from the newest checkpoint; without any
+checkpoint it starts a new run and says so. With --resume and without --config, the run's own configuration is
+used. --extend trains a finished run longer.
 
 To share the work among M processes, run torchrun --nproc-per-node=M -m blitzgs train with the same flags.
 With torchrun's --max-restarts=K and --resume, a job that loses a process continues from its last checkpoint.

@@ -16,10 +16,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from blitzgs.formats.web_page import check_replaces_page
 from blitzgs.util.output import write_file
 
 MAX_BYTES = 10_000_000
+_ROOM_FOR_NOTES = 1000
 
 
 def page(
@@ -54,26 +57,18 @@ def fitted(
     Raises:
         ValueError: the page is larger without either.
     """
-    pictures, notes = list(data["pictures"]), list(data["left_out"])
-    while True:
-        left = [*notes]
-        if len(pictures) < len(data["pictures"]):
-            left.append(
-                f"{len(data['pictures']) - len(pictures)} pictures are left out to keep this file small."
-            )
-        text = page(title, scripts, data | {"pictures": pictures, "left_out": left}, look)
-        size = len(text.encode())
-        if size <= MAX_BYTES:
-            return text
-        if look is not None:
-            look = None
-            notes.append("The model in 3D is left out to keep this file small.")
-        elif pictures:
-            pictures = pictures[: len(pictures) * 3 // 4]
-        else:
-            raise ValueError(
-                f"the page would have {size / 1e6:.1f} MB without any picture, more than {MAX_BYTES / 1e6:g}"
-            )
+    pictures, notes = data["pictures"], list(data["left_out"])
+    room = MAX_BYTES - _ROOM_FOR_NOTES - len(page(title, scripts, data | {"pictures": []}).encode())
+    if room < 0:
+        raise ValueError(f"the page would have more than {MAX_BYTES / 1e6:g} MB without any picture")
+    sizes = np.cumsum([0, *(len(_json(picture)) + 1 for picture in pictures)])
+    if look is not None and sizes[-1] + len(_json(look)) > room:
+        look = None
+        notes.append("The model in 3D is left out to keep this file small.")
+    fitting = int((sizes <= room).sum()) - 1
+    if fitting < len(pictures):
+        notes.append(f"{len(pictures) - fitting} pictures are left out to keep this file small.")
+    return page(title, scripts, data | {"pictures": pictures[:fitting], "left_out": notes}, look)
 
 
 def write_page(path: Path, text: str) -> None:

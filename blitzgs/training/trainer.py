@@ -107,7 +107,7 @@ class Trainer:
     def show_on(self) -> None:
         """Serve a watcher that stays after the training, until a signal (Ctrl-C); every rank calls this."""
         state, watching = self.state, self._watching
-        if watching is None:
+        if watching is None or not self._watched_on:
             return
         try:
             with StopRequest() as stop:

@@ -110,7 +110,7 @@ class Drawer:
             ranges = self._owners.divide([None], look.width, look.height, options.tile_size)
             assignment = TileAssignment(ranks, ranges)
         frame = pipeline.forward(table, views, options, active, assignment)
-        image = _image(frame, look, subject.unit, ranges)
+        image = self._together(lambda: _image(frame, look, subject.unit, ranges))
         if ranges is not None:
             collect_images(image, ranges, ranks, destination=0)
         seen = int(frame.visible.sum())

@@ -108,9 +108,10 @@ class Live:
         visitor, ask = self._last
         # Packing and sending the pictures before this one took time of the same processor.
         sent, self._sent = self.page.send_seconds - self._sent, self.page.send_seconds
-        spent = seconds + sent
-        self._allowed = time.monotonic() + spent * (1 / self._share - 1)
+        begin = time.monotonic()
         self.page.deliver(visitor, ask, picture)
+        spent = seconds + sent + time.monotonic() - begin
+        self._allowed = time.monotonic() + spent * (1 / self._share - 1)
 
     def failed(self, reason: str) -> None:
         """Tell the visitor that there is no picture."""
