@@ -115,6 +115,20 @@ def test_the_plan_is_seen_from_above(trained):
     assert flat.max() > 0.5 * size
 
 
+def test_measured_training_views_are_coloured_too(trained, tmp_path):
+    folder = copied(trained, tmp_path / "run")
+    before = data_of(report(folder))["cameras"]
+    assert [p[3] is not None for p in before["points"]] == [bool(p[2]) for p in before["points"]]
+    arguments = ["eval", str(folder), "--data", str(trained[0]), "--split", "train", "--pictures", "0"]
+    assert main(arguments) == 0
+    after = data_of(report(folder))
+    views = open_run(folder).metrics()["train"]["views"]
+    assert after["cameras"]["trained_known"] and not before["trained_known"]
+    for *_, held_out, psnr, name in after["cameras"]["points"]:
+        assert held_out or psnr == pytest.approx(views[name]["psnr"], abs=0.006)
+    assert len(after["views"]) == 4  # those of the held-out views
+
+
 def test_names_and_warnings_cannot_become_markup(trained, tmp_path):
     def renamed(content):
         content["views"] = {HOSTILE: next(iter(content["views"].values()))}
