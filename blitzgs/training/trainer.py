@@ -23,7 +23,6 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.frame import Frame
 from blitzgs.ops.density_stats import density_stats_
 from blitzgs.population.importance import PHI
-from blitzgs.runs import exposure
 from blitzgs.runs import files as run_files
 from blitzgs.runs.guard import LossGuard, ModelLostError
 from blitzgs.runs.lod import lod_gate
@@ -45,9 +44,6 @@ from blitzgs.training.step_report import StepRecord, log_step, measure_step
 from blitzgs.training.watching import Watching
 from blitzgs.util.output import write_file
 from blitzgs.view.views import render_options
-
-# Kinds of work during which the training clock does not run.
-_UNCOUNTED = ("setup", "evaluate", "paused", "final_checkpoint")
 
 
 class Trainer:
@@ -374,10 +370,9 @@ class Trainer:
             try:
                 # The pace was measured after the run first wrote its configuration.
                 save_config(state.config, state.folder / run_files.CONFIG)
-                if (exposures := state.stepper.exposures) is not None:
+                if state.stepper.exposures is not None:
                     names = [state.capture.cameras[index].name for index in state.capture.train]
-                    found = dict(zip(names, exposures.values(), strict=True))
-                    write_file(state.folder / exposure.FILE, json.dumps(found))
+                    state.stepper.exposures.write(state.folder, names)
                 if state.lineage is not None:
                     state.lineage.describe(lineage_subject(state.config, state.capture))
                 write_file(state.folder / run_files.SUMMARY, json.dumps(summary, indent=1) + "\n")
@@ -391,7 +386,7 @@ class Trainer:
         figures = {
             "images": state.images_seen,
             "seconds": state.progress.seconds,
-            "stages": self._stages(),
+            "stages": state.stages(),
             "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
             "gaussians": state.population(),
             "peak_gaussians": state.progress.peak_gaussians,
@@ -411,12 +406,6 @@ class Trainer:
         if state.stepper.exposures is not None:
             figures["exposure"] = state.stepper.exposures.describe()
         return figures
-
-    def _stages(self) -> dict[str, float]:
-        """Return the seconds of each kind of work; "steps" is the training time that no other kind has."""
-        progress = self.state.progress
-        others = sum(seconds for name, seconds in progress.stages.items() if name not in _UNCOUNTED)
-        return {"steps": max(0.0, progress.seconds - others)} | progress.stages
 
 
 def _stopped_by(signal: str | None) -> str:
