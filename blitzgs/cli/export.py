@@ -29,7 +29,7 @@ Write a model as a PLY file in INRIA's layout, which most viewers read, or as on
 
 The HTML file has the model and a viewer in it; a browser opens it from the disk, without a server. The
 model is compressed. Where it would be larger than --max-mb, the SH degree is reduced, then the Gaussians
-of least opacity times area are left out; the page and the output of this command say how many.
+that contribute least are left out; the page and the output of this command say how many.
 
 Georeferenced models are written around their own origin, because the file's float32 numbers cannot hold large
 coordinates. The offset is in the header (`comment offset X Y Z`) and in FILE.offset.json.
