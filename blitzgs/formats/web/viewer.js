@@ -51,10 +51,10 @@
     const boxes = ranges(3), sizes = ranges(3), tints = ranges(3);
     const low = planes(3), high = planes(3), scales = planes(3), colours = planes(3), quats = planes(4);
     const opacities = plane(), levels = scene.lod ? plane() : null;
-    const rest = planes(3 * scene.degree * (scene.degree + 2)), texels = Math.ceil(rest.length / 16);
+    const rest = planes(3 * scene.degree * (scene.degree + 2)), texels = Math.ceil(rest.length / 12);
 
     const positions = new Float32Array(3 * n), geometry = new Uint32Array(8 * WIDTH * Math.ceil((2 * n) / WIDTH));
-    const shades = new Uint8Array(16 * WIDTH * Math.max(1, Math.ceil((texels * n) / WIDTH)));
+    const shades = new Uint32Array(4 * WIDTH * Math.max(1, Math.ceil((texels * n) / WIDTH)));
     const words = new Float32Array(geometry.buffer);
     for (let i = 0; i < n; i++) {
       const b = 2 * Math.floor(i / BLOCK), of = (found, codes, axis) => found[axis][b] + codes * found[axis][b + 1];
@@ -69,9 +69,9 @@
       geometry[g + 5] = shade(2) | (half(opacities[i] / 255) << 16);
       geometry[g + 6] = size(0) | (size(1) << 16);
       geometry[g + 7] = size(2) | (half(levels ? levels[i] : 0) << 16);
-      for (let k = 0; k < rest.length; k++) shades[16 * texels * i + k] = rest[k][i];
+      for (let k = 0; k < rest.length; k += 3) shades[4 * texels * i + k / 3] = rest[k][i] | (rest[k + 1][i] << 8) | (rest[k + 2][i] << 16);
     }
-    return { positions, levels, geometry, texels, shades: new Uint32Array(shades.buffer) };
+    return { positions, levels, geometry, texels, shades };
   }
 
   // --- Drawing ---------------------------------------------------------------------------------------------------
