@@ -32,10 +32,10 @@ def read_cameras(path: Path, offset: Float64) -> list[Camera]:
         views, _, _ = read_layout(path, "images", 1)
     else:
         raise FileNotFoundError(f"{path}: there is no such transforms file or folder of a COLMAP model")
-    check_lenses(views)
-    views = sorted(with_finite_poses(views), key=lambda view: view.name)
     if not views:
         raise ValueError(f"{path} has no cameras")
+    check_lenses(views)
+    views = sorted(with_finite_poses(views), key=lambda view: view.name)
     return [_pinhole(view, offset) for view in views]
 
 

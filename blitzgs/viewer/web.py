@@ -71,7 +71,7 @@ def web_file(opened: Opened, max_bytes: int) -> WebFile:
     scene = _scene(opened)
     kept = min(visible, int(0.99 * visible * space / estimated_bytes(splats)))
     if kept < visible:
-        rows = rows[_scores(opened)[rows].argsort(descending=True, stable=True)]
+        rows = rows[contributions(opened)[rows].argsort(descending=True, stable=True)]
     while True:
         if kept < 1:
             raise ValueError(f"a file of {max_bytes / 1e6:g} MB holds no Gaussian: choose a larger --max-mb")
@@ -97,7 +97,7 @@ def _seen(table: GaussianTable) -> Tensor:
     return seen.nonzero()[:, 0]
 
 
-def _scores(opened: Opened) -> Tensor:
+def contributions(opened: Opened) -> Tensor:
     """Return how much each Gaussian contributes to views of the capture."""
     table, exhibit, subject = opened.table, opened.exhibit, opened.subject
     if not exhibit.cameras:
