@@ -18,8 +18,8 @@ from blitzgs.runs.files import run_and_checkpoint
 from blitzgs.runs.folder import open_run
 from blitzgs.util.output import write_file
 
-# Default of --max-mb.
-MAX_MB = 50
+# Default of --max-mb, and the largest file whose text browsers still hold in one piece.
+MAX_MB, LARGEST_MB = 50, 500
 
 HELP = """\
 Write a model as a PLY file in INRIA's layout, which most viewers read, or as one HTML file to send:
@@ -127,8 +127,8 @@ def _megabytes(text: str) -> float:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"must be a positive number of megabytes, got {text}")
+    if not 0 < value <= LARGEST_MB:
+        raise argparse.ArgumentTypeError(f"must be a number of megabytes up to {LARGEST_MB}, got {text}")
     return value
 
 

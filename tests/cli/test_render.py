@@ -20,11 +20,14 @@ from tests.distributed.rank_harness import run_ranks
 def test_a_film_of_a_path_shows_its_views(trained, tmp_path, capsys):
     run, file, film = open_run(trained[1]), tmp_path / "p.json", tmp_path / "new" / "p.mp4"
     model, cameras = run.model(), run.cameras().cameras
-    keys = []
+    keys, views = [], []
+    grey = np.array([0.2126, 0.7152, 0.0722])  # colours have half the resolution in a film
     for camera in cameras[:3]:
         pose = np.linalg.inv(camera.world_to_camera)
         pose[:3, 3] += model.space.offset
-        keys.append(Keyframe(pose, float(np.degrees(2 * np.arctan(16 / camera.K[1, 1]))), 1.5))
+        keys.append(Keyframe(pose, float(np.degrees(2 * np.arctan(16 / 41))), 1.5))
+        centred = model.camera([[41, 0, 24], [0, 41, 16], [0, 0, 1]], np.linalg.inv(pose), 48, 32)
+        views.append(model.render(centred).clamp(0, 1).numpy() * 255 @ grey)
     file.write_text(to_json(CameraPath(keys, width=48, height=32, fps=5, seconds=1)))
     assert main(["render", str(trained[1]), "--path", str(file), "--out", str(film)]) == 0
     assert f"{film}: 5 frames" in capsys.readouterr().out
@@ -34,10 +37,8 @@ def test_a_film_of_a_path_shows_its_views(trained, tmp_path, capsys):
         frames = [frame.to_ndarray(format="rgb24").astype(float) for frame in container.decode(stream)]
     assert len(frames) == 5
     for place, key in ((0, 0), (2, 1), (4, 2)):
-        wanted = model.render(key).clamp(0, 1).numpy() * 255
-        others = [model.render(other).clamp(0, 1).numpy() * 255 for other in range(3) if other != key]
-        error = np.abs(frames[place] - wanted).mean()
-        assert error < 6 and all(error < 0.6 * np.abs(frames[place] - other).mean() for other in others)
+        errors = [np.abs(frames[place] @ grey - view).mean() for view in views]
+        assert errors[key] < 3 and all(errors[key] < 0.3 * errors[other] for other in {0, 1, 2} - {key})
     assert sorted(path.name for path in film.parent.iterdir()) == ["p.mp4"]
 
 
@@ -47,7 +48,7 @@ def test_depth_and_alpha_come_back_from_16_bits(trained, tmp_path):
     assert main([*flags, "--depth", "--alpha", "--raw", "--out", str(tmp_path / "raw")]) == 0
     scale = json.loads((tmp_path / "png" / "depth.json").read_text())["scale"]
     names = sorted(path.name for path in (tmp_path / "raw").glob("*.npy"))
-    assert names == [f"frame_0000{n}{kind}.npy" for n in (1, 2, 3) for kind in ("", ".alpha", ".depth")]
+    assert names == [f"frame_0000{n}{kind}.npy" for n in (1, 2, 3) for kind in (".alpha", ".depth", "")]
     for number in (1, 2, 3):
         for kind, step in (("depth", scale), ("alpha", 1 / 65535)):
             stem = f"frame_0000{number}.{kind}"
@@ -56,7 +57,7 @@ def test_depth_and_alpha_come_back_from_16_bits(trained, tmp_path):
             assert stored.dtype == np.uint16 and stored.shape == (32, 48) and exact.max() > 100 * step
             held = stored < 65535
             assert held.mean() > 0.5
-            assert np.abs(stored * step - exact)[held].max() <= 0.501 * step
+            assert np.abs(stored * step - exact)[held].max() <= 0.51 * step
             assert (exact[~held] >= 65534 * step).all()
 
 

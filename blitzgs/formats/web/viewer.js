@@ -21,7 +21,8 @@
     if (typeof DecompressionStream === "undefined") fail("This browser is too old for this page.");
     const element = document.getElementById("model"), text = atob(element.textContent.trim());
     element.remove();
-    const bytes = Uint8Array.from({ length: text.length }, (_, i) => text.charCodeAt(i));
+    const bytes = new Uint8Array(text.length);
+    for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
     const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
     return new Uint8Array(await new Response(stream).arrayBuffer());
   }
@@ -96,6 +97,7 @@
   }
 
   function texture(unit, internal, format, type, width, height, values) {
+    if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) fail("The model is too large for this graphics card.");
     const made = gl.createTexture();
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, made);
@@ -112,6 +114,10 @@
   let kept = 0, gated = false;
 
   function prepare(model) {
+    // Half precision keeps the many faint layers that eight bits would round away.
+    if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float")) {
+      fail("This graphics card cannot draw in half precision.");
+    }
     splats = program("splat.vert", "splat.frag");
     screen = program("screen.vert", "screen.frag");
     const uint = gl.UNSIGNED_INT, integers = gl.RGBA_INTEGER, rows = (values, each) => values.length / each / WIDTH;
@@ -147,10 +153,7 @@
   function resize(width, height) {
     if (target.made && target.width === width && target.height === height) return;
     gl.deleteTexture(target.made);
-    // Half precision keeps the many faint layers that eight bits would round away.
-    const deep = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
-    const kind = deep ? [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT] : [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE];
-    Object.assign(target, { width, height, made: texture(3, ...kind, width, height, null) });
+    Object.assign(target, { width, height, made: texture(3, gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT, width, height, null) });
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target.made, 0);
   }
