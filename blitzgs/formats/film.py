@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -65,21 +66,33 @@ def new_film(
         width: pixels, even.
         height: pixels, even.
         fps: frames a second.
+
+    Raises:
+        OSError: the file cannot be written; an existing one is unchanged.
     """
     av = require_av()
-    with new_file(path) as partial, av.open(str(partial), "w", format="mp4") as container:
-        stream = container.add_stream("libx264", Fraction(fps).limit_denominator(1001))
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.options = {"crf": _QUALITY}
-        # Players take the matrix of HD films unless the file says otherwise; so it is used, and named.
-        context = stream.codec_context
-        context.colorspace, context.color_primaries, context.color_trc = 1, 1, 1
-        context.color_range = 1
+    with new_file(path) as partial:
+        try:
+            with av.open(str(partial), "w", format="mp4") as container:
+                stream = _stream(container, width, height, fps)
 
-        def append(picture: npt.NDArray[np.uint8]) -> None:
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-            frame = frame.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
-            container.mux(stream.encode(frame))
+                def append(picture: npt.NDArray[np.uint8]) -> None:
+                    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+                    frame = frame.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
+                    container.mux(stream.encode(frame))
 
-        yield append
-        container.mux(stream.encode(None))
+                yield append
+                container.mux(stream.encode(None))
+        except av.error.FFmpegError as error:
+            # A plain error, whose file name `new_file` can replace by the final one.
+            raise OSError(error.errno, error.strerror) from error
+
+
+def _stream(container: Any, width: int, height: int, fps: float) -> Any:
+    stream = container.add_stream("libx264", Fraction(fps).limit_denominator(1001))
+    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+    stream.options = {"crf": _QUALITY}
+    # Players take the matrix of HD films unless the file says otherwise; so it is used, and named.
+    context = stream.codec_context
+    context.colorspace, context.color_primaries, context.color_trc, context.color_range = 1, 1, 1, 1
+    return stream

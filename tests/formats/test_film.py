@@ -2,6 +2,7 @@
 """Films: frames, sizes, colours; what is left of an interrupted one."""
 
 import builtins
+import resource
 
 import numpy as np
 import pytest
@@ -39,6 +40,22 @@ def test_an_interrupted_film_leaves_no_file(tmp_path):
     with pytest.raises(ValueError), new_film(file, 64, 48, 30) as append:
         append(np.zeros((48, 64), np.uint8))
     assert file.read_bytes().endswith(b"before") and list(tmp_path.iterdir()) == [file]
+
+
+def test_a_full_disk_is_named_and_leaves_no_file(tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    noise = np.random.default_rng(0).integers(0, 255, (20, 48, 64, 3), dtype=np.uint8)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, before[1]))
+    try:
+        with (
+            pytest.raises(OSError, match="File too large") as raised,
+            new_film(tmp_path / "a.mp4", 64, 48, 30) as append,
+        ):
+            for picture in noise:
+                append(picture)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert raised.value.filename == str(tmp_path / "a.mp4") and list(tmp_path.iterdir()) == []
 
 
 def test_what_is_no_film_is_kept(tmp_path):
