@@ -39,7 +39,7 @@ blitzgs train --help explains the training; blitzgs train --help FIELD explains 
 COMMANDS = {
     "train": ("blitzgs.cli.train", "train a model of photographs with known cameras"),
     "eval": ("blitzgs.cli.evaluate", "measure PSNR and SSIM of a run's held-out views"),
-    "render": ("blitzgs.cli.render", "render the views of a run to files (needs no photographs)"),
+    "render": ("blitzgs.cli.render", "render views of a model to pictures, or a path to a film"),
     "view": ("blitzgs.cli.view", "look at a model in the browser"),
     "report": ("blitzgs.cli.report", "write the report of a run"),
     "compare": ("blitzgs.cli.compare", "put runs side by side"),

@@ -18,8 +18,8 @@ from blitzgs.runs.files import run_and_checkpoint
 from blitzgs.runs.folder import open_run
 from blitzgs.util.output import write_file
 
-# Default of --max-mb.
-MAX_MB = 50
+# Default of --max-mb, and the largest file whose text browsers still hold in one piece.
+MAX_MB, LARGEST_MB = 50, 500
 
 HELP = """\
 Write a model as a PLY file in INRIA's layout, which most viewers read, or as one HTML file to send:
@@ -29,7 +29,7 @@ Write a model as a PLY file in INRIA's layout, which most viewers read, or as on
 
 The HTML file has the model and a viewer in it; a browser opens it from the disk, without a server. The
 model is compressed. Where it would be larger than --max-mb, the SH degree is reduced, then the Gaussians
-of least opacity times area are left out; the page and the output of this command say how many.
+that contribute least are left out; the page and the output of this command say how many.
 
 Georeferenced models are written around their own origin, because the file's float32 numbers cannot hold large
 coordinates. The offset is in the header (`comment offset X Y Z`) and in FILE.offset.json.
@@ -127,8 +127,8 @@ def _megabytes(text: str) -> float:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"must be a positive number of megabytes, got {text}")
+    if not 0 < value <= LARGEST_MB:
+        raise argparse.ArgumentTypeError(f"must be a number of megabytes up to {LARGEST_MB}, got {text}")
     return value
 
 

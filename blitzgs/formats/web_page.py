@@ -152,7 +152,7 @@ def packed(splats: WebSplats) -> bytes:
     content = b"".join(
         (plane if plane.dtype == np.float32 else plane.astype(np.uint8).T).tobytes() for plane in planes
     )
-    return zlib.compress(content, 9)
+    return zlib.compress(content, 6)
 
 
 def _quantised(

@@ -7,12 +7,12 @@ precision highp int;
 precision highp usampler2D;
 
 uniform usampler2D geometry;   // two texels for each Gaussian
-uniform usampler2D harmonics;  // `texels` texels for each Gaussian: signed bytes, coefficient by coefficient
+uniform usampler2D harmonics;  // `texels` texels for each Gaussian, a word for each coefficient
 uniform usampler2D order;      // front to back
 uniform int count;
 uniform int degree;
 uniform int texels;
-uniform float harmonic;  // value of the coefficient 1
+uniform float harmonic;  // value of one step of a coefficient
 uniform mat3 rotation;   // world to camera
 uniform vec3 centre;     // of the camera
 uniform vec2 focal;
@@ -32,41 +32,29 @@ uvec4 texel(usampler2D source, int index) {
   return texelFetch(source, ivec2(index % width, index / width), 0);
 }
 
-float coefficient(uvec4 words, int byte) {
-  return harmonic * float(int(words[byte >> 2] << (24 - 8 * (byte & 3))) >> 24);
-}
+// A coefficient's red, green and blue: signed bytes.
+vec3 rgb(uint word) { return vec3(ivec3(word << 24, word << 16, word << 8) >> 24); }
 
-vec3 view_dependent(int id, vec3 d) {
-  float x = d.x, y = d.y, z = d.z;
-  float basis[15];
-  basis[0] = -0.4886025119029199 * y;
-  basis[1] = 0.4886025119029199 * z;
-  basis[2] = -0.4886025119029199 * x;
+vec3 by_direction(int id, vec3 d) {
+  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
+  uvec4 words = texel(harmonics, id * texels);
+  vec3 sum = 0.4886025119029199 * (z * rgb(words.y) - y * rgb(words.x) - x * rgb(words.z));
   if (degree > 1) {
-    basis[3] = 1.0925484305920792 * x * y;
-    basis[4] = -1.0925484305920792 * y * z;
-    basis[5] = 0.31539156525252005 * (2.0 * z * z - x * x - y * y);
-    basis[6] = -1.0925484305920792 * x * z;
-    basis[7] = 0.5462742152960396 * (x * x - y * y);
+    sum += 1.0925484305920792 * x * y * rgb(words.w);
+    words = texel(harmonics, id * texels + 1);
+    sum += -1.0925484305920792 * y * z * rgb(words.x) + 0.31539156525252005 * (2.0 * zz - xx - yy) * rgb(words.y)
+         - 1.0925484305920792 * x * z * rgb(words.z) + 0.5462742152960396 * (xx - yy) * rgb(words.w);
   }
   if (degree > 2) {
-    basis[8] = -0.5900435899266435 * y * (3.0 * x * x - y * y);
-    basis[9] = 2.890611442640554 * x * y * z;
-    basis[10] = -0.4570457994644658 * y * (4.0 * z * z - x * x - y * y);
-    basis[11] = 0.3731763325901154 * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y);
-    basis[12] = -0.4570457994644658 * x * (4.0 * z * z - x * x - y * y);
-    basis[13] = 1.445305721320277 * z * (x * x - y * y);
-    basis[14] = -0.5900435899266435 * x * (x * x - 3.0 * y * y);
+    words = texel(harmonics, id * texels + 2);
+    sum += -0.5900435899266435 * y * (3.0 * xx - yy) * rgb(words.x) + 2.890611442640554 * x * y * z * rgb(words.y)
+         - 0.4570457994644658 * y * (4.0 * zz - xx - yy) * rgb(words.z)
+         + 0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * rgb(words.w);
+    words = texel(harmonics, id * texels + 3);
+    sum += -0.4570457994644658 * x * (4.0 * zz - xx - yy) * rgb(words.x)
+         + 1.445305721320277 * z * (xx - yy) * rgb(words.y) - 0.5900435899266435 * x * (xx - 3.0 * yy) * rgb(words.z);
   }
-  vec3 sum = vec3(0.0);
-  int values = 3 * (degree * (degree + 2));
-  for (int k = 0; k < values; k += 16) {
-    uvec4 words = texel(harmonics, id * texels + (k >> 4));
-    for (int byte = 0; byte < 16 && k + byte < values; byte++) {
-      sum[(k + byte) % 3] += basis[(k + byte) / 3] * coefficient(words, byte);
-    }
-  }
-  return sum;
+  return harmonic * sum;
 }
 
 mat3 rotation_matrix(uint bits) {
@@ -129,7 +117,7 @@ void main() {
   if (any(lessThan(pixel + extent, vec2(0.0))) || any(greaterThan(pixel - extent, size))) return;
 
   vec3 colour = 0.5 + 0.28209479177387814 * vec3(red_green, blue_opacity.x);
-  if (degree > 0) colour += view_dependent(id, normalize(away));
+  if (degree > 0) colour += by_direction(id, normalize(away));
   splat = vec4(max(colour, 0.0), opacity);
   gl_Position = vec4((pixel + shift) / size * vec2(2.0, -2.0) + vec2(-1.0, 1.0), 0.0, 1.0);
 }

@@ -21,7 +21,8 @@
     if (typeof DecompressionStream === "undefined") fail("This browser is too old for this page.");
     const element = document.getElementById("model"), text = atob(element.textContent.trim());
     element.remove();
-    const bytes = Uint8Array.from({ length: text.length }, (_, i) => text.charCodeAt(i));
+    const bytes = new Uint8Array(text.length);
+    for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
     const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
     return new Uint8Array(await new Response(stream).arrayBuffer());
   }
@@ -51,10 +52,10 @@
     const boxes = ranges(3), sizes = ranges(3), tints = ranges(3);
     const low = planes(3), high = planes(3), scales = planes(3), colours = planes(3), quats = planes(4);
     const opacities = plane(), levels = scene.lod ? plane() : null;
-    const rest = planes(3 * scene.degree * (scene.degree + 2)), texels = Math.ceil(rest.length / 16);
+    const rest = planes(3 * scene.degree * (scene.degree + 2)), texels = Math.ceil(rest.length / 12);
 
     const positions = new Float32Array(3 * n), geometry = new Uint32Array(8 * WIDTH * Math.ceil((2 * n) / WIDTH));
-    const shades = new Uint8Array(16 * WIDTH * Math.max(1, Math.ceil((texels * n) / WIDTH)));
+    const shades = new Uint32Array(4 * WIDTH * Math.max(1, Math.ceil((texels * n) / WIDTH)));
     const words = new Float32Array(geometry.buffer);
     for (let i = 0; i < n; i++) {
       const b = 2 * Math.floor(i / BLOCK), of = (found, codes, axis) => found[axis][b] + codes * found[axis][b + 1];
@@ -69,9 +70,9 @@
       geometry[g + 5] = shade(2) | (half(opacities[i] / 255) << 16);
       geometry[g + 6] = size(0) | (size(1) << 16);
       geometry[g + 7] = size(2) | (half(levels ? levels[i] : 0) << 16);
-      for (let k = 0; k < rest.length; k++) shades[16 * texels * i + k] = rest[k][i];
+      for (let k = 0; k < rest.length; k += 3) shades[4 * texels * i + k / 3] = rest[k][i] | (rest[k + 1][i] << 8) | (rest[k + 2][i] << 16);
     }
-    return { positions, levels, geometry, texels, shades: new Uint32Array(shades.buffer) };
+    return { positions, levels, geometry, texels, shades };
   }
 
   // --- Drawing ---------------------------------------------------------------------------------------------------
@@ -96,6 +97,7 @@
   }
 
   function texture(unit, internal, format, type, width, height, values) {
+    if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) fail("The model is too large for this graphics card.");
     const made = gl.createTexture();
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, made);
@@ -112,6 +114,10 @@
   let kept = 0, gated = false;
 
   function prepare(model) {
+    // Half precision keeps the many faint layers that eight bits would round away.
+    if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float")) {
+      fail("This graphics card cannot draw in half precision.");
+    }
     splats = program("splat.vert", "splat.frag");
     screen = program("screen.vert", "screen.frag");
     const uint = gl.UNSIGNED_INT, integers = gl.RGBA_INTEGER, rows = (values, each) => values.length / each / WIDTH;
@@ -147,10 +153,7 @@
   function resize(width, height) {
     if (target.made && target.width === width && target.height === height) return;
     gl.deleteTexture(target.made);
-    // Half precision keeps the many faint layers that eight bits would round away.
-    const deep = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
-    const kind = deep ? [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT] : [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE];
-    Object.assign(target, { width, height, made: texture(3, ...kind, width, height, null) });
+    Object.assign(target, { width, height, made: texture(3, gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT, width, height, null) });
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target.made, 0);
   }
