@@ -53,7 +53,7 @@ demo: venv build
 	$(RUN) blitzgs export $(DEMO)/run --ply $(DEMO)/city.ply
 	@echo
 	@echo "Pictures (render | photograph | error): $(DEMO)/run/evaluation"
-	@echo "Figures:                           $(DEMO)/run/summary.json"
+	@echo "Report, for a browser:             $(DEMO)/run/report.html"
 	@echo "The model, for any 3DGS viewer:    $(DEMO)/city.ply"
 	@echo "Another run from the start:        make demo DEMO=runs/another"
 

@@ -8,7 +8,7 @@ from blitzgs.cli import main
 from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
 
 # Folders of tests with tiny trainings.
-_TRAININGS = ("config", "runs", "spawn", "training")
+_TRAININGS = ("config", "report", "runs", "spawn", "training")
 
 # Of `lineage_run`: density events at 20, 40, 60 and 80; the gate judges from 60 on, a checkpoint lies at 50.
 LINEAGE = (

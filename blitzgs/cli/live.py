@@ -32,6 +32,19 @@ def add_live_page(parser: argparse.ArgumentParser) -> None:
         metavar="HOST",
         help="address to listen on (default: %(default)s, this machine only)",
     )
+    parser.add_argument(
+        "--viewer-stay",
+        action="store_true",
+        help="after the training, keep the page open until Ctrl-C (default: it closes)",
+    )
+
+
+def say_where_to_look(args: argparse.Namespace) -> None:
+    """Print whether the page of a finished training stays open."""
+    if args.viewer is not None and args.viewer_stay:
+        print("the viewer's page stays open (Ctrl-C ends)", flush=True)
+    elif args.viewer is not None:
+        print("the viewer's page is closed: see above, or train with --viewer-stay to keep it open")
 
 
 def check_live_page(port: int | None) -> None:

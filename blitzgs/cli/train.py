@@ -18,7 +18,8 @@ from rich.console import Console
 from rich.table import Table
 
 from blitzgs.cli.arguments import Commands, add_command, add_device, named_path
-from blitzgs.cli.live import add_live_page, check_live_page, live_page
+from blitzgs.cli.final_report import kept_warnings, write_final_report
+from blitzgs.cli.live import add_live_page, check_live_page, live_page, say_where_to_look
 from blitzgs.config.describe import describe, describe_all, describe_page
 from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, load_config, to_dict
@@ -49,11 +50,12 @@ and stops.
 Times in the configuration count the images that were trained on. --schedule.scale=0.5 makes the whole
 schedule half as long; with --minutes=M the run measures its speed and chooses this factor itself.
 
-RUN gets config.yaml, cameras.json, log.jsonl, checkpoints/, evaluation/, summary.json and trajectory.svg, and
-tensorboard/ if TensorBoard is installed. A checkpoint is written every 10 minutes (log.checkpoint_seconds)
-and when the run is interrupted (Ctrl-C, SIGTERM or SIGHUP). The same command with --resume continues from the
-newest checkpoint; without any checkpoint it starts a new run and says so. With --resume and without --config,
-the run's own configuration is used. --extend trains a finished run longer.
+RUN gets config.yaml, cameras.json, log.jsonl, checkpoints/, evaluation/, summary.json, trajectory.svg and
+report.html (open it in a browser), exposures.json with model.exposure, and tensorboard/ if TensorBoard is
+installed. A checkpoint is written every 10 minutes (log.checkpoint_seconds) and when the run is interrupted
+(Ctrl-C, SIGTERM or SIGHUP). The same command with --resume continues from the newest checkpoint; without any
+checkpoint it starts a new run and says so. With --resume and without --config, the run's own configuration is
+used. --extend trains a finished run longer.
 
 To share the work among M processes, run torchrun --nproc-per-node=M -m blitzgs train with the same flags.
 With torchrun's --max-restarts=K and --resume, a job that loses a process continues from its last checkpoint.
@@ -169,13 +171,16 @@ def run(args: argparse.Namespace) -> int:
     if args.check:
         return _check(args, config)
     job = config.ranks
-    with Ranks.from_environment(
-        args.device,
-        job.timeout_seconds,
-        cast(Transport, job.transport),
-        job.share_gpus,
-        tables_on_host=config.memory.resident_gb > 0,
-    ) as ranks:
+    with (
+        kept_warnings() as warned,
+        Ranks.from_environment(
+            args.device,
+            job.timeout_seconds,
+            cast(Transport, job.transport),
+            job.share_gpus,
+            tables_on_host=config.memory.resident_gb > 0,
+        ) as ranks,
+    ):
         # A capture that cannot be read leaves no empty folder behind.
         capture, images = open_capture(config, ranks)
         check_worlds(capture)
@@ -185,11 +190,16 @@ def run(args: argparse.Namespace) -> int:
             _print_block(understood(config, capture, images))
         with locked(args.out, ranks):
             trainer = Trainer(config, capture, images, args.out, ranks, args.resume, args.extend)
+            trainer.warned = warned
             if args.viewer is not None:
-                trainer.watch(live_page(trainer.state, args.viewer, args.viewer_host))
+                trainer.watch(live_page(trainer.state, args.viewer, args.viewer_host), args.viewer_stay)
             summary = trainer.train()
-        if summary is not None and ranks.rank == 0:
-            _print_summary(summary, args.out)
+            if ranks.rank == 0:
+                write_final_report(args.out, summary)
+                if summary is not None:
+                    _print_summary(summary, args.out)
+                    say_where_to_look(args)
+            trainer.show_on()
     return 0
 
 
@@ -249,6 +259,7 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
     # Quoted, so that the commands can be copied.
     name = shlex.quote(str(folder))
     for text in (
+        f"report: {folder / run_files.REPORT}",
         f"pictures: {folder / run_files.EVALUATION}",
         "next:",
         f"  blitzgs view {name}                       the model in the browser",

@@ -22,6 +22,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.pixels import collect_images
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.ops.photometric import ssim
+from blitzgs.runs.previews import Previews
 from blitzgs.util.memory import explaining_memory
 from blitzgs.util.output import OutputFolder
 from blitzgs.util.progress import Report
@@ -173,7 +174,7 @@ def evaluate(
         folder: folder for `metrics.json` and the pictures; None: nothing is written.
         owners: divides the tiles among the ranks; every rank calls this function.
         pictures: number of evenly spaced views for which render | photograph | error are written side by
-            side.
+            side; if not 0, the previews of the report are written too.
         lpips: from `load_lpips`.
         report: called with (views rendered, number of views) after each view.
         inputs: files that must not be overwritten.
@@ -197,6 +198,7 @@ def evaluate(
     chosen = files.plan(indices, cameras, pictures) if files is not None else {}
     per_view: dict[str, dict[str, float]] = {}
     lost: str | None = None
+    previews = Previews(folder, set(chosen)) if folder is not None and pictures > 0 else None
     own = list(indices[ranks.rank :: ranks.world_size])
     finder = VisibleFinder(scene, lod)
     for position, index in enumerate(indices):
@@ -222,9 +224,17 @@ def evaluate(
             if files is not None and index in chosen:
                 picture = comparison(render, target, mask)
                 files.write(chosen[index], encode_image(picture, ".jpg"))
+            if previews is not None:
+                previews.add(index, per_view[cameras[index].name]["psnr"], render, target, mask)
     result = _over_all_ranks(per_view, lost, [cameras[index].name for index in indices], ranks)
     if files is not None and ranks.rank == 0:
         files.write(files.output.root / "metrics.json", json.dumps(result, indent=1).encode())
+    if files is not None and previews is not None:
+        psnr = {
+            i: result["views"][cameras[i].name]["psnr"] for i in indices if cameras[i].name in result["views"]
+        }
+        for path, content in previews.files(psnr, ranks.rank == 0):
+            files.write(path, content)
     return result
 
 

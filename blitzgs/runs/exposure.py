@@ -10,6 +10,8 @@ from torch import Tensor
 
 # Photographs whose gains differ by less than this, as a standard deviation, have the same exposure.
 LEAST_SPREAD = 0.02
+# File in the folder of a finished run: gain and bias, [2, 3], by the name of the photograph.
+FILE = "exposures.json"
 # Name of the tensor among those of a checkpoint that are the same on all ranks.
 SHARED = "exposures"
 

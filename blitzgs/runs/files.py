@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 
 import blitzgs
@@ -33,6 +34,7 @@ from blitzgs.view.visible import Scene
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 SUMMARY = "summary.json"
+REPORT = "report.html"
 EVALUATION = "evaluation"
 LINEAGE = "lineage"
 # Sections and fields that a resumed run may change, because they do not change the result beyond rounding.
@@ -72,6 +74,7 @@ class Progress:
         train_views: digest of the names of the training views, in their order; empty in old checkpoints.
         curve: result of `blitzgs.training.curve.Curve.saved`; empty in old checkpoints.
         gate: digest of the spawn gate's files; empty without a gate, and in old checkpoints.
+        stages: seconds of each kind of work besides the optimiser steps; see `TrainingState.stage`.
         events_left: (time, order, kind) of the events of the last step that a signal kept from running.
     """
 
@@ -89,6 +92,7 @@ class Progress:
     train_views: str = ""
     curve: dict[str, Any] = dataclasses.field(default_factory=dict)
     gate: str = ""
+    stages: dict[str, float] = dataclasses.field(default_factory=dict)
     events_left: list[tuple[Any, ...]] = dataclasses.field(default_factory=list)
 
 
@@ -228,6 +232,12 @@ def _problem_of_columns(columns: dict[str, torch.Tensor]) -> str | None:
     return bad_column(GaussianTable(columns))
 
 
+def run_and_checkpoint(path: Path) -> tuple[Path, str | None]:
+    """Return the folder of a run and the name of a checkpoint, for either's folder; None: the newest."""
+    inside = path.resolve()
+    return (inside.parent.parent, inside.name) if inside.parent.name == CHECKPOINTS else (path, None)
+
+
 def check_is_run(folder: Path) -> None:
     """Check that a folder looks like a run.
 
@@ -349,6 +359,14 @@ def peak_memory_bytes(device: torch.device) -> int:
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def memory_bytes(device: torch.device) -> int:
+    """Return this process's memory in bytes now: allocated on a GPU, or resident on the CPU."""
+    if device.type == "cuda":
+        # torch.cuda.memory_allocated reads the same, but copies all figures of the allocator first.
+        return int(torch.cuda.memory_stats_as_nested_dict(device)["allocated_bytes"]["all"]["current"])
+    return int(psutil.Process().memory_info().rss)
 
 
 def versions(device: torch.device) -> dict[str, str]:

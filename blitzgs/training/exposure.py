@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.exposure import SHARED, effective
+from blitzgs.runs.exposure import FILE, SHARED, effective
 from blitzgs.training.batch import Batch
+from blitzgs.util.output import write_file
 
 # One step in so many measures the photographs of its batch, at one pixel in so many of each row and column.
 _EVERY, _STRIDE = 4, 4
@@ -114,6 +117,11 @@ class Exposures:
         if found is not None and len(found) == len(self.counts):
             found = found.to(self.measured.device)
             self.measured, self.counts = found[:, :-1].reshape(-1, 2, 3).clone(), found[:, -1].clone()
+
+    def write(self, folder: Path, names: Sequence[str]) -> None:
+        """Write `effective` into the folder of a run, by the names of the training views."""
+        found = self.effective().cpu().numpy().round(5).tolist()
+        write_file(folder / FILE, json.dumps(dict(zip(names, found, strict=True))))
 
     def describe(self) -> dict[str, float]:
         """Return figures for the summary: spread and range of the gains in use, mean of the channels."""

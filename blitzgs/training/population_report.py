@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from blitzgs.runs.files import peak_memory_bytes
+from blitzgs.runs.files import memory_bytes, peak_memory_bytes
 from blitzgs.runs.log import LOG
 from blitzgs.training.state import TrainingState
 from blitzgs.util.charts import line_chart
@@ -31,8 +31,7 @@ class MemoryMeter:
     def sample(self, device: torch.device) -> None:
         """Add a sample of the memory that is allocated now."""
         if device.type == "cuda":
-            # torch.cuda.memory_allocated reads the same, but copies all figures of the allocator first.
-            self.total += torch.cuda.memory_stats_as_nested_dict(device)["allocated_bytes"]["all"]["current"]
+            self.total += memory_bytes(device)
             self.samples += 1
 
     def mean(self) -> int | None:

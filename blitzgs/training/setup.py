@@ -20,6 +20,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY, octree_gaussians
 from blitzgs.population.position_noise import PositionNoise
+from blitzgs.runs import exposure
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import CAMERAS, save_cameras
 from blitzgs.runs.evaluation import load_lpips
@@ -152,7 +153,10 @@ def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
     Raises:
         FileExistsError, FolderError: as for `set_up`.
     """
-    written = (run_files.CONFIG, CAMERAS, LOG, run_files.SUMMARY, PICTURE, run_files.LINEAGE)
+    written = (
+        run_files.CONFIG, CAMERAS, LOG, run_files.SUMMARY, PICTURE, run_files.LINEAGE, run_files.REPORT,
+        exposure.FILE,
+    )  # fmt: skip
     check_unclaimed(folder / run_files.CHECKPOINTS, written, ranks)
     check_writable(folder / run_files.CHECKPOINTS, ranks)
     if not resume and any((folder / run_files.CHECKPOINTS).glob("checkpoint_*")):

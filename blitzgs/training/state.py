@@ -34,6 +34,9 @@ from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
 from blitzgs.view.views import Space, ViewSet, render_options
 
+# Kinds of work during which the training clock does not run.
+_UNCOUNTED = ("setup", "evaluate", "paused", "final_checkpoint")
+
 
 def never() -> bool:
     """Return False: nothing asks the run to stop."""
@@ -133,6 +136,26 @@ class TrainingState:
             yield
         finally:
             self._started += self.clock() - paused
+
+    @contextlib.contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time inside this context to `progress.stages`."""
+        begin = self.clock()
+        try:
+            yield
+        finally:
+            self.add_stage(name, self.clock() - begin)
+
+    def add_stage(self, name: str, seconds: float) -> None:
+        """Add seconds to a kind of work in `progress.stages`."""
+        stages = self.progress.stages
+        self.progress = replace(self.progress, stages=stages | {name: stages.get(name, 0.0) + seconds})
+
+    def stages(self) -> dict[str, float]:
+        """Return the seconds of each kind of work; "steps" is the training time that no other kind has."""
+        progress = self.progress
+        others = sum(seconds for name, seconds in progress.stages.items() if name not in _UNCOUNTED)
+        return {"steps": max(0.0, progress.seconds - others)} | progress.stages
 
     def change_pace(self, factor: float) -> None:
         """Multiply `schedule.scale` by `factor` from now on; every rank calls this."""

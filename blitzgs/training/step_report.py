@@ -11,6 +11,7 @@ import torch
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.frame import Frame
 from blitzgs.ops.host import HostCopy
+from blitzgs.runs.files import memory_bytes
 from blitzgs.runs.guard import check_table, find_bad
 from blitzgs.training.batch import Batch
 from blitzgs.training.loss import batch_psnr, opacity_term, photometric, scale_term
@@ -76,6 +77,8 @@ def log_step(state: TrainingState, record: StepRecord) -> None:
         "visible": visible,
         "gaussians": int(population),
         "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
+        "seconds": state.progress.seconds,
+        "memory_bytes": memory_bytes(state.ranks.device),
     } | state.stepper.report()
     if loss.scale > 0:
         values["l_scale"] = scale

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -52,6 +53,7 @@ class Trainer:
         state: state of the run.
         loader: the batches of the coming steps.
         memory: measures the GPU's memory over the run.
+        warned: texts of warnings, which the log takes over at the end.
     """
 
     def __init__(
@@ -65,7 +67,10 @@ class Trainer:
         extend: float | None = None,
     ) -> None:
         """Set up the run; arguments and errors are those of `blitzgs.training.setup.set_up`."""
+        begin = time.monotonic()
         self.state = state = set_up(config, capture, images, folder, ranks, resume, extend)
+        state.add_stage("setup", time.monotonic() - begin)
+        self.warned: list[str] = []
         self._saves_first = extend is not None
         self.loader = BatchLoader(
             images,
@@ -82,15 +87,30 @@ class Trainer:
         self._writes_late = ranks.device.type == "cuda"
         self._warned_of_masks = False
         self._watching: Watching | None = None
+        self._watched_on = False
         self.memory = MemoryMeter()
 
-    def watch(self, watcher: Watcher | None) -> None:
+    def watch(self, watcher: Watcher | None, stays: bool = False) -> None:
         """Let somebody watch the training; every rank calls this before `train`.
 
         Args:
             watcher: who watches; None on ranks other than 0.
+            stays: after a whole training, the watcher stays until `show_on` ends.
         """
-        self._watching = Watching(self.state, watcher)
+        self._watching, self._watched_on = Watching(self.state, watcher), stays
+
+    @torch.no_grad()
+    def show_on(self) -> None:
+        """Serve a watcher that stays after the training, until a signal (Ctrl-C); every rank calls this."""
+        state, watching = self.state, self._watching
+        if watching is None or not self._watched_on:
+            return
+        try:
+            with StopRequest() as stop:
+                agreement = Agreement(state.ranks, stop, state.save_clock)
+                watching.serve_on(lambda: agreement.now(state.progress.step).signal is not None)
+        finally:
+            watching.close()
 
     @torch.no_grad()
     def train(self) -> dict[str, Any] | None:
@@ -141,7 +161,8 @@ class Trainer:
                         self._stop(_stopped_by(agreement.now(step).signal))
                         return None
                     budget.after(step)
-                    glances.after((step - 1) * size, step * size)
+                    with state.stage("glances"):
+                        glances.after((step - 1) * size, step * size)
                     if step == state.schedule.steps:
                         break
                     decision = agreement.after(step, self.loader.lost is not None)
@@ -151,7 +172,8 @@ class Trainer:
                     if decision.lost:
                         break
                     if decision.save:
-                        save.run(state)
+                        with state.stage("checkpoint"):
+                            save.run(state)
                     if decision.watched and watching is not None:
                         self._write_record()
                         watching.serve(state.stops)
@@ -208,8 +230,13 @@ class Trainer:
 
     def close(self) -> None:
         """Stop loading batches and close the log."""
-        if self._watching is not None:
+        state = self.state
+        if self._watching is not None and not (
+            self._watched_on and state.progress.step >= state.schedule.steps
+        ):
             self._watching.close()
+        for text in dict.fromkeys(self.warned):
+            state.log.event(state.images_seen, "warned", {"warning": text})
         self.loader.close()
         self.state.log.close()
         if self.state.lineage is not None:
@@ -326,12 +353,14 @@ class Trainer:
         state.catch_up()
         if state.population() == 0:
             raise ModelLostError("no Gaussian is left: do the poses and the points belong together?")
-        save.run_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
+        with state.stage("final_checkpoint"):
+            save.run_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
         population = population_report(state, self.memory)
         state.log.event(state.images_seen, "population", population, describe(population))
         images = state.images.memory()
         state.log.event(state.images_seen, "image_memory", dataclasses.asdict(images), str(images))
-        metrics = evaluate.run(state)
+        with state.stage("evaluate"):
+            metrics = evaluate.run(state)
         if not metrics:
             self._log_stop(_stopped_by(agreement.now(step).signal))
             return None
@@ -341,6 +370,9 @@ class Trainer:
             try:
                 # The pace was measured after the run first wrote its configuration.
                 save_config(state.config, state.folder / run_files.CONFIG)
+                if state.stepper.exposures is not None:
+                    names = [state.capture.cameras[index].name for index in state.capture.train]
+                    state.stepper.exposures.write(state.folder, names)
                 if state.lineage is not None:
                     state.lineage.describe(lineage_subject(state.config, state.capture))
                 write_file(state.folder / run_files.SUMMARY, json.dumps(summary, indent=1) + "\n")
@@ -354,6 +386,7 @@ class Trainer:
         figures = {
             "images": state.images_seen,
             "seconds": state.progress.seconds,
+            "stages": state.stages(),
             "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
             "gaussians": state.population(),
             "peak_gaussians": state.progress.peak_gaussians,

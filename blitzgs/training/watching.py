@@ -15,7 +15,7 @@ from blitzgs.runs.watch import Watcher, Wish
 from blitzgs.table.pool import Pool
 from blitzgs.training.events import save
 from blitzgs.training.state import TrainingState
-from blitzgs.view.draw import Drawer, Subject
+from blitzgs.view.draw import Drawer, DrawingError, Subject
 from blitzgs.view.look import Look, Picture
 
 T = TypeVar("T")
@@ -46,14 +46,20 @@ class Watching:
         """
         wish = self._next()
         if wish.pause:
-            with self._state.paused_clock():
+            with self._state.paused_clock(), self._state.stage("paused"):
                 while wish.pause and not stops():
                     self._fulfil(wish)
                     if wish.look is None:
                         time.sleep(_PAUSE_SECONDS)
                     wish = self._next()
         if not wish.pause:
-            self._fulfil(wish)
+            with self._state.stage("viewer"):
+                self._fulfil(wish)
+
+    def serve_on(self, stops: Callable[[], bool]) -> None:
+        """Fulfil what the watcher wants after the training, until `stops` or until the watcher is gone."""
+        self._asked(lambda watcher: watcher.stay(), None)
+        self.serve(stops)
 
     def close(self) -> None:
         """Tell the watcher that the training has ended."""
@@ -72,8 +78,8 @@ class Watching:
         begin, look = time.perf_counter(), wish.look
         try:
             picture = self._drawn(look)
-        except RuntimeError as error:
-            if self._state.ranks.world_size > 1:
+        except Exception as error:
+            if self._state.ranks.world_size > 1 and not isinstance(error, DrawingError):
                 raise  # the other ranks are in the middle of the picture
             reason = str(error)
             self._asked(lambda watcher: watcher.failed(reason), None)

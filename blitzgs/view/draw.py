@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import TypeVar, cast
 
 import numpy as np
 import torch
@@ -19,13 +20,19 @@ from blitzgs.frame.pixels import collect_images
 from blitzgs.frame.tiles import TileAssignment, TileRanges
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.rasterize import rasterize
+from blitzgs.table.pool import Pool
 from blitzgs.table.table import PARAMETERS, GaussianTable, schema
 from blitzgs.view.gate import SceneGate
 from blitzgs.view.look import Look, Picture
 from blitzgs.view.visible import Scene, VisibleFinder
 
+T = TypeVar("T")
+
 # The constant of the first spherical harmonic: colour = 0.5 + _SH_0 * coefficient.
 _SH_0 = 0.28209479177387814
+# Bytes of a frame for each Gaussian that a view may see (the splat, its copy on another rank, list entries
+# and their sorting), and for each pixel.
+_ROW_BYTES, _PIXEL_BYTES = 300, 64
 # Colours of the octree levels from coarse to fine, repeated beyond the last.
 LEVEL_COLOURS = (
     (0.27, 0.00, 0.33), (0.23, 0.32, 0.55), (0.13, 0.57, 0.55), (0.37, 0.79, 0.38), (0.99, 0.91, 0.14),
@@ -68,6 +75,10 @@ def table_of_parameters(columns: Mapping[str, Tensor]) -> GaussianTable:
     return GaussianTable(known)
 
 
+class DrawingError(RuntimeError):
+    """A picture cannot be drawn; every rank of the job raises this together, and may go on."""
+
+
 class Drawer:
     """Draws one `Subject`; every rank of the job has one."""
 
@@ -82,23 +93,24 @@ class Drawer:
 
         Returns:
             The picture on rank 0; None elsewhere.
+
+        Raises:
+            DrawingError: a rank lacks the memory, or cannot find what the view sees.
         """
         begin, subject, ranks = time.perf_counter(), self._subject, self._owners.ranks
         device = ranks.device
         pose, K = (torch.from_numpy(matrix).float()[None].to(device) for matrix in (look.viewmat, look.K))  # noqa: N806
         views = Views(pose, K, look.width, look.height)
-        options, finder = self._options(look), self._finder(look)
-        table, active, _ = finder.find(*views.as_arguments(), options.limits)
-        if look.crop is not None:
-            active = _cropped(active, table["means"], look.crop)
-        if look.mode == "level":
-            table = _painted(table)
+        options = self._options(look)
+        if ranks.world_size > 1:
+            self._together(lambda: _reserve(subject.scene, look, device))
+        table, active = self._together(lambda: self._found(look, views, options))
         ranges = assignment = None
         if ranks.world_size > 1:
             ranges = self._owners.divide([None], look.width, look.height, options.tile_size)
             assignment = TileAssignment(ranks, ranges)
         frame = pipeline.forward(table, views, options, active, assignment)
-        image = _image(frame, look, subject.unit, ranges)
+        image = self._together(lambda: _image(frame, look, subject.unit, ranges))
         if ranges is not None:
             collect_images(image, ranges, ranks, destination=0)
         seen = int(frame.visible.sum())
@@ -107,6 +119,27 @@ class Drawer:
         values = image[0].cpu().numpy()
         values = values[..., 0] if values.shape[-1] == 1 else values
         return Picture(values, seen, 1000 * (time.perf_counter() - begin))
+
+    def _together(self, work: Callable[[], T]) -> T:
+        """Do this rank's part; an error on one rank is one on all, before they wait for each other."""
+        ranks, result, reason = self._owners.ranks, None, None
+        try:
+            result = work()
+        except Exception as error:
+            if ranks.world_size == 1:
+                raise DrawingError(str(error)) from error
+            reason = f"rank {ranks.rank}: {error}"
+        if ranks.world_size > 1:
+            reasons = [text for text in ranks.all_gather_object(reason) if text is not None]
+            if reasons:
+                raise DrawingError("; ".join(reasons))
+        return cast(T, result)
+
+    def _found(self, look: Look, views: Views, options: RenderOptions) -> tuple[GaussianTable, ActiveRows]:
+        table, active, _ = self._finder(look).find(*views.as_arguments(), options.limits)
+        if look.crop is not None:
+            active = _cropped(active, table["means"], look.crop)
+        return (_painted(table) if look.mode == "level" else table), active
 
     def _options(self, look: Look) -> RenderOptions:
         options, gate = self._subject.options, self._gate(look)
@@ -132,6 +165,18 @@ class Drawer:
         if key not in self._finders:
             self._finders[key] = VisibleFinder(self._subject.scene, self._gate(look))
         return self._finders[key]
+
+
+def _reserve(scene: Scene, look: Look, device: torch.device) -> None:
+    """Allocate the memory of a frame, which torch keeps for it: without, one rank would fail in its middle.
+
+    Raises:
+        RuntimeError: it cannot.
+    """
+    if device.type == "cuda":
+        rows = len(scene.held if isinstance(scene, Pool) else scene)
+        size = rows * _ROW_BYTES + look.width * look.height * _PIXEL_BYTES
+        torch.empty(size, dtype=torch.uint8, device=device)
 
 
 def _cropped(

@@ -16,7 +16,7 @@ from blitzgs.viewer.world import World
 if TYPE_CHECKING:
     import viser
 
-# More would slow the browser down; they are then evenly spaced among all.
+# More would slow the browser down.
 MAX_FRUSTUMS = 400
 TRAIN_COLOUR, TEST_COLOUR = (64, 170, 255), (255, 150, 40)
 
@@ -37,10 +37,7 @@ class Frustums:
     ) -> None:
         """Add the frustums; `stand` is called with the number of the visitor who clicks, and the camera."""
         cameras, test = exhibit.cameras, set(exhibit.test)
-        step = max(1.0, len(cameras) / MAX_FRUSTUMS)
-        self.indices = sorted(
-            {int(k * step) for k in range(math.ceil(len(cameras) / step))} & set(range(len(cameras)))
-        )
+        self.indices = shown_cameras(len(cameras), test)
         self._handles: list[Any] = []
         size = frustum_size(world)
         for index in self.indices:
@@ -71,6 +68,21 @@ class Frustums:
         """Draw the frustums larger or smaller than usual."""
         for handle in self._handles:
             handle.scale = frustum_size(world) * factor
+
+
+def shown_cameras(count: int, test: set[int]) -> list[int]:
+    """Return the cameras that get a frustum: all, or `MAX_FRUSTUMS`, evenly spaced.
+
+    Held-out cameras, which are often every 8th, keep their share.
+    """
+    share = min(1.0, MAX_FRUSTUMS / max(1, count))
+    held = sorted(test & set(range(count)))
+    parts = held, [index for index in range(count) if index not in test]
+    few = math.ceil(share * len(held))
+    sizes = few, min(len(parts[1]), MAX_FRUSTUMS - few)
+    return sorted(
+        part[k * len(part) // size] for part, size in zip(parts, sizes, strict=True) for k in range(size)
+    )
 
 
 def _click(stand: Callable[[int | None, int], None], index: int) -> Callable[[Any], None]:

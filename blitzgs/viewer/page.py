@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     import viser
 
 MISSING = 'the viewer needs the package viser: pip install "blitzgs[view]"'
+# Seconds that a picture waits to be sent: a photograph to compare with may come from a slow disk.
+_SEND_SECONDS = 1.0
 # Seconds between two updates of the figures on the page.
 _FIGURES_SECONDS = 0.2
 
@@ -161,8 +163,9 @@ class Page:
         return None
 
     def deliver(self, visitor: Visitor, ask: Ask, picture: Picture) -> None:
-        """Send a picture to a visitor; waits only if two others are still being sent."""
-        self._sending.acquire()
+        """Send a picture to a visitor; drops it if two others have not been sent within a second."""
+        if not self._sending.acquire(timeout=_SEND_SECONDS):
+            return
         try:
             self._sender.submit(self._send, visitor, ask, picture)
         except RuntimeError:  # the page is closed

@@ -22,7 +22,7 @@ from blitzgs.viewer.world import SCALE
 HELP = (
     "**Orbit**: drag turns around a point, right drag moves it, the wheel nears it. "
     "**Fly**: drag turns your head. **Walk**: the same, at eye height above the ground. "
-    "Keys: W A S D, Q down, E up, arrows turn. Click a frustum to stand there."
+    "Keys: W A S D move level, Q down, E up, arrows turn. Click a frustum to stand there."
 )
 
 
@@ -72,6 +72,8 @@ class Panel:
         visitor, gui, exhibit = self._visitor, self._gui, self._exhibit
         shown = gui.add_checkbox("Show cameras", True, hint="Blue: trained on. Orange: held out.")
         shown.on_update(lambda _: self._frustums.show(shown.value))
+        if (few := len(self._frustums.indices)) < len(exhibit.cameras):
+            gui.add_markdown(f"{few} of {len(exhibit.cameras):,} are shown; *Camera* below reaches all.")
         size = gui.add_slider("Camera size", min=0.1, max=4.0, step=0.1, initial_value=1.0)
         size.on_update(lambda _: self._frustums.resize(size.value, visitor.world))
         number = gui.add_slider(

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exposures of photographs are found against renders, keep their mean, and survive a resume."""
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -94,6 +95,10 @@ def test_a_resumed_run_repeats_every_bit_and_a_render_shows_the_exposures(tmp_pa
     resumed, _ = train_on_unequal_photographs(tmp_path / "parts", resume=True)
     assert_same_table(resumed.state.table, whole.state.table)
     assert torch.equal(resumed.state.stepper.exposures.measured, whole.state.stepper.exposures.measured)
+    content = json.loads((tmp_path / "whole" / "exposures.json").read_text())
+    train = [whole.state.capture.cameras[index].name for index in whole.state.capture.train]
+    assert list(content) == train
+    np.testing.assert_allclose(list(content.values()), whole.state.stepper.exposures.effective(), atol=1e-5)
     out = {}
     for name, flags in (("mean", []), ("own", ["--exposure"])):
         folder = tmp_path / name

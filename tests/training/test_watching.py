@@ -1,4 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
+import os
+import signal
+
 import numpy as np
 import pytest
 
@@ -8,6 +11,7 @@ from blitzgs.training.trainer import Trainer
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Look
 from blitzgs.view.views import viewmat
+from blitzgs.view.visible import VisibleFinder
 from tests.distributed.rank_harness import run_ranks
 from tests.training.tiny import tiny_config, tiny_scene
 from tests.training.tiny_runs import assert_same_table, train
@@ -19,6 +23,7 @@ class Recorder:
     def __init__(self, look=None, fails=None, pauses=0, saves=0):
         self.look, self.fails, self.pauses, self.saves = look, fails, pauses, saves
         self.pictures, self.records, self.closed, self.failures = [], [], 0, []
+        self.stays, self.shown_on = False, 0
 
     def wants(self):
         if self.fails == "wants":
@@ -29,6 +34,11 @@ class Recorder:
         if self.fails == "wish":
             raise KeyError("a fault of the viewer")
         pauses, self.pauses = self.pauses > 0, self.pauses - 1
+        if self.stays:
+            self.shown_on += 1
+            if self.shown_on == 3:
+                os.kill(os.getpid(), signal.SIGINT)
+            pauses = True
         saves, self.saves = self.saves > 0, 0
         return Wish(self.look, pauses, saves)
 
@@ -40,6 +50,9 @@ class Recorder:
 
     def failed(self, reason):
         self.failures.append(reason)
+
+    def stay(self):
+        self.stays = True
 
     def told(self, t, values):
         self.records.append((t, dict(values)))
@@ -113,6 +126,44 @@ def test_all_ranks_draw_for_the_first(tmp_path):
     assert none == 0
     _, summary = train(tmp_path / "alone", "schedule.iterations=40")
     assert psnr == pytest.approx(summary["psnr"], abs=0.1)
+
+
+def _fails_on_the_second_rank(ranks, folder):
+    draw = VisibleFinder.find
+
+    def found(self, *arguments):
+        if ranks.rank == 1:
+            raise RuntimeError("no room")
+        return draw(self, *arguments)
+
+    trainer = Trainer(tiny_config("schedule.iterations=20"), *tiny_scene(), folder, ranks)
+    watcher = Recorder(some_look(trainer.state))
+    trainer.watch(watcher if ranks.rank == 0 else None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("blitzgs.view.draw.VisibleFinder.find", found)
+        patch.setattr(
+            "blitzgs.training.events.evaluate.evaluate", lambda *_, **__: {"psnr": 1.0, "views": {}}
+        )
+        summary = trainer.train()
+    return len(watcher.pictures), set(watcher.failures), summary["images"]
+
+
+def test_a_rank_that_cannot_draw_does_not_end_the_training(tmp_path):
+    (pictures, failures, images), (_, _, other) = run_ranks(_fails_on_the_second_rank, 2, tmp_path)
+    assert (pictures, failures) == (0, {"rank 1: no room"})
+    assert images == other == 20
+
+
+def test_a_watcher_may_stay_after_the_training(tmp_path):
+    trainer = Trainer(tiny_config("schedule.iterations=20"), *tiny_scene(), tmp_path, Ranks())
+    watcher = Recorder(some_look(trainer.state))
+    trainer.watch(watcher, stays=True)
+    trainer.train()
+    seen = len(watcher.pictures)
+    assert watcher.closed == 0
+    trainer.show_on()  # until the watcher sends a signal
+    assert watcher.closed == 1
+    assert len(watcher.pictures) >= seen + 2
 
 
 def test_intrinsics_are_centred():

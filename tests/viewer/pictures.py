@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the pictures of docs/guide/view.md.
+"""Makes the pictures of docs/guide/view.md and docs/guide/report.md.
 
     python -m tests.viewer.pictures RUN [--data CAPTURE]
 
@@ -22,8 +22,11 @@ import cv2
 
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
+from blitzgs.report.look import look_of
+from blitzgs.report.report import write_report
 from blitzgs.runs.folder import open_run
 from blitzgs.viewer.studio import Studio, open_model
+from blitzgs.viewer.web import web_file
 from blitzgs.viewer.world import looking
 from tests.browser import Browser, wait_for
 
@@ -66,6 +69,31 @@ def at_rest(run: Path, data: Path | None) -> None:
     studio.close()
 
 
+def report(run: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        file = write_report(run, look_of(run), Path(folder) / "report.html")
+        with Browser(f"file://{file}", 1200, 1240) as browser:
+            wait_for(
+                lambda: browser.evaluate("document.querySelectorAll('.chart').length > 3"), 60, "the page"
+            )
+            browser.evaluate("document.querySelector('header p').remove()")  # the path of the run
+            time.sleep(1)
+            save(browser, "report.jpg")
+
+
+def sent(run: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "scene.html"
+        page = web_file(open_model(run, Ranks()), 50_000_000)
+        file.write_text(page.text)
+        with Browser(file.as_uri(), 1280, 720) as browser:
+            wait_for(lambda: browser.evaluate("window.blitzgs?.scene.count"), 60, "the page's program")
+            browser.evaluate("blitzgs.ready")
+            browser.drag((700, 300), (560, 290))
+            time.sleep(3)
+            save(browser, "scene_page.jpg")
+
+
 def live(data: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
@@ -98,7 +126,9 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--data", type=Path)
     args = parser.parse_args()
+    report(args.run)
     at_rest(args.run, args.data)
+    sent(args.run)
     live(args.data or Path(open_run(args.run).config().data.path))
 
 

@@ -151,7 +151,7 @@ def test_a_click_on_a_frustum_stands_there(studio, browser):
     settled(studio)
     wanted = world.stance(world.poses[visitor.standing], visitor.stance.fov)
     assert visitor.stance.is_near(wanted)
-    assert visitor._stance.is_near(wanted, 0.02, 0.01)  # the browser's own camera
+    wait_for(lambda: visitor._stance.is_near(wanted, 0.02, 0.01), 60, "the browser's own camera is there")
     name = studio.page.exhibit.cameras[visitor.standing].name
     wait_for(lambda: browser.place_of(f"Standing at {name}"), 60, "the panel names the photograph")
 
@@ -209,6 +209,25 @@ def test_walking_is_at_eye_height(studio, browser):
     wait_for(lambda: visitor.motion == "orbit", 60, "the motion is chosen")
     settled(studio)
     assert browser.errors() == []
+
+
+@needs_chromium
+def test_keys_move_a_visitor_who_flies(studio, browser):
+    visitor = settled(studio)
+    browser.press("fly")
+    wait_for(lambda: visitor.motion == "fly", 60, "the motion is chosen")
+    settled(studio)
+    up = studio.page.world.up
+    for code, direction in (("KeyW", np.cross(up, visitor.stance.rotation[:, 0])), ("KeyE", up)):
+        before = visitor.stance.position
+        browser.call("Input.dispatchKeyEvent", type="keyDown", code=code, key=code[-1].lower())
+        wait_for(lambda at=before: np.linalg.norm(visitor.stance.position - at) > 0.3, 30, code)
+        browser.call("Input.dispatchKeyEvent", type="keyUp", code=code, key=code[-1].lower())
+        settled(studio)
+        step = visitor.stance.position - before
+        assert step @ direction > 0.95 * np.linalg.norm(step)
+    browser.press("orbit")
+    wait_for(lambda: visitor.motion == "orbit", 60, "the motion is chosen")
 
 
 @needs_chromium

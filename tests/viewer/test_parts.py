@@ -15,7 +15,7 @@ from blitzgs.view.views import Space
 from blitzgs.viewer import compare, paths
 from blitzgs.viewer.curves import Curves
 from blitzgs.viewer.door import Door, is_loopback
-from blitzgs.viewer.frustums import quaternion
+from blitzgs.viewer.frustums import MAX_FRUSTUMS, quaternion, shown_cameras
 from blitzgs.viewer.overlay import round_length
 from blitzgs.viewer.pace import Pace
 from blitzgs.viewer.shade import shaded
@@ -233,3 +233,13 @@ def test_a_port_in_use_is_an_error(behind):
 def test_addresses_of_this_machine():
     assert is_loopback("localhost") and is_loopback("127.0.0.1") and is_loopback("::1")
     assert not is_loopback("0.0.0.0") and not is_loopback("machine.example")
+
+
+def test_frustums_are_thinned_evenly_and_held_out_ones_keep_their_share():
+    assert shown_cameras(5, {0}) == [0, 1, 2, 3, 4]
+    assert shown_cameras(0, set()) == []
+    test = set(range(0, 3200, 8))  # of which steps of 8 would show all, or none
+    shown = shown_cameras(3200, test)
+    assert len(shown) == MAX_FRUSTUMS == 400 and len(set(shown) & test) == 50
+    assert max(np.diff(sorted(set(shown) & test))) == 64
+    assert max(np.diff(shown)) <= 16

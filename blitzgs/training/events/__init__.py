@@ -47,7 +47,8 @@ def handle_all(state: TrainingState, events: Sequence[Event]) -> bool:
     ordered = sorted(events, key=lambda event: event.kind in ("evaluate", "checkpoint"))
     for done, event in enumerate(ordered):
         try:
-            HANDLERS[event.kind](state, event)
+            with state.stage(event.kind):
+                HANDLERS[event.kind](state, event)
         except (SweepStoppedError, PoolError) as error:
             state.progress = replace(state.progress, events_left=[astuple(other) for other in ordered[done:]])
             if isinstance(error, PoolError):

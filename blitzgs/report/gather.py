@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reads what a page shows of a run from the files in its folder."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blitzgs.runs import exposure
+from blitzgs.runs import files as run_files
+from blitzgs.runs.cameras import CAMERAS, RunCameras, load_cameras
+from blitzgs.runs.evaluation import METRICS
+from blitzgs.runs.folder import RunFolder, open_run
+from blitzgs.runs.previews import FOLDER, INDEX, PARTS, preview_file
+from blitzgs.viewer.world import up_direction
+
+Point = tuple[float, float | None, float]
+# A curve has at most this many points: means of its records.
+MAX_POINTS = 500
+# Training cameras of the plan, and photographs with a listed exposure, at most; they are then evenly spaced.
+MAX_LISTED = 20_000
+_MAX_WARNINGS, _MAX_TEXT, _MAX_NAME = 200, 2000, 200
+_CURVES = ("loss", "psnr", "gaussians", "images_per_second", "memory_bytes")
+_POPULATION_EVENTS = (None, "densify", "pass_1", "pass_2")
+# Keys of the start's record that do not describe the environment.
+_NO_ENVIRONMENT = ("t", "run", "event", "origin", "train", "test")
+
+
+@dataclass
+class RunData:
+    """What is known of a run.
+
+    Attributes:
+        folder: the run.
+        summary: `summary.json`; empty while the run is not finished.
+        log: records of the newest run in the folder, oldest first.
+        cameras: all cameras, or None if the file is missing or damaged.
+        measured: folder of the newest evaluation of the held-out views, or None.
+        views: metrics of each view, by its name.
+        problems: what could not be read, as sentences.
+    """
+
+    folder: RunFolder
+    summary: dict[str, Any]
+    log: list[dict[str, Any]]
+    cameras: RunCameras | None
+    measured: Path | None
+    views: dict[str, dict[str, float]]
+    problems: list[str] = field(default_factory=list)
+
+    @property
+    def is_test(self) -> bool:
+        """Whether the measured views are held out."""
+        return self.cameras is None or bool(self.cameras.test)
+
+
+def read_run(path: Path) -> RunData:
+    """Read a run; damaged files are left out, and named in `problems`.
+
+    Raises:
+        FileNotFoundError: the folder is not a run.
+    """
+    folder = open_run(path)
+    data = RunData(folder, {}, [], None, None, {})
+    try:
+        data.summary = _mapping(folder.summary())
+    except ValueError as error:
+        data.problems.append(f"{error}.")
+    records = [record for record in folder.log() if isinstance(record, dict) and _is_number(record.get("t"))]
+    identity = next(
+        (record.get("run") for record in reversed(records) if record.get("event") == "start"), None
+    )
+    data.log = [record for record in records if record.get("run") == identity]
+    if (path / CAMERAS).exists():
+        try:
+            data.cameras = load_cameras(path)
+        except ValueError as error:
+            data.problems.append(f"{error}.")
+    evaluations = path / run_files.EVALUATION
+    found = [
+        file
+        for file in evaluations.glob("*/metrics.json")
+        if file.parent.name.isdigit() or file.parent.name == "test"
+    ]
+    if found:
+        newest = max(found, key=lambda file: file.stat().st_mtime)
+        data.measured, data.views = newest.parent, _views_of(newest, data.problems)
+    return data
+
+
+def metrics_of(views: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Return the metrics that a run's views have."""
+    return [metric for metric in METRICS if any(metric in view for view in views.values())]
+
+
+def curves(data: RunData) -> dict[str, list[Point]]:
+    """Return the curves of the log by name: (images, seconds of training or None, value)."""
+    found: dict[str, list[Point]] = {name: [] for name in (*_CURVES, "held_out")}
+    seconds: float | None = 0.0
+    for record in data.log:
+        kind, t = record.get("event"), float(record["t"])
+        if kind is None:
+            seconds = float(record["seconds"]) if _is_number(record.get("seconds")) else None
+        for name in _CURVES:
+            kinds = _POPULATION_EVENTS if name == "gaussians" else (None,)
+            if kind in kinds and _is_number(record.get(name)):
+                found[name].append((t, seconds, float(record[name])))
+        if (
+            kind in ("glance", "evaluation")
+            and record.get("split") != "train"
+            and _is_number(record.get("psnr"))
+        ):
+            found["held_out"].append((t, seconds, float(record["psnr"])))
+    return {name: _thinned(points) for name, points in found.items()}
+
+
+def _thinned(points: list[Point]) -> list[Point]:
+    """Return means over stretches of a curve, with five digits."""
+    size = max(1, math.ceil(len(points) / MAX_POINTS))
+    parts = [points[k : k + size] for k in range(0, len(points), size)]
+    return [
+        (
+            part[-1][0],
+            None if part[-1][1] is None else round(part[-1][1], 1),
+            digits(_mean(p[2] for p in part)),
+        )
+        for part in parts
+    ]
+
+
+def warnings_of(data: RunData) -> list[tuple[float, str, str]]:
+    """Return (images, kind, text) of the log's warnings and hints, each text once."""
+    found: dict[tuple[str, str], float] = {}
+    for record in data.log:
+        kind = record.get("event")
+        if kind == "worst views":
+            continue
+        for name in ("warning", "hint", "reason"):
+            if isinstance(text := record.get(name), str):
+                label = "warning" if name == "warning" else str(kind)
+                found.setdefault((label, text[:_MAX_TEXT]), float(record["t"]))
+    return [(t, kind, text) for (kind, text), t in found.items()][:_MAX_WARNINGS]
+
+
+def environment(data: RunData) -> dict[str, object]:
+    """Return where the run was trained: versions, device, transport."""
+    start: dict[str, Any] = next(
+        (record for record in reversed(data.log) if record.get("event") == "start"), {}
+    )
+    found = {name: value for name, value in start.items() if name not in _NO_ENVIRONMENT}
+    found |= _mapping(data.summary.get("versions"))
+    views = {name: start[name] for name in ("train", "test") if name in start}
+    return (
+        found
+        | {f"{name} views": value for name, value in views.items()}
+        | {"run": data.summary.get("run", "")}
+    )
+
+
+def plan(data: RunData) -> dict[str, Any] | None:
+    """Return the cameras from above: (x, y, held out, PSNR or None, name) of each, in the capture's unit."""
+    cameras = data.cameras
+    if cameras is None or not cameras.cameras:
+        return None
+    poses = [np.asarray(camera.world_to_camera, dtype=np.float64) for camera in cameras.cameras]
+    centres = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
+    up = up_direction(poses)
+    east = np.array([1.0, 0, 0]) if abs(up[0]) < 0.9 else np.array([0, 1.0, 0])
+    east -= up * (east @ up)
+    east /= np.linalg.norm(east)
+    flat = np.stack([centres @ east, centres @ np.cross(up, east)], axis=1)
+    step = max(1e-9, float(np.ptp(flat, axis=0).max())) / 5000
+    decimals = max(0, math.ceil(-math.log10(step)))
+    others = _other_views(data)
+    known = {name: view["psnr"] for name, view in (others | data.views).items() if "psnr" in view}
+    held = set(cameras.test)
+    train = evenly([index for index in range(len(poses)) if index not in held], MAX_LISTED)
+    points = []
+    for index in sorted({*train, *held}):
+        name = cameras.cameras[index].name
+        psnr = known.get(name)
+        place = [round(float(value), decimals) for value in flat[index]]
+        points.append(
+            (*place, int(index in held), None if psnr is None else round(psnr, 2), short_name(name))
+        )
+    measured = bool(train) and all(cameras.cameras[index].name in known for index in train)
+    return {"points": points, "trained_known": measured}
+
+
+def _other_views(data: RunData) -> dict[str, dict[str, float]]:
+    """Return the metrics of training views that `blitzgs eval --split train` or `all` has measured."""
+    found: dict[str, dict[str, float]] = {}
+    for split in ("all", "train"):
+        file = data.folder.path / run_files.EVALUATION / split / "metrics.json"
+        if file.exists():
+            found |= _views_of(file, data.problems)
+    return found
+
+
+def exposures(data: RunData) -> list[list[Any]]:
+    """Return [name, gain R, G, B, bias R, G, B] of the training photographs; empty without exposures."""
+    path = data.folder.path / exposure.FILE
+    if not path.exists():
+        return []
+    try:
+        content = _mapping(json.loads(path.read_text(encoding="utf-8")))
+        rows = [
+            [short_name(str(name)), *(float(part) for row in values for part in row)]
+            for name, values in content.items()
+        ]
+        if any(len(row) != 7 for row in rows):
+            raise ValueError("an exposure has another number of values")
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        data.problems.append(f"{path} is damaged ({error}).")
+        return []
+    return [rows[index] for index in evenly(list(range(len(rows))), MAX_LISTED)]
+
+
+def pictured(data: RunData) -> dict[str, int]:
+    """Return the cameras of the newest evaluation that have previews, by the names of their views."""
+    if data.measured is None or data.cameras is None:
+        return {}
+    path = data.measured / FOLDER / INDEX
+    try:
+        indices = json.loads(path.read_text(encoding="utf-8"))
+        cameras = data.cameras.cameras
+        return {cameras[index].name: index for index in indices if cameras[index].name in data.views}
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+        data.problems.append(f"{path} is damaged ({error}).")
+        return {}
+
+
+def layers(data: RunData, index: int) -> dict[str, str] | None:
+    """Return the previews of a camera as data addresses by their parts; None if one is missing."""
+    found = {}
+    for part in PARTS:
+        try:
+            content = preview_file(data.measured / FOLDER, index, part).read_bytes()  # type: ignore[operator]
+        except OSError:
+            return None
+        found[part] = "data:image/webp;base64," + base64.b64encode(content).decode()
+    return found
+
+
+def subtitle(data: RunData) -> str:
+    """Return a line below the title."""
+    state = "finished" if data.summary else "not finished"
+    made = time.strftime("%Y-%m-%d %H:%M")
+    return f"{data.folder.path.resolve()} · {state} · written {made} by blitzgs"
+
+
+def rows_of(views: Mapping[str, Mapping[str, float]], metrics: Sequence[str]) -> Iterator[list[Any]]:
+    """Yield [name, value of each metric or None] of each view."""
+    for name, view in views.items():
+        yield [short_name(name), *(digits(view[metric], 6) if metric in view else None for metric in metrics)]
+
+
+def evenly(values: list[int], most: int) -> list[int]:
+    """Return at most so many of some values, evenly spaced."""
+    return [values[k * len(values) // most] for k in range(most)] if len(values) > most else values
+
+
+def short_name(name: str) -> str:
+    """Return a name that is not too long for a page."""
+    return name if len(name) <= _MAX_NAME else f"{name[: _MAX_NAME // 2]}…{name[-_MAX_NAME // 2 :]}"
+
+
+def digits(value: float, count: int = 5) -> float:
+    """Return a number with so many digits."""
+    return float(f"{value:.{count}g}")
+
+
+def _views_of(file: Path, problems: list[str]) -> dict[str, dict[str, float]]:
+    """Read the metrics of each view of an evaluation."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        return {
+            str(name): {metric: float(value) for metric, value in view.items() if _is_number(value)}
+            for name, view in content["views"].items()
+        }
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        problems.append(f"{file} is damaged ({error}).")
+        return {}
+
+
+def _mapping(value: object) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _mean(values: Iterator[float]) -> float:
+    found = list(values)
+    return sum(found) / len(found)
