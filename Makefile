@@ -10,7 +10,7 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu' 'examples/*.cpp')
 DEMO ?= runs/demo
 
-.PHONY: venv venv-test build io demo test browser test-python test-cxx test-cuda test-slow sanitize fuzz lint format clean
+.PHONY: venv venv-test build demo test browser test-python test-cxx test-cuda test-slow sanitize fuzz lint format clean
 
 venv: $(VENV)/.installed
 venv-test: $(VENV)/.installed-test
@@ -25,7 +25,7 @@ $(VENV)/.torch: | $(VENV)/bin/python
 
 # The installation is editable: the sources run in place and the kernels are built into blitzgs/_lib.
 $(VENV)/.installed: pyproject.toml setup.py $(VENV)/.torch
-	$(PYTHON) -m pip install --quiet cmake ninja "pybind11>=2.13" "setuptools>=77" wheel
+	$(PYTHON) -m pip install --quiet cmake ninja "setuptools>=77" wheel
 	$(RUN) $(PYTHON) -m pip install --quiet --no-build-isolation -e ".[synth,log]"
 	touch $@
 
@@ -36,12 +36,6 @@ $(VENV)/.installed-test: $(VENV)/.installed
 # Rebuilds what changed in csrc/.
 build:
 	$(RUN) $(PYTHON) setup.py --quiet build_ext --inplace
-
-# Builds the one module that depends on Python's version, without CMake and torch, for kernels that are built already.
-io:
-	$(CXX) -O3 -std=c++20 -shared -fPIC -fvisibility=hidden -Icsrc $$($(PYTHON) -m pybind11 --includes) \
-	  $(filter-out %_test.cpp,$(wildcard csrc/io/*.cpp)) \
-	  -o blitzgs/_lib/_io$$($(PYTHON) -c "import sysconfig; print(sysconfig.get_config_var('EXT_SUFFIX'))")
 
 # A second `make demo` continues the run where it stopped, or measures the finished one again. A new run from the
 # start goes into a folder of its own, and has to when the configuration has changed: make demo DEMO=runs/another
@@ -80,7 +74,7 @@ test-cxx:
 	    || { apt-get update -qq && apt-get install -y -qq catch2; } >/dev/null 2>&1; }; } \
 	  || { echo "Catch2 is missing: install it (Debian: apt-get install catch2)"; exit 1; }
 	$(RUN) cmake -S . -B build-tests -G Ninja -DBLITZGS_TESTS=ON -DBLITZGS_SANITIZE=ON -DBLITZGS_CUDA=OFF \
-	  -DBLITZGS_IO=OFF -DCMAKE_BUILD_TYPE=None -DCMAKE_CXX_FLAGS=-O1 -DPython3_EXECUTABLE="$(abspath $(PYTHON))" >/dev/null
+	  -DCMAKE_BUILD_TYPE=None -DCMAKE_CXX_FLAGS=-O1 -DPython3_EXECUTABLE="$(abspath $(PYTHON))" >/dev/null
 	$(RUN) cmake --build build-tests --target blitzgs_tests
 	./build-tests/blitzgs_tests
 
@@ -106,7 +100,7 @@ sanitize-%:
 FUZZ_CXX ?= clang++
 FUZZ_SECONDS ?= 60
 FUZZERS = jpeg image_header qoi ply colmap_binary colmap_text
-FUZZ_SOURCES = csrc/io/fuzz/readers_fuzz.cpp $(filter-out %_test.cpp %/module.cpp,$(wildcard csrc/io/*.cpp))
+FUZZ_SOURCES = csrc/io/fuzz/readers_fuzz.cpp $(filter-out %_test.cpp %/io_api.cpp,$(wildcard csrc/io/*.cpp))
 fuzz: $(FUZZERS:%=fuzz-%)
 fuzz-%: build-fuzz/%
 	mkdir -p build-fuzz/corpus/$*

@@ -12,6 +12,8 @@ if(BLITZGS_CUDA_ARCHS STREQUAL "all")
     100-real
     120
   )
+  # A third of the size. The driver decompresses a kernel when it is first used.
+  set(compress --compress-mode=size)
 elseif(BLITZGS_CUDA_ARCHS)
   set(CMAKE_CUDA_ARCHITECTURES ${BLITZGS_CUDA_ARCHS})
 else()
@@ -44,6 +46,7 @@ target_compile_options(
     --extended-lambda
     -Xcompiler=-Wall
     -lineinfo
+    ${compress}
     -diag-suppress=20012>
 )
 
