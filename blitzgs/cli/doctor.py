@@ -43,6 +43,7 @@ Put the output of --json into reports of faults.
 """
 
 State = Literal["ok", "warning", "missing", "failed"]
+_PACKAGE = Path(__file__).resolve().parents[1]
 # The largest errors of the small rendering in float32, and of its gradients relative to the largest of each.
 _IMAGE_ERROR, _GRADIENT_ERROR = 1e-5, 1e-3
 _SLOW_DISK_MB_S = 50
@@ -113,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
 def examine(folder: Path | None = None, timeout: float = 120.0) -> list[Line]:
     """Return the lines of the report."""
     lines = [
-        Line("blitzgs", "ok", f"{__version__} in {LIBRARY_DIR.parent}"),
+        Line("blitzgs", "ok", f"{__version__} in {_PACKAGE}"),
         _system(),
         _memory(),
         *_packages(),
@@ -165,7 +166,7 @@ def run_command(command: Sequence[str], timeout: float) -> str:
     Raises:
         ProbeError: it cannot be started, failed, was killed or took longer than `timeout` seconds.
     """
-    path = os.pathsep.join(filter(None, [str(LIBRARY_DIR.parents[1]), os.environ.get("PYTHONPATH")]))
+    path = os.pathsep.join(filter(None, [str(_PACKAGE.parent), os.environ.get("PYTHONPATH")]))
     try:
         process = subprocess.Popen(
             command,
