@@ -10,7 +10,7 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu' 'examples/*.cpp')
 DEMO ?= runs/demo
 
-.PHONY: venv venv-test build sdist wheel demo test browser test-python test-cxx test-cuda test-slow sanitize fuzz lint format clean
+.PHONY: venv venv-test build sdist wheel test-wheel demo test browser test-python test-cxx test-cuda test-slow sanitize fuzz lint format clean
 
 venv: $(VENV)/.installed
 venv-test: $(VENV)/.installed-test
@@ -50,9 +50,14 @@ wheel: venv
 	rm -rf build/wheel build/lib* build/bdist*
 	$(RUN) BLITZGS_CUDA=$(or $(BLITZGS_CUDA),ON) BLITZGS_CUDA_ARCHS=$(or $(BLITZGS_CUDA_ARCHS),all) BLITZGS_GLIBC=2.28 \
 	  $(PYTHON) -m build --quiet --no-isolation --wheel --outdir build/wheel
-	$(RUN) auditwheel repair --plat manylinux_2_28_x86_64 --strip $(WHEEL_TORCH_LIBRARIES:%=--exclude %) \
+	$(RUN) auditwheel repair --plat manylinux_2_28_x86_64 --only-plat --strip $(WHEEL_TORCH_LIBRARIES:%=--exclude %) \
 	  --wheel-dir dist build/wheel/*.whl
 	@ls -l dist/*.whl
+
+# The wheel and the archive in dist/, in fresh environments with two versions of torch and of Python.
+test-wheel: venv-test
+	$(PYTHON) -m pip install --quiet uv
+	$(RUN) $(PYTHON) -m pytest -q -m slow --timeout 3600 tests/packaging
 
 # A second `make demo` continues the run where it stopped, or measures the finished one again. A new run from the
 # start goes into a folder of its own, and has to when the configuration has changed: make demo DEMO=runs/another
@@ -100,7 +105,7 @@ test-cuda: venv-test build
 	$(RUN) $(PYTHON) -m pytest -v -rf --tb short -m cuda tests
 
 test-slow: venv-test build
-	$(RUN) $(PYTHON) -m pytest -q -m slow --timeout 3600 tests
+	$(RUN) $(PYTHON) -m pytest -q -m slow --timeout 3600 --ignore tests/packaging tests
 
 # Every CUDA kernel under compute-sanitizer, each allocation with bounds of its own; -j4 runs the tools side by side.
 # Other tests than the small suite: make sanitize SANITIZE_TESTS="tests/cuda tests/ops"
