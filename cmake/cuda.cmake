@@ -33,8 +33,7 @@ set(CMAKE_CUDA_RUNTIME_LIBRARY Static)
 list(JOIN CMAKE_CUDA_ARCHITECTURES "," architectures)
 set_source_files_properties(
   csrc/common/cuda_build.cpp
-  PROPERTIES
-    COMPILE_DEFINITIONS "BLITZGS_CUDA_BUILD=\"${CMAKE_CUDA_COMPILER_VERSION} ${architectures}\""
+  PROPERTIES COMPILE_DEFINITIONS "BLITZGS_CUDA_BUILD=\"${CMAKE_CUDA_COMPILER_VERSION} ${architectures}\""
 )
 add_library(
   blitzgs_cuda

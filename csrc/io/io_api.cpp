@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// The C interface of the host-side readers and writers, libblitzgs_io.so: one function that runs another one by
-// its name. Arguments and results are columns of numbers or of characters. The library depends neither on torch
-// nor on the version of Python; blitzgs/formats/native.py is its public face.
+// The C interface of the host-side readers and writers, libblitzgs_io.so: one function that runs another one
+// by its name. Arguments and results are columns of numbers or of characters. The library depends neither on
+// torch nor on the version of Python; blitzgs/formats/native.py is its public face.
 #include "io/io_api.h"
 
 #include <algorithm>
@@ -365,14 +365,14 @@ struct Function {
 };
 #define BLITZGS_IO_FUNCTION(name) {#name, &name}
 constexpr Function kFunctions[] = {
-    BLITZGS_IO_FUNCTION(camera_models),     BLITZGS_IO_FUNCTION(read_cameras),
-    BLITZGS_IO_FUNCTION(read_images),       BLITZGS_IO_FUNCTION(read_points),
-    BLITZGS_IO_FUNCTION(write_cameras),     BLITZGS_IO_FUNCTION(write_images),
-    BLITZGS_IO_FUNCTION(write_points),      BLITZGS_IO_FUNCTION(read_ply),
-    BLITZGS_IO_FUNCTION(write_ply),         BLITZGS_IO_FUNCTION(check_jpeg),
-    BLITZGS_IO_FUNCTION(check_png),         BLITZGS_IO_FUNCTION(read_image_header),
-    BLITZGS_IO_FUNCTION(tiff_as_stored),    BLITZGS_IO_FUNCTION(encode_qoi),
-    BLITZGS_IO_FUNCTION(decode_qoi),        BLITZGS_IO_FUNCTION(set_flag),
+    BLITZGS_IO_FUNCTION(camera_models),  BLITZGS_IO_FUNCTION(read_cameras),
+    BLITZGS_IO_FUNCTION(read_images),    BLITZGS_IO_FUNCTION(read_points),
+    BLITZGS_IO_FUNCTION(write_cameras),  BLITZGS_IO_FUNCTION(write_images),
+    BLITZGS_IO_FUNCTION(write_points),   BLITZGS_IO_FUNCTION(read_ply),
+    BLITZGS_IO_FUNCTION(write_ply),      BLITZGS_IO_FUNCTION(check_jpeg),
+    BLITZGS_IO_FUNCTION(check_png),      BLITZGS_IO_FUNCTION(read_image_header),
+    BLITZGS_IO_FUNCTION(tiff_as_stored), BLITZGS_IO_FUNCTION(encode_qoi),
+    BLITZGS_IO_FUNCTION(decode_qoi),     BLITZGS_IO_FUNCTION(set_flag),
     BLITZGS_IO_FUNCTION(flag_is_set),
 };
 

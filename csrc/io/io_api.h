@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The C interface of libblitzgs_io.so. Only these types and functions cross its border, so that it contains the
-// C++ library that it was built with.
+// The C interface of libblitzgs_io.so. Only these types and functions cross its border, so that it contains
+// the C++ library that it was built with.
 #pragma once
 #include <stddef.h>
 #include <stdint.h>
@@ -28,8 +28,8 @@ enum blitzgs_io_status_code {
   BLITZGS_IO_ERROR,
 };
 
-// Contiguous values of one type, or the characters of a text. Texts are two columns: their characters, and the
-// end of each (uint64).
+// Contiguous values of one type, or the characters of a text. Texts are two columns: their characters, and
+// the end of each (uint64).
 struct blitzgs_io_column {
   const void* data;
   size_t size;  // in values
@@ -38,7 +38,8 @@ struct blitzgs_io_column {
 
 struct blitzgs_io_reply;
 
-// Runs a function of io_api.cpp. The columns of the reply live until it is freed. Null: no memory for the reply.
+// Runs a function of io_api.cpp. The columns of the reply live until it is freed. Null: no memory for the
+// reply.
 BLITZGS_IO_API blitzgs_io_reply* blitzgs_io_call(const char* name, const blitzgs_io_column* arguments,
                                                  size_t count);
 BLITZGS_IO_API int blitzgs_io_status(const blitzgs_io_reply* reply);

@@ -74,7 +74,7 @@ def test_the_doctor_finds_no_fault(environment):
 
 def test_the_public_call(environment):
     red, green = map(float, run(environment, "python", "-c", CALL).split())
-    # Opacity 0.5 of the first Gaussian near its centre, then a part of the rest from the second, off its centre.
+    # 0.5 of the first Gaussian near its centre, then a part of the rest from the second, off its centre.
     assert 0.45 < red < 0.5 and 0.0 < green < 0.25
 
 
