@@ -35,7 +35,7 @@ from blitzgs.capture.check_files import FileCheck, mask_error
 from blitzgs.capture.image_files import UInt8, apply_orientation, decode_mask, decode_rgb, read_whole
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.capture.undistort import Rectification
-from blitzgs.formats.native import native_io
+from blitzgs.formats import native
 
 DEFAULT_BUDGET = 4 << 30
 _MAPS_KEPT = 4
@@ -288,10 +288,10 @@ class ImageStore:
             return self._decode(camera, self._read(camera.image_path))
         packed = self.compressed.get(index)
         if packed is not None:
-            return _uint8(native_io().decode_qoi(packed))
+            return _uint8(native.decode_qoi(packed))
         pixels = self._prepare(camera, self._decode(camera, read_whole(camera.image_path)))
         if self._shared is None:
-            packed = native_io().encode_qoi(pixels)
+            packed = native.encode_qoi(pixels)
             self.compressed.put(index, packed, len(packed))
         return pixels
 
