@@ -238,6 +238,7 @@ def read_image_header(data: bytes, name: Path) -> dict[str, Any]:
     """Return what the header of an image says: the fields of `ImageHeader` in csrc/io/image_header.h."""
     texts, ends, numbers, flags, grey = _call("read_image_header", data, name)
     numbered = ("width", "height", "orientation", "bits", "colors", "extras")
+    flagged = ("supported", "is_white_zero", "is_lossy", "is_planar")
     return {
         **dict(zip(("format", "samples", "alpha"), _texts(texts, ends), strict=True)),
         **dict(zip(numbered, numbers.tolist(), strict=True)),
