@@ -242,9 +242,7 @@ def read_image_header(data: bytes, name: Path) -> dict[str, Any]:
     return {
         **dict(zip(("format", "samples", "alpha"), _texts(texts, ends), strict=True)),
         **dict(zip(numbered, numbers.tolist(), strict=True)),
-        **dict(
-            zip(("supported", "is_white_zero", "is_lossy", "is_planar"), (flags != 0).tolist(), strict=True)
-        ),
+        **dict(zip(flagged, (flags != 0).tolist(), strict=True)),
         "transparent_grey": None if grey[0] < 0 else int(grey[0]),
     }
 
