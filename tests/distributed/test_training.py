@@ -18,7 +18,7 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.training.trainer import Trainer
-from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
+from tests.distributed.rank_harness import EIGHT, RankError, on_each_device, run_ranks
 from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene, write_tiny_capture
 from tests.training.tiny_runs import events_of, read_log, steps_of
 
@@ -71,7 +71,7 @@ def start(tmp_path_factory):
     return make
 
 
-@pytest.mark.parametrize(("world_size", "device"), on_each_device(2, 4))
+@pytest.mark.parametrize(("world_size", "device"), [*on_each_device(2, 4), EIGHT])
 def test_twenty_steps_agree_with_one_rank(start, tmp_path, world_size, device):
     whole, base = start(device)
     folder = tmp_path / "run"

@@ -17,7 +17,7 @@ from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batch import Batch
 from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term
-from tests.distributed.rank_harness import on_each_device, run_ranks
+from tests.distributed.rank_harness import EIGHT, on_each_device, run_ranks
 from tests.helpers import parameter_gradients, sum_parts
 from tests.training.tiny import look_at_origin, random_gaussians
 
@@ -132,7 +132,7 @@ def relative(a, b):
 
 
 @pytest.mark.parametrize("transport", ["auto", "collective"])
-@pytest.mark.parametrize(("world_size", "device"), on_each_device(2, 3, 4))
+@pytest.mark.parametrize(("world_size", "device"), [*on_each_device(2, 3, 4), EIGHT])
 def test_images_are_the_same_bits_and_losses_agree(alone, world_size, device, transport):
     if device == "cpu" and transport == "auto":
         pytest.skip("ranks on CPUs share no memory")
