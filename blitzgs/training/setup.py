@@ -45,6 +45,7 @@ from blitzgs.training.population_report import PICTURE
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
+from blitzgs.training.tour import tour_of
 from blitzgs.training.track_gains import differ, track_gains
 from blitzgs.training.view_level import keep_to_views
 from blitzgs.view.levels import measure_levels
@@ -113,7 +114,10 @@ def set_up(
     owners = _tile_owners(ranks, progress, restored)
     views = ViewSet(list(capture.cameras), space, ranks.device)
     sizes = [(capture.cameras[i].width, capture.cameras[i].height) for i in capture.train]
-    sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed)
+    tour = None
+    if config.memory.resident_gb > 0 and config.memory.tour:
+        tour = tour_of([capture.cameras[i] for i in capture.train], capture.points)
+    sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed, tour)
     if config.memory.resident_gb > 0:
         table = HostTable(table.release(), pinned=ranks.device.type == "cuda")
     stepper = _stepper(
