@@ -324,7 +324,7 @@ class MemoryConfig:
         resident_gb: gigabytes of each rank's device for Gaussians. All Gaussians are stored in host memory,
             and those that the next views may see are copied to the device. 0: all are stored on the device.
         tour: with `resident_gb`, the views of an epoch come along a tour of the places that they show, from
-            another place each time and shuffled over a sixteenth of it, so that most of what they see is
+            another place each time and shuffled over an eighth of it, so that most of what they see is
             on the device already. false: in random order.
     """
 

@@ -81,13 +81,15 @@ class BlockVisibility:
         return found
 
     @cached_property
-    def next_use(self) -> npt.NDArray[np.int64]:
+    def next_use(self) -> npt.NDArray[np.uint8]:
         """The first batch that may see each block, [N]; `UNSEEN` if none may. Waits for the device."""
         seen = self._read()
-        # The exponent of the lowest set bit as a float32 is the number of the first view.
-        lowest = (seen & (~seen + np.uint32(1))).astype(np.float32)
-        first_view = (lowest.view(np.int32) >> 23) - 127
-        return np.where(seen == 0, UNSEEN, first_view // self._batch_size).astype(np.int64)
+        # The exponent of the lowest set bit as a float32 is the number of the first view; 0 without a bit.
+        exponents = (seen & (~seen + np.uint32(1))).astype(np.float32).view(np.int32) >> 23
+        batch_of = np.full(127 + MAX_VIEWS, UNSEEN, dtype=np.uint8)
+        batch_of[127:] = np.arange(MAX_VIEWS) // self._batch_size
+        found: npt.NDArray[np.uint8] = batch_of[exponents]
+        return found
 
 
 def culled_blocks(cull: Tensor) -> Tensor:

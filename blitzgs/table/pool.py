@@ -317,6 +317,8 @@ class Pool:
         # Batch k has k steps, of which this is the first, until its blocks must be there.
         needed = loading + np.bincount(due[missing], minlength=batches).cumsum()[1:]
         rate = int(np.ceil((needed / np.arange(1, batches)).max()))
+        if rate == loading:
+            return
         slots = self._first_to_go(due < UNSEEN, min(rate - loading, len(missing)))
         coming = missing[np.argsort(due[missing], kind="stable")[: len(slots)]]
         self._fetch(slots, coming, self._begun)
@@ -345,13 +347,13 @@ class Pool:
         free = (self._block_in < 0).nonzero()[0]
         if count <= len(free):
             return free[: max(0, count)]
-        taken = (self._block_in >= 0).nonzero()[0]
-        idle = taken[~held[self._block_in[taken]]]
+        blocks = ((self._slot_of >= 0) & ~held).nonzero()[0]
+        idle = self._slot_of[blocks]
         count -= len(free)
         if count < len(idle):
-            next_use = self._visibility.next_use[self._block_in[idle]]
-            rank = next_use * (self._clock + 1) - self._last_use[idle]
-            idle = idle[np.argpartition(-rank, count)[:count]]
+            next_use = self._visibility.next_use[blocks].astype(np.int64)
+            rank = self._last_use[idle] - next_use * (self._clock + 1)
+            idle = idle[np.argpartition(rank, count)[:count]]
         return np.append(free, idle)
 
     # --- Moves --------------------------------------------------------------------------------------------

@@ -11,8 +11,8 @@ import torch
 from blitzgs.ops.counter_random import hash_keys, uniform
 
 # A view moves by up to this share of a tour, see `BatchSampler`. The views of such a piece should see no more
-# Gaussians than the device holds: a sixteenth of a survey sees about an eighth of its Gaussians.
-_PIECE = 0.0625
+# Gaussians than the device holds: an eighth of a survey sees about a fifth of its Gaussians.
+_PIECE = 0.125
 
 
 class BatchSampler:
@@ -24,7 +24,7 @@ class BatchSampler:
     run and every rank get the same batches.
 
     With a tour, an epoch still has every view once, but follows the tour from a random place in a random
-    direction, and each view comes later by a random share of up to a sixteenth of the tour. So the views of a
+    direction, and each view comes later by a random share of up to an eighth of the tour. So the views of a
     piece are shuffled, and what they see stays in the memory of the device meanwhile.
 
     Attributes:
