@@ -6,11 +6,11 @@
 The scene is `scenes.aerial` with SH degree 3 under a survey: cameras on parallel lines over the whole square
 kilometre, 150 m high, which look 60 degrees down, each at a few percent of the Gaussians. The trainer's own
 steps run with all Gaussians on the device ("resident"), then with a pool for 1 / ratio of them ("4x": a
-quarter; `blitzgs.training.offload`). The views come in the sampler's random order, as in a training, or
-along the flight lines. Measured are: the mean wall time of a step, after as many steps to warm up; the bytes
-moved between host and device in a step; the share of visible blocks that were on the device when they were
-tested, a step ahead; and "sweep", the time to move the whole table through the pool and back, as events of
-the schedule do.
+quarter; `blitzgs.training.offload`). The views come in random order, along the sampler's tour as in a
+training with a pool, or along the flight lines. Measured are: the mean wall time of a step, after as many
+steps to warm up; the bytes moved between host and device in a step; the share of visible blocks that were
+there and not loaded for it; and "sweep", the time to move the whole table through the pool and back, as
+events of the schedule do.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ from blitzgs.training.batch import Batch
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
+from blitzgs.training.tour import tour_of
 from blitzgs.view.views import Space, ViewSet
 
 LINES, VIEWS_A_LINE = 12, 20
@@ -85,9 +86,12 @@ class Survey:
         cameras = survey(scene)
         self.ranks, self.batch_size = Ranks(device=device), batch_size
         self.views = ViewSet(list(cameras), Space((0.0, 0.0, 0.0), 1.0, 1.0), device)
+        points = scene.means[:: max(1, len(scene.means) // 100_000)].double().cpu().numpy()
+        sizes, tour = [0] * len(cameras), tour_of(cameras, points)
         self.orders = {
-            "random": BatchSampler([0] * len(cameras), batch_size, seed=0),
-            "flight": FlightOrder([0] * len(cameras), batch_size, seed=0),
+            "random": BatchSampler(sizes, batch_size, seed=0),
+            "tour": BatchSampler(sizes, batch_size, 0, tour),
+            "flight": FlightOrder(sizes, batch_size, seed=0),
         }
         shape = (batch_size, scene.height, scene.width, 3)
         self.targets = torch.randint(0, 256, shape, dtype=torch.uint8, device=device)
@@ -216,7 +220,8 @@ def main() -> None:
     parser = make_parser(__doc__, device="cuda")
     parser.add_argument("--gaussians", type=int, default=16_000_000)
     parser.add_argument("--ratios", type=float, nargs="+", default=[1, 2, 4])
-    parser.add_argument("--orders", nargs="+", default=["random", "flight"], choices=["random", "flight"])
+    orders = ["random", "tour", "flight"]
+    parser.add_argument("--orders", nargs="+", default=orders, choices=orders)
     parser.add_argument("--batch-size", type=int, default=1)
     parser.add_argument("--steps", type=int, default=40)
     args = parser.parse_args()

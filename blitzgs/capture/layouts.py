@@ -178,12 +178,12 @@ def _with_photographs(root: Path, source: Source, views: Sequence[SourceView]) -
     used = {view.path for view in views}
     suffixes = {path.suffix.lower() for path in used} & set(_PHOTOGRAPH_SUFFIXES)
     folders = {path.parent for path in used}
-    masks = {view.mask_path for view in views}
+    known = used | {view.mask_path for view in views}
     without = sorted(
         file
         for folder in folders
         for file in (folder.iterdir() if folder.is_dir() else ())
-        if file.suffix.lower() in suffixes and file not in used | masks and not _BY_PRODUCT.search(file.stem)
+        if file.suffix.lower() in suffixes and file not in known and not _BY_PRODUCT.search(file.stem)
     )
     if without:
         warnings.warn(

@@ -32,6 +32,7 @@ from blitzgs.training.extension import LEAST_IMAGES
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import check_worlds, understood
+from blitzgs.util.laps import Laps
 from blitzgs.util.terminal import printable
 
 HELP = """\
@@ -171,7 +172,8 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.check:
         return _check(args, config)
-    job = config.ranks
+    job, laps = config.ranks, Laps(since_start=True)
+    laps.lap("imports")
     with (
         kept_warnings() as warned,
         Ranks.from_environment(
@@ -182,15 +184,18 @@ def run(args: argparse.Namespace) -> int:
             tables_on_host=config.memory.resident_gb > 0,
         ) as ranks,
     ):
+        laps.lap("processes")
         # A capture that cannot be read leaves no empty folder behind.
         capture, images = open_capture(config, ranks)
         check_worlds(capture)
+        laps.lap("capture")
         # Otherwise a damaged photograph would be found when its turn comes, a held-out one at the end.
         images.check_files(range(ranks.rank, len(capture.cameras), ranks.world_size))
+        laps.lap("files")
         if ranks.rank == 0:
             _print_block(understood(config, capture, images))
         with locked(args.out, ranks):
-            trainer = Trainer(config, capture, images, args.out, ranks, args.resume, args.extend)
+            trainer = Trainer(config, capture, images, args.out, ranks, args.resume, args.extend, laps)
             trainer.warned = warned
             if args.viewer is not None:
                 trainer.watch(live_page(trainer.state, args.viewer, args.viewer_host), args.viewer_stay)

@@ -322,14 +322,18 @@ class ViewConfig:
 
 @dataclass(frozen=True)
 class MemoryConfig:
-    """Where the Gaussians are stored during training; no field changes the result beyond rounding.
+    """Where the Gaussians are stored during training; only `tour` changes the result beyond rounding.
 
     Attributes:
         resident_gb: gigabytes of each rank's device for Gaussians. All Gaussians are stored in host memory,
             and those that the next views may see are copied to the device. 0: all are stored on the device.
+        tour: with `resident_gb`, the views of an epoch come along a tour of the places that they show, from
+            another place each time and shuffled over an eighth of it, so that most of what they see is
+            on the device already. false: in random order.
     """
 
     resident_gb: float = 0.0
+    tour: bool = False
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.capture.cameras import MAX_SIDE
+from blitzgs.capture.cameras import MAX_SIDE, Float64
 from blitzgs.capture.capture import Capture
 from blitzgs.util.output import write_file
 from blitzgs.view.views import CameraLike
@@ -76,24 +76,44 @@ def checked_camera(
             raise TypeError(f"{argument} must be an integer, got {size!r} ({type(size).__name__})")
     intrinsics, pose = _matrix("K", K), _matrix("world_to_camera", world_to_camera)
     for argument, matrix, shape in (("K", intrinsics, (3, 3)), ("world_to_camera", pose, (4, 4))):
-        if matrix.shape != shape or not np.isfinite(matrix).all():
+        if matrix.shape != shape:
             raise ValueError(f"{argument} must be a finite matrix {shape}, got {matrix.tolist()}")
-    if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
-        raise ValueError(f"K must have positive focal lengths, got {intrinsics.tolist()}")
-    if not np.allclose(intrinsics[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1], atol=1e-9):
-        raise ValueError(
-            "K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (a skew has no effect; divide K by K[2, 2]), "
-            f"got {intrinsics.tolist()}"
-        )
-    rotation = pose[:3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise ValueError(f"world_to_camera[:3, :3] must be a rotation, got {rotation.tolist()}")
-    if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-9):
-        raise ValueError(f"the last row of world_to_camera must be 0, 0, 0, 1, got {pose[3].tolist()}")
-    for argument, size in (("width", width), ("height", height)):
-        if not 1 <= size <= MAX_SIDE or size != int(size):
-            raise ValueError(f"{argument} must be an integer from 1 to {MAX_SIDE:,}, got {size}")
+    _check(np.array([[width, height]], dtype=np.float64), intrinsics[None], pose[None])
     return RunCamera(name, int(width), int(height), intrinsics, pose)
+
+
+def _check(sizes: Float64, Ks: Float64, poses: Float64) -> None:  # noqa: N803
+    """Refuse impossible values of cameras: sizes [N, 2], Ks [N, 3, 3] and poses [N, 4, 4].
+
+    Raises:
+        ValueError: the message names the first one.
+    """
+    rotations = poses[:, :3, :3]
+    with np.errstate(invalid="ignore"):
+        turned = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) < 1e-3
+        turned &= np.linalg.det(rotations) > 0
+    whole = (sizes >= 1) & (sizes <= MAX_SIDE) & (sizes == np.floor(sizes))
+    for right, values, text in (
+        (np.isfinite(Ks).all((1, 2)), Ks, "K must be a finite matrix (3, 3)"),
+        (np.isfinite(poses).all((1, 2)), poses, "world_to_camera must be a finite matrix (4, 4)"),
+        (np.minimum(Ks[:, 0, 0], Ks[:, 1, 1]) > 0, Ks, "K must have positive focal lengths"),
+        (
+            _near(Ks[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1]),
+            Ks,
+            "K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (a skew has no effect; divide K by K[2, 2])",
+        ),
+        (turned, rotations, "world_to_camera[:3, :3] must be a rotation"),
+        (_near(poses[:, 3], [0, 0, 0, 1]), poses[:, 3], "the last row of world_to_camera must be 0, 0, 0, 1"),
+        (whole[:, 0], sizes[:, 0], f"width must be an integer from 1 to {MAX_SIDE:,}"),
+        (whole[:, 1], sizes[:, 1], f"height must be an integer from 1 to {MAX_SIDE:,}"),
+    ):
+        if not right.all():
+            raise ValueError(f"{text}, got {values[int(right.argmin())].tolist()}")
+
+
+def _near(rows: Float64, expected: list[int]) -> npt.NDArray[np.bool_]:
+    """Tell which rows are what is expected, up to the rounding of float32."""
+    return np.asarray(np.isclose(rows, expected, rtol=1e-5, atol=1e-9).all(1))
 
 
 def _matrix(argument: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -141,11 +161,19 @@ def load_cameras(folder: Path) -> RunCameras:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["version"] != _VERSION:
             raise ValueError(f"version {content['version']}, this program reads {_VERSION}")
-        cameras = [
-            checked_camera(
-                str(view["name"]), view["width"], view["height"], view["K"], view["world_to_camera"]
+        views = content["cameras"]
+        sizes, Ks, poses = (  # noqa: N806
+            np.array(values, dtype=np.float64).reshape(len(views), *shape)
+            for values, shape in (
+                ([(view["width"], view["height"]) for view in views], (2,)),
+                ([view["K"] for view in views], (3, 3)),
+                ([view["world_to_camera"] for view in views], (4, 4)),
             )
-            for view in content["cameras"]
+        )
+        _check(sizes, Ks, poses)
+        cameras = [
+            RunCamera(str(view["name"]), int(width), int(height), K, pose)
+            for view, (width, height), K, pose in zip(views, sizes, Ks, poses, strict=True)
         ]
         train, test = _indices(content["train"], len(cameras)), _indices(content["test"], len(cameras))
         return RunCameras(cameras, train, test, [Path(text) for text in content["inputs"]])

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from blitzgs.ops.pool import seen_blocks
 from blitzgs.ops.projection_types import MAX_VIEWS
 
 _MAX_WORDS = 1 << 26  # words of a mask that are processed together
+UNSEEN = MAX_VIEWS  # above the numbers of all batches
 
 
 class Cameras(NamedTuple):
@@ -78,11 +80,16 @@ class BlockVisibility:
         found: npt.NDArray[np.bool_] = (self._read() & np.uint32(bits & 0xFFFFFFFF)) != 0
         return found
 
-    def next_use(self, blocks: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return the first batch that may see each block; a number above all batches if none may."""
-        seen = self._read()[blocks].astype(np.int64)
-        first_view = np.frexp((seen & -seen).astype(np.float64))[1] - 1
-        return np.where(seen == 0, MAX_VIEWS, first_view // self._batch_size).astype(np.int64)
+    @cached_property
+    def next_use(self) -> npt.NDArray[np.uint8]:
+        """The first batch that may see each block, [N]; `UNSEEN` if none may. Waits for the device."""
+        seen = self._read()
+        # The exponent of the lowest set bit as a float32 is the number of the first view; 0 without a bit.
+        exponents = (seen & (~seen + np.uint32(1))).astype(np.float32).view(np.int32) >> 23
+        batch_of = np.full(127 + MAX_VIEWS, UNSEEN, dtype=np.uint8)
+        batch_of[127:] = np.arange(MAX_VIEWS) // self._batch_size
+        found: npt.NDArray[np.uint8] = batch_of[exponents]
+        return found
 
 
 def culled_blocks(cull: Tensor) -> Tensor:

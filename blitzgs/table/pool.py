@@ -10,7 +10,8 @@ device, are tested against the views of that step and of the next ones (`seen_bl
 second stream loads the blocks that the next step sees into the slots of the blocks that are needed last. The
 bounds of a block change only when a step moves its rows, and the blocks of the present step keep their slots
 until it has ended. The result of the test is therefore still right after the step. If the blocks of both
-steps do not fit together, the next step loads its remaining blocks when it begins.
+steps do not fit together, the next step loads its remaining blocks when it begins. Blocks of the steps after
+the next one come early where that evens out the traffic.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from torch import Tensor
 from blitzgs.ops.blocks import BLOCK_ROWS
 from blitzgs.ops.host import to_device
 from blitzgs.ops.pool import swap_blocks_
-from blitzgs.table.block_visibility import BlockVisibility, Cameras, culled_blocks
+from blitzgs.table.block_visibility import UNSEEN, BlockVisibility, Cameras, culled_blocks
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.layouts import CULL, LAYOUTS, sectors_in
@@ -253,8 +254,10 @@ class Pool:
         # known.
         if self._visibility.batches > 1:
             following = self._visibility.blocks_of_batch(1)
+            before = self.moved.loaded
             if self._load(following, self._begun, kept=now):
                 self._ready_for = step
+                self._load_ahead(self.moved.loaded - before)
 
     def store_bounds(self, index: BlockIndex) -> None:
         """Store the bounds of the index that `load_for_step` returned, after a step has moved rows."""
@@ -293,18 +296,39 @@ class Pool:
     ) -> bool:
         """Start to load as many blocks as fit; return whether that is all of the wanted blocks."""
         missing = (wanted & (self._slot_of < 0)).nonzero()[0]
-        free = (self._block_in < 0).nonzero()[0]
-        if len(missing) > len(free):
-            held = wanted if kept is None else wanted | kept
-            taken = (self._block_in >= 0).nonzero()[0]
-            idle = taken[~held[self._block_in[taken]]]
-            free = np.append(free, self._first_to_go(idle, len(missing) - len(free)))
+        free = self._first_to_go(wanted if kept is None else wanted | kept, len(missing))
         if required and len(missing) > len(free):
             self._refuse(int(wanted.sum()))
-        count = min(len(missing), len(free))
-        self._move(free[:count], missing[:count], after)
-        self._count(loaded=count)
-        return count == len(missing)
+        self._fetch(free, missing[: len(free)], after)
+        return len(missing) <= len(free)
+
+    def _load_ahead(self, loading: int) -> None:
+        """Start to load blocks of the steps after the next one, where the next one has all its blocks.
+
+        Views that follow each other may see quite different blocks, and the bus would be idle before. So this
+        loads at the lowest steady rate at which all blocks that are known to be needed come in time. They
+        take slots whose block is not known to be needed.
+
+        Args:
+            loading: blocks that are already being loaded during this step.
+        """
+        due, batches = self._visibility.next_use, self._visibility.batches
+        missing = ((self._slot_of < 0) & (due < UNSEEN)).nonzero()[0]
+        # Batch k has k steps, of which this is the first, until its blocks must be there.
+        needed = loading + np.bincount(due[missing], minlength=batches).cumsum()[1:]
+        rate = int(np.ceil((needed / np.arange(1, batches)).max()))
+        if rate == loading:
+            return
+        slots = self._first_to_go(due < UNSEEN, min(rate - loading, len(missing)))
+        coming = missing[np.argsort(due[missing], kind="stable")[: len(slots)]]
+        self._fetch(slots, coming, self._begun)
+
+    def _fetch(
+        self, slots: npt.NDArray[np.int64], blocks: npt.NDArray[np.int64], after: torch.cuda.Event | None
+    ) -> None:
+        """Start to load blocks that views see into slots."""
+        self._move(slots, blocks, after)
+        self._count(loaded=len(blocks))
 
     def _refuse(self, needed: int) -> None:
         slots = len(self._block_in)
@@ -315,12 +339,22 @@ class Pool:
             "schedule.batch_size"
         )
 
-    def _first_to_go(self, slots: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:
-        """Choose the slots whose blocks are needed last; among equals, those that were used longest ago."""
-        if len(slots) <= count:
-            return slots
-        rank = self._visibility.next_use(self._block_in[slots]) * (self._clock + 1) - self._last_use[slots]
-        return slots[np.argpartition(-rank, count)[:count]]
+    def _first_to_go(self, held: npt.NDArray[np.bool_], count: int) -> npt.NDArray[np.int64]:
+        """Choose up to `count` slots to load into: empty ones, then those whose blocks are needed last.
+
+        Among equals, those that were used longest ago go first. A block in `held` stays.
+        """
+        free = (self._block_in < 0).nonzero()[0]
+        if count <= len(free):
+            return free[: max(0, count)]
+        blocks = ((self._slot_of >= 0) & ~held).nonzero()[0]
+        idle = self._slot_of[blocks]
+        count -= len(free)
+        if count < len(idle):
+            next_use = self._visibility.next_use[blocks].astype(np.int64)
+            rank = self._last_use[idle] - next_use * (self._clock + 1)
+            idle = idle[np.argpartition(rank, count)[:count]]
+        return np.append(free, idle)
 
     # --- Moves --------------------------------------------------------------------------------------------
 

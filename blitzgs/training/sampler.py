@@ -9,7 +9,11 @@ from functools import lru_cache
 import torch
 
 from blitzgs.config.schedule import Schedule
-from blitzgs.ops.counter_random import hash_keys
+from blitzgs.ops.counter_random import hash_keys, uniform
+
+# A view moves by up to this share of a tour, see `BatchSampler`. The views of such a piece should see no more
+# Gaussians than the device holds: an eighth of a survey sees about a fifth of its Gaussians.
+_PIECE = 0.125
 
 
 class BatchSampler:
@@ -20,13 +24,22 @@ class BatchSampler:
     groups, in proportion to their sizes. The result of a call does not depend on earlier calls, so a resumed
     run and every rank get the same batches.
 
+    With a tour, an epoch still has every view once, but follows the tour from a random place in a random
+    direction, and each view comes later by a random share of up to an eighth of the tour. So the views of a
+    piece are shuffled, and what they see stays in the memory of the device meanwhile.
+
     Attributes:
         batch_size: views per batch, B.
         schedule: decides on the resolution; None: it is always the full one.
     """
 
     def __init__(
-        self, sizes: Sequence[Hashable], batch_size: int, seed: int, schedule: Schedule | None = None
+        self,
+        sizes: Sequence[Hashable],
+        batch_size: int,
+        seed: int,
+        schedule: Schedule | None = None,
+        tour: Sequence[int] | None = None,
     ) -> None:
         """Group the views.
 
@@ -35,12 +48,17 @@ class BatchSampler:
             batch_size: views per batch, B.
             seed: of the shuffles.
             schedule: see above.
+            tour: all views, so ordered that neighbours see the same places; None: no place matters.
 
         Raises:
-            ValueError: there is no view.
+            ValueError: there is no view, or the tour does not have each view once.
         """
         if not sizes:
             raise ValueError("there are no training views: check the capture and its split")
+        if tour is not None and sorted(tour) != list(range(len(sizes))):
+            raise ValueError(f"the tour must have each of the {len(sizes)} views once, got {len(tour)} views")
+        # Of each view, the share of the tour before it.
+        self._places = None if tour is None else torch.tensor(tour).argsort() / len(sizes)
         groups: dict[Hashable, list[int]] = {}
         for view, size in enumerate(sizes):
             groups.setdefault(size, []).append(view)
@@ -51,13 +69,15 @@ class BatchSampler:
         # The latest round: its first step and its batches. Most steps use the same round as the one before.
         self._round: tuple[int, list[tuple[int, int]]] = (0, [])
         self._epoch = lru_cache(maxsize=2 * len(groups))(self._make_epoch)
+        # Who looks ahead asks for this round and the next one in turn.
+        self._batches_of = lru_cache(maxsize=2)(self._make_round)
 
     def batch(self, step: int) -> list[int]:
         """Return the B views of a step (0-based); a view repeats only where its group's epochs meet."""
         first, batches = self._round
         if not first <= step < first + len(batches):
             index = self._round_of(step)
-            first, batches = self._round = self._batches_before(index), self._make_round(index)
+            first, batches = self._round = self._batches_before(index), self._batches_of(index)
         group, batch = batches[step - first]
         begin = batch * self.batch_size
         return [self._view(group, position) for position in range(begin, begin + self.batch_size)]
@@ -89,15 +109,30 @@ class BatchSampler:
             for g, count in enumerate(self._counts)
             for k in range(self._group_batches(count, index), self._group_batches(count, index + 1))
         ]
+        if self._places is not None:
+            return sorted(slots, key=lambda slot: self._time(slot[0], slot[1] * self.batch_size))
         order = hash_keys(torch.arange(len(slots)), self._seed, index, 1).argsort()
         return [slots[position] for position in order.tolist()]
 
-    def _make_epoch(self, group: int, epoch: int) -> list[int]:
-        """List the views of a group in the order of an epoch."""
+    def _make_epoch(self, group: int, epoch: int) -> tuple[list[int], list[float]]:
+        """List the views of a group in the order of an epoch, and the keys by which they are sorted."""
         views = self._groups[group]
-        order: list[int] = views[hash_keys(views, self._seed, epoch, 0).argsort()].tolist()
-        return order
+        if self._places is None:
+            keys = hash_keys(views, self._seed, epoch, 0)
+        else:
+            begin, direction = uniform(torch.arange(2), self._seed, epoch, 2)
+            places = (self._places[views] + begin) % 1.0
+            keys = (places if direction < 0.5 else 1.0 - places) + _PIECE * uniform(
+                views, self._seed, epoch, 0
+            )
+        order = keys.argsort(stable=True)
+        return views[order].tolist(), keys[order].tolist()
+
+    def _time(self, group: int, position: int) -> tuple[int, float]:
+        """Return when the view at a position of a group's sequence comes: its epoch and its key there."""
+        epoch, slot = divmod(position, self._counts[group])
+        return epoch, self._epoch(group, epoch)[1][slot]
 
     def _view(self, group: int, position: int) -> int:
         epoch, slot = divmod(position, self._counts[group])
-        return self._epoch(group, epoch)[slot]
+        return self._epoch(group, epoch)[0][slot]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,6 +46,7 @@ from blitzgs.training.population_report import PICTURE
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
+from blitzgs.training.tour import tour_of
 from blitzgs.training.track_gains import differ, track_gains
 from blitzgs.training.view_level import keep_to_views
 from blitzgs.view.levels import measure_levels
@@ -59,6 +61,7 @@ def set_up(
     ranks: Ranks,
     resume: bool,
     extend: float | None = None,
+    lap: Callable[[str], None] = lambda _: None,
 ) -> TrainingState:
     """Make the state of a new run, or restore the state of the run in `folder`.
 
@@ -70,6 +73,7 @@ def set_up(
         ranks: the job.
         resume: continue from the newest checkpoint in `folder`, if there is one.
         extend: with `resume`, train a finished run longer, see `extension.extended`.
+        lap: called with the name of each part of this work at its end (`Laps.lap`).
 
     Raises:
         FileExistsError: the folder holds a trained run and `resume` is not set, or files of another program.
@@ -86,6 +90,7 @@ def set_up(
     _check_folder(folder, ranks, resume)
     lpips = load_lpips(config.log.lpips_weights)
     space = Space.of(capture.offset, capture.extent)
+    lap("checks")
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
     restored = run_files.restore(folder, ranks, home) if resume else None
     config = _resolved(config, capture, restored)
@@ -99,6 +104,7 @@ def set_up(
     else:
         table, progress = restored.table, restored.progress
         check_capture(restored.space, capture, folder)
+    lap("gaussians")
     # The views and the spawn gate are compared with those of the checkpoint.
     progress = keep_to_views(table, progress, capture, ranks)
     veto, spawn_gate_digest = open_spawn_gate(config, capture, ranks, progress.gate)
@@ -114,7 +120,10 @@ def set_up(
     owners = _tile_owners(ranks, progress, restored)
     views = ViewSet(list(capture.cameras), space, ranks.device)
     sizes = [(capture.cameras[i].width, capture.cameras[i].height) for i in capture.train]
-    sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed, schedule)
+    tour = None
+    if config.memory.resident_gb > 0 and config.memory.tour:
+        tour = tour_of([capture.cameras[i] for i in capture.train], capture.points)
+    sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed, schedule, tour)
     if config.memory.resident_gb > 0:
         table = HostTable(table.release(), pinned=ranks.device.type == "cuda")
     stepper = _stepper(
@@ -122,6 +131,8 @@ def set_up(
     )
     if config.model.exposure:
         stepper.exposures = _exposures(capture, images, ranks, progress, restored)
+    lineage = _start_lineage(config, capture, folder, table, progress, ranks)
+    lap("table")
     return TrainingState(
         config=config,
         capture=capture,
@@ -142,7 +153,7 @@ def set_up(
         origin=_origin(restored, resume, folder, schedule.iterations),
         save_clock=SaveClock(config.log.checkpoint_seconds),
         veto=veto,
-        lineage=_start_lineage(config, capture, folder, table, progress, ranks),
+        lineage=lineage,
         curve=Curve.of(progress.curve),
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )

@@ -42,6 +42,7 @@ from blitzgs.training.setup import set_up
 from blitzgs.training.state import never
 from blitzgs.training.step_report import StepRecord, log_step, measure_step
 from blitzgs.training.watching import Watching
+from blitzgs.util.laps import Laps
 from blitzgs.util.output import write_file
 from blitzgs.view.views import render_options
 
@@ -65,10 +66,11 @@ class Trainer:
         ranks: Ranks,
         resume: bool = False,
         extend: float | None = None,
+        laps: Laps | None = None,
     ) -> None:
-        """Set up the run; arguments and errors are those of `blitzgs.training.setup.set_up`."""
-        begin = time.monotonic()
-        self.state = state = set_up(config, capture, images, folder, ranks, resume, extend)
+        """Set up the run; `laps` goes on until the first step; others as for `training.setup.set_up`."""
+        begin, self._laps = time.monotonic(), laps or Laps()
+        self.state = state = set_up(config, capture, images, folder, ranks, resume, extend, self._laps.lap)
         state.add_stage("setup", time.monotonic() - begin)
         self.warned: list[str] = []
         self._saves_first = extend is not None
@@ -152,6 +154,9 @@ class Trainer:
                 while (step := state.progress.step + 1) <= state.schedule.steps:
                     with self._saving_without_room("a step", is_saved=step == done + 1):
                         self.step(step)
+                    if step == done + 1:
+                        self._laps.lap("first step")
+                        state.log.event(step * size, "setup", self._laps.seconds, self._laps.text())
                     events = state.schedule.events((step - 1) * size, step * size)
                     if events:
                         self._write_record()

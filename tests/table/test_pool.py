@@ -2,6 +2,7 @@
 import copy
 import gc
 import sys
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 
 from blitzgs.ops.blocks import BLOCK_ROWS
 from blitzgs.ops.pool import seen_blocks
-from blitzgs.table import host_table
+from blitzgs.table import block_visibility, host_table
 from blitzgs.table.block_visibility import BlockVisibility, Cameras, culled_blocks
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.host_table import HostMemoryError, HostTable
@@ -120,6 +121,69 @@ def test_the_blocks_that_are_needed_last_go_first():
     assert gone
     if idle:
         assert min(next_use[b] for b in gone) >= max(next_use[b] for b in idle)
+
+
+def known(monkeypatch, steps):
+    """Let step i of single views see the blocks `steps[i]`; return cameras for all of them."""
+
+    def seen_blocks(bounds, viewmats, *_):
+        seen = torch.zeros(len(bounds), dtype=torch.int64)
+        for view, blocks in enumerate(steps[len(steps) - len(viewmats) :]):
+            seen[list(blocks)] |= 1 << view
+        return torch.where(seen < 1 << 31, seen, seen - (1 << 32)).int()
+
+    monkeypatch.setattr(block_visibility, "seen_blocks", seen_blocks)
+    return cameras(len(steps))
+
+
+def loads(pool, views):
+    """Return how many blocks each step loads, where it begins and ahead."""
+    counts = []
+    for step in range(len(views.viewmats)):
+        before = pool.moved.loaded
+        pool.load_for_step(step, first(views, step), 1)
+        pool.prefetch(step + 1)
+        counts.append(pool.moved.loaded - before)
+    return counts
+
+
+def fewest_loads(steps, slots):
+    """Try all choices of what leaves a pool that holds the blocks of each step and of the next one."""
+    costs = {frozenset(steps[0]): len(steps[0])}
+    for now, following in pairwise(steps):
+        found = {}
+        for held, cost in costs.items():
+            must, rest = now | following, sorted(held - now - following)
+            for kept in combinations(rest, min(len(rest), slots - len(must))):
+                pool = frozenset(must.union(kept))
+                found[pool] = min(found.get(pool, 10**6), cost + len(following - held))
+        costs = found
+    return min(costs.values())
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_no_choice_of_what_leaves_loads_fewer_blocks(monkeypatch, seed):
+    rng = np.random.default_rng(seed)
+    steps = [set(rng.choice(9, 2, replace=False).tolist()) for _ in range(20)]
+    _, pool = make_pool(9 * BLOCK_ROWS, slots=5 - 1)
+    assert len(pool.held) == 5 * BLOCK_ROWS
+    fewest = fewest_loads(steps, 5)
+    assert sum(loads(pool, known(monkeypatch, steps))) == fewest
+    # It matters what leaves: the choice of what was not used for longest loads more.
+    recent, least_recent = [], 0
+    for now, following in pairwise([set(), *steps]):
+        least_recent += len(following - set(recent))
+        recent = [b for b in recent if b not in now | following] + sorted(now) + sorted(following - now)
+        recent = recent[-5:]
+    assert fewest < least_recent
+
+
+def test_a_view_elsewhere_is_loaded_over_the_steps_before_it(monkeypatch):
+    """Nine steps see two blocks each, the tenth sees 18 others: all steps load two blocks."""
+    steps = [{0, 1}] * 9 + [set(range(2, 20))] + [{0, 1}] * 3
+    _, pool = make_pool(40 * BLOCK_ROWS, slots=25)
+    counts = loads(pool, known(monkeypatch, steps))
+    assert counts == [2 + 2, *[2] * 8, *[0] * 4]
 
 
 def _blocks(pool, views, view):

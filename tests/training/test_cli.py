@@ -20,6 +20,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
 from blitzgs.runs import files as run_files
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, as_flags, write_tiny_capture
+from tests.training.tiny_runs import events_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -27,6 +28,13 @@ ROOT = Path(__file__).parents[2]
 def test_train_leaves_a_summary(trained):
     summary = json.loads((trained[1] / "summary.json").read_text())
     assert summary["images"] == 40 and summary["psnr"] > 15
+
+
+def test_the_log_itemises_the_set_up(trained):
+    (event,) = events_of(trained[1], "setup")
+    names = ("imports", "processes", "capture", "files", "checks", "gaussians", "table", "first step")
+    assert tuple(event)[-len(names) :] == names
+    assert all(event[name] >= 0 for name in names) and event["capture"] > 0
 
 
 @pytest.mark.parametrize("strategy", ["density", "relocation"])

@@ -20,7 +20,10 @@ from tests.training.tiny_runs import steps_of, stop_at
 
 COUNT, VIEWS = 8000, 12
 RESIDENT = "memory.resident_gb=0.0078"
-SETTINGS = ("lod.visible_threshold=0", "schedule.iterations=60", "population.max_gaussians=40000")
+SETTINGS = (
+    "lod.visible_threshold=0", "schedule.iterations=60", "population.max_gaussians=40000",
+)  # fmt: skip
+TOUR = (RESIDENT, "memory.tour=true")
 
 
 def street(count=COUNT):
@@ -115,6 +118,40 @@ def test_a_run_goes_on_with_and_without_a_pool(tmp_path, monkeypatch):
         monkeypatch.undo()
     resumed, _ = train(tmp_path / "cut", RESIDENT, resume=True)
     assert_same_run(resumed, whole)
+
+
+def test_a_tour_moves_less_and_shows_the_same_views(tmp_path):
+    options = ("schedule.densify_until=0", "schedule.iterations=48")
+    (random, usual_summary), (toured, summary) = (
+        train(tmp_path / name, *options, *more) for name, more in (("random", [RESIDENT]), ("tour", TOUR))
+    )
+    views = len(toured.state.capture.train)
+    drawn = [toured.state.sampler.batch(step)[0] for step in range(4 * views)]
+    assert all(sorted(drawn[at : at + views]) == list(range(views)) for at in range(0, 4 * views, views))
+    moved, usual = (run.state.stepper.report(whole=True) for run in (toured, random))
+    assert 0 < moved["moved_mb_per_step"] < 0.7 * usual["moved_mb_per_step"]
+    assert moved["resident_hits"] > usual["resident_hits"]
+    assert abs(summary["psnr"] - usual_summary["psnr"]) < 0.3
+
+
+def test_a_tour_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
+    whole, _ = train(tmp_path / "whole", *TOUR)
+    stop_at(monkeypatch, 23)
+    assert train(tmp_path / "cut", *TOUR)[1] is None
+    monkeypatch.undo()
+    resumed, _ = train(tmp_path / "cut", *TOUR, resume=True)
+    assert_same_run(resumed, whole)
+
+
+def _drawn(ranks, folder):
+    trainer = Trainer(tiny_config(*SETTINGS, *TOUR), *street(), folder, ranks)
+    return [trainer.state.sampler.batch(step) for step in range(60)]
+
+
+@pytest.mark.slow
+def test_a_tour_is_the_same_on_every_rank_of_any_number(tmp_path):
+    alone = _drawn(Ranks(), tmp_path / "alone")
+    assert run_ranks(_drawn, 2, tmp_path / "two") == [alone, alone]
 
 
 def _train(ranks, folder, overrides):
