@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -149,29 +150,28 @@ def sum_splats(
     return torch.ops.blitzgs.sum_splats(values, places, list(group_sizes), splats, list(widths))
 
 
+@dataclass
 class GradientBuffer:
     """Memory in which the CUDA backward pass sums the gradients of splats; the forward pass has zeroed it.
 
     It serves one backward pass; each later one gets other memory.
+
+    Attributes:
+        zeros: [P or more, 12], the last output of `rasterize_fwd`; [0, 12] or None if there is none.
+        others: returns zeroed memory for later backward passes. If it is None or returns None, memory is
+            allocated instead.
     """
 
-    def __init__(self, zeros: Tensor | None, others: Callable[[], Tensor | None] | None = None) -> None:
-        """Take over the zeroed memory.
-
-        Args:
-            zeros: [P or more, 12], the last output of `rasterize_fwd`; [0, 12] or None if there is none.
-            others: returns zeroed memory for later backward passes. If it is None or returns None, memory is
-                allocated instead.
-        """
-        self._zeros, self._others = zeros, others
+    zeros: Tensor | None
+    others: Callable[[], Tensor | None] | None = None
 
     def take(self, means2d: Tensor) -> Tensor:
         """Return zeros [P, 12] for the P splats."""
-        zeros, self._zeros = self._zeros, None
+        zeros, self.zeros = self.zeros, None
         count = means2d.shape[0]
         if zeros is not None and zeros.shape[0] >= count:
             return zeros if zeros.shape[0] == count else zeros[:count]
-        others = None if self._others is None else self._others()
+        others = None if self.others is None else self.others()
         return means2d.new_zeros(count, SPLAT_GRADIENT) if others is None else others
 
 
