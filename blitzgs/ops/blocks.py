@@ -183,7 +183,7 @@ def cull_blocks(
 
 
 def _rows(means: Tensor, scales: Tensor, pending: PendingSteps | None) -> list[Tensor]:
-    """Return the group `rows` of the ops (`hold_rows` of csrc/active/blocks_op.cpp)."""
+    """Return the group `rows` of the ops (`hold_rows` of csrc/active/active_op.cpp)."""
     return [means, scales, *(pending or ())]
 
 
