@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -30,7 +30,7 @@ from blitzgs.frame.transport import (
     open_transport,
     unmarked,
 )
-from blitzgs.ops.blocks import ActiveRows
+from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import (
     ProjectedSplats,
@@ -113,6 +113,17 @@ class RenderOptions:
             antialiased=self.antialiased,
             fade=self.fade,
         )
+
+
+class ViewFilter(Protocol):
+    """What the views of a batch leave out before projection; frames and steps know no more of it."""
+
+    @property
+    def columns(self) -> Sequence[int]:
+        """The views' columns in the table's cull matrix; empty: no view has a mask."""
+
+    def rules(self, table: GaussianTable) -> GateRules:
+        """Return the rules for a table, as the ops take them."""
 
 
 class Frame(NamedTuple):

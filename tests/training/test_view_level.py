@@ -53,10 +53,10 @@ def whole_run(tmp_path_factory):
     folder, steps = tmp_path_factory.mktemp("run"), {}
     forward = Stepper.forward
 
-    def watched(self, step, options, batch, mark=None, view_gate=None):
-        frame, *rest = forward(self, step, options, batch, view_gate=view_gate)
+    def watched(self, step, options, batch, mark=None, view_filter=None):
+        frame, *rest = forward(self, step, options, batch, view_filter=view_filter)
         table = {name: self.table[name].clone() for name in self.table}
-        steps[step] = (view_gate, frame.projected, batch.indices, table)
+        steps[step] = (view_filter, frame.projected, batch.indices, table)
         return frame, *rest
 
     with pytest.MonkeyPatch.context() as patch:
