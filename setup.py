@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from setuptools import Extension, setup
+from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 from setuptools.command.build_py import build_py
 
@@ -45,7 +46,7 @@ class CMakeBuild(build_ext):
             f"-DBLITZGS_OUTPUT_DIR={output}",
             f"-DBLITZGS_TORCH_DIR={torch_folder()}",
         ]
-        for name in ("BLITZGS_CUDA", "BLITZGS_CUDA_ARCHS", "BLITZGS_TESTS"):
+        for name in ("BLITZGS_CUDA", "BLITZGS_CUDA_ARCHS", "BLITZGS_GLIBC"):
             if name in os.environ:
                 arguments.append(f"-D{name}={os.environ[name]}")
         subprocess.check_call(["cmake", "-S", str(ROOT), "-B", str(build), "-G", "Ninja", *arguments])
@@ -70,7 +71,14 @@ class CopyRecipes(build_py):
                 shutil.copy(path, folder)
 
 
+class AnyPython(bdist_wheel):
+    """The libraries depend on the platform and on torch's stable ABI, but on no version of Python."""
+
+    def get_tag(self) -> tuple[str, str, str]:
+        return ("py3", "none", super().get_tag()[2])
+
+
 setup(
     ext_modules=[Extension("blitzgs._lib.kernels", sources=[])],
-    cmdclass={"build_ext": CMakeBuild, "build_py": CopyRecipes},
+    cmdclass={"build_ext": CMakeBuild, "build_py": CopyRecipes, "bdist_wheel": AnyPython},
 )

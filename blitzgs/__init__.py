@@ -3,14 +3,8 @@
 
 from __future__ import annotations
 
-import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
-
-# Idle OpenMP threads sleep instead of spinning. On a machine with other work, spinning makes every parallel
-# section wait for the scheduler: small training steps became twenty times slower. Torch reads this when it is
-# loaded, so it has no effect on a program that imported torch before.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
     from blitzgs import optim

@@ -1,29 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads the op libraries once, when `blitzgs.ops` is first imported.
-
-The environment variable BLITZGS_LIBRARY_DIR names another folder to load them from, for a build with other
-options.
-"""
+"""Loads the op libraries once, when `blitzgs.ops` is first imported."""
 
 from __future__ import annotations
 
-import ctypes
-import hashlib
-import os
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from blitzgs._built import LIBRARY_DIR, REGISTRATION, schema_digest, source_digest
 from blitzgs._torch import below_autograd
 
 __all__ = ["below_autograd", "load_libraries", "schema_digest", "source_digest", "without_autograd"]
-
-# The list of ops in a checkout; it must be the one that the libraries were built with.
-REGISTRATION = Path(__file__).resolve().parents[1] / "csrc" / "registration.cpp"
-LIBRARY_DIR = Path(os.environ.get("BLITZGS_LIBRARY_DIR") or Path(__file__).parent / "_lib")
 
 
 def load_libraries() -> None:
@@ -49,25 +38,6 @@ def _load(path: Path) -> None:
         raise ImportError(
             f"{path} was built before the ops changed (it does not match {REGISTRATION}): run `make build`"
         )
-
-
-def schema_digest(path: Path) -> str:
-    """Return the `source_digest` of the ops that a library was built with; "" if the library has none."""
-    try:
-        digest = ctypes.CDLL(str(path)).blitzgs_schema_digest
-    except AttributeError:
-        return ""
-    digest.restype = ctypes.c_char_p
-    return str(digest().decode())
-
-
-def source_digest(registration: Path) -> str:
-    """Return the SHA-256 of the schemas of all ops in a registration.cpp; CMakeLists.txt computes the same.
-
-    Comments, white space and the seams of string literals do not count.
-    """
-    text = re.sub(r"//[^\n]*|[ \n]+", "", registration.read_text()).replace('""', "")
-    return hashlib.sha256(";".join(re.findall(r'm\.def\("[^"]*"', text)).encode()).hexdigest()
 
 
 def without_autograd(op: Callable[..., Any]) -> Callable[..., Any]:

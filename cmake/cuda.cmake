@@ -12,6 +12,8 @@ if(BLITZGS_CUDA_ARCHS STREQUAL "all")
     100-real
     120
   )
+  # A third of the size. The driver decompresses a kernel when it is first used.
+  set(compress --compress-mode=size)
 elseif(BLITZGS_CUDA_ARCHS)
   set(CMAKE_CUDA_ARCHITECTURES ${BLITZGS_CUDA_ARCHS})
 else()
@@ -28,7 +30,19 @@ find_package(CUDAToolkit REQUIRED)
 set(CMAKE_CUDA_STANDARD 20)
 set(CMAKE_CUDA_RUNTIME_LIBRARY Static)
 
-add_library(blitzgs_cuda SHARED csrc/common/schema_digest.cpp ${op_sources} ${cuda_kernels})
+list(JOIN CMAKE_CUDA_ARCHITECTURES "," architectures)
+set_source_files_properties(
+  csrc/common/cuda_build.cpp
+  PROPERTIES COMPILE_DEFINITIONS "BLITZGS_CUDA_BUILD=\"${CMAKE_CUDA_COMPILER_VERSION} ${architectures}\""
+)
+add_library(
+  blitzgs_cuda
+  SHARED
+  csrc/common/cuda_build.cpp
+  csrc/common/schema_digest.cpp
+  ${op_sources}
+  ${cuda_kernels}
+)
 target_compile_definitions(blitzgs_cuda PRIVATE BLITZGS_BACKEND_CUDA USE_CUDA)
 if(BLITZGS_SM80_BRANCHES)
   target_compile_definitions(blitzgs_cuda PRIVATE BLITZGS_SM80_BRANCHES=1)
@@ -44,6 +58,7 @@ target_compile_options(
     --extended-lambda
     -Xcompiler=-Wall
     -lineinfo
+    ${compress}
     -diag-suppress=20012>
 )
 

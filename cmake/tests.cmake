@@ -6,7 +6,7 @@ if(NOT Catch2_FOUND)
 endif()
 file(GLOB test_sources CONFIGURE_DEPENDS csrc/*/*_test.cpp)
 file(GLOB io_library CONFIGURE_DEPENDS csrc/io/*.cpp)
-list(FILTER io_library EXCLUDE REGEX "(_test|module)\\.cpp$")
+list(FILTER io_library EXCLUDE REGEX "_test\\.cpp$")
 add_executable(
   blitzgs_tests
   csrc/common/catch_main.cpp

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-import blitzgs  # isort: skip  # noqa: F401  (before torch: it sets how OpenMP threads wait)
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: it says how OpenMP threads wait
 
 import pytest
 import torch

@@ -23,6 +23,23 @@ for name in blitzgs.__all__:
 assert issubclass(blitzgs.optim.LazyAdam, object)
 """
 
+ENVIRONMENT = """
+import os
+before = dict(os.environ)
+import blitzgs
+assert dict(os.environ) == before
+import cv2
+import torch
+before = dict(os.environ)  # torch and cv2 may set variables of their own
+for name in blitzgs.__all__:
+    getattr(blitzgs, name)
+assert dict(os.environ) == before, set(os.environ.items()) ^ set(before.items())
+"""
+
+
+def test_import_changes_no_environment_variable():
+    subprocess.run([sys.executable, "-c", ENVIRONMENT], check=True)
+
 
 def test_public_names_are_loaded_when_they_are_asked_for():
     subprocess.run([sys.executable, "-c", CODE], check=True)

@@ -36,16 +36,20 @@ class BoundedCache(Generic[K, V]):
             self._entries.move_to_end(key)
             return self._entries[key][0]
 
-    def put(self, key: K, value: V, size: int) -> None:
-        """Add or replace an entry of `size` bytes, dropping the oldest until all fit."""
+    def put(self, key: K, value: V, size: int, spare: bool = False) -> None:
+        """Add or replace an entry of `size` bytes, dropping the oldest until all fit.
+
+        A spare entry drops no other one, and is the first to be dropped.
+        """
         with self._lock:
             if key in self._entries:
                 self.bytes -= self._entries.pop(key)[1]
-            if size > self.budget:
+            if size > self.budget or (spare and self.bytes + size > self.budget):
                 return
             while self.bytes + size > self.budget:
                 self.bytes -= self._entries.popitem(last=False)[1][1]
             self._entries[key] = (value, size)
+            self._entries.move_to_end(key, last=not spare)
             self.bytes += size
             self.most_bytes = max(self.most_bytes, self.bytes)
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.formats.native import native_io
+from blitzgs.formats import native
 
 Float64 = npt.NDArray[np.float64]
 FILES = ("cameras", "images", "points3D")
@@ -95,7 +95,7 @@ class ColmapModel:
 @cache
 def camera_models() -> dict[str, list[str]]:
     """Return the names of the parameters, in order, of every camera model of COLMAP."""
-    return {name: params.split(",") for _, name, params in native_io().camera_models()}
+    return {name: params.split(",") for _, name, params in native.camera_models()}
 
 
 def find_model(path: Path) -> Path | None:
@@ -153,7 +153,7 @@ def count_images(folder: Path) -> int:
     if not all(_file(folder, name, ".bin").is_file() for name in FILES):
         path = folder / "images.txt"
     try:
-        return len(native_io().read_images(os.fsencode(path), False)["ids"])
+        return len(native.read_images(os.fsencode(path), False)["ids"])
     except ValueError:
         return 0
 
@@ -177,11 +177,13 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
     for path in paths.values():
         if not path.is_file():
             raise FileNotFoundError(f"{path} is missing: {folder} is not a complete COLMAP sparse model")
-    io, in_ply = native_io(), paths["points3D"].suffix == ".ply"
+    in_ply = paths["points3D"].suffix == ".ply"
     return ColmapModel(
-        [ColmapCamera(*row) for row in io.read_cameras(os.fsencode(paths["cameras"]))],
-        ColmapImages(**io.read_images(os.fsencode(paths["images"]), points2d)),
-        ColmapPoints() if in_ply else ColmapPoints(**io.read_points(os.fsencode(paths["points3D"]), tracks)),
+        [ColmapCamera(*row) for row in native.read_cameras(os.fsencode(paths["cameras"]))],
+        ColmapImages(**native.read_images(os.fsencode(paths["images"]), points2d)),
+        ColmapPoints()
+        if in_ply
+        else ColmapPoints(**native.read_points(os.fsencode(paths["points3D"]), tracks)),
         paths["points3D"],
     )
 
@@ -196,11 +198,10 @@ def write_model(folder: Path | str, model: ColmapModel, *, text: bool = False) -
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     suffix = ".txt" if text else ".bin"
-    io = native_io()
     rows = [(c.id, c.model, c.width, c.height, [float(p) for p in c.params]) for c in model.cameras]
-    io.write_cameras(os.fsencode(folder / f"cameras{suffix}"), rows)
-    io.write_images(os.fsencode(folder / f"images{suffix}"), _columns(model.images))
-    io.write_points(os.fsencode(folder / f"points3D{suffix}"), _columns(model.points))
+    native.write_cameras(os.fsencode(folder / f"cameras{suffix}"), rows)
+    native.write_images(os.fsencode(folder / f"images{suffix}"), _columns(model.images))
+    native.write_points(os.fsencode(folder / f"points3D{suffix}"), _columns(model.points))
 
 
 def _columns(table: ColmapImages | ColmapPoints) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.formats.native import native_io
+from blitzgs.formats import native
 
 UInt8 = npt.NDArray[np.uint8]
 
@@ -83,7 +83,7 @@ def _describe(data: bytes, name: str) -> dict[str, Any]:
         raise ValueError(f"{name}: the file is empty; copy it again")
     if data.startswith(_LFS_START):
         raise ValueError(f"{name}: a pointer of Git LFS, not the file itself; fetch it with git lfs pull")
-    found: dict[str, Any] = native_io().read_image_header(data, os.fsencode(name))
+    found: dict[str, Any] = native.read_image_header(data, os.fsencode(name))
     suffix = Path(name).suffix.lower()
     if not found["format"] and suffix in _FORMATS_BY_SUFFIX:
         return found | {"format": _FORMATS_BY_SUFFIX[suffix], "supported": False}
@@ -149,7 +149,7 @@ def _quiet() -> Iterator[None]:
 
 def _imdecode(data: bytes, flags: int, name: str, header: dict[str, Any]) -> npt.NDArray[Any]:
     if data[:4] in _TIFF_STARTS:
-        data = native_io().tiff_as_stored(data, os.fsencode(name))
+        data = native.tiff_as_stored(data, os.fsencode(name))
     try:
         with _quiet():
             pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
@@ -174,9 +174,9 @@ def read_whole(path: Path) -> bytes:
     """
     data = path.read_bytes()
     if data[:2] == b"\xff\xd8":
-        native_io().check_jpeg(data, os.fsencode(path))
+        native.check_jpeg(data, os.fsencode(path))
     elif data[:8] == _PNG_START:
-        native_io().check_png(data, os.fsencode(path))
+        native.check_png(data, os.fsencode(path))
     return data
 
 

@@ -7,8 +7,9 @@ decoded images (`shared_images`), it takes the place of both. The compressed for
 itself if the file needs no processing. An image that must be undistorted or downscaled is processed once
 and kept as QOI, which is lossless. For an image of 1.9 megapixels, decoding the QOI takes 16 ms at full
 size and 1 ms at a quarter; decoding, undistorting and averaging the JPEG again takes 22 and 16 ms, and
-PNG 46 and 3 ms. Nothing is written to disk. The images do not depend on budgets, threads or the order of
-calls.
+PNG 46 and 3 ms. Reduced images (`schedule.resolution`) are made once from the decoded ones, by the same
+threads, and are kept beside them. Nothing is written to disk. The images do not depend on budgets, threads
+or the order of calls.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeAlias, Unpack
 
 import cv2
 import numpy as np
@@ -33,12 +34,15 @@ from blitzgs.capture.cameras import Camera, same_shape
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.check_files import FileCheck, mask_error
 from blitzgs.capture.image_files import UInt8, apply_orientation, decode_mask, decode_rgb, read_whole
+from blitzgs.capture.reduced import reduced, reduced_mask
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.capture.undistort import Rectification
-from blitzgs.formats.native import native_io
+from blitzgs.formats import native
 
 DEFAULT_BUDGET = 4 << 30
 _MAPS_KEPT = 4
+# "image" or "mask", the camera, and the factor by which it is reduced.
+_Key: TypeAlias = tuple[str, int, int]
 
 
 @dataclass(frozen=True)
@@ -76,14 +80,14 @@ class PhotographError(RuntimeError):
 class Images(Protocol):
     """What training reads of an image store (`blitzgs.capture.images.ImageStore`)."""
 
-    def get(self, index: int) -> Tensor:
-        """Return an image, uint8 [H, W, 3]."""
+    def get(self, index: int, factor: int = 1) -> Tensor:
+        """Return an image, uint8 [H / factor, W / factor, 3], sizes rounded down."""
 
-    def mask(self, index: int) -> Tensor | None:
-        """Return the image's mask, uint8 [H, W] with 0 = excluded, or None."""
+    def mask(self, index: int, factor: int = 1) -> Tensor | None:
+        """Return the image's mask, uint8 [H / factor, W / factor] with 0 = excluded, or None."""
 
-    def prefetch(self, indices: Sequence[int], masks: Sequence[int] = ()) -> None:
-        """Decode images and masks in the background."""
+    def prefetch(self, indices: Sequence[int], masks: Sequence[int] = (), factor: int = 1) -> None:
+        """Decode images and masks in the background, and reduce them by a factor."""
 
     def memory(self) -> ImageMemory:
         """Return how much host memory the images have taken."""
@@ -101,13 +105,20 @@ def has_mask(camera: Camera) -> bool:
     return camera.mask_path is not None or camera.rectification.has_invalid
 
 
-def decoded_shapes(capture: Capture) -> dict[Hashable, tuple[int, ...]]:
-    """Return the shapes of all decoded images and masks of a capture, by the keys of `ImageStore`."""
+def decoded_shapes(capture: Capture, factors: Iterable[int] = ()) -> dict[Hashable, tuple[int, ...]]:
+    """Return the shapes of all decoded images and masks of a capture, by the keys of `ImageStore`.
+
+    Args:
+        capture: the capture.
+        factors: by which images are reduced in addition.
+    """
     shapes: dict[Hashable, tuple[int, ...]] = {}
-    for index, camera in enumerate(capture.cameras):
-        shapes["image", index] = (camera.height, camera.width, 3)
-        if has_mask(camera):
-            shapes["mask", index] = (camera.height, camera.width)
+    for factor in (1, *factors):
+        for index, camera in enumerate(capture.cameras):
+            height, width = camera.height // factor, camera.width // factor
+            shapes["image", index, factor] = (height, width, 3)
+            if has_mask(camera):
+                shapes["mask", index, factor] = (height, width)
     return shapes
 
 
@@ -147,49 +158,55 @@ class ImageStore:
         self._background = background if capture.has_alpha else None
         self.compressed: BoundedCache[Path | int, bytes] = BoundedCache(budget_bytes)
         self._decoded_bytes = decoded_bytes
-        self.decoded: BoundedCache[tuple[str, int], UInt8] = BoundedCache(self._decoded_budget())
+        self.decoded: BoundedCache[_Key, UInt8] = BoundedCache(self._decoded_budget())
         self._maps: OrderedDict[Rectification, _Maps] = OrderedDict()
         self._maps_lock = threading.Lock()
-        self._pending: dict[tuple[str, int], Future[UInt8]] = {}
+        self._pending: dict[_Key, Future[UInt8]] = {}
         self._pending_lock = threading.Lock()
         self._budget_lock = threading.Lock()
         self._times_decoded = 0
         self._check: FileCheck | None = None
         self._pool = ThreadPoolExecutor(max(1, threads), thread_name_prefix="blitzgs-images")
 
-    def get(self, index: int) -> Tensor:
+    def get(self, index: int, factor: int = 1) -> Tensor:
         """Return a camera's image, uint8 RGB [height, width, 3] on the CPU. It is shared: do not write to it.
+
+        Args:
+            index: the camera.
+            factor: by which the image is `reduced`.
 
         Raises:
             ValueError: the file is damaged or its size changed; names it.
             OSError: the file cannot be read.
         """
-        return torch.from_numpy(self._result("image", index))
+        return torch.from_numpy(self._result("image", index, factor))
 
-    def mask(self, index: int) -> Tensor | None:
+    def mask(self, index: int, factor: int = 1) -> Tensor | None:
         """Return which pixels count, uint8 0 or 1 [height, width]; None: all. Shared: do not write to it.
 
-        A pixel that mixes counted and excluded pixels of the file is excluded.
+        A pixel that mixes counted and excluded pixels of the file is excluded. `reduced_mask` says which
+        pixels of a reduced image count.
         """
-        return (
-            torch.from_numpy(self._result("mask", index)) if has_mask(self.capture.cameras[index]) else None
-        )
+        if not has_mask(self.capture.cameras[index]):
+            return None
+        return torch.from_numpy(self._result("mask", index, factor))
 
-    def prefetch(self, indices: Iterable[int], masks: Iterable[int] = ()) -> None:
+    def prefetch(self, indices: Iterable[int], masks: Iterable[int] = (), factor: int = 1) -> None:
         """Start to decode what is needed next, in order, as much as the memory for decoded images holds.
 
         Args:
             indices: cameras whose images are needed.
             masks: cameras whose masks are needed, if they have one.
+            factor: by which images and masks are reduced.
         """
         wanted = [("mask", index, 1) for index in masks if has_mask(self.capture.cameras[index])]
         planned, budget = 0, self._room()
         for kind, index, channels in [*wanted, *(("image", index, 3) for index in indices)]:
             camera = self.capture.cameras[index]
-            planned += channels * camera.width * camera.height
+            planned += channels * (camera.width // factor) * (camera.height // factor)
             if planned > budget:
                 return
-            self._submit(kind, index)
+            self._submit((kind, index, factor))
 
     def memory(self) -> ImageMemory:
         """Return the memory that images have taken so far."""
@@ -230,15 +247,14 @@ class ImageStore:
         budget = self.compressed.budget
         return budget // 4 + budget - self.compressed.bytes
 
-    def _result(self, kind: str, index: int) -> UInt8:
+    def _result(self, *key: Unpack[_Key]) -> UInt8:
         if self._check is not None and self._check.damage is not None:
             raise ValueError(self._check.damage)
-        found = self._submit(kind, index)
+        found = self._submit(key)
         return found.result() if isinstance(found, Future) else found
 
-    def _submit(self, kind: str, index: int) -> UInt8 | Future[UInt8]:
+    def _submit(self, key: _Key) -> UInt8 | Future[UInt8]:
         """Return the images that are decoded or waiting to be decoded."""
-        key = (kind, index)
         # An image that is no longer pending is decoded. Both lists are looked up under one lock; otherwise a
         # thread that is delayed between the two look-ups would decode the image again.
         with self._pending_lock:
@@ -247,31 +263,56 @@ class ImageStore:
             found = self._found(key)
             if found is not None:
                 return found
-            future = self._pending[key] = self._pool.submit(self._produce, kind, index)
+            future = self._pending[key] = self._pool.submit(self._produce, key)
             return future
 
-    def _found(self, key: tuple[str, int]) -> UInt8 | None:
+    def _found(self, key: _Key) -> UInt8 | None:
         return self.decoded.get(key) if self._shared is None else self._shared.get(key)
 
-    def _produce(self, kind: str, index: int) -> UInt8:
-        key = (kind, index)
+    def _produce(self, key: _Key) -> UInt8:
+        kind, index, factor = key
         try:
-            # Another process may have decoded it since the look-up.
+            if factor == 1:
+                return self._whole(kind, index)
+            # Another process may have reduced it since the look-up.
             found = self._found(key)
-            if found is not None:
-                return found
-            with self._pending_lock:
-                self._times_decoded += 1
-            pixels = self._make_image(index) if kind == "image" else self._make_mask(index)
-            if self._shared is not None:
-                return self._shared.put(key, pixels)
-            with self._budget_lock:  # so that no thread restores a budget of before another one's image
-                self.decoded.resize(self._decoded_budget())
-            self.decoded.put(key, pixels, pixels.nbytes)
-            return pixels
+            return self._keep(key, self._reduce(kind, index, factor)) if found is None else found
         finally:
             with self._pending_lock:
                 del self._pending[key]
+
+    def _whole(self, kind: str, index: int, spare: bool = False) -> UInt8:
+        """Return an image or mask of the full size from memory, or decode it here and keep it.
+
+        Args:
+            kind: "image" or "mask".
+            index: the camera.
+            spare: it is not what training reads now; see `BoundedCache.put`.
+        """
+        key = (kind, index, 1)
+        found = self._found(key)  # another process may have decoded it since the look-up
+        if found is not None:
+            return found
+        with self._pending_lock:
+            self._times_decoded += 1
+        pixels = self._make_image(index) if kind == "image" else self._make_mask(index)
+        return self._keep(key, pixels, spare)
+
+    def _reduce(self, kind: str, index: int, factor: int) -> UInt8:
+        masked = has_mask(self.capture.cameras[index])
+        mask = self._whole("mask", index, spare=True) if masked else None
+        if kind == "image":
+            return reduced(self._whole("image", index, spare=True), mask, factor)
+        assert mask is not None  # nobody asks for the mask of another camera
+        return reduced_mask(mask, factor)
+
+    def _keep(self, key: _Key, pixels: UInt8, spare: bool = False) -> UInt8:
+        if self._shared is not None:
+            return self._shared.put(key, pixels)
+        with self._budget_lock:  # so that no thread restores a budget of before another one's image
+            self.decoded.resize(self._decoded_budget())
+        self.decoded.put(key, pixels, pixels.nbytes, spare)
+        return pixels
 
     def _read(self, path: Path) -> bytes:
         data = self.compressed.get(path)
@@ -288,10 +329,10 @@ class ImageStore:
             return self._decode(camera, self._read(camera.image_path))
         packed = self.compressed.get(index)
         if packed is not None:
-            return _uint8(native_io().decode_qoi(packed))
+            return _uint8(native.decode_qoi(packed))
         pixels = self._prepare(camera, self._decode(camera, read_whole(camera.image_path)))
         if self._shared is None:
-            packed = native_io().encode_qoi(pixels)
+            packed = native.encode_qoi(pixels)
             self.compressed.put(index, packed, len(packed))
         return pixels
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blitzgs.capture.image_files import UInt8
-from blitzgs.formats.native import native_io
+from blitzgs.formats import native
 
 _TOKEN_BYTES, _ALIGNMENT = 16, 64
 
@@ -86,13 +86,13 @@ class SharedImages:
     def get(self, key: Hashable) -> UInt8 | None:
         """Return an image in shared memory; None if no process has put it there yet. Do not write to it."""
         number, pixels = self._places[key]
-        return pixels if native_io().flag_is_set(self._flags, number) else None
+        return pixels if native.flag_is_set(self._flags, number) else None
 
     def put(self, key: Hashable, pixels: UInt8) -> UInt8:
         """Copy an image to its place, and return it there."""
         number, place = self._places[key]
         np.copyto(place, pixels)
-        native_io().set_flag(self._flags, number)
+        native.set_flag(self._flags, number)
         return place
 
     @property

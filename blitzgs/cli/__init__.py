@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `blitzgs train | eval | render | view | report | ...`, one file per command.
+"""The command line, `blitzgs COMMAND`; one file per command.
 
 A command's file is imported when the command is used: `blitzgs --help` needs no torch.
 """
@@ -45,6 +45,8 @@ COMMANDS = {
     "compare": ("blitzgs.cli.compare", "put runs side by side"),
     "export": ("blitzgs.cli.export", "write a model as a PLY file for viewers, or as one HTML file to send"),
     "gate": ("blitzgs.cli.gate", "fit and evaluate spawn gates, which make smaller models"),
+    "doctor": ("blitzgs.cli.doctor", "check this installation"),
+    "completion": ("blitzgs.cli.completion", "print a script that completes commands in a shell"),
     "synth": (
         "blitzgs.cli.synth",
         "make a synthetic city: photographs, cameras and points to train on",
@@ -72,6 +74,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     A terminal or pipe that closes ends no command: what cannot be printed is lost, and the work goes on.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
+    # Idle OpenMP threads sleep instead of spinning. On a machine with other work, spinning makes every
+    # parallel section wait for the scheduler: small training steps became twenty times slower. Torch reads
+    # this when it is loaded, which is after this line.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with surviving_output() as outputs:
         try:
             status = _run(given)
@@ -125,15 +131,28 @@ def _arguments(parser: Parser, command: Parser | None, chosen: str, given: list[
 
 def _parser(chosen: str) -> tuple[Parser, Parser | None]:
     """Return the parser of all commands, and that of the chosen one, whose module alone is imported."""
-    parser = Parser(prog="blitzgs", description=HELP, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--version", action="version", version=f"blitzgs {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    parser, commands = _new_parser()
     for name, (module, summary) in COMMANDS.items():
         if name == chosen:
             import_module(module).add_to(commands, summary)
         else:
             commands.add_parser(name, help=summary)
     return parser, commands.choices[chosen] if chosen in COMMANDS else None
+
+
+def parser_of_all() -> tuple[Parser, dict[str, str]]:
+    """Return the parser of all commands, whose modules are imported, and what each command does."""
+    parser, commands = _new_parser()
+    for module, summary in COMMANDS.values():
+        import_module(module).add_to(commands, summary)
+    return parser, {name: summary for name, (_, summary) in COMMANDS.items()}
+
+
+def _new_parser() -> tuple[Parser, argparse._SubParsersAction[Parser]]:
+    parser = Parser(prog="blitzgs", description=HELP, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--version", action="version", version=f"blitzgs {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    return parser, commands
 
 
 @contextmanager
@@ -186,7 +205,17 @@ def _message(error: BaseException) -> str:
 
 
 # Commands whose result is what they print.
-_PRINTING = ("eval", "--show-config", "--check", "--help", "--help-fields", "-h", "--version")
+_PRINTING = (
+    "eval",
+    "completion",
+    "--json",
+    "--show-config",
+    "--check",
+    "--help",
+    "--help-fields",
+    "-h",
+    "--version",
+)
 
 
 def _report_lost(given: list[str], outputs: dict[str, Output]) -> int:

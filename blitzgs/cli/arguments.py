@@ -7,10 +7,13 @@ import argparse
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from blitzgs.capture.capture import Capture
 from blitzgs.config.ranges import RANGES
-from blitzgs.runs.cameras import RunCameras
+
+if TYPE_CHECKING:
+    from blitzgs.capture.capture import Capture
+    from blitzgs.runs.cameras import RunCameras
 
 Commands = argparse._SubParsersAction  # argparse has no public name for it
 

@@ -27,10 +27,11 @@ from blitzgs.config.recipes import default_recipe, recipe_path
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.folder_checks import locked
+from blitzgs.training.estimate import estimate
 from blitzgs.training.extension import LEAST_IMAGES
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
-from blitzgs.training.understood import check_worlds, estimate, understood
+from blitzgs.training.understood import check_worlds, understood
 from blitzgs.util.terminal import printable
 
 HELP = """\

@@ -127,6 +127,9 @@ class ScheduleConfig:
         pace: pairs (image of the run, factor): from that image on, `scale` is multiplied by the factor. A run
             with `minutes` writes its changes of pace here; a run without `minutes` repeats them.
         batch_size: B, views per optimiser step; a step advances the clock by B images.
+        resolution: pairs (factor, time): up to that time, training compares with photographs whose width and
+            height are divided by the factor, 8, 4 or 2. [[4, 1000], [2, 4000]]: a quarter, then half, then
+            all. Everything else has the full resolution: importance passes, the cull mask, evaluation.
         densify_from, densify_until, densify_every: density events happen at from, from + every, ... < until.
         size_prune_after: density events later than this also prune by size.
         reset_every: all opacities are capped at `population.reset_opacity` at every multiple of this before
@@ -149,6 +152,7 @@ class ScheduleConfig:
     minutes: float = 0.0
     pace: tuple[tuple[int, float], ...] = ()
     batch_size: int = 1
+    resolution: tuple[tuple[int, int], ...] = ()
     densify_from: int = 500
     densify_until: int = 15_000
     densify_every: int = 100

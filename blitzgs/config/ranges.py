@@ -34,6 +34,8 @@ class Range:
         return f"in {brackets[0]}{self.low:,.12g}, {self.high:,.12g}{brackets[1]}"
 
 
+# Factors of `schedule.resolution`: float32 intrinsics are divided by them exactly.
+REDUCTIONS = (2, 4, 8)
 # Images of a whole run: its table of learning rates takes 48 bytes a step.
 MAX_IMAGES = 10_000_000
 SCALE = Range(1e-4, 1e4)
@@ -60,6 +62,7 @@ RANGES: Mapping[str, Range] = {
     "schedule.minutes": Range(0, 1e6),
     "schedule.pace": Range(1e-4, 1e9),
     "schedule.batch_size": Range(1, 32),
+    "schedule.resolution": Range(1, 1e9),
     "schedule.densify_from": _TIME,
     "schedule.densify_until": _TIME,
     "schedule.densify_every": _EVERY,
@@ -136,6 +139,7 @@ def problems(config: Config) -> Iterator[str]:
         # The rate falls by a power of the ratio of position_final to it, which must stay a number.
         yield f"optimiser.position: must be 0 or at least 1e-20, got {config.optimiser.position}"
     yield from _problems_of_length(schedule)
+    yield from _problems_of_resolution(schedule)
     if schedule.reset_every > 0 and not population.min_opacity < population.reset_opacity:
         yield (
             f"population.reset_opacity: must be above population.min_opacity ({population.min_opacity}), or "
@@ -179,6 +183,15 @@ def _problems_of_length(schedule: ScheduleConfig) -> Iterator[str]:
             f"schedule.scale: must be 1 with schedule.minutes (--minutes), which chooses the scale; got "
             f"{schedule.scale}: add --schedule.scale=1 or leave out the minutes"
         )
+
+
+def _problems_of_resolution(schedule: ScheduleConfig) -> Iterator[str]:
+    """Name the problems with the resolution of the photographs."""
+    factors, times = [pair[0] for pair in schedule.resolution], [pair[1] for pair in schedule.resolution]
+    if any(factor not in REDUCTIONS for factor in factors) or factors != sorted(set(factors), reverse=True):
+        yield f"schedule.resolution: its factors must be 8, 4 or 2 and decrease, got {factors}"
+    if times != sorted(set(times)):
+        yield f"schedule.resolution: its times must increase, got {times}"
 
 
 def flat_fields(section: Any, where: str = "") -> Iterator[tuple[str, Any]]:

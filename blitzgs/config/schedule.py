@@ -65,6 +65,7 @@ class Schedule:
         self.steps = max(1, math.ceil(self._scaled(config.iterations) / self.batch_size))
         self.iterations = self.steps * self.batch_size
         self._found: tuple[int, int, list[Event]] = (0, 0, [])  # the events of [first, last) images
+        self._reductions = [(factor, self._scaled(until)) for factor, until in config.resolution]
 
     def _scaled(self, time: float) -> int:
         # The small term keeps 0.1 * 30 from being rounded down to 2.
@@ -124,6 +125,10 @@ class Schedule:
         """Return the SH degree of the step at [begin, begin + B): one more each `sh_every`, up to `limit`."""
         time = self.pace.time(begin + self.batch_size)
         return min(limit, max(1, math.ceil(time / self._config.sh_every - 1e-9)) - 1)
+
+    def reduction(self, begin: int) -> int:
+        """Return by which factor the photographs of the step at [begin, begin + B) are reduced."""
+        return next((factor for factor, until in self._reductions if begin < until), 1)
 
     def gathers_statistics(self, begin: int) -> bool:
         """Tell whether a later density event uses the statistics of the step at [begin, begin + B)."""

@@ -1,25 +1,279 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled readers and writers of files, loaded when they are first needed."""
+"""The compiled readers and writers of files (csrc/io), loaded when they are first needed.
+
+They run without the GIL. Arrays that they return own the memory that was filled; arguments are not copied if
+they have the wanted type.
+"""
 
 from __future__ import annotations
 
-import importlib
+import ctypes
+import os
+import weakref
+from collections.abc import Iterable, Sequence
 from functools import cache
-from types import ModuleType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs._built import LIBRARY_DIR
+
+Array = npt.NDArray[Any]
+Path = str | bytes
+
+
+class FormatError(ValueError):
+    """A file is damaged; the message has the file, the place and the reason."""
+
+
+class WriteError(OSError):
+    """A file cannot be written."""
+
+
+# In the order of blitzgs_io_type and blitzgs_io_status_code of csrc/io/io_api.h.
+_TYPES = tuple(np.dtype(name) for name in ("u1", "u4", "i8", "u8", "f8"))
+_ERRORS = (None, FormatError, WriteError, ValueError, MemoryError, RuntimeError)
+
+
+class _Column(ctypes.Structure):
+    _fields_ = [("data", ctypes.c_void_p), ("size", ctypes.c_size_t), ("type", ctypes.c_int32)]
 
 
 @cache
-def native_io() -> ModuleType:
-    """Import the compiled readers and writers (`blitzgs._lib._io`).
+def _library() -> ctypes.CDLL:
+    """Load libblitzgs_io.so.
 
     Raises:
-        ImportError: the module was not built for this Python; says how to build it.
+        ImportError: it was not built, or cannot be loaded; says how to build it.
     """
+    path = LIBRARY_DIR / "libblitzgs_io.so"
     try:
-        module = importlib.import_module("blitzgs._lib._io")
-    except ImportError as error:
+        library = ctypes.CDLL(str(path))
+    except OSError as error:
         raise ImportError(
-            f"the host I/O module of blitzgs is missing for this Python ({error}); run `pip install .`, or "
-            "`make build` in a checkout (`make io` where the kernels are built already)"
+            f"the readers and writers of files are not built ({error}): run `pip install .`, or `make build` "
+            "in a checkout"
         ) from error
-    return module
+    library.blitzgs_io_call.restype = ctypes.c_void_p
+    library.blitzgs_io_call.argtypes = [ctypes.c_char_p, ctypes.POINTER(_Column), ctypes.c_size_t]
+    library.blitzgs_io_columns.restype = ctypes.c_size_t
+    library.blitzgs_io_columns.argtypes = [ctypes.c_void_p, ctypes.POINTER(ctypes.POINTER(_Column))]
+    library.blitzgs_io_message.restype = ctypes.c_char_p
+    for function in (library.blitzgs_io_message, library.blitzgs_io_status, library.blitzgs_io_free):
+        function.argtypes = [ctypes.c_void_p]
+    return library
+
+
+class _Reply:
+    """The memory of the results of a call, which lives as long as one of the arrays in it."""
+
+    def __init__(self, handle: int) -> None:
+        weakref.finalize(self, _library().blitzgs_io_free, handle)
+
+    def array(self, column: _Column) -> Array:
+        dtype = _TYPES[column.type]
+        if not column.size:
+            return np.empty(0, dtype)
+        memory = (ctypes.c_char * (column.size * dtype.itemsize)).from_address(column.data)
+        memory.reply = self
+        return np.frombuffer(memory, dtype)
+
+
+def _call(name: str, *arguments: Path | Array) -> list[Array]:
+    """Call a function of csrc/io/io_api.cpp; arrays must be contiguous."""
+    library = _library()
+    values = [os.fsencode(value) if isinstance(value, str) else value for value in arguments]
+    columns = (_Column * len(values))()
+    for column, value in zip(columns, values, strict=True):
+        if isinstance(value, bytes):
+            column.data, column.size = ctypes.cast(ctypes.c_char_p(value), ctypes.c_void_p).value, len(value)
+        else:
+            column.data, column.size, column.type = value.ctypes.data, value.size, _TYPES.index(value.dtype)
+    handle = library.blitzgs_io_call(name.encode(), columns, len(columns))
+    if not handle:
+        raise MemoryError
+    reply = _Reply(handle)
+    if error := _ERRORS[library.blitzgs_io_status(handle)]:
+        raise error(os.fsdecode(library.blitzgs_io_message(handle)))
+    found = ctypes.POINTER(_Column)()
+    return [reply.array(found[i]) for i in range(library.blitzgs_io_columns(handle, ctypes.byref(found)))]
+
+
+def _array(values: object, dtype: str) -> Array:
+    return np.ascontiguousarray(values, np.dtype(dtype))
+
+
+def _texts(characters: Array, ends: Array) -> list[str]:
+    """Return texts; bytes that are not UTF-8 are decoded as by os.fsdecode."""
+    data, begins = characters.tobytes(), [0, *ends.tolist()]
+    return [os.fsdecode(data[begin:end]) for begin, end in zip(begins, begins[1:], strict=False)]
+
+
+def _columns_of(texts: Iterable[str]) -> tuple[bytes, Array]:
+    data = [os.fsencode(text) for text in texts]
+    return b"".join(data), np.cumsum([len(text) for text in data], dtype="u8")
+
+
+def camera_models() -> list[tuple[int, str, str]]:
+    """Return the id, name and parameters (separated by commas) of every camera model of COLMAP."""
+    ids, names, name_ends, params, param_ends = _call("camera_models")
+    return list(zip(ids.tolist(), _texts(names, name_ends), _texts(params, param_ends), strict=True))
+
+
+def read_cameras(path: Path) -> list[tuple[int, str, int, int, Array]]:
+    """Read cameras.bin or .txt: the id, model, width, height and parameters (float64) of each."""
+    ids, models, model_ends, widths, heights, params, ends = _call("read_cameras", path)
+    each = np.split(params, ends[:-1].astype(np.int64)) if len(ids) else []
+    names = _texts(models, model_ends)
+    return list(zip(ids.tolist(), names, widths.tolist(), heights.tolist(), each, strict=True))
+
+
+def read_images(path: Path, with_points2d: bool) -> dict[str, Any]:
+    """Read images.bin or .txt, as the fields of `ColmapImages`."""
+    ids, quats, translations, camera_ids, names, ends, offsets, points2d, point3d_ids = _call(
+        "read_images", path, _array([with_points2d], "u8")
+    )
+    return {
+        "ids": ids,
+        "quats": quats.reshape(-1, 4),
+        "translations": translations.reshape(-1, 3),
+        "camera_ids": camera_ids,
+        "names": _texts(names, ends),
+        "point2d_offsets": offsets,
+        "points2d": points2d.reshape(-1, 2),
+        "point3d_ids": point3d_ids,
+    }
+
+
+def read_points(path: Path, with_tracks: bool) -> dict[str, Array]:
+    """Read points3D.bin or .txt, as the fields of `ColmapPoints`."""
+    ids, positions, colors, errors, offsets, image_ids, point2d_ids = _call(
+        "read_points", path, _array([with_tracks], "u8")
+    )
+    return {
+        "ids": ids,
+        "positions": positions.reshape(-1, 3),
+        "colors": colors.reshape(-1, 3),
+        "errors": errors,
+        "track_offsets": offsets,
+        "track_image_ids": image_ids,
+        "track_point2d_ids": point2d_ids,
+    }
+
+
+def write_cameras(path: Path, rows: Sequence[tuple[int, str, int, int, Sequence[float]]]) -> None:
+    """Write cameras.bin or .txt; the inverse of `read_cameras`."""
+    ids, models, widths, heights, params = zip(*rows, strict=True) if rows else ((),) * 5
+    _call(
+        "write_cameras",
+        path,
+        _array(ids, "u4"),
+        *_columns_of(models),
+        _array(widths, "u8"),
+        _array(heights, "u8"),
+        _array([value for values in params for value in values], "f8"),
+        np.cumsum([len(values) for values in params], dtype="u8"),
+    )
+
+
+def write_images(path: Path, columns: dict[str, Any]) -> None:
+    """Write images.bin or .txt; the inverse of `read_images`."""
+    _call(
+        "write_images",
+        path,
+        _array(columns["ids"], "u4"),
+        _array(columns["quats"], "f8"),
+        _array(columns["translations"], "f8"),
+        _array(columns["camera_ids"], "u4"),
+        *_columns_of(columns["names"]),
+        _array(columns["point2d_offsets"], "u8"),
+        _array(columns["points2d"], "f8"),
+        _array(columns["point3d_ids"], "i8"),
+    )
+
+
+def write_points(path: Path, columns: dict[str, Any]) -> None:
+    """Write points3D.bin or .txt; the inverse of `read_points`."""
+    _call(
+        "write_points",
+        path,
+        _array(columns["ids"], "i8"),
+        _array(columns["positions"], "f8"),
+        _array(columns["colors"], "u1"),
+        _array(columns["errors"], "f8"),
+        _array(columns["track_offsets"], "u8"),
+        _array(columns["track_image_ids"], "u4"),
+        _array(columns["track_point2d_ids"], "u4"),
+    )
+
+
+def read_ply(path: Path) -> tuple[list[str], list[tuple[str, str]], int, Array]:
+    """Read the vertices of a PLY: comments, names and numpy types, number, and packed rows (uint8)."""
+    comments, comment_ends, names, name_ends, types, type_ends, count, rows = _call("read_ply", path)
+    properties = list(zip(_texts(names, name_ends), _texts(types, type_ends), strict=True))
+    return _texts(comments, comment_ends), properties, int(count[0]), rows
+
+
+def write_ply(
+    path: Path, comments: Sequence[str], properties: Sequence[tuple[str, str]], count: int, rows: Array
+) -> None:
+    """Write the vertices of a PLY; the inverse of `read_ply`."""
+    names, types = zip(*properties, strict=True) if properties else ((), ())
+    texts = (*_columns_of(comments), *_columns_of(names), *_columns_of(types))
+    _call("write_ply", path, *texts, _array([count], "u8"), _array(rows, "u1"))
+
+
+def check_jpeg(data: bytes, name: Path) -> None:
+    """Refuse a JPEG that is damaged (csrc/io/jpeg.h); `name` names it in the message."""
+    _call("check_jpeg", data, name)
+
+
+def check_png(data: bytes, name: Path) -> None:
+    """Refuse a PNG that is damaged (csrc/io/image_header.h)."""
+    _call("check_png", data, name)
+
+
+def read_image_header(data: bytes, name: Path) -> dict[str, Any]:
+    """Return what the header of an image says: the fields of `ImageHeader` in csrc/io/image_header.h."""
+    texts, ends, numbers, flags, grey = _call("read_image_header", data, name)
+    numbered = ("width", "height", "orientation", "bits", "colors", "extras")
+    flagged = ("supported", "is_white_zero", "is_lossy", "is_planar")
+    return {
+        **dict(zip(("format", "samples", "alpha"), _texts(texts, ends), strict=True)),
+        **dict(zip(numbered, numbers.tolist(), strict=True)),
+        **dict(zip(flagged, (flags != 0).tolist(), strict=True)),
+        "transparent_grey": None if grey[0] < 0 else int(grey[0]),
+    }
+
+
+def tiff_as_stored(data: bytes, name: Path) -> bytes:
+    """Return a TIFF that OpenCV decodes as it is stored (csrc/io/image_header.h)."""
+    (changed,) = _call("tiff_as_stored", data, name)
+    return changed.tobytes() if len(changed) else data
+
+
+def encode_qoi(rgb: Array) -> bytes:
+    """Return a picture, uint8 [H, W, 3], as a QOI file."""
+    if rgb.ndim != 3 or rgb.shape[2] != 3:
+        raise ValueError("qoi: the image must be [H, W, 3]")
+    (file,) = _call(
+        "encode_qoi", _array(rgb, "u1"), _array(rgb.shape[:1], "u8"), _array(rgb.shape[1:2], "u8")
+    )
+    return file.tobytes()
+
+
+def decode_qoi(data: bytes) -> Array:
+    """Return the picture in a QOI file, uint8 [H, W, 3]."""
+    size, rgb = _call("decode_qoi", data)
+    return rgb.reshape(int(size[0]), int(size[1]), 3)
+
+
+def set_flag(flags: npt.NDArray[np.uint8], index: int) -> None:
+    """Set a flag in shared memory: who sees it also sees all that was written before."""
+    _call("set_flag", flags[index : index + 1])
+
+
+def flag_is_set(flags: npt.NDArray[np.uint8], index: int) -> bool:
+    """Tell whether `set_flag` was called for a flag."""
+    return bool(_call("flag_is_set", flags[index : index + 1])[0][0])

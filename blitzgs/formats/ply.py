@@ -21,7 +21,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.formats.native import native_io
+from blitzgs.formats import native
 from blitzgs.util.arguments import check_tensor
 from blitzgs.util.output import check_replaceable, new_file
 
@@ -58,7 +58,7 @@ def _property_names(coefficients: int) -> list[str]:
 
 
 def _read_table(path: Path) -> tuple[list[str], npt.NDArray[np.void]]:
-    comments, properties, count, rows = native_io().read_ply(os.fsencode(path))
+    comments, properties, count, rows = native.read_ply(os.fsencode(path))
     return comments, np.frombuffer(rows, dtype=np.dtype(properties), count=count)
 
 
@@ -172,7 +172,7 @@ def write_ply(
     properties = [(name, "f4") for name in names]
     with new_file(path) as partial:
         try:
-            native_io().write_ply(os.fsencode(partial), comments or [], properties, n, rows.view(np.uint8))
+            native.write_ply(os.fsencode(partial), comments or [], properties, n, rows.view(np.uint8))
         except OSError as error:
             reason = str(error).rpartition(": ")[2]
             raise OSError(f"{path} cannot be written: {reason}") from error

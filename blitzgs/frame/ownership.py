@@ -81,7 +81,10 @@ class TileOwners:
             halo: see `TileRanges`.
         """
         if step in self._planned:
-            return TileRanges(self._planned[step], len(keys), width, height, halo=halo)
+            ranges = TileRanges(self._planned[step], len(keys), width, height, halo=halo)
+            # The resolution of the step may have changed since, with the pace of the run.
+            if ranges.bounds[-1] == len(keys) * ranges.tiles_per_view:
+                return ranges
         ranges = self.divide(keys, width, height, halo=halo)
         self._planned[step] = ranges.bounds
         return ranges

@@ -17,7 +17,7 @@ class Batch:
 
     Attributes:
         indices: the B cameras of the batch, as indices into the capture.
-        views: the same cameras as the renderer takes them.
+        views: the same cameras as the renderer takes them, at the resolution of the step.
         targets: uint8 [B, H, W, 3]; on several ranks, undefined outside the pixels that this rank's loss
             reads.
         masks: uint8 [B, H, W], 0 = excluded pixel; None when no view of the batch has a mask.

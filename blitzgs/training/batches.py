@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import time
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -33,6 +35,7 @@ class _Plan(NamedTuple):
     indices: list[int]
     ranges: TileRanges | None
     rows: list[tuple[int, int]]  # the pixel rows [y0, y1) of each view that this rank needs
+    reduction: int  # by which factor the photographs are reduced
 
 
 class _Photograph(NamedTuple):
@@ -135,8 +138,6 @@ class BatchLoader:
         lost: on several ranks, why this rank could not read a photograph (the first one, if there are
             several). The rank cannot stop alone in the middle of a step, so it continues and treats all
             pixels of such photographs as masked. None: it has read all photographs.
-        views_masked: number of views, among the `views_read`, of which a mask excludes more than
-            `MAX_MASKED`.
         waited: seconds that the caller has waited for batches so far.
     """
 
@@ -166,9 +167,9 @@ class BatchLoader:
         self._images = images
         self._views = views
         self._owners = owners
-        self._sample_counts: dict[int, float] = {}
+        self._sample_counts: dict[tuple[int, int], float] = {}  # by view and reduction
+        self._masked: dict[int, bool] = {}  # of each view that was read, whether nearly all is masked
         self.lost: str | None = None
-        self.views_masked = 0
         self.waited = 0.0
         self._train = train
         self._sampler = sampler
@@ -193,6 +194,8 @@ class BatchLoader:
             self._current = None  # in case the next batch cannot be loaded
         if self._owners is not None:
             self._owners.forget_before(step)
+        if step in self._plans and self._plans[step].reduction != self._sampler.reduction(step):
+            self._drop(step)  # the pace of the run has changed since
         for later in range(step, max(step + 1, min(step + (1 + _DECODED_AHEAD) * self._ahead + 1, last))):
             is_near = later <= step + self._ahead
             if later not in self._plans:
@@ -202,7 +205,7 @@ class BatchLoader:
             if is_near and later not in self._pending:
                 if later not in self._prefetched:  # there was no room for its photographs before
                     self._prefetch(later)
-                self._pending[later] = self._worker.submit(self._load, *self._plans[later])
+                self._pending[later] = self._worker.submit(self._load, self._plans[later])
         begin = time.perf_counter()
         batch, slot = self._pending.pop(step).result()
         self.waited += time.perf_counter() - begin
@@ -216,7 +219,12 @@ class BatchLoader:
     @property
     def views_read(self) -> int:
         """The number of views that have been read so far, each counted once."""
-        return len(self._sample_counts)
+        return len(self._masked)
+
+    @property
+    def views_masked(self) -> int:
+        """The number of views, among the `views_read`, of which a mask excludes more than `MAX_MASKED`."""
+        return sum(self._masked.values())
 
     def close(self) -> None:
         """Stop the thread."""
@@ -229,44 +237,57 @@ class BatchLoader:
 
     def _plan(self, step: int) -> _Plan:
         """Choose the views of a step and divide their tiles."""
-        indices = [self._train[view] for view in self._sampler.batch(step)]
+        indices, reduction = (
+            [self._train[view] for view in self._sampler.batch(step)],
+            self._sampler.reduction(step),
+        )
         # This is done in the caller's thread and not in the other one, and always as many steps ahead: at
         # this point all ranks know the same costs.
-        ranges = self._divide(step, indices)
-        return _Plan(indices, ranges, self._rows(indices, ranges))
+        ranges = self._divide(step, indices, reduction)
+        return _Plan(indices, ranges, self._rows(indices, ranges, reduction), reduction)
+
+    def _drop(self, step: int) -> None:
+        """Forget the plan of a step, and its batch if that is prepared."""
+        del self._plans[step]
+        self._prefetched.discard(step)
+        if step in self._pending:
+            with contextlib.suppress(OSError, ValueError):
+                self._give_back(self._pending.pop(step).result()[1])
 
     def _prefetch(self, step: int) -> None:
         """Start to decode the photographs and masks of a planned batch."""
         plan = self._plans[step]
         self._prefetched.add(step)
         needed = [index for index, (y0, y1) in zip(plan.indices, plan.rows, strict=True) if y0 < y1]
-        self._images.prefetch(needed, plan.indices)
+        self._images.prefetch(needed, plan.indices, plan.reduction)
 
     def _has_room(self, batches: int, plan: _Plan) -> bool:
         """Tell whether this number of batches takes at most half of the memory for decoded images."""
-        width, height = self._views.size(plan.indices)
+        width, height = self._views.size(plan.indices, plan.reduction)
         size = 4 * width * height * len(plan.indices)  # images and masks
         return 2 * batches * size <= self._images.memory().decoded_budget
 
-    def _divide(self, step: int, indices: list[int]) -> TileRanges | None:
+    def _divide(self, step: int, indices: list[int], reduction: int) -> TileRanges | None:
         if self._owners is None:
             return None
-        return self._owners.plan(step, indices, *self._views.size(indices), halo=LOSS_HALO)
+        # Costs of another resolution belong to another number of tiles, and are not used.
+        return self._owners.plan(step, indices, *self._views.size(indices, reduction), halo=LOSS_HALO)
 
-    def _rows(self, indices: list[int], ranges: TileRanges | None) -> list[tuple[int, int]]:
+    def _rows(self, indices: list[int], ranges: TileRanges | None, reduction: int) -> list[tuple[int, int]]:
         """Return the pixel rows [y0, y1) of each view that this rank needs."""
         if ranges is None or self._owners is None:
-            return [(0, self._views.size([index])[1]) for index in indices]
+            return [(0, self._views.size([index], reduction)[1]) for index in indices]
         return ranges.pixel_rows(self._owners.ranks.rank)
 
-    def _load(
-        self, indices: list[int], ranges: TileRanges | None, rows: list[tuple[int, int]]
-    ) -> tuple[Batch, _Slot]:
+    def _load(self, plan: _Plan) -> tuple[Batch, _Slot]:
         # Read before taking a slot, so that an unreadable image does not occupy one.
-        photographs = [self._read(index, *needed) for index, needed in zip(indices, rows, strict=True)]
+        photographs = [
+            self._read(index, *needed, plan.reduction)
+            for index, needed in zip(plan.indices, plan.rows, strict=True)
+        ]
         slot = self._free.popleft()
         try:
-            return self._fill(slot, indices, ranges, rows, photographs), slot
+            return self._fill(slot, plan, photographs), slot
         except BaseException:  # give the slot back, or it would be missing from then on
             self._give_back(slot)
             raise
@@ -276,29 +297,27 @@ class BatchLoader:
         assert slot not in self._free, "two batches would share this memory; this is a bug, please report it"
         self._free.append(slot)
 
-    def _read(self, index: int, y0: int, y1: int) -> _Photograph:
+    def _read(self, index: int, y0: int, y1: int, reduction: int) -> _Photograph:
         """Read pixel rows [y0, y1) and the mask of a view."""
+        size = self._views.size([index], reduction)
         try:
-            mask = self._images.mask(index)
-            strip = self._images.get(index).numpy()[y0:y1] if y0 < y1 else None
+            mask = self._images.mask(index, reduction)
+            strip = self._images.get(index, reduction).numpy()[y0:y1] if y0 < y1 else None
         except (OSError, ValueError) as error:
             if self._owners is None:
                 raise
             self.lost = self.lost or str(error)
-            width, height = self._views.size([index])
-            return _Photograph(None, torch.zeros(height, width, dtype=torch.uint8), 3.0 * width * height)
-        return _Photograph(strip, mask, self._samples(index, mask))
+            return _Photograph(None, torch.zeros(size[::-1], dtype=torch.uint8), 3.0 * math.prod(size))
+        if (index, reduction) not in self._sample_counts:
+            counted = math.prod(size) if mask is None else int((mask != 0).sum())
+            self._masked.setdefault(index, counted < (1.0 - MAX_MASKED) * math.prod(size))
+            self._sample_counts[index, reduction] = float(max(1, 3 * counted))
+        return _Photograph(strip, mask, self._sample_counts[index, reduction])
 
-    def _fill(
-        self,
-        slot: _Slot,
-        indices: list[int],
-        ranges: TileRanges | None,
-        rows: list[tuple[int, int]],
-        photographs: list[_Photograph],
-    ) -> Batch:
+    def _fill(self, slot: _Slot, plan: _Plan, photographs: list[_Photograph]) -> Batch:
         """Assemble a batch in a slot and start to upload it."""
-        count, (width, height) = len(indices), self._views.size(indices)
+        indices, ranges, rows, reduction = plan
+        count, (width, height) = len(indices), self._views.size(indices, reduction)
         strips, masks, samples = zip(*photographs, strict=True)
         if self._stream is not None:
             slot.uploaded.synchronize()  # returns at once: this upload ended long ago
@@ -310,21 +329,12 @@ class BatchLoader:
         if memory.included is not None:
             for place, mask in zip(memory.included, masks, strict=True):
                 place[...] = 1 if mask is None else mask.numpy()
-        self._views.write(indices, memory.numbers[:-count])
+        self._views.write(indices, memory.numbers[:-count], reduction)
         memory.numbers[-count:] = samples
         memory.upload(rows)
         if self._stream is not None:
             slot.uploaded.record(self._stream)
         return memory.batch(indices, ranges)
-
-    def _samples(self, index: int, mask: Tensor | None) -> float:
-        """Return `Batch.samples` of a view; count its pixels when it is read for the first time."""
-        if index not in self._sample_counts:
-            width, height = self._views.size([index])
-            counted = width * height if mask is None else int((mask != 0).sum())
-            self.views_masked += counted < (1.0 - MAX_MASKED) * width * height
-            self._sample_counts[index] = float(max(1, 3 * counted))
-        return self._sample_counts[index]
 
 
 def _aligned(size: int) -> int:

@@ -23,7 +23,12 @@ def hints_of(state: TrainingState) -> list[str]:
     capture, ranks = state.capture, state.ranks
     hints = [
         undistortion_note(capture),
-        sharing_hint(capture, state.config.data.cache_bytes, ranks.local_world_size),
+        sharing_hint(
+            capture,
+            state.config.data.cache_bytes,
+            ranks.local_world_size,
+            [factor for factor, _ in state.config.schedule.resolution],
+        ),
     ]
     if state.progress.step == 0:  # a resumed run keeps its batches and images
         hints.append(large_images_hint(capture, state.config.data.downscale, ranks.device.type))

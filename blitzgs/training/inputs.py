@@ -7,7 +7,7 @@ import contextlib
 import hashlib
 import os
 import socket
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ from blitzgs.view.views import Space
 
 # Fields that may differ between the hosts of a job.
 HOST_FIELDS = ("data.path", "data.cache_bytes", "data.threads")
+# The least width and height of reduced photographs: a window of SSIM has 11 pixels.
+LEAST_SIDE = 11
 # The largest memory of a container in bytes, or "max" (Linux, control groups 2).
 _CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
@@ -68,7 +70,8 @@ def open_capture(
     except MissingImagesError as error:
         raise MissingImagesError(f"{error} ({remedy})") from error
     budget = min(data.cache_bytes, _host_memory() // 2)
-    shared, taken = _share_decoded(capture, budget // 2, ranks)
+    factors = [factor for factor, _ in config.schedule.resolution]
+    shared, taken = _share_decoded(decoded_shapes(capture, factors), budget // 2, ranks)
     left = max(0, budget - taken)  # this rank's budget may be below that of the rank which made the memory
     threads = data.threads or _decoder_threads(ranks.local_world_size)
     background = config.model.background
@@ -85,8 +88,10 @@ def _damaged_of_share(ranks: Ranks, files: Sequence[tuple[Path, Path | None]]) -
     return dict(sorted(item for found in ranks.all_gather_object(own) for item in found.items()))
 
 
-def _share_decoded(capture: Capture, budget: int, ranks: Ranks) -> tuple[SharedImages | None, int]:
-    """Open memory for all decoded images that the ranks of this host share. Collective.
+def _share_decoded(
+    shapes: Mapping[Hashable, tuple[int, ...]], budget: int, ranks: Ranks
+) -> tuple[SharedImages | None, int]:
+    """Open memory for decoded images of these shapes that the ranks of this host share. Collective.
 
     Returns:
         The memory, and the bytes that it takes from this host. The memory is None if this is the host's only
@@ -96,8 +101,7 @@ def _share_decoded(capture: Capture, budget: int, ranks: Ranks) -> tuple[SharedI
     """
     if ranks.world_size == 1:
         return None, 0
-    shapes, host = decoded_shapes(capture), socket.gethostname()
-    shared, offer = None, None
+    shared, offer, host = None, None, socket.gethostname()
     # The numbers of a host's ranks follow one another, so exactly one of them is a multiple of their count,
     # also where another host has another count.
     makes = ranks.rank % ranks.local_world_size == 0 and ranks.local_world_size > 1
@@ -114,18 +118,21 @@ def _share_decoded(capture: Capture, budget: int, ranks: Ranks) -> tuple[SharedI
     return shared, size_of(shapes) if offers else 0
 
 
-def sharing_hint(capture: Capture, cache_bytes: int, local_ranks: int) -> str | None:
+def sharing_hint(
+    capture: Capture, cache_bytes: int, local_ranks: int, factors: Iterable[int] = ()
+) -> str | None:
     """Return what to do if the decoded images are too many to be shared by the ranks of a host.
 
     Args:
         capture: the images.
         cache_bytes: `DataConfig.cache_bytes`.
         local_ranks: number of ranks of the host.
+        factors: by which images are reduced in addition.
 
     Returns:
         None for a single rank, if the images fit already, or if they are too many for the host's memory.
     """
-    size, memory = size_of(decoded_shapes(capture)), _host_memory() // 2
+    size, memory = size_of(decoded_shapes(capture, factors)), _host_memory() // 2
     if local_ranks == 1 or size <= min(cache_bytes, memory) // 2 or size > memory // 2:
         return None
     gigabytes = -(-2 * size // 10**9)
@@ -158,6 +165,22 @@ def check_capture(space: Space, capture: Capture, folder: Path) -> None:
     """
     if Space.of(capture.offset, capture.extent) != space:
         raise ValueError(f"{capture.root} is not the capture of the run in {folder}: its cameras differ")
+
+
+def check_resolution(config: Config, capture: Capture) -> None:
+    """Check that the photographs are large enough for `schedule.resolution`.
+
+    Raises:
+        ConfigError: one of them is not.
+    """
+    most = max((factor for factor, _ in config.schedule.resolution), default=1)
+    sizes = {(capture.cameras[index].width, capture.cameras[index].height) for index in capture.train}
+    width, height = min(sizes, key=min)
+    if most > 1 and min(width, height) < LEAST_SIDE * most:
+        raise ConfigError(
+            f"schedule.resolution: divided by {most}, photographs must have at least {LEAST_SIDE} pixels in "
+            f"width and height, got some of {width} x {height}: choose a smaller factor"
+        )
 
 
 def check_alike(config: Config, capture: Capture, ranks: Ranks, resume: bool) -> None:

@@ -56,6 +56,12 @@ class UpcomingCameras:
         views = torch.tensor([view for batch in batches for view in batch])
         columns = to_device(views, self._columns[0].device)
         viewmats, Ks, sizes = (column[columns] for column in self._columns)  # noqa: N806
+        reductions = [self._sampler.reduction(step - 1 + ahead) for ahead in range(len(batches))]
+        if reductions[0] > 1:  # they decrease
+            factors = torch.tensor(reductions, dtype=torch.int32).repeat_interleave(self.batch_size)
+            factors = to_device(factors, sizes.device)
+            Ks[:, :2] /= factors[:, None, None]
+            sizes //= factors[:, None]
         return Cameras(viewmats, Ks, sizes, limits, columns)
 
 

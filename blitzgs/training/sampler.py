@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chooses the training views of each step's batch."""
+"""Chooses the training views of each step's batch, and the resolution of their photographs."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import torch
 
+from blitzgs.config.schedule import Schedule
 from blitzgs.ops.counter_random import hash_keys
 
 
@@ -21,15 +22,19 @@ class BatchSampler:
 
     Attributes:
         batch_size: views per batch, B.
+        schedule: decides on the resolution; None: it is always the full one.
     """
 
-    def __init__(self, sizes: Sequence[Hashable], batch_size: int, seed: int) -> None:
+    def __init__(
+        self, sizes: Sequence[Hashable], batch_size: int, seed: int, schedule: Schedule | None = None
+    ) -> None:
         """Group the views.
 
         Args:
             sizes: image size of each view, any hashable value.
             batch_size: views per batch, B.
             seed: of the shuffles.
+            schedule: see above.
 
         Raises:
             ValueError: there is no view.
@@ -41,7 +46,7 @@ class BatchSampler:
             groups.setdefault(size, []).append(view)
         self._groups = [torch.tensor(views) for views in groups.values()]
         self._counts = [len(views) for views in groups.values()]
-        self.batch_size = batch_size
+        self.batch_size, self.schedule = batch_size, schedule
         self._seed = seed
         # The latest round: its first step and its batches. Most steps use the same round as the one before.
         self._round: tuple[int, list[tuple[int, int]]] = (0, [])
@@ -56,6 +61,10 @@ class BatchSampler:
         group, batch = batches[step - first]
         begin = batch * self.batch_size
         return [self._view(group, position) for position in range(begin, begin + self.batch_size)]
+
+    def reduction(self, step: int) -> int:
+        """Return by which factor the photographs of a step (0-based) are reduced."""
+        return 1 if self.schedule is None else self.schedule.reduction(step * self.batch_size)
 
     def _group_batches(self, size: int, rounds: int) -> int:
         return rounds * size // self.batch_size

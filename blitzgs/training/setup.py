@@ -38,7 +38,7 @@ from blitzgs.training.agreement import SaveClock
 from blitzgs.training.curve import Curve
 from blitzgs.training.exposure import Exposures
 from blitzgs.training.extension import extended
-from blitzgs.training.inputs import check_alike, check_capture
+from blitzgs.training.inputs import check_alike, check_capture, check_resolution
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.population_report import PICTURE
@@ -82,6 +82,7 @@ def set_up(
     # its folder as it was. The ranks are compared before they work together, and the folder is checked before
     # a checkpoint is read from it.
     check_alike(config, capture, ranks, resume)
+    check_resolution(config, capture)
     _check_folder(folder, ranks, resume)
     lpips = load_lpips(config.log.lpips_weights)
     space = Space.of(capture.offset, capture.extent)
@@ -113,7 +114,7 @@ def set_up(
     owners = _tile_owners(ranks, progress, restored)
     views = ViewSet(list(capture.cameras), space, ranks.device)
     sizes = [(capture.cameras[i].width, capture.cameras[i].height) for i in capture.train]
-    sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed)
+    sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed, schedule)
     if config.memory.resident_gb > 0:
         table = HostTable(table.release(), pinned=ranks.device.type == "cuda")
     stepper = _stepper(

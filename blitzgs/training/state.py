@@ -164,6 +164,7 @@ class TrainingState:
         self.config = replace(self.config, schedule=replace(schedule, pace=pace))
         self.schedule = Schedule(self.config.schedule)
         self.optimiser.follow(self.schedule)
+        self.sampler.schedule = self.schedule
         self.stepper.reindex()
         self.log.total = self.schedule.iterations
 

@@ -246,6 +246,7 @@ class Trainer:
         """Take optimiser step number `step` (from 1), without the schedule's events."""
         state, config, schedule = self.state, self.state.config, self.state.schedule
         begin, end = (step - 1) * schedule.batch_size, step * schedule.batch_size
+        reduction = self._follow_resolution(step)
         try:
             batch = self.loader.get(step - 1, schedule.steps)
         except (OSError, ValueError) as error:
@@ -268,7 +269,7 @@ class Trainer:
             keep_means2d=schedule.gathers_statistics(begin),
         )
         if v_means2d is not None:
-            self._add_statistics(frame, v_means2d)
+            self._add_statistics(frame, v_means2d, reduction)
         state.stepped(step, degree)
         state.log.advance(end)
         if is_logged:
@@ -298,8 +299,23 @@ class Trainer:
             log_step(self.state, self._unwritten)
             self._unwritten = None
 
-    def _add_statistics(self, frame: Frame, v_means2d: Tensor) -> None:
-        """Add a step's screen-space gradients to the statistics that density control reads."""
+    def _follow_resolution(self, step: int) -> int:
+        """Return by which factor the photographs of a step are reduced; report where it differs."""
+        state = self.state
+        reduction = state.sampler.reduction(step - 1)
+        if reduction != (state.sampler.reduction(step - 2) if step > 1 else 1):
+            self._write_record()
+            state.curve.restart()  # reduced photographs have a higher PSNR
+            share = f"1/{reduction} of the resolution" if reduction > 1 else "the full resolution"
+            text = f"training compares with photographs of {share}"
+            state.log.event(state.images_seen, "resolution", {"reduction": reduction}, text)
+        return reduction
+
+    def _add_statistics(self, frame: Frame, v_means2d: Tensor, reduction: int) -> None:
+        """Add a step's screen-space gradients to the statistics that density control reads.
+
+        Radii are counted in pixels of the whole photograph, and gradients do not depend on the resolution.
+        """
         splats, views, table = frame.projected, frame.views, self.state.stepper.table
         density_stats_(
             table["grad_sum"],
@@ -308,7 +324,7 @@ class Trainer:
             splats.visible_ids,
             splats.splat_offsets,
             v_means2d,
-            splats.conics,
+            splats.conics if reduction == 1 else splats.conics / reduction**2,
             views.width,
             views.height,
             float(len(views)),

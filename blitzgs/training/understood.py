@@ -12,20 +12,12 @@ from blitzgs.capture.capture import Capture
 from blitzgs.capture.images import Images
 from blitzgs.capture.lengths import NEAR_OF_EXTENT, depths_seen, sampled
 from blitzgs.config.fields import Config
-from blitzgs.config.schedule import Schedule, stretched
-from blitzgs.population.growth import growth_limit
 from blitzgs.util.terminal import printable
 
 # Photographs that are decoded before the training, and views that are compared with the points.
 _DECODED, _PROJECTED = 16, 100
 # Means of a photograph or of all points' colours, of 255, from which it is black or saturated.
 _BLACK, _SATURATED = 4.0, 251.0
-# What a Gaussian needs in bytes: its row with the optimiser's state, and the scratch memory of a step.
-_ROW_BYTES, _SCRATCH_BYTES = 750, 500
-_PROGRAM_BYTES = 400_000_000
-# Rough speeds of one CPU core and of one data-centre GPU: seconds of a step, for each megapixel and million
-# Gaussians of the model, as measured with one view a step.
-_CPU_SECONDS, _GPU_SECONDS = (0.0, 0.3, 0.6), (0.003, 0.004, 0.004)
 
 
 class HopelessCaptureError(ValueError):
@@ -83,40 +75,6 @@ def understood(config: Config, capture: Capture, images: Images) -> list[str]:
     ]
     # A name may have characters that a terminal would obey.
     return [f"{name + ':':15}{printable(text)}" for name, text in lines]
-
-
-def estimate(config: Config, capture: Capture, on_gpu: bool, cores: int) -> str:
-    """Return roughly how much memory and time a training will take."""
-    sizes = [capture.cameras[i].width * capture.cameras[i].height for i in capture.train]
-    population = config.population
-    limit = growth_limit(
-        population.max_gaussians,
-        sum(sizes),
-        population.pixels_per_gaussian,
-        len(capture.points),
-        population.gaussians_per_point,
-        None,
-    )
-    # The octree begins with more Gaussians than points, whatever limits its growth.
-    count = max(int(1.3 * len(capture.points)), limit.count if limit is not None else 5 * len(capture.points))
-    schedule = Schedule(stretched(config.schedule, len(capture.train)))
-    pixels = float(np.mean(sizes))
-    fixed, per_megapixel, per_million = _GPU_SECONDS if on_gpu else _CPU_SECONDS
-    step = fixed + (per_megapixel * pixels + per_million * count) / 1e6
-    minutes = schedule.iterations * step / (1 if on_gpu else max(1, cores)) / 60
-    if config.schedule.minutes > 0:
-        minutes = config.schedule.minutes
-    memory = _PROGRAM_BYTES + count * (_ROW_BYTES + _SCRATCH_BYTES) + 100 * max(sizes)
-    device = "a data-centre GPU" if on_gpu else f"{cores} CPU cores"
-    return (
-        f"about {_rounded(count):,} Gaussians at most, {memory / 1e9:.1f} GB and {max(1, round(minutes)):,} "
-        f"minutes on {device} for {schedule.iterations:,} images (rough: within a factor of 3)"
-    )
-
-
-def _rounded(count: int) -> int:
-    digits = max(0, len(str(count)) - 2)
-    return round(count / 10**digits) * 10**digits
 
 
 def _look(capture: Capture, images: Images) -> Pictures:

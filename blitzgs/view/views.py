@@ -106,8 +106,8 @@ class ViewSet:
         self._sizes = [(camera.width, camera.height) for camera in cameras]
         self._device = device
 
-    def size(self, indices: list[int]) -> tuple[int, int]:
-        """Return the width and height that cameras share.
+    def size(self, indices: list[int], factor: int = 1) -> tuple[int, int]:
+        """Return the width and height that cameras share, divided by `factor` and rounded down.
 
         Raises:
             ValueError: the cameras differ in size.
@@ -115,14 +115,18 @@ class ViewSet:
         sizes = {self._sizes[index] for index in indices}
         if len(sizes) != 1:
             raise ValueError(f"the views of a batch must share one image size, got {sorted(sizes)}")
-        return sizes.pop()
+        width, height = sizes.pop()
+        return width // factor, height // factor
 
-    def write(self, indices: list[int], numbers: npt.NDArray[np.float32]) -> None:
-        """Write B views into `numbers` [B * 25], for `unpack_views`."""
+    def write(self, indices: list[int], numbers: npt.NDArray[np.float32], factor: int = 1) -> None:
+        """Write B views into `numbers` [B * 25], for `unpack_views`; each pixel is `factor` squared ones."""
         count = 16 * len(indices)
         # `take` needs half the time of an index: this thread holds Python's lock meanwhile.
         numbers[:count] = self._viewmats.take(indices, axis=0).ravel()
-        numbers[count:] = self._Ks.take(indices, axis=0).ravel()
+        Ks = self._Ks.take(indices, axis=0)  # noqa: N806
+        if factor > 1:
+            Ks[:, :2] /= factor
+        numbers[count:] = Ks.ravel()
 
     def columns(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return viewmats [V, 4, 4], Ks [V, 3, 3] and sizes (int32 [V, 2]) of all cameras, on the device."""

@@ -18,6 +18,8 @@ TOURS: tuple[Tour, ...] = get_args(Tour)
 _CIRCLE, _STATIONS = 48, 24
 # A flight looks at most so steeply down, so that the horizon's side of the scene is in the picture.
 _STEEPEST = math.radians(35)
+# Cameras that look down less than this look at no point on the ground nearby.
+_FLAT = math.radians(10)
 
 
 def tour(kind: Tour, world: World, fovs: list[float]) -> CameraPath:
@@ -82,12 +84,14 @@ def _flight(world: World, fov: float) -> list[Stance]:
     _, _, axes = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
     ahead = axes[0] - world.up * (axes[0] @ world.up)
     ahead /= np.linalg.norm(ahead)
-    ends = np.quantile(flat @ ahead, (0.02, 0.98))
+    ends = np.quantile(flat @ ahead, (0.1, 0.9))
     height = float(np.median(heights))
     slopes = [math.asin(float(np.clip(pose[2, :3] @ world.up, -1, 1))) for pose in world.poses]
     slope = max(-_STEEPEST, min(0.0, float(np.median(slopes))))
     view = ahead * math.cos(slope) + world.up * math.sin(slope)
-    places = [world.middle + along * ahead + height * world.up for along in ends]
+    # The point on the ground that the camera looks at goes from end to end.
+    behind = height / math.tan(-slope) if height > 0 and slope < -_FLAT else 0.0
+    places = [world.middle + (along - behind) * ahead + height * world.up for along in ends]
     return [looking(place, place + view, world.up, fov) for place in places]
 
 

@@ -4,7 +4,7 @@ import pycolmap
 import pytest
 
 from blitzgs.capture import colmap
-from blitzgs.formats.native import native_io
+from blitzgs.formats import native
 from tests.capture.helpers import reconstruction, shared_data
 
 NAMES = ["a.jpg", "sub/b c.png", "ü.jpg"]
@@ -43,7 +43,7 @@ def assert_same(model: colmap.ColmapModel, rec: pycolmap.Reconstruction) -> None
 
 
 def test_every_camera_model_of_colmap_is_known_with_its_parameters():
-    ours = {name: (id_, params) for id_, name, params in native_io().camera_models()}
+    ours = {name: (id_, params) for id_, name, params in native.camera_models()}
     for name, model_id in pycolmap.CameraModelId.__members__.items():
         if name == "INVALID":
             continue

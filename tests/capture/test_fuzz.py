@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from blitzgs.capture.image_files import decode_rgb, read_header, read_whole
 from blitzgs.capture.transforms import read_transforms
-from blitzgs.formats.native import native_io
+from blitzgs.formats import native
 from blitzgs.formats.ply import read_ply, read_point_cloud
 from tests.capture.helpers import ROOT, reconstruction, smooth_image, write_image
 from tests.capture.image_bytes import tiff
@@ -40,7 +40,7 @@ def samples():
     (folder / "photo.tif").write_bytes(tiff(np.ones((8, 8, 4), dtype=np.uint8), 2, t274=6))
     rows = np.zeros(4, [(name, "f4") for name in ("x", "y", "z", "red", "green", "blue")])
     plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")], text=True).write(folder / "cloud.ply")
-    (folder / "QOI").write_bytes(native_io().encode_qoi(smooth_image(48, 64)))
+    (folder / "QOI").write_bytes(native.encode_qoi(smooth_image(48, 64)))
     frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "mask_path": "b.png"}
     frame |= {"camera_angle_x": 1.0, "camera_angle_y": 0.8, "cx": 31.5, "is_fisheye": False}
     lens = {"w": 64, "h": 48, "fl_x": 60.0, "k1": 0.1, "ply_file_path": "p.ply", "camera_model": "RADIAL"}
@@ -67,28 +67,28 @@ def read_image(path: str) -> None:
 def read_parts(path: str) -> None:
     """Read what this package reads of a file itself, before OpenCV decodes it."""
     data, name = Path(path).read_bytes(), path.encode()
-    native_io().read_image_header(data, name)
+    native.read_image_header(data, name)
     if path.endswith(".tif"):
-        native_io().tiff_as_stored(data, name)
+        native.tiff_as_stored(data, name)
     if path.endswith(".png"):
-        native_io().check_png(data, name)
+        native.check_png(data, name)
 
 
 READERS = {
     "photo.png": read_parts,
     "photo.tif": read_parts,
     "cloud.ply": read_point_cloud,
-    "cameras.bin": native_io().read_cameras,
-    "images.bin": lambda path: native_io().read_images(path, True),
-    "points3D.bin": lambda path: native_io().read_points(path, True),
-    "cameras.txt": native_io().read_cameras,
-    "images.txt": lambda path: native_io().read_images(path, True),
-    "points3D.txt": lambda path: native_io().read_points(path, True),
+    "cameras.bin": native.read_cameras,
+    "images.bin": lambda path: native.read_images(path, True),
+    "points3D.bin": lambda path: native.read_points(path, True),
+    "cameras.txt": native.read_cameras,
+    "images.txt": lambda path: native.read_images(path, True),
+    "points3D.txt": lambda path: native.read_points(path, True),
     "model.ply": read_ply,
     "photo.jpg": read_image,
     "stages.jpg": read_image,
     "transforms.json": lambda path: read_transforms(Path(path).parent),
-    "QOI": lambda path: native_io().decode_qoi(Path(path).read_bytes()),  # its messages have no other name
+    "QOI": lambda path: native.decode_qoi(Path(path).read_bytes()),  # its messages have no other name
 }
 FRACTION = st.floats(0, 1, exclude_max=True)
 
@@ -222,9 +222,9 @@ def test_damaged_headers_of_all_formats_are_read_or_refused(suffix):
 
     def attempt(damaged: bytes) -> None:
         try:
-            found = native_io().read_image_header(damaged, name)
+            found = native.read_image_header(damaged, name)
             if found["format"] == "TIFF":
-                assert len(native_io().tiff_as_stored(damaged, name)) == len(damaged)
+                assert len(native.tiff_as_stored(damaged, name)) == len(damaged)
             assert 1 <= found["orientation"] <= 8 and found["extras"] >= 0
         except ValueError as error:
             assert str(error).startswith("file: ")

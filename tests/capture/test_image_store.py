@@ -302,3 +302,26 @@ def test_bounded_cache_drops_the_least_recently_used():
     assert (cache.get("a"), cache.bytes) == ("a2", 6)
     cache.put("big", "big", 11)
     assert cache.get("big") is None and cache.bytes == 6
+
+
+def test_reduced_images_are_made_once_from_images_that_are_decoded_once(capture):
+    store = ImageStore(capture)
+    store.prefetch(range(12), factor=4)
+    found = [store.get(i, 4) for i in range(12)]
+    whole = [store.get(i) for i in range(12)]
+    assert store.memory().decoded == 12
+    assert store.decoded.bytes == 12 * (IMAGE_BYTES + IMAGE_BYTES // 16)
+    for small, image in zip(found, whole, strict=True):
+        means = image.double().view(12, 4, 16, 4, 3).mean((1, 3))
+        assert small.shape == (12, 16, 3) and (small - means).abs().max() <= 0.5
+    assert store.get(3, 4).data_ptr() == found[3].data_ptr()
+
+
+def test_whole_images_leave_their_memory_to_reduced_ones(capture):
+    """With room for all reduced images but not for all whole ones, no image is decoded a third time."""
+    store = ImageStore(capture, decoded_bytes=6 * IMAGE_BYTES, threads=1)
+    for _ in range(3):
+        for index in range(12):
+            assert store.get(index, 2).shape == (24, 32, 3)
+        assert store.memory().decoded == 12
+    assert store.decoded.bytes <= 6 * IMAGE_BYTES

@@ -87,12 +87,28 @@ def test_masks_are_shared_too(tmp_path):
     cv2.imwrite(str(mask), 255 * (noise((48, 64)) > 99).astype(np.uint8))
     cameras = [dataclasses.replace(camera, mask_path=mask) for camera in capture.cameras]
     capture = dataclasses.replace(capture, cameras=cameras)
-    shapes = decoded_shapes(capture)
-    assert shapes["mask", 1] == (48, 64) and size_of(shapes) > 2 * 4 * 48 * 64
+    shapes = decoded_shapes(capture, [4])
+    assert shapes["mask", 1, 4] == (12, 16)
+    assert shapes["mask", 1, 1] == (48, 64) and size_of(shapes) > 2 * 4 * 48 * 64
     shared, _ = SharedImages.create(shapes)
     first, second = ImageStore(capture, shared=shared), ImageStore(capture, shared=shared)
     assert torch.equal(first.mask(1), ImageStore(capture).mask(1))
     assert torch.equal(second.mask(1), first.mask(1)) and second.memory().decoded == 0
+    counted = first.mask(1).double().view(12, 4, 16, 4)
+    assert torch.equal(second.mask(1, 4) != 0, counted.mean((1, 3)) >= 0.5)
+    colours = first.get(1).double().view(12, 4, 16, 4, 3) * counted[..., None]
+    means = colours.sum((1, 3)) / counted.sum((1, 3)).clamp(min=1)[..., None]
+    assert (first.get(1, 4) - means).abs().max() <= 0.5 + 1e-4
+
+
+def test_reduced_images_are_shared_too(tmp_path):
+    capture = load_capture(write_capture(tmp_path, NAMES[:2]))
+    shared, _ = SharedImages.create(decoded_shapes(capture, [4, 2]))
+    first, second = ImageStore(capture, shared=shared), ImageStore(capture, shared=shared)
+    for factor in (4, 2, 1):
+        assert torch.equal(first.get(1, factor), ImageStore(capture).get(1, factor))
+        assert torch.equal(second.get(1, factor), first.get(1, factor))
+    assert first.memory().decoded == 1 and second.memory().decoded == 0
 
 
 def _decode_all(ranks, folder, cache_bytes):

@@ -37,6 +37,7 @@ def phases_of(schedule, begin):
     """Return all properties of the step that begins with an image, except for events and rates."""
     return (
         schedule.sh_degree(begin, 3),
+        schedule.reduction(begin),
         schedule.gathers_statistics(begin),
         schedule.has_lod_gate(begin),
         schedule.has_spawn_gate(begin),
@@ -55,6 +56,7 @@ def test_a_change_of_pace_does_not_change_past_events():
             densify_until=1_500,
             densify_every=40,
             reset_every=300,
+            resolution=((4, 310), (2, 877)),
             t1=700,
             t2=1_600,
             sh_every=100,

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
+import re
 
 import pytest
 import torch
 
 from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
+from blitzgs.config.files import ConfigError, load_config
 from blitzgs.config.schedule import Schedule, stretched
 
 
@@ -39,6 +41,31 @@ def test_one_field_scales_every_time(scale):
     expected = sorted({math.floor(t * scale + 1e-6) for t in range(50, 1_500, 10)})
     assert times == expected
     assert schedule.steps == math.floor(3_000 * scale + 1e-6)
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 2.0])
+def test_the_resolution_rises_at_its_times(scale):
+    config = ScheduleConfig(iterations=3_000, batch_size=4, resolution=((4, 100), (2, 902)), scale=scale)
+    schedule = Schedule(config)
+    for begin in range(0, schedule.iterations, 4):
+        expected = 4 if begin < 100 * scale else 2 if begin < math.floor(902 * scale + 1e-6) else 1
+        assert schedule.reduction(begin) == expected
+    assert Schedule(ScheduleConfig()).reduction(0) == 1
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("[[3, 100]]", "factors must be 8, 4 or 2 and decrease, got [3]"),
+        ("[[2, 100], [4, 200]]", "factors must be 8, 4 or 2 and decrease, got [2, 4]"),
+        ("[[4, 200], [2, 200]]", "times must increase, got [200, 200]"),
+        ("[[2, 0]]", "must be in [1, 1,000,000,000], got ((2, 0),)"),
+        ("[2, 100]", "[0]: must be a list of 2 values, got 2"),
+    ],
+)
+def test_a_resolution_that_cannot_be_is_refused(value, message):
+    with pytest.raises(ConfigError, match=r"schedule\.resolution.*" + re.escape(message)):
+        load_config(None, [f"schedule.resolution={value}"])
 
 
 @pytest.mark.parametrize(

@@ -76,6 +76,10 @@ def on_each_device(*world_sizes):
     return [pytest.param(size, "cpu", id=f"cpu-{size}") for size in world_sizes] + on_cuda(*world_sizes)
 
 
+# As many ranks as a host of eight GPUs has, on the CPU.
+EIGHT = pytest.param(8, "cpu", id="cpu-8", marks=pytest.mark.slow)
+
+
 def run_ranks(
     function,
     world_size,

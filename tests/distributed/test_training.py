@@ -18,7 +18,7 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.training.trainer import Trainer
-from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
+from tests.distributed.rank_harness import EIGHT, RankError, on_each_device, run_ranks
 from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene, write_tiny_capture
 from tests.training.tiny_runs import events_of, read_log, steps_of
 
@@ -71,7 +71,7 @@ def start(tmp_path_factory):
     return make
 
 
-@pytest.mark.parametrize(("world_size", "device"), on_each_device(2, 4))
+@pytest.mark.parametrize(("world_size", "device"), [*on_each_device(2, 4), EIGHT])
 def test_twenty_steps_agree_with_one_rank(start, tmp_path, world_size, device):
     whole, base = start(device)
     folder = tmp_path / "run"
@@ -141,7 +141,7 @@ def _lose_a_photograph(ranks, folder):
     trainer = Trainer(tiny_config(*SETTINGS), capture, images, folder, ranks)
     step = trainer.step
 
-    def gone(index):
+    def gone(index, factor=1):
         raise FileNotFoundError(2, "No such file or directory", f"/photos/{index:02}.png")
 
     def losing(number):
@@ -181,7 +181,7 @@ def _lose_the_last_photographs(ranks, folder):
         images.get = gone if number == 30 and ranks.rank == 0 else get
         step(number)
 
-    def gone(index):
+    def gone(index, factor=1):
         raise ValueError(f"/photos/{index:02}.png is damaged")
 
     trainer.step = losing
@@ -199,7 +199,7 @@ def _lose_a_held_out_photograph(ranks, folder, resume):
     capture, images = tiny_scene()
     capture.train, capture.test, get = [0, 2, 4, 6], [1, 3, 5, 7], images.get
 
-    def gone(index):
+    def gone(index, factor=1):
         if index == 5:
             raise FileNotFoundError(2, "No such file or directory", "/photos/05.png")
         return get(index)
@@ -226,7 +226,7 @@ def _stop_in_an_evaluation(ranks, folder, every):
     trainer = Trainer(config, capture, images, folder, ranks)
     get, compared = images.get, []
 
-    def stopping(index):
+    def stopping(index, factor=1):
         if threading.current_thread() is threading.main_thread():  # another one reads images for training
             compared.append(trainer.state.progress.step)
             if ranks.rank == ranks.world_size - 1:

@@ -183,3 +183,14 @@ def test_costs_of_an_earlier_version_are_left_out():
     )
     assert owners.plan(7, [5, 2], *SIZE, 0).bounds == (0, 3, 24)
     assert owners.plan(8, [5, 2], *SIZE, 0).bounds == (0, 12, 24)
+
+
+def test_a_stored_division_of_another_resolution_is_not_used():
+    owners = TileOwners(Ranks(world_size=4))
+    first = owners.plan(7, [0, 1], 160, 96, halo=10)
+    assert owners.plan(7, [0, 1], 160, 96, halo=10).bounds == first.bounds
+    again = TileOwners(Ranks(world_size=4))
+    again.restore(owners.columns())
+    reduced = again.plan(7, [0, 1], 80, 48, halo=10)
+    assert reduced.bounds[-1] == 2 * 5 * 3 != first.bounds[-1]
+    assert again.columns()["bounds"].tolist() == [list(reduced.bounds)]

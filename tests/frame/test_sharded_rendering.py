@@ -17,7 +17,7 @@ from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batch import Batch
 from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term
-from tests.distributed.rank_harness import on_each_device, run_ranks
+from tests.distributed.rank_harness import EIGHT, on_each_device, run_ranks
 from tests.helpers import parameter_gradients, sum_parts
 from tests.training.tiny import look_at_origin, random_gaussians
 
@@ -25,7 +25,7 @@ WIDTH, HEIGHT, EXTENT = 150, 90, 0.3
 LOSS = LossConfig(opacity=0.1)
 OPTIONS = RenderOptions(sh_degree=0, near_plane=0.05, far_plane=100.0, background=(0.1, 0.2, 0.3))
 # Return the owner of each row: shards of several sizes, an empty one and 3 : 1 among them.
-LAYOUTS = {1: [0], 2: [0, 0, 0, 1], 3: [0, 2, 2], 4: [0, 3, 1, 0, 0, 3]}
+LAYOUTS = {1: [0], 2: [0, 0, 0, 1], 3: [0, 2, 2], 4: [0, 3, 1, 0, 0, 3], 8: [0, 7, 5, 1, 1, 1, 2, 3, 4]}
 
 
 def cameras(n_views, blind=False, device="cpu"):
@@ -60,7 +60,7 @@ def photographs(n_views):
 def uneven(world_size, n_views):
     """Return borders in the middle of a tile row, ranks without tiles, a rank with more than a view."""
     total = TileRanges((0,), n_views, WIDTH, HEIGHT).tiles_per_view * n_views
-    bounds = (0, *[0, 34, 34][: world_size - 1], total)
+    bounds = (0, *[0, 34, 34, 35, 36, 36, 40][: world_size - 1], total)
     return TileRanges(bounds, n_views, WIDTH, HEIGHT, halo=LOSS_HALO)
 
 
@@ -132,7 +132,7 @@ def relative(a, b):
 
 
 @pytest.mark.parametrize("transport", ["auto", "collective"])
-@pytest.mark.parametrize(("world_size", "device"), on_each_device(2, 3, 4))
+@pytest.mark.parametrize(("world_size", "device"), [*on_each_device(2, 3, 4), EIGHT])
 def test_images_are_the_same_bits_and_losses_agree(alone, world_size, device, transport):
     if device == "cpu" and transport == "auto":
         pytest.skip("ranks on CPUs share no memory")
@@ -163,7 +163,8 @@ def test_images_are_the_same_bits_and_losses_agree(alone, world_size, device, tr
     first, second = ([a[1][step]["tiles"] for a in answers] for step in (1, 4))
     assert first != second
     work = [a[1][4]["work"] for a in answers]
-    assert max(work) <= 1.15 * sum(work) / len(work)
+    # A rank of eight has seven or eight tiles of a batch.
+    assert max(work) <= (1.25 if world_size == 8 else 1.15) * sum(work) / len(work)
 
 
 def _render_plain(ranks):

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Batches have the photographs, masks and views of their cameras, although their memory is reused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from blitzgs.capture.images import ImageMemory
+from blitzgs.config.fields import ScheduleConfig
+from blitzgs.config.schedule import Schedule
 from blitzgs.training.batches import BatchLoader
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.view.views import Space, ViewSet
@@ -71,6 +75,56 @@ def test_each_step_gets_its_own_views(capture, device, ahead):
             assert masks is None
 
 
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("ahead", [0, 3])
+def test_reduced_photographs_and_their_cameras(capture, device, ahead):
+    """Also where the resolution rises, and where the pace changes when later batches are prepared already."""
+    cameras, images = capture
+    loader, sampler, views = make_loader(cameras, images, torch.device(device), ahead)
+    config = ScheduleConfig(iterations=100, batch_size=2, resolution=((4, 8), (2, 30)))
+    sampler.schedule, seen = Schedule(config), []
+    try:
+        for step in range(STEPS):
+            batch = loader.get(step, STEPS)
+            factor = 4 if step < 4 else 2 if step < 12 else 1
+            seen.append(factor)
+            expected = views.pick(batch.indices)
+            assert batch.indices == sampler.batch(step)
+            assert torch.equal(batch.views.viewmats, expected.viewmats)
+            assert torch.equal(
+                batch.views.Ks * torch.tensor([[factor], [factor], [1]], device=device), expected.Ks
+            )
+            width, height = SIZES[batch.indices[0]]
+            assert (batch.views.width, batch.views.height) == (width // factor, height // factor)
+            for view, index in enumerate(batch.indices):
+                photo, mask = images.get(index), images.mask(index)
+                if mask is None:
+                    mask = torch.ones(height, width, dtype=torch.uint8)
+                target, counted = by_squares(photo.numpy(), mask.numpy(), factor)
+                difference = batch.targets[view].cpu().numpy() - target
+                assert np.abs(difference[counted]).max() <= 0.5 + 1e-4
+                assert batch.samples[view] == 3 * counted.sum()
+                if batch.masks is not None:
+                    assert np.array_equal(batch.masks[view].cpu().numpy() != 0, counted)
+            if step == 10:  # the resolution now rises at image 24 and not 30; batch 13 may be prepared
+                sampler.schedule = Schedule(replace(config, pace=((22, 0.25),)))
+    finally:
+        loader.close()
+    assert set(seen) == {4, 2, 1} and loader.views_read == len(SIZES)
+
+
+def by_squares(photo, mask, factor):
+    """Mean colours of the pixels that count in squares of pixels, and where at least half of them do."""
+    height, width = photo.shape[0] // factor, photo.shape[1] // factor
+    means, counted = np.zeros((height, width, 3)), np.zeros((height, width), dtype=bool)
+    for y, x in np.ndindex(height, width):
+        square = np.s_[y * factor : (y + 1) * factor, x * factor : (x + 1) * factor]
+        inside = photo[square][mask[square] != 0]
+        counted[y, x] = 2 * len(inside) >= factor**2
+        means[y, x] = inside.mean(0) if len(inside) else 0
+    return means, counted
+
+
 @pytest.mark.parametrize(("batches", "first"), [(100, 11), (16, 9), (0, 3)])
 def test_photographs_are_decoded_before_their_batches_are_assembled(capture, batches, first, monkeypatch):
     """Up to half of the memory for decoded images, and always those of the batches that are assembled."""
@@ -78,7 +132,7 @@ def test_photographs_are_decoded_before_their_batches_are_assembled(capture, bat
     wanted = []
     budget = batches * 2 * 4 * 48 * 32  # images and masks of batches of two views
     monkeypatch.setattr(images, "memory", lambda: ImageMemory(0, 0, 0, budget, 0))
-    monkeypatch.setattr(images, "prefetch", lambda indices, masks: wanted.append((indices, masks)))
+    monkeypatch.setattr(images, "prefetch", lambda indices, masks, factor: wanted.append((indices, masks)))
     loader, sampler, _ = make_loader(cameras, images, torch.device("cpu"), ahead=2, train=range(5))
     try:
         loader.get(0, STEPS)
@@ -100,7 +154,7 @@ def test_memory_is_used_once_though_an_image_could_not_be_read(capture, device, 
     loader, sampler, _ = make_loader(cameras, images, torch.device(device), ahead)
     fails, get = True, images.get
 
-    def sometimes(index):
+    def sometimes(index, factor):
         if fails and index in sampler.batch(5):
             raise OSError("cannot be read")
         return get(index)
@@ -131,7 +185,7 @@ def test_memory_is_given_back_when_a_batch_cannot_be_assembled(capture, device, 
     loader, sampler, _ = make_loader(cameras, images, torch.device(device), ahead=1)
     get, failures = images.get, 0
 
-    def too_narrow(index):
+    def too_narrow(index, factor):
         nonlocal failures
         if failures < 10:
             failures += 1

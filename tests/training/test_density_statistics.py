@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -45,8 +46,13 @@ def take_steps(trainer: Trainer, count: int) -> None:
             trainer.step(trainer.state.progress.step + 1)
 
 
-def of_one_view(trainer: Trainer, index: int, sh_degree: int) -> tuple[torch.Tensor, ...]:
-    """Return gradient norm (half images), visibility and radius of each Gaussian in a view, by autograd."""
+def of_one_view(trainer: Trainer, index: int, sh_degree: int, reduction: int) -> tuple[torch.Tensor, ...]:
+    """Return gradient norm (half images), visibility and radius of each Gaussian in a view, by autograd.
+
+    The view has a lower resolution: width and height are divided by `reduction`.
+    """
+    width, height = WIDTH // reduction, HEIGHT // reduction
+    K = torch.tensor([[1 / reduction], [1 / reduction], [1]])
     state, table = trainer.state, trainer.state.table
     views = state.views.pick([index])
     model, extent = state.config.model, state.space.extent
@@ -57,36 +63,40 @@ def of_one_view(trainer: Trainer, index: int, sh_degree: int) -> tuple[torch.Ten
         table["opacities"].double().sigmoid(),
         table["sh"],
         views.viewmats[0],
-        views.Ks[0],
-        WIDTH,
-        HEIGHT,
+        views.Ks[0] * K,
+        width,
+        height,
         sh_degree=sh_degree,
         near_plane=model.near * extent,
         antialiased=model.antialiased,
     )
-    loss = photometric_loss(image.image[None], state.images.get(index)[None], None, state.config.loss.ssim)
+    target = cv2.resize(state.images.get(index).numpy(), (width, height), interpolation=cv2.INTER_AREA)
+    target = torch.from_numpy(target)[None]
+    loss = photometric_loss(image.image[None], target, None, state.config.loss.ssim)
     (gradient,) = torch.autograd.grad(loss.sum(), image.splats.means2d)
     splats, count = image.splats, len(table)
     norms, seen, radii = torch.zeros(count).double(), torch.zeros(count).bool(), torch.zeros(count).double()
-    norms[splats.ids] = (gradient * torch.tensor([WIDTH / 2, HEIGHT / 2])).norm(dim=1)
+    norms[splats.ids] = (gradient * torch.tensor([width / 2, height / 2])).norm(dim=1)
     a, b, c = splats.conics.detach().unbind(dim=1)
     # A Gaussian counts if the box around alpha >= 1/255 overlaps the image.
     sigmas = (2 * (255 * splats.opacities.detach()).clamp(min=1).log()).sqrt()
     spread = torch.stack([c, a], dim=1) / (a * c - b * b)[:, None]
-    half, size = sigmas[:, None] * spread.sqrt(), torch.tensor([WIDTH, HEIGHT])
+    half, size = sigmas[:, None] * spread.sqrt(), torch.tensor([width, height])
     centres = splats.means2d.detach()
     seen[splats.ids] = ((centres + half > 0) & (centres - half < size)).all(dim=1) & (sigmas > 0)
     # 3 sigma along the longer axis; INRIA's renderer takes round splats for a little larger than they are.
-    half_trace = spread.sum(dim=1) / 2
-    gap = (half_trace**2 - 1 / (a * c - b * b)).clamp(min=0.1)
+    # The radius is that in the whole photograph.
+    half_trace = reduction**2 * spread.sum(dim=1) / 2
+    gap = (half_trace**2 - reduction**4 / (a * c - b * b)).clamp(min=0.1)
     radii[splats.ids] = 3 * (half_trace + gap.sqrt()).sqrt()
     return norms, seen, radii
 
 
-@pytest.mark.parametrize("batch_size", [1, 3])
-def test_statistics_are_those_of_autograd(tmp_path, batch_size):
+@pytest.mark.parametrize(("batch_size", "resolution"), [(1, ()), (3, ()), (3, ((2, 6),)), (1, ((2, 4),))])
+def test_statistics_are_those_of_autograd(tmp_path, batch_size, resolution):
     """Over several steps that change the Gaussians, through loss, compositing and projection."""
-    trainer = make_trainer(tmp_path, f"schedule.batch_size={batch_size}")
+    reduced = f"schedule.resolution={[list(pair) for pair in resolution]}"
+    trainer = make_trainer(tmp_path, f"schedule.batch_size={batch_size}", reduced)
     table, steps = trainer.state.table, 4
     sums, counts = torch.zeros(len(table)).double(), torch.zeros(len(table)).int()
     radii = torch.zeros(len(table)).double()
@@ -102,7 +112,8 @@ def test_statistics_are_those_of_autograd(tmp_path, batch_size):
         trainer.state.optimiser.catch_up(table, None, step)
         degree = trainer.state.schedule.sh_degree(step * batch_size, 3)
         for index in batches[step].indices:
-            norms, seen, reach = of_one_view(trainer, index, degree)
+            reduction = 2 if resolution and step * batch_size < resolution[0][1] else 1
+            norms, seen, reach = of_one_view(trainer, index, degree, reduction)
             sums += norms
             counts += seen
             radii = torch.maximum(radii, reach.where(seen, 0))

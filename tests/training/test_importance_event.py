@@ -220,7 +220,7 @@ def test_lineage_of_a_run_that_was_stopped_adds_up(tmp_path, monkeypatch):
 def test_lineage_of_a_run_that_was_saved_before_its_first_step_adds_up(tmp_path, monkeypatch):
     """The first Gaussians were logged before a photograph could not be read, and stay logged."""
     pytest.importorskip("pyarrow")
-    monkeypatch.setattr(Images, "get", lambda self, index: Path("/photos/00.png").read_bytes())
+    monkeypatch.setattr(Images, "get", lambda self, index, factor=1: Path("/photos/00.png").read_bytes())
     with pytest.raises(PhotographError, match="put the photograph back"):
         train(tmp_path, "population.lineage=true")
     monkeypatch.undo()

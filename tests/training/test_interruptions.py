@@ -233,7 +233,7 @@ def test_a_photograph_that_vanishes_costs_nothing(tmp_path, monkeypatch):
     capture, images = tiny_scene()
     get = images.get
 
-    def gone(index):
+    def gone(index, factor=1):
         raise FileNotFoundError(errno.ENOENT, "No such file or directory", f"/photos/{index:02}.png")
 
     at_step(monkeypatch, 40, lambda self: setattr(images, "get", gone))
@@ -254,7 +254,7 @@ def test_a_held_out_photograph_that_vanishes_costs_nothing(tmp_path):
     capture, images = tiny_scene()
     get = images.get
 
-    def held_out_is_gone(index):
+    def held_out_is_gone(index, factor=1):
         if index in capture.test:
             raise ValueError(f"/photos/{index:02}.png is no JPEG or PNG file")
         return get(index)

@@ -12,6 +12,7 @@ import torch
 
 from blitzgs.capture.images import ImageMemory
 from blitzgs.capture.lengths import Sight
+from blitzgs.capture.reduced import reduced, reduced_mask
 from blitzgs.config.fields import Config
 from blitzgs.config.files import load_config
 from blitzgs.frame import frame as pipeline
@@ -69,13 +70,18 @@ class Images:
     def __init__(self, images, masks=None):
         self.images, self.masks = images, masks
 
-    def get(self, index):
-        return self.images[index]
+    def get(self, index, factor=1):
+        if factor == 1:
+            return self.images[index]
+        mask = self.mask(index)
+        mask = None if mask is None else mask.numpy()
+        return torch.from_numpy(reduced(self.images[index].numpy(), mask, factor))
 
-    def mask(self, index):
-        return None if self.masks is None else self.masks[index]
+    def mask(self, index, factor=1):
+        mask = None if self.masks is None else self.masks[index]
+        return mask if mask is None or factor == 1 else torch.from_numpy(reduced_mask(mask.numpy(), factor))
 
-    def prefetch(self, indices, masks=()):
+    def prefetch(self, indices, masks=(), factor=1):
         pass
 
     def memory(self):

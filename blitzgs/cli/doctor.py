@@ -1,0 +1,386 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command `blitzgs doctor`: does this installation work, and what is missing.
+
+It works without torch and with libraries that do not load: what may fail runs in processes of its own
+(blitzgs/cli/doctor_probes.py), which are ended when they take too long.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+from blitzgs import __version__
+from blitzgs._built import LIBRARY_DIR
+from blitzgs.cli.arguments import Commands, add_command, named_path
+
+HELP = """\
+Check this installation: torch, the GPUs, the libraries, optional packages, and small renderings that are
+compared with a float64 reference, on the CPU and on each GPU backend. Each line is
+
+  ok        it works
+  warning   it works, but not well or not everywhere
+  missing   it is not there; an optional package is needed for some commands only
+  failed    it is there and does not work
+
+and says what mends it. The exit status is 1 if something that BlitzGS cannot do without is missing or failed.
+Put the output of --json into reports of faults.
+"""
+
+State = Literal["ok", "warning", "missing", "failed"]
+_PACKAGE = Path(__file__).resolve().parents[1]
+# The largest errors of the small rendering in float32, and of its gradients relative to the largest of each.
+_IMAGE_ERROR, _GRADIENT_ERROR = 1e-5, 1e-3
+_SLOW_DISK_MB_S = 50
+_LITTLE_MEMORY = 4 << 30
+_NOT_FOR_USERS = ("test", "lint", "all")
+_REINSTALL = "pip install --force-reinstall --no-deps blitzgs (in a checkout: make build)"
+
+
+@dataclass
+class Line:
+    """A line of the report.
+
+    Attributes:
+        name: what was looked at.
+        state: see `HELP`.
+        text: what was found.
+        remedy: what mends it; "": nothing has to be mended.
+        required: BlitzGS cannot do without it.
+        values: figures for programs.
+    """
+
+    name: str
+    state: State
+    text: str
+    remedy: str = ""
+    required: bool = True
+    values: dict[str, Any] = field(default_factory=dict)
+
+
+class ProbeError(Exception):
+    """A probe failed or took too long; the message says how."""
+
+
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
+    """Add the command."""
+    parser = add_command(commands, "doctor", run, summary, HELP)
+    parser.add_argument("--json", action="store_true", help="print the report as JSON")
+    parser.add_argument(
+        "--folder",
+        type=named_path,
+        metavar="DIR",
+        help="measure the disk of this folder too, with a file of 64 MB that is removed",
+    )
+    parser.add_argument(
+        "--timeout",
+        type=float,
+        default=120.0,
+        metavar="SECONDS",
+        help="end each test after this time (default: %(default)g)",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the report; returns 1 if something required is missing or failed, else 0."""
+    lines = examine(args.folder, args.timeout)
+    broken = [line for line in lines if line.required and line.state in ("missing", "failed")]
+    if args.json:
+        print(json.dumps({"ok": not broken, "lines": [asdict(line) for line in lines]}, indent=1))
+    else:
+        for line in lines:
+            print(f"{line.state:8} {line.name:12} {line.text}")
+            if line.remedy:
+                print(f"{'':21} -> {line.remedy}")
+        print(f"\n{len(broken)} faults" if broken else "\nBlitzGS works here.")
+    return 1 if broken else 0
+
+
+def examine(folder: Path | None = None, timeout: float = 120.0) -> list[Line]:
+    """Return the lines of the report."""
+    lines = [
+        Line("blitzgs", "ok", f"{__version__} in {_PACKAGE}"),
+        _system(),
+        _memory(),
+        *_packages(),
+    ]
+    torch_line = _torch(timeout)
+    gpus = torch_line.values.get("gpus", [])
+    lines += [
+        torch_line,
+        _driver(timeout),
+        *(_gpu(number, gpu) for number, gpu in enumerate(gpus)),
+        _nvcc(timeout),
+    ]
+    works = torch_line.state in ("ok", "warning")
+    checks: list[Callable[[], Line]] = [lambda: _library("io", timeout)]
+    if works:
+        backends = ["cpu", *(["cuda"] if gpus else [])]
+        checks += [lambda name=name: _library(name, timeout, gpus) for name in backends]  # type: ignore[misc]
+        checks += [lambda device=device: _render(device, timeout) for device in backends]  # type: ignore[misc]
+        checks.append(lambda: _exchange("cpu", timeout))
+        if gpus:
+            checks.append(lambda: _exchange("cuda", timeout) if len(gpus) > 1 else _nccl(timeout))
+    if folder is not None:
+        checks.append(lambda: _disk(folder, timeout))
+    with ThreadPoolExecutor(2) as pool:
+        lines += pool.map(lambda check: check(), checks)
+    if not works:
+        lines.append(Line("self-tests", "failed", "not run without torch", torch_line.remedy))
+    return lines
+
+
+def probe(name: str, *arguments: str, timeout: float) -> dict[str, Any]:
+    """Run a probe in a process of its own and return what it found.
+
+    Raises:
+        ProbeError: it failed, crashed or took longer than `timeout` seconds.
+    """
+    command = [sys.executable, "-m", "blitzgs.cli.doctor_probes", name, *arguments]
+    output = run_command(command, timeout)
+    try:
+        found: dict[str, Any] = json.loads(output.splitlines()[-1])
+    except (IndexError, ValueError) as error:
+        raise ProbeError(f"printed no result: {output[-200:]!r}") from error
+    return found
+
+
+def run_command(command: Sequence[str], timeout: float) -> str:
+    """Run a command, with all processes that it starts, and return its standard output.
+
+    Raises:
+        ProbeError: it cannot be started, failed, was killed or took longer than `timeout` seconds.
+    """
+    path = os.pathsep.join(filter(None, [str(_PACKAGE.parent), os.environ.get("PYTHONPATH")]))
+    try:
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            env=os.environ | {"PYTHONPATH": path},
+            start_new_session=True,
+        )
+    except OSError as error:
+        raise ProbeError(f"{command[0]}: {error.strerror}") from error
+    try:
+        output, errors = process.communicate(timeout=timeout)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        raise ProbeError(f"no answer within {timeout:g} s") from None
+    if process.returncode < 0:
+        raise ProbeError(f"ended by {signal.Signals(-process.returncode).name}: {_last(errors)}")
+    if process.returncode:
+        raise ProbeError(_last(errors) or f"exit status {process.returncode}")
+    return output
+
+
+def _last(errors: str) -> str:
+    """Return the last line of a traceback that says something."""
+    lines = [line.strip() for line in errors.splitlines() if line.strip()]
+    return lines[-1][:300] if lines else ""
+
+
+def _system() -> Line:
+    cores = len(os.sched_getaffinity(0))
+    text = (
+        f"Python {platform.python_version()}, {' '.join(platform.libc_ver())}, Linux {platform.release()}, "
+        f"{cores} of {os.cpu_count()} cores"
+    )
+    if sys.platform != "linux" or platform.machine() != "x86_64":
+        return Line("system", "failed", f"{text}, {platform.machine()}", "BlitzGS runs on Linux x86-64")
+    return Line("system", "ok", text, values={"cores": cores})
+
+
+def _memory() -> Line:
+    found = re.findall(
+        r"^(MemTotal|MemAvailable): +(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE
+    )
+    total, free = (1024 * int(dict(found)[name]) for name in ("MemTotal", "MemAvailable"))
+    text = f"{free / 1e9:.1f} of {total / 1e9:.1f} GB free"
+    little = free < _LITTLE_MEMORY
+    remedy = "end other programs, or train with --data.downscale=2" if little else ""
+    return Line("memory", "warning" if little else "ok", text, remedy, False, {"bytes": total, "free": free})
+
+
+def _packages() -> list[Line]:
+    """Return a line for each package that BlitzGS needs (but torch), and for each of the extras."""
+    try:
+        wanted = metadata.requires("blitzgs") or []
+    except metadata.PackageNotFoundError:
+        return [Line("packages", "warning", "blitzgs is not installed as a package", "pip install .", False)]
+    lines = []
+    for requirement in wanted:
+        name = re.match(r"[\w.-]+", requirement)
+        extra = re.search(r"extra == ['\"](\w+)", requirement)
+        if not name or name[0] in ("torch", "blitzgs") or (extra and extra[1] in _NOT_FOR_USERS):
+            continue
+        what = f"blitzgs[{extra[1]}]" if extra else "needed"
+        try:
+            lines.append(Line(name[0], "ok", f"{metadata.version(name[0])} ({what})", "", not extra))
+        except metadata.PackageNotFoundError:
+            remedy = f"pip install '{what if extra else name[0]}'"
+            lines.append(Line(name[0], "missing", f"({what})", remedy, not extra))
+    return lines
+
+
+def torch_bounds() -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the lowest torch that BlitzGS works with, and the first one that is not tested."""
+    for requirement in metadata.requires("blitzgs") or []:
+        bounds = dict(re.findall(r"(>=|<)([\d.]+)", requirement))
+        if requirement.startswith("torch") and len(bounds) == 2:
+            return _version(bounds[">="]), _version(bounds["<"])
+    raise metadata.PackageNotFoundError("torch")
+
+
+def _version(text: str) -> tuple[int, ...]:
+    return tuple(map(int, re.findall(r"\d+", text.partition("+")[0])[:2]))
+
+
+def _torch(timeout: float) -> Line:
+    try:
+        low, high = torch_bounds()
+    except metadata.PackageNotFoundError:
+        low, high = (0,), (10**6,)
+    install = f"pip install 'torch>={'.'.join(map(str, low))},<{'.'.join(map(str, high))}'"
+    try:
+        found = probe("torch", timeout=timeout)
+    except ProbeError as error:
+        missing = "No module named 'torch'" in str(error)
+        return Line("torch", "missing" if missing else "failed", str(error), install)
+    version = _version(found["version"])
+    cuda = f"CUDA {found['cuda']}" if found["cuda"] else "for CPUs only"
+    nccl = f", NCCL {found['nccl']}" if found["nccl"] else ""
+    text = f"{found['version']}, {cuda}{nccl}, {found['threads']} threads"
+    if version < low:
+        return Line("torch", "failed", f"{text}: too old", install, values=found)
+    if version >= high:
+        return Line("torch", "warning", f"{text}: newer than what is tested", install, values=found)
+    return Line("torch", "ok", text, values=found)
+
+
+def _driver(timeout: float) -> Line:
+    query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    if shutil.which("nvidia-smi") is None:
+        return Line("driver", "missing", "no NVIDIA driver: BlitzGS trains on the CPU", "", False)
+    try:
+        version = run_command(query, timeout).split("\n")[0]
+    except ProbeError as error:
+        return Line("driver", "failed", str(error), "restart the machine, or install the driver again", False)
+    return Line("driver", "ok", f"NVIDIA {version}", "", False)
+
+
+def _gpu(number: int, gpu: dict[str, Any]) -> Line:
+    peers = f"writes to GPUs {gpu['peers']}" if gpu["peers"] else "no peer access"
+    memory = f"{gpu['free_bytes'] / 1e9:.1f} of {gpu['bytes'] / 1e9:.1f} GB free"
+    text = f"{gpu['name']}, {gpu['architecture']}, {memory}, {peers}"
+    return Line(f"GPU {number}", "ok", text, "", False, gpu)
+
+
+def _nvcc(timeout: float) -> Line:
+    if shutil.which("nvcc") is None:
+        return Line("nvcc", "missing", "only needed to build the CUDA library from the sources", "", False)
+    try:
+        found = re.search(r"release [\d.]+", run_command(["nvcc", "--version"], timeout))
+    except ProbeError as error:
+        return Line("nvcc", "warning", str(error), "", False)
+    return Line("nvcc", "ok", found[0] if found else "", "", False)
+
+
+def _library(name: str, timeout: float, gpus: Sequence[dict[str, Any]] = ()) -> Line:
+    path = LIBRARY_DIR / f"libblitzgs_{name}.so"
+    line = f"lib {name}"
+    if not path.exists():
+        return Line(line, "missing", str(path), _REINSTALL)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    text = f"{path.stat().st_size / 1e6:.1f} MB, sha256 {digest}"
+    try:
+        found = probe("library", name, timeout=timeout)
+    except ProbeError as error:
+        return Line(line, "failed", f"{text}: {error}", _REINSTALL)
+    if "cuda" in found:
+        text += f", CUDA {found['cuda']} for {found['architectures']}"
+        native = [gpu["architecture"].removeprefix("sm_") for gpu in gpus]
+        foreign = [arch for arch in native if arch not in re.split(r"\D+", found["architectures"])]
+        if foreign and found["architectures"] != "native":
+            remedy = "the driver compiles the kernels at the first use; to avoid it: make build"
+            return Line(line, "warning", f"{text}, not for sm_{foreign[0]}", remedy, values=found)
+    return Line(line, "ok", text, values=found | {"sha256": digest})
+
+
+def _render(device: str, timeout: float) -> Line:
+    try:
+        found = probe("render", device, timeout=timeout)
+    except ProbeError as error:
+        return Line(f"render {device}", "failed", str(error), _REINSTALL)
+    good = found["image_error"] <= _IMAGE_ERROR and found["gradient_error"] <= _GRADIENT_ERROR
+    text = (
+        f"error of the image {found['image_error']:.1e}, of gradients {found['gradient_error']:.1e} "
+        f"({found['seconds']:.1f} s)"
+    )
+    remedy = "" if good else "report this with `blitzgs doctor --json`"
+    return Line(f"render {device}", "ok" if good else "failed", text, remedy, values=found)
+
+
+def _exchange(device: str, timeout: float) -> Line:
+    """Let two processes render together."""
+    port = _free_port()
+    name = "exchange " + ("Gloo" if device == "cpu" else "NCCL")
+    try:
+        with ThreadPoolExecutor(2) as pool:
+            found = list(pool.map(lambda rank: probe("exchange", device, rank, port, timeout=timeout), "01"))
+    except ProbeError as error:
+        remedy = "allow connections to 127.0.0.1; until then train with one process"
+        return Line(name, "failed", str(error), remedy, False)
+    good = all(part["differing_values"] == 0 and part["covered"] > 0.1 for part in found)
+    text = f"two ranks, {found[0]['backend']}: " + (
+        "the bits of one" if good else "another image than one rank's"
+    )
+    remedy = "" if good else "report this with `blitzgs doctor --json`"
+    return Line(name, "ok" if good else "failed", text, remedy, False, {"ranks": found})
+
+
+def _nccl(timeout: float) -> Line:
+    try:
+        good = probe("nccl", _free_port(), timeout=timeout)["sum"] == 28.0
+    except ProbeError as error:
+        return Line("exchange NCCL", "failed", str(error), "NCCL_DEBUG=WARN blitzgs doctor", False)
+    text = "one GPU: it sums" if good else "one GPU: a wrong sum"
+    return Line("exchange NCCL", "ok" if good else "failed", text, "", False)
+
+
+def _free_port() -> str:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return str(listener.getsockname()[1])
+
+
+def _disk(folder: Path, timeout: float) -> Line:
+    try:
+        found = probe("disk", str(folder), timeout=timeout)
+    except ProbeError as error:
+        return Line("disk", "failed", f"{folder}: {error}", "choose a folder that can be written", False)
+    slow = min(found["write_mb_s"], found["read_mb_s"]) < _SLOW_DISK_MB_S
+    text = (
+        f"{folder}: writes {found['write_mb_s']:.0f} and reads {found['read_mb_s']:.0f} MB/s, "
+        f"{found['free_bytes'] / 1e9:.0f} GB free"
+    )
+    remedy = "keep captures and runs on a local disk" if slow else ""
+    return Line("disk", "warning" if slow else "ok", text, remedy, False, found)

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `blitzgs doctor` tries in processes of its own, because it may crash or hang there.
+
+Each probe prints one line of JSON: `python -m blitzgs.cli.doctor_probes NAME ARGUMENTS`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from blitzgs.reference.render import ReferenceImage
+
+_WIDTH, _HEIGHT, _COUNT = 48, 32, 60
+_DISK_BYTES = 64 << 20
+
+
+def torch_() -> dict[str, Any]:
+    """Return what torch says of itself and of the GPUs."""
+    import torch
+
+    gpus = range(torch.cuda.device_count() if torch.cuda.is_available() else 0)
+    return {
+        "version": torch.__version__,
+        "cuda": torch.version.cuda,
+        "threads": torch.get_num_threads(),
+        "gpus": [
+            {
+                "name": torch.cuda.get_device_name(i),
+                "architecture": "sm_{}{}".format(*torch.cuda.get_device_capability(i)),
+                "bytes": torch.cuda.mem_get_info(i)[1],
+                "free_bytes": torch.cuda.mem_get_info(i)[0],
+                "peers": [j for j in gpus if j != i and torch.cuda.can_device_access_peer(i, j)],
+            }
+            for i in gpus
+        ],
+        "nccl": ".".join(map(str, torch.cuda.nccl.version())) if len(gpus) else None,
+    }
+
+
+def library(name: str) -> dict[str, Any]:
+    """Load a library; return the digest of its ops, and with which CUDA it was built."""
+    import ctypes
+
+    from blitzgs import _built
+
+    path = _built.LIBRARY_DIR / f"libblitzgs_{name}.so"
+    if name == "io":
+        from blitzgs.formats import native
+
+        return {"models": len(native.camera_models())}
+    import torch
+
+    torch.ops.load_library(str(path))
+    found = {"ops": _built.schema_digest(path)}
+    if _built.REGISTRATION.exists() and found["ops"] != _built.source_digest(_built.REGISTRATION):
+        raise ImportError(
+            f"{path} was built before the ops changed (it does not match csrc/registration.cpp)"
+        )
+    if name == "cuda":
+        build = ctypes.CDLL(str(path)).blitzgs_cuda_build
+        build.restype = ctypes.c_char_p
+        found["cuda"], found["architectures"] = build().decode().split(" ")
+    return found
+
+
+def render(device: str) -> dict[str, Any]:
+    """Render a small scene and differentiate it; return the largest errors against the float64 reference."""
+    import torch
+
+    tensors = [tensor.to(device).requires_grad_() for tensor in _scene()]
+    viewmat, K = (tensor.to(device) for tensor in _camera(0))
+    begin = time.perf_counter()
+    images = _rendered(tensors, viewmat, K, False)
+    leaves, reference = _reference()
+    weights = torch.randn(reference.image.shape, generator=_generator(), dtype=torch.float64)
+    weights[reference.cut] = 0  # where rounding decides whether a Gaussian counts
+    (images[0].double().cpu() * weights).sum().backward()
+    (reference.image * weights).sum().backward()
+    image = (images[0].detach().double().cpu() - reference.image.detach()).abs()
+    gradients = []
+    for ours, exact in zip(tensors, leaves, strict=True):
+        assert ours.grad is not None and exact.grad is not None
+        gradients.append((ours.grad.double().cpu() - exact.grad).abs().max() / exact.grad.abs().max())
+    return {
+        "image_error": float(image[~reference.cut].max()),
+        "gradient_error": float(max(gradients)),
+        "seconds": time.perf_counter() - begin,
+    }
+
+
+def exchange(device: str, rank: str, port: str) -> dict[str, Any]:
+    """Render one view with Gaussians divided between two ranks; return how it differs from one rank's."""
+    import torch
+
+    from blitzgs.distributed.group import Ranks
+
+    os.environ.update(RANK=rank, LOCAL_RANK=rank, WORLD_SIZE="2", LOCAL_WORLD_SIZE="2")
+    os.environ.update(MASTER_ADDR="127.0.0.1", MASTER_PORT=port)
+    with Ranks.from_environment(device, timeout_seconds=30) as ranks:
+        viewmat, K, *scene = (tensor.to(ranks.device) for tensor in (*_camera(int(rank)), *_scene()))
+        half = slice(0, 20) if rank == "0" else slice(20, None)
+        begin = time.perf_counter()
+        together = _rendered([tensor[half].contiguous() for tensor in scene], viewmat, K, True)
+        seconds = time.perf_counter() - begin
+        alone = _rendered(scene, viewmat, K, False)
+        ranks.barrier()
+        return {
+            "differing_values": int((together != alone).sum()),
+            "covered": float((alone > 0).double().mean()),
+            "seconds": seconds,
+            "backend": torch.distributed.get_backend(),
+        }
+
+
+def nccl(port: str) -> dict[str, Any]:
+    """Sum over one rank with NCCL, which is what one GPU can try."""
+    import torch
+
+    torch.distributed.init_process_group("nccl", f"tcp://127.0.0.1:{port}", world_size=1, rank=0)
+    values = torch.arange(8.0, device="cuda")
+    torch.distributed.all_reduce(values)
+    total = float(values.sum())
+    torch.distributed.destroy_process_group()
+    return {"sum": total}
+
+
+def disk(folder: str) -> dict[str, Any]:
+    """Write and read a file; return megabytes a second."""
+    data = os.urandom(1 << 20)
+    with tempfile.TemporaryFile(dir=folder) as file:
+        begin = time.perf_counter()
+        for _ in range(_DISK_BYTES // len(data)):
+            file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+        written = time.perf_counter()
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        file.seek(0)
+        count = 0
+        while block := file.read(1 << 20):
+            count += block == data
+        read = time.perf_counter()
+    if count * len(data) != _DISK_BYTES:
+        raise OSError(f"{folder}: what was written is not what is read")
+    room = os.statvfs(folder)
+    return {
+        "write_mb_s": _DISK_BYTES / (written - begin) / 1e6,
+        "read_mb_s": _DISK_BYTES / (read - written) / 1e6,
+        "free_bytes": room.f_bavail * room.f_frsize,
+    }
+
+
+def _generator() -> Any:
+    import torch
+
+    return torch.Generator().manual_seed(4)
+
+
+def _scene() -> list[Tensor]:
+    """Return the means, quats, scales, opacities and SH coefficients of some Gaussians, float32."""
+    import torch
+
+    generator = _generator()
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(_COUNT, *shape, generator=generator)
+
+    means = torch.cat([uniform(-1.2, 1.2, 1), uniform(-0.8, 0.8, 1), uniform(2, 4, 1)], dim=1)
+    return [means, uniform(-1, 1, 4), uniform(0.05, 0.3, 3), uniform(0.2, 0.9), uniform(-0.3, 0.8, 4, 3)]
+
+
+def _camera(number: int) -> tuple[Tensor, Tensor]:
+    import torch
+
+    viewmat = torch.eye(4)
+    viewmat[0, 3] = 0.1 * number
+    return viewmat, torch.tensor([[40.0, 0, _WIDTH / 2], [0, 40.0, _HEIGHT / 2], [0, 0, 1]])
+
+
+def _rendered(scene: list[Tensor], viewmat: Tensor, K: Tensor, distributed: bool) -> Tensor:
+    """Return an image [1, H, W, 3]."""
+    import blitzgs
+
+    means, quats, scales, opacities, colors = scene
+    return blitzgs.rasterization(
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmat[None],
+        K[None],
+        _WIDTH,
+        _HEIGHT,
+        sh_degree=1,
+        distributed=distributed,
+    )[0]
+
+
+def _reference() -> tuple[list[Tensor], ReferenceImage]:
+    from blitzgs.reference.render import render as render_reference
+
+    leaves = [tensor.double().requires_grad_() for tensor in _scene()]
+    means, quats, scales, opacities, colors = leaves
+    viewmat, K = _camera(0)
+    return leaves, render_reference(
+        means, quats, scales, opacities, colors, viewmat, K, _WIDTH, _HEIGHT, sh_degree=1
+    )
+
+
+PROBES: dict[str, Callable[..., dict[str, Any]]] = {
+    "torch": torch_,
+    "library": library,
+    "render": render,
+    "exchange": exchange,
+    "nccl": nccl,
+    "disk": disk,
+}
+
+if __name__ == "__main__":
+    print(json.dumps(PROBES[sys.argv[1]](*sys.argv[2:])))

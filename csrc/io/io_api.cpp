@@ -1,0 +1,419 @@
+// SPDX-License-Identifier: Apache-2.0
+// The C interface of the host-side readers and writers, libblitzgs_io.so: one function that runs another one
+// by its name. Arguments and results are columns of numbers or of characters. The library depends neither on
+// torch nor on the version of Python; blitzgs/formats/native.py is its public face.
+#include "io/io_api.h"
+
+#include <algorithm>
+#include <atomic>
+#include <cerrno>
+#include <cstring>
+#include <fstream>
+#include <iterator>
+#include <memory>
+#include <new>
+#include <span>
+#include <stdexcept>
+#include <string>
+#include <string_view>
+#include <tuple>
+#include <type_traits>
+#include <utility>
+#include <vector>
+
+#include "io/colmap.h"
+#include "io/image_header.h"
+#include "io/jpeg.h"
+#include "io/ply.h"
+#include "io/qoi.h"
+
+namespace {
+
+namespace io = blitzgs::io;
+using Bytes = std::span<const std::uint8_t>;
+
+template <class T>
+constexpr std::int32_t type_of() {
+  if constexpr (std::is_same_v<T, std::uint8_t>) return BLITZGS_IO_UINT8;
+  if constexpr (std::is_same_v<T, std::uint32_t>) return BLITZGS_IO_UINT32;
+  if constexpr (std::is_same_v<T, std::int64_t>) return BLITZGS_IO_INT64;
+  if constexpr (std::is_same_v<T, std::uint64_t>) return BLITZGS_IO_UINT64;
+  if constexpr (std::is_same_v<T, double>) return BLITZGS_IO_FLOAT64;
+}
+
+// Thrown if a file cannot be written; OSError in Python.
+struct WriteError : std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+
+// The columns of a call, taken in order.
+class Arguments {
+ public:
+  explicit Arguments(std::span<const blitzgs_io_column> columns) : columns_(columns) {}
+
+  template <class T>
+  std::span<const T> take() {
+    if (next_ == columns_.size()) throw std::logic_error("an argument is missing");
+    const blitzgs_io_column& column = columns_[next_++];
+    if (column.type != type_of<T>()) throw std::logic_error("an argument has another type");
+    return {static_cast<const T*>(column.data), column.size};
+  }
+  template <class T>
+  std::vector<T> vector() {
+    const auto values = take<T>();
+    return {values.begin(), values.end()};
+  }
+  template <class T = std::uint64_t>
+  T number() {
+    return take<T>()[0];
+  }
+  std::string text() {
+    const Bytes bytes = take<std::uint8_t>();
+    return {bytes.begin(), bytes.end()};
+  }
+  // Texts in one column, of which the next one has the ends.
+  std::vector<std::string> texts() {
+    const Bytes bytes = take<std::uint8_t>();
+    std::vector<std::string> out;
+    std::uint64_t begin = 0;
+    for (const std::uint64_t end : take<std::uint64_t>()) {
+      out.emplace_back(bytes.begin() + begin, bytes.begin() + end);
+      begin = end;
+    }
+    return out;
+  }
+
+ private:
+  std::span<const blitzgs_io_column> columns_;
+  std::size_t next_ = 0;
+};
+
+}  // namespace
+
+// The results own their memory.
+struct blitzgs_io_reply {
+  int status = BLITZGS_IO_OK;
+  std::string message;
+  std::vector<blitzgs_io_column> columns;
+  std::vector<std::shared_ptr<const void>> held;
+
+  template <class T>
+  void add(std::vector<T>&& values) {
+    const auto owner = std::make_shared<const std::vector<T>>(std::move(values));
+    columns.push_back({owner->data(), owner->size(), type_of<T>()});
+    held.push_back(owner);
+  }
+  template <class T = std::uint64_t>
+  void add_number(T value) {
+    add(std::vector<T>{value});
+  }
+  void add_text(std::string_view text) { add(std::vector<std::uint8_t>(text.begin(), text.end())); }
+  template <class Texts>
+  void add_texts(const Texts& texts) {
+    std::vector<std::uint8_t> bytes;
+    std::vector<std::uint64_t> ends;
+    for (const std::string_view text : texts) {
+      bytes.insert(bytes.end(), text.begin(), text.end());
+      ends.push_back(bytes.size());
+    }
+    add(std::move(bytes));
+    add(std::move(ends));
+  }
+  std::uint8_t* add_uninitialised(std::size_t size) {
+    const auto owner = std::make_shared_for_overwrite<std::uint8_t[]>(size);
+    columns.push_back({owner.get(), size, BLITZGS_IO_UINT8});
+    held.push_back(owner);
+    return owner.get();
+  }
+};
+
+namespace {
+
+using Reply = blitzgs_io_reply;
+
+bool is_text(const std::string& path) { return path.ends_with(".txt"); }
+
+std::ifstream opened(const std::string& path) {
+  std::ifstream in(path, std::ios::binary);
+  if (!in) throw io::FormatError(path, "cannot be opened");
+  return in;
+}
+
+template <class Write>
+void to_file(const std::string& path, Write write) {
+  std::ofstream out(path, std::ios::binary | std::ios::trunc);
+  if (!out) throw WriteError(path + ": cannot be opened for writing: " + std::strerror(errno));
+  write(out);
+  out.close();
+  if (!out) throw WriteError(path + ": writing failed: " + std::strerror(errno));
+}
+
+void camera_models(Arguments&, Reply& reply) {
+  std::vector<std::string_view> names, params;
+  std::vector<std::int64_t> ids;
+  for (const io::CameraModel& model : io::camera_models()) {
+    ids.push_back(model.id);
+    names.push_back(model.name);
+    params.push_back(model.params);
+  }
+  reply.add(std::move(ids));
+  reply.add_texts(names);
+  reply.add_texts(params);
+}
+
+void read_cameras(Arguments& arguments, Reply& reply) {
+  const std::string path = arguments.text();
+  std::ifstream in = opened(path);
+  const auto cameras = is_text(path) ? io::read_cameras_text(in, path) : io::read_cameras_binary(in, path);
+  std::vector<std::uint32_t> ids;
+  std::vector<std::string_view> models;
+  std::vector<std::uint64_t> widths, heights, ends;
+  std::vector<double> params;
+  for (const io::ColmapCamera& camera : cameras) {
+    ids.push_back(camera.id);
+    models.push_back(io::find_camera_model(camera.model)->name);
+    widths.push_back(camera.width);
+    heights.push_back(camera.height);
+    params.insert(params.end(), camera.params.begin(), camera.params.end());
+    ends.push_back(params.size());
+  }
+  reply.add(std::move(ids));
+  reply.add_texts(models);
+  reply.add(std::move(widths));
+  reply.add(std::move(heights));
+  reply.add(std::move(params));
+  reply.add(std::move(ends));
+}
+
+void read_images(Arguments& arguments, Reply& reply) {
+  const std::string path = arguments.text();
+  const bool with_points2d = arguments.number() != 0;
+  std::ifstream in = opened(path);
+  auto images = is_text(path) ? io::read_images_text(in, path, with_points2d)
+                              : io::read_images_binary(in, path, with_points2d);
+  reply.add(std::move(images.ids));
+  reply.add(std::move(images.quats));
+  reply.add(std::move(images.translations));
+  reply.add(std::move(images.camera_ids));
+  reply.add_texts(images.names);
+  reply.add(std::move(images.point2d_offsets));
+  reply.add(std::move(images.points2d));
+  reply.add(std::move(images.point3d_ids));
+}
+
+void read_points(Arguments& arguments, Reply& reply) {
+  const std::string path = arguments.text();
+  const bool with_tracks = arguments.number() != 0;
+  std::ifstream in = opened(path);
+  auto points = is_text(path) ? io::read_points_text(in, path, with_tracks)
+                              : io::read_points_binary(in, path, with_tracks);
+  reply.add(std::move(points.ids));
+  reply.add(std::move(points.positions));
+  reply.add(std::move(points.colors));
+  reply.add(std::move(points.errors));
+  reply.add(std::move(points.track_offsets));
+  reply.add(std::move(points.track_image_ids));
+  reply.add(std::move(points.track_point2d_ids));
+}
+
+void write_cameras(Arguments& arguments, Reply&) {
+  const std::string path = arguments.text();
+  const auto ids = arguments.take<std::uint32_t>();
+  const std::vector<std::string> models = arguments.texts();
+  const auto widths = arguments.take<std::uint64_t>();
+  const auto heights = arguments.take<std::uint64_t>();
+  const auto params = arguments.take<double>();
+  const auto ends = arguments.take<std::uint64_t>();
+  std::vector<io::ColmapCamera> cameras;
+  for (std::size_t i = 0; i < ids.size(); ++i) {
+    const io::CameraModel* known = io::find_camera_model(models[i]);
+    if (!known) throw std::invalid_argument("unknown camera model " + models[i]);
+    const std::uint64_t begin = i ? ends[i - 1] : 0;
+    cameras.push_back({ids[i], known->id, widths[i], heights[i],
+                       std::vector<double>(params.begin() + begin, params.begin() + ends[i])});
+  }
+  io::check_columns(cameras);
+  to_file(path, [&](std::ostream& out) {
+    is_text(path) ? io::write_cameras_text(out, cameras) : io::write_cameras_binary(out, cameras);
+  });
+}
+
+void write_images(Arguments& arguments, Reply&) {
+  const std::string path = arguments.text();
+  io::ColmapImages images;
+  images.ids = arguments.vector<std::uint32_t>();
+  images.quats = arguments.vector<double>();
+  images.translations = arguments.vector<double>();
+  images.camera_ids = arguments.vector<std::uint32_t>();
+  images.names = arguments.texts();
+  images.point2d_offsets = arguments.vector<std::uint64_t>();
+  images.points2d = arguments.vector<double>();
+  images.point3d_ids = arguments.vector<std::int64_t>();
+  // Before the file is opened, so that bad columns leave no file behind.
+  io::check_columns(images);
+  if (is_text(path)) io::check_text_names(images);
+  to_file(path, [&](std::ostream& out) {
+    is_text(path) ? io::write_images_text(out, images) : io::write_images_binary(out, images);
+  });
+}
+
+void write_points(Arguments& arguments, Reply&) {
+  const std::string path = arguments.text();
+  io::ColmapPoints points;
+  points.ids = arguments.vector<std::int64_t>();
+  points.positions = arguments.vector<double>();
+  points.colors = arguments.vector<std::uint8_t>();
+  points.errors = arguments.vector<double>();
+  points.track_offsets = arguments.vector<std::uint64_t>();
+  points.track_image_ids = arguments.vector<std::uint32_t>();
+  points.track_point2d_ids = arguments.vector<std::uint32_t>();
+  io::check_columns(points);
+  to_file(path, [&](std::ostream& out) {
+    is_text(path) ? io::write_points_text(out, points) : io::write_points_binary(out, points);
+  });
+}
+
+constexpr std::string_view kNumpyTypes[] = {"i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"};
+
+void read_ply(Arguments& arguments, Reply& reply) {
+  const std::string path = arguments.text();
+  std::ifstream in = opened(path);
+  io::PlyTable table = io::read_ply(in, path);
+  std::vector<std::string_view> names, types;
+  for (const io::PlyProperty& property : table.properties) {
+    names.push_back(property.name);
+    types.push_back(kNumpyTypes[static_cast<int>(property.type)]);
+  }
+  reply.add_texts(table.comments);
+  reply.add_texts(names);
+  reply.add_texts(types);
+  reply.add_number(table.count);
+  reply.add(std::move(table.rows));
+}
+
+void write_ply(Arguments& arguments, Reply&) {
+  const std::string path = arguments.text();
+  io::PlyTable table;
+  table.comments = arguments.texts();
+  const std::vector<std::string> names = arguments.texts();
+  const std::vector<std::string> types = arguments.texts();
+  for (std::size_t i = 0; i < names.size(); ++i) {
+    const auto found = std::find(std::begin(kNumpyTypes), std::end(kNumpyTypes), types[i]);
+    if (found == std::end(kNumpyTypes)) throw std::invalid_argument("ply: unknown type " + types[i]);
+    table.properties.push_back({names[i], static_cast<io::PlyType>(found - std::begin(kNumpyTypes))});
+  }
+  table.count = arguments.number();
+  table.rows = arguments.vector<std::uint8_t>();
+  to_file(path, [&](std::ostream& out) { io::write_ply(out, table); });
+}
+
+void check_jpeg(Arguments& arguments, Reply&) {
+  const Bytes file = arguments.take<std::uint8_t>();
+  io::check_jpeg(file, arguments.text());
+}
+
+void check_png(Arguments& arguments, Reply&) {
+  const Bytes file = arguments.take<std::uint8_t>();
+  io::check_png(file, arguments.text());
+}
+
+void read_image_header(Arguments& arguments, Reply& reply) {
+  const Bytes file = arguments.take<std::uint8_t>();
+  const io::ImageHeader header = io::read_image_header(file, arguments.text());
+  constexpr std::string_view kAlpha[] = {"", "straight", "associated"};
+  constexpr std::string_view kSamples[] = {"uint", "int", "float"};
+  reply.add_texts(std::vector<std::string_view>{header.format, kSamples[static_cast<int>(header.samples)],
+                                                kAlpha[static_cast<int>(header.alpha)]});
+  reply.add(std::vector<std::uint64_t>{header.width, header.height, header.orientation, header.bits,
+                                       header.colors, header.extras});
+  reply.add(
+      std::vector<std::uint8_t>{header.supported, header.is_white_zero, header.is_lossy, header.is_planar});
+  reply.add_number(header.transparent_grey ? std::int64_t{*header.transparent_grey} : std::int64_t{-1});
+}
+
+void tiff_as_stored(Arguments& arguments, Reply& reply) {
+  const Bytes file = arguments.take<std::uint8_t>();
+  reply.add(io::tiff_as_stored(file, arguments.text()));
+}
+
+void encode_qoi(Arguments& arguments, Reply& reply) {
+  const Bytes rgb = arguments.take<std::uint8_t>();
+  const auto height = static_cast<std::uint32_t>(arguments.number());
+  const auto width = static_cast<std::uint32_t>(arguments.number());
+  reply.add(io::encode_qoi(rgb.data(), {width, height}));
+}
+
+void decode_qoi(Arguments& arguments, Reply& reply) {
+  const Bytes file = arguments.take<std::uint8_t>();
+  const io::QoiSize size = io::qoi_size(file);
+  reply.add(std::vector<std::uint64_t>{size.height, size.width});
+  io::decode_qoi(file, reply.add_uninitialised(std::size_t{3} * size.height * size.width));
+}
+
+// Flags in memory that several processes share: a process that sees a flag also sees all that was written
+// before the flag was set.
+std::atomic_ref<std::uint8_t> flag_of(Arguments& arguments) {
+  return std::atomic_ref(*const_cast<std::uint8_t*>(arguments.take<std::uint8_t>().data()));
+}
+void set_flag(Arguments& arguments, Reply&) { flag_of(arguments).store(1, std::memory_order_release); }
+void flag_is_set(Arguments& arguments, Reply& reply) {
+  reply.add_number<std::uint8_t>(flag_of(arguments).load(std::memory_order_acquire));
+}
+
+struct Function {
+  std::string_view name;
+  void (*call)(Arguments&, Reply&);
+};
+#define BLITZGS_IO_FUNCTION(name) {#name, &name}
+constexpr Function kFunctions[] = {
+    BLITZGS_IO_FUNCTION(camera_models),  BLITZGS_IO_FUNCTION(read_cameras),
+    BLITZGS_IO_FUNCTION(read_images),    BLITZGS_IO_FUNCTION(read_points),
+    BLITZGS_IO_FUNCTION(write_cameras),  BLITZGS_IO_FUNCTION(write_images),
+    BLITZGS_IO_FUNCTION(write_points),   BLITZGS_IO_FUNCTION(read_ply),
+    BLITZGS_IO_FUNCTION(write_ply),      BLITZGS_IO_FUNCTION(check_jpeg),
+    BLITZGS_IO_FUNCTION(check_png),      BLITZGS_IO_FUNCTION(read_image_header),
+    BLITZGS_IO_FUNCTION(tiff_as_stored), BLITZGS_IO_FUNCTION(encode_qoi),
+    BLITZGS_IO_FUNCTION(decode_qoi),     BLITZGS_IO_FUNCTION(set_flag),
+    BLITZGS_IO_FUNCTION(flag_is_set),
+};
+
+// Returns the status of a call, and the message of its exception.
+std::pair<int, std::string> run(std::string_view name, Arguments arguments, Reply& reply) {
+  try {
+    const auto found = std::find_if(std::begin(kFunctions), std::end(kFunctions),
+                                    [&](const Function& function) { return function.name == name; });
+    if (found == std::end(kFunctions)) throw std::logic_error("there is no such function");
+    found->call(arguments, reply);
+    return {BLITZGS_IO_OK, ""};
+  } catch (const io::FormatError& error) {
+    return {BLITZGS_IO_FORMAT_ERROR, error.what()};
+  } catch (const WriteError& error) {
+    return {BLITZGS_IO_WRITE_ERROR, error.what()};
+  } catch (const std::logic_error& error) {  // std::invalid_argument, mostly
+    return {BLITZGS_IO_VALUE_ERROR, error.what()};
+  } catch (const std::bad_alloc& error) {
+    return {BLITZGS_IO_MEMORY_ERROR, error.what()};
+  } catch (const std::exception& error) {
+    return {BLITZGS_IO_ERROR, error.what()};
+  }
+}
+
+}  // namespace
+
+blitzgs_io_reply* blitzgs_io_call(const char* name, const blitzgs_io_column* arguments, std::size_t count) {
+  try {
+    auto reply = std::make_unique<blitzgs_io_reply>();
+    std::tie(reply->status, reply->message) = run(name, Arguments({arguments, count}), *reply);
+    return reply.release();
+  } catch (const std::bad_alloc&) {
+    return nullptr;
+  }
+}
+
+int blitzgs_io_status(const blitzgs_io_reply* reply) { return reply->status; }
+const char* blitzgs_io_message(const blitzgs_io_reply* reply) { return reply->message.c_str(); }
+std::size_t blitzgs_io_columns(const blitzgs_io_reply* reply, const blitzgs_io_column** columns) {
+  *columns = reply->columns.data();
+  return reply->columns.size();
+}
+void blitzgs_io_free(blitzgs_io_reply* reply) { delete reply; }

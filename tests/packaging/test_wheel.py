@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The wheel in dist/ works in fresh environments without a compiler; `make test-wheel` runs this.
+
+Each environment downloads a torch, which takes gigabytes. Interpreters that are not there are skipped:
+PYTHONS="/path/python3.10 /path/python3.13" names others than those in PATH.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+WHEELS = sorted((ROOT / "dist").glob("blitzgs-*manylinux_2_28_x86_64.whl"))
+ARCHIVES = sorted((ROOT / "dist").glob("blitzgs-*.tar.gz"))
+PYTHONS = os.environ.get("PYTHONS", "python3.10 python3.13").split()
+TORCHES = os.environ.get("TORCHES", "2.11.0 2.13.0").split()
+CALL = """
+import torch, blitzgs
+means = torch.tensor([[0.0, 0, 2], [0.2, 0, 3]], requires_grad=True)
+image, alpha, meta = blitzgs.rasterization(
+    means, torch.tensor([[1.0, 0, 0, 0]] * 2), torch.full((2, 3), 0.2), torch.full((2,), 0.5),
+    torch.tensor([[1.0, 0, 0], [0, 1, 0]]), torch.eye(4)[None],
+    torch.tensor([[[32.0, 0, 16], [0, 32, 16], [0, 0, 1]]]), 32, 32)
+image.sum().backward()
+assert means.grad.abs().max() > 0
+print(float(image[0, 16, 16, 0]), float(image[0, 16, 16, 1]))
+"""
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
+
+
+@pytest.fixture(scope="module", params=[(p, t) for p in PYTHONS for t in TORCHES], ids="-torch".join)
+def environment(request, tmp_path_factory):
+    """A fresh environment with the wheel; the PATH of its programs has no compiler."""
+    python, torch = request.param
+    if shutil.which(python) is None:
+        pytest.skip(f"{python} is not here")
+    assert WHEELS, "build the wheel first: make wheel"
+    folder = tmp_path_factory.mktemp("environment")
+    uv = shutil.which("uv")
+    if uv is None:
+        pytest.skip("needs uv, whose environments share their files: pip install uv")
+    subprocess.run([uv, "venv", "-q", "--python", shutil.which(python), folder], check=True)
+    install = [uv, "pip", "install", "-q", "--python", folder / "bin" / "python", f"torch=={torch}"]
+    subprocess.run([*install, f"blitzgs[synth] @ file://{WHEELS[-1]}"], check=True)
+    return folder
+
+
+def run(environment, *command):
+    """Run a program of the environment and return its output."""
+    variables = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "BLITZGS", "CUDA_HOME"))}
+    done = subprocess.run(
+        [environment / "bin" / command[0], *command[1:]],
+        env=variables | {"PATH": str(environment / "bin"), "PIP_NO_INDEX": "1"},
+        cwd=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_the_doctor_finds_no_fault(environment):
+    assert shutil.which("c++", path=str(environment / "bin")) is None
+    found = json.loads(run(environment, "blitzgs", "doctor", "--json"))
+    lines = {line["name"]: line for line in found["lines"]}
+    assert found["ok"] and lines["blitzgs"]["text"].endswith("site-packages/blitzgs")
+    assert lines["nvcc"]["state"] == "missing" and lines["exchange Gloo"]["state"] == "ok"
+
+
+def test_the_public_call(environment):
+    red, green = map(float, run(environment, "python", "-c", CALL).split())
+    # 0.5 of the first Gaussian near its centre, then a part of the rest from the second, off its centre.
+    assert 0.45 < red < 0.5 and 0.0 < green < 0.25
+
+
+def test_a_first_model(environment):
+    run(environment, "blitzgs", "synth", "city", "--views=24", "--width=96", "--height=64")
+    arguments = ("--config=smoke", "--data=city", "--out=run", "--schedule.scale=0.05", "--log.pictures=0")
+    run(environment, "blitzgs", "train", *arguments)
+    summary = json.loads((environment / "run" / "summary.json").read_text())
+    assert summary["psnr"] > 12
+    run(environment, "blitzgs", "export", "run", "--ply", "model.ply")
+    assert (environment / "model.ply").read_bytes().startswith(b"ply\n")
+
+
+def test_the_sources_install(tmp_path):
+    """`pip install` of the archive builds the libraries of the CPU, with this environment's torch."""
+    assert ARCHIVES, "build the archive first: make sdist"
+    python = ROOT / ".venv" / "bin" / "python"
+    target = tmp_path / "target"
+    command = [python, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--target", target]
+    path = f"{python.parent}{os.pathsep}{os.environ['PATH']}"
+    environment = os.environ | {"BLITZGS_CUDA": "OFF", "PATH": path}
+    subprocess.run([*command, ARCHIVES[-1]], check=True, env=environment, cwd=tmp_path)
+    names = {path.name for path in (target / "blitzgs" / "_lib").iterdir()}
+    assert names == {"libblitzgs_cpu.so", "libblitzgs_io.so"}
+    variables = os.environ | {"PYTHONPATH": str(target)}
+    done = subprocess.run([python, "-c", CALL], capture_output=True, text=True, env=variables, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
