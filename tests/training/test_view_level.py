@@ -113,7 +113,8 @@ def test_what_the_run_says_and_saves(whole_run):
     assert again["gated_views"] == progress.gated_views.count("1") and again["kept"] < 0.95
     assert events_of(folder, "clear_cull")[0]["t"] == 85 and CULL not in trainer.state.table
     saved = run_files.open_model(folder, Ranks())
-    assert saved.progress == progress
+    # What comes after the checkpoint takes time, too.
+    assert saved.progress == dataclasses.replace(progress, stages=saved.progress.stages)
     gate = scene_gate(saved.config, saved.progress, saved.table, Ranks())
     assert gate.gate == scene_gate(trainer.state.config, progress, trainer.state.table, Ranks()).gate
 
