@@ -123,16 +123,17 @@ sanitize-%:
 	  $(PYTHON) tests/small_suite.py $(SANITIZE_TESTS)
 
 # The readers of foreign files under libFuzzer with AddressSanitizer and UBSan, FUZZ_SECONDS each. What it finds lies
-# in build-fuzz; add it to csrc/io/fuzz/corpus once it is mended. Needs clang (Debian: apt-get install clang).
+# in build-fuzz; add it to csrc/io/fuzz/corpus.tar.gz once it is mended. Needs clang (Debian: apt-get install clang).
 FUZZ_CXX ?= clang++
 FUZZ_SECONDS ?= 60
 FUZZERS = jpeg image_header qoi ply colmap_binary colmap_text
 FUZZ_SOURCES = csrc/io/fuzz/readers_fuzz.cpp $(filter-out %_test.cpp %/io_api.cpp,$(wildcard csrc/io/*.cpp))
 fuzz: $(FUZZERS:%=fuzz-%)
 fuzz-%: build-fuzz/%
-	mkdir -p build-fuzz/corpus/$*
+	mkdir -p build-fuzz/found/$*
+	tar -C build-fuzz -xzf csrc/io/fuzz/corpus.tar.gz corpus/$*
 	build-fuzz/$* -max_total_time=$(FUZZ_SECONDS) -max_len=16384 -timeout=10 -rss_limit_mb=2048 -print_final_stats=1 \
-	  -verbosity=0 -artifact_prefix=build-fuzz/$*- build-fuzz/corpus/$* csrc/io/fuzz/corpus/$*
+	  -verbosity=0 -artifact_prefix=build-fuzz/$*- build-fuzz/found/$* build-fuzz/corpus/$*
 build-fuzz/%: $(FUZZ_SOURCES) $(wildcard csrc/io/*.h)
 	mkdir -p build-fuzz
 	$(FUZZ_CXX) -std=c++20 -O2 -g -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all -Icsrc \

@@ -18,22 +18,16 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 # A context in which autograd records nothing, as in `torch.no_grad`, in less of the host's time.
 below_autograd = torch._C._AutoDispatchBelowAutograd
+# Tells whether the caller is inside a transform of `torch.func`.
+func_transforms_are_active = torch._C._are_functorch_transforms_active
+# Returns the hooks on saved tensors, which checkpointing uses, or None; the argument is True.
+hooks_on_saved_tensors = torch._C._autograd._top_saved_tensors_default_hooks
 
 
 def current_stream_numbers(device_index: int) -> tuple[int, int, int]:
     """Return (id, device index, device type) of the current stream of a CUDA device; -1: the current one."""
     numbers: tuple[int, int, int] = torch._C._cuda_getCurrentStream(device_index)
     return numbers
-
-
-def saved_tensors_are_hooked() -> bool:
-    """Tell whether hooks on saved tensors are active, as in checkpointing."""
-    return torch._C._autograd._top_saved_tensors_default_hooks(True) is not None
-
-
-def func_transforms_are_active() -> bool:
-    """Tell whether the caller is inside a transform of `torch.func`."""
-    return bool(torch._C._are_functorch_transforms_active())
 
 
 def refusing_derivatives(

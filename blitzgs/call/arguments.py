@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from numbers import Integral, Real
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import torch
 from torch import Tensor
@@ -41,6 +41,13 @@ GSPLAT_DEFAULTS: dict[str, Any] = {
     "viewmats_rs": None,
     "ut_params": None,
     "renderer_config": None,
+}
+# Whole numbers: the least, the largest, and what an error says.
+_WHOLE = {
+    "width": (1, MAX_SIDE, "1 to 2^20 px"),
+    "height": (1, MAX_SIDE, "1 to 2^20 px"),
+    "tile_size": (1, 64, "1 to 64 px"),
+    "sh_degree": (0, MAX_SH_DEGREE, f"0 to {MAX_SH_DEGREE}"),
 }
 _ANY = object()  # in place of a default: no value changes the result
 # The same for `blitzgs.raw_rasterization`, which has fewer of the arguments.
@@ -101,7 +108,7 @@ class Gaussians:
         per_view: whether every view has its own colours.
         lead: the batch dimensions, and C.
         raw: whether scales and opacities are before their activation.
-        given: the arguments that `named` returns, if they are not the tensors of the scenes.
+        named: the arguments of the call that have to be finite, a tensor for each scene.
         signals: the extra signals; None: none.
     """
 
@@ -112,16 +119,8 @@ class Gaussians:
     per_view: bool
     lead: tuple[int, ...]
     raw: bool
-    given: Mapping[str, tuple[Tensor, ...]] | None = None
+    named: Mapping[str, tuple[Tensor, ...]]
     signals: Signals | None = None
-
-    @property
-    def named(self) -> Mapping[str, tuple[Tensor, ...]]:
-        """The arguments of the call that have to be finite, a tensor for each scene."""
-        if self.given is not None:
-            return self.given
-        columns = zip(Scene._fields, zip(*self.scenes, strict=True), strict=True)
-        return {name: own for name, own in columns if name != "covariances" and own[0] is not None}
 
     @property
     def views(self) -> int:
@@ -185,21 +184,21 @@ def check_options(
         TypeError: a size or the degree is not a whole number, or another option not a number.
         ValueError: one is out of range or has an unknown value.
     """
-    for name, size in (("width", width), ("height", height)):
-        _check_whole(name, size)
-        if not 1 <= size <= MAX_SIDE:
-            raise ValueError(f"{name} must be 1 to 2^20 px, got {size}")
-    _check_whole("tile_size", tile_size)
-    if not 1 <= tile_size <= 64:
-        raise ValueError(f"tile_size must be 1 to 64 px, got {tile_size}")
+    whole = {"width": width, "height": height, "tile_size": tile_size}
     if sh_degree is not None:
-        _check_whole("sh_degree", sh_degree)
-        if not 0 <= sh_degree <= MAX_SH_DEGREE:
-            raise ValueError(f"sh_degree must be 0 to {MAX_SH_DEGREE}, got {sh_degree}")
-    _check_number("near_plane", near_plane)
-    _check_number("far_plane", far_plane)
-    _check_number("eps2d", eps2d)
-    _check_number("radius_clip", radius_clip)
+        whole["sh_degree"] = sh_degree
+    for name, value in whole.items():
+        # int comes first, because asking an abstract class takes longer; torch traces with SymInt.
+        if not isinstance(value, (int, Integral, torch.SymInt)):
+            raise TypeError(f"{name} must be a whole number, got {value!r}")
+        least, most, described = _WHOLE[name]
+        if not least <= value <= most:
+            raise ValueError(f"{name} must be {described}, got {value}")
+    numbers = {"near_plane": near_plane, "far_plane": far_plane, "eps2d": eps2d, "radius_clip": radius_clip}
+    for name, number in numbers.items():
+        # YAML reads 1e10 as a string. A tensor of one number is taken as torch's own functions take it.
+        if not isinstance(number, (float, Real, torch.SymFloat, Tensor)):
+            raise TypeError(f"{name} must be a number, got {number!r}")
     # NaN fails each of these comparisons.
     if not near_plane < far_plane:
         raise ValueError(f"near_plane must be less than far_plane, got {near_plane} and {far_plane}")
@@ -215,18 +214,6 @@ def check_options(
         raise ValueError(
             f"blitzgs.rasterization does not support camera_model={camera_model!r}; leave it out"
         )
-
-
-def _check_whole(name: str, value: object) -> None:
-    # int comes first, because asking an abstract class takes longer; torch traces a function with SymInt.
-    if not isinstance(value, (int, Integral, torch.SymInt)):
-        raise TypeError(f"{name} must be a whole number, got {value!r}")
-
-
-def _check_number(name: str, value: object) -> None:
-    # YAML reads 1e10 as a string. A tensor of one number is taken as torch's own functions take it.
-    if not isinstance(value, (float, Real, torch.SymFloat, Tensor)):
-        raise TypeError(f"{name} must be a number, got {value!r}")
 
 
 def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]) -> None:
@@ -300,12 +287,16 @@ def gaussians_of(
             f"{list(viewmats.shape)}"
         )
     batch, N, C = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
-    _require("means", means, (*batch, N, 3), "[..., N, 3]")
-    _require("quats", quats, (*batch, N, 4), "[..., N, 4]")
-    _require("scales", scales, (*batch, N, 3), "[..., N, 3]")
-    _require("opacities", opacities, (*batch, N), "[..., N]")  # another shape might broadcast
-    _require("viewmats", viewmats, (*batch, C, 4, 4), "[..., C, 4, 4]")
-    _require("Ks", Ks, (*batch, C, 3, 3), "[..., C, 3, 3]")
+    for name, tensor, last, described in (
+        ("means", means, (N, 3), "N, 3"),
+        ("quats", quats, (N, 4), "N, 4"),
+        ("scales", scales, (N, 3), "N, 3"),
+        ("opacities", opacities, (N,), "N"),  # another shape might broadcast
+        ("viewmats", viewmats, (C, 4, 4), "C, 4, 4"),
+        ("Ks", Ks, (C, 3, 3), "C, 3, 3"),
+    ):
+        if tensor.shape != (*batch, *last):
+            _refuse_shape(name, tensor, (*batch, *last), described)
     with_colors = "RGB" in render_mode
     if colors is None and with_colors:
         raise ValueError("colors may be None for the render modes D and ED alone")
@@ -325,12 +316,13 @@ def gaussians_of(
         colors = colors_of_views(degree, means, viewmats, colors, per_view)
         per_view, degree = True, None
     whole = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
-    return Gaussians(_scenes(whole, batch), colors, opacities, degree, per_view, (*batch, C), raw)
+    scenes = _scenes(whole, batch) if batch else (whole,)
+    columns = zip(Scene._fields, zip(*scenes, strict=True), strict=True)
+    named = {name: own for name, own in columns if own[0] is not None}
+    return Gaussians(scenes, colors, opacities, degree, per_view, (*batch, C), raw, named)
 
 
 def _scenes(whole: Scene, batch: tuple[int, ...]) -> tuple[Scene, ...]:
-    if not batch:
-        return (whole,)
     count = math.prod(batch)
     if count == 0:
         raise ValueError(f"the batch {[*batch]} is empty")
@@ -352,7 +344,9 @@ def with_covariances(gaussians: Gaussians, covars: Tensor) -> Gaussians:
         ValueError: the shape does not fit.
     """
     batch = gaussians.lead[:-1]
-    _require("covars", covars, (*batch, gaussians.count, 3, 3), "[..., N, 3, 3]")
+    wanted = (*batch, gaussians.count, 3, 3)
+    if covars.shape != wanted:
+        _refuse_shape("covars", covars, wanted, "N, 3, 3")
     scenes, uppers = [], []
     for scene, own in zip(
         gaussians.scenes, covars.reshape(len(gaussians.scenes), *covars.shape[-3:]).unbind(0), strict=True
@@ -362,7 +356,7 @@ def with_covariances(gaussians: Gaussians, covars: Tensor) -> Gaussians:
         scenes.append(scene._replace(quats=found.quats, scales=found.scales, covariances=found))
     named = {name: given for name, given in gaussians.named.items() if name not in ("quats", "scales")}
     named["covars"] = tuple(uppers)
-    return replace(gaussians, scenes=tuple(scenes), given=named)
+    return replace(gaussians, scenes=tuple(scenes), named=named)
 
 
 def with_signals(gaussians: Gaussians, extra_signals: Tensor, sh_degree: int | None) -> Gaussians:
@@ -376,7 +370,8 @@ def with_signals(gaussians: Gaussians, extra_signals: Tensor, sh_degree: int | N
     values, count = signals.values, len(gaussians.scenes)
     own = values.reshape(count, *values.shape[len(batch) :]).unbind(0) if batch else (values,)
     scenes = tuple(s._replace(extra_signals=part) for s, part in zip(gaussians.scenes, own, strict=True))
-    return replace(gaussians, scenes=scenes, signals=signals)
+    named = {**gaussians.named, "extra_signals": own}
+    return replace(gaussians, scenes=scenes, named=named, signals=signals)
 
 
 def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree: int | None) -> bool:
@@ -397,6 +392,5 @@ def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree:
     return shape != (*batch, N)
 
 
-def _require(name: str, tensor: Tensor, shape: tuple[int, ...], described: str) -> None:
-    if tensor.shape != shape:
-        raise ValueError(f"{name} must be {described} = {[*shape]}, got {list(tensor.shape)}")
+def _refuse_shape(name: str, tensor: Tensor, shape: tuple[int, ...], described: str) -> NoReturn:
+    raise ValueError(f"{name} must be [..., {described}] = {[*shape]}, got {list(tensor.shape)}")

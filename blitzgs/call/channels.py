@@ -41,12 +41,12 @@ class ImageOptions(NamedTuple):
 
 
 def background_rows(
-    backgrounds: Tensor | None, gaussians: Gaussians, render_mode: str, normals: bool = False
+    backgrounds: Tensor, gaussians: Gaussians, render_mode: str, normals: bool = False
 ) -> Tensor | None:
     """Return the background of each image, [I, channels], from `backgrounds`, [..., C, D] or [..., C, D + E].
 
     Args:
-        backgrounds: of the colours and, as in gsplat, of the E extra signals if there are any; None: zero.
+        backgrounds: of the colours and, as in gsplat, of the E extra signals if there are any.
         gaussians: the Gaussians, with their extra signals.
         render_mode: which channels are rendered.
         normals: whether normals are.
@@ -54,7 +54,7 @@ def background_rows(
     Raises:
         ValueError: the shape does not fit.
     """
-    if backgrounds is None or "RGB" not in render_mode:
+    if "RGB" not in render_mode:
         return None
     assert gaussians.colors is not None
     channels = given = gaussians.colors.shape[-1]
@@ -99,8 +99,6 @@ def split_channels(
     renders: Tensor, gaussians: Gaussians, image: ImageOptions
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Divide an image into colours with depth, and what `meta` has: extra signals and normals, by key."""
-    if gaussians.signals is None and not image.normals:
-        return renders, {}
     widths = {
         "render_extra_signals": 0 if gaussians.signals is None else gaussians.signals.channels,
         "normals": NORMAL_CHANNELS if image.normals else 0,

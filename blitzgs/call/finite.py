@@ -109,8 +109,8 @@ def watch_for_non_finite(
             return
         columns, opacities = [*named["viewmats"], *named["Ks"]], []
     else:
-        checked = (t for name, given in named.items() if name not in (*COLOURS, SIGNALS) for t in given)
-        columns = [*checked, *colours]
+        columns = [t for name, given in named.items() if name not in (*COLOURS, SIGNALS) for t in given]
+        columns += colours
         # Splats whose SH are not finite have no opacity, and no other splat is below 1/255.
         opacities = [layout.splats.opacities]
     # One pass over the columns tells whether a closer check is needed.

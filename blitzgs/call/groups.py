@@ -11,7 +11,7 @@ from torch import Tensor
 
 from blitzgs.call.arguments import Gaussians, Scene
 from blitzgs.call.covariances import Decomposed, shaped_by
-from blitzgs.call.queued import Rendered, ShTables
+from blitzgs.call.queued import ShTables
 from blitzgs.ops.project import differentiable_splats, project_splats
 from blitzgs.ops.project_gradient import TableRows
 from blitzgs.ops.projection_types import MAX_VIEWS, ProjectedSplats, ProjectionInputs, ProjectionOptions
@@ -57,8 +57,8 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
     most = 1 if sh_per_view else MAX_VIEWS
     for s, scene in enumerate(gaussians.scenes):
         # Do not split a single group: the split would add a node to autograd's graph.
-        views = [(scene.viewmats, scene.Ks)]
-        if gaussians.views > most:
+        views, n_views = [(scene.viewmats, scene.Ks)], scene.viewmats.shape[0]
+        if n_views > most:
             views = list(zip(scene.viewmats.split(most), scene.Ks.split(most), strict=True))
         sh = _sh_of_views(gaussians, scene, len(views))
         for part, (viewmats, Ks) in enumerate(views):
@@ -66,7 +66,7 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
             harmonics = sh[part]
             own = [means, quats, scales, opacities, *([] if harmonics is None else [harmonics])]
             inputs = ProjectionInputs(own, (viewmats, Ks), options)
-            groups.append(Group(inputs, s * gaussians.views + part * most, scene.covariances))
+            groups.append(Group(inputs, s * n_views + part * most, scene.covariances))
     return groups
 
 
@@ -96,16 +96,15 @@ def _sh_of_views(gaussians: Gaussians, scene: Scene, parts: int) -> Sequence[Ten
     if not gaussians.per_view:
         return (scene.colors,) * parts
     # Without views there is still one part, and the sum over no views is a zero for each coefficient.
-    return scene.colors.unbind(0) if gaussians.views else (scene.colors.sum(dim=0),)
+    return scene.colors.unbind(0) if scene.colors.shape[0] else (scene.colors.sum(dim=0),)
 
 
-def project_groups(groups: Sequence[Group], sparse_grad: bool, ready: Rendered | None) -> ProjectedSplats:
+def project_groups(groups: Sequence[Group], sparse_grad: bool) -> ProjectedSplats:
     """Return the splats of all images, those of a group after those of the groups before.
 
     Args:
         groups: the groups to project.
         sparse_grad: see `blitzgs.ops.project.project`.
-        ready: what `render_queued` returned for the only group; None: project the groups.
 
     Returns:
         Splats whose camera_ids number all images of the call. Of several groups, visible_ids and
@@ -113,9 +112,7 @@ def project_groups(groups: Sequence[Group], sparse_grad: bool, ready: Rendered |
     """
     parts = []
     for group in groups:
-        done = () if ready is None else (ready.splats, ready.rows)
-        if group.rows is not None:
-            done = _splats_of_rows(group)
+        done = () if group.rows is None else _splats_of_rows(group)
         tables = group.inputs if group.rows is None else group.rows.tables
         splats = differentiable_splats(tables, sparse_grad, *done)
         if group.covariances is not None:

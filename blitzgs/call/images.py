@@ -20,10 +20,11 @@ from blitzgs.call.layout import Layout
 from blitzgs.call.lists import Lists, lists_of, lists_of_pixels
 from blitzgs.call.meta import make_meta
 from blitzgs.call.pixels import Pixels
-from blitzgs.call.queued import ShTables, queued
+from blitzgs.call.queued import ShTables, render_queued
 from blitzgs.call.ranks import Job, send_splats
 from blitzgs.call.signals import Signals
 from blitzgs.ops.pixel_splats import pixel_splats
+from blitzgs.ops.project import differentiable_splats
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import Through, rasterize
 
@@ -59,13 +60,16 @@ def render(
             colours = [_nan_or_zero(scene, valued, gaussians.signals) for scene in gaussians.scenes]
             shown = _without_non_finite(gaussians, colours)
         groups = groups_of(shown, project)
+    beside = gaussians.signals is not None or image.normals
+    plain = gaussians.sh_degree is not None and not beside and image.render_mode == "RGB"
     ready, cameras = None, None
     if job is None and not compiling and image.pixels is None and groups_may_be_queued(groups):
-        ready = queued(groups[0].inputs, gaussians, image, tables)
-    elif not compiling:
-        cameras = CamerasOnHost(gaussians)
-    splats = project_groups(groups, image.sparse_grad, ready)
-    layout = Layout(splats, gaussians.lead, gaussians.count, image.packed)
+        ready = render_queued(groups[0].inputs, gaussians, image, plain, tables)
+        splats = differentiable_splats(groups[0].inputs, image.sparse_grad, ready.splats, ready.rows)
+    else:
+        cameras = None if compiling else CamerasOnHost(gaussians)
+        splats = project_groups(groups, image.sparse_grad)
+    layout = Layout(splats, (*gaussians.lead, gaussians.opacities.shape[-1]), image.packed)
     # As in gsplat, Gaussians without a splat have their own opacity.
     over_all = not (image.packed or project.antialiased or image.sparse_grad)
     arranged = layout.rendered_columns(gaussians.opacities if over_all else None)
@@ -78,15 +82,18 @@ def render(
             through = Through(layout.places, [arranged[name] for name in ("means2d", "conics", "opacities")])
             if image.render_mode != "RGB" or image.median:
                 rendered = splats._replace(depths=layout.gather(arranged["depths"])[0])
-    channels, lead = channels_of(rendered, gaussians, image), gaussians.lead
+    channels, lead = rendered.colors if plain else channels_of(rendered, gaussians, image), gaussians.lead
     if job is not None:
         (rendered, channels), lead = send_splats(rendered, channels, job), (job.views,)
     # The projection counts the tiles of the splats that it returns. Ranks exchange splats, and the conics of
     # covariances differ from the projection's by rounding, so their tiles have to be counted again.
-    uncounted = compiling or job is not None or ready is not None or groups[0].covariances is not None
-    count = -1 if uncounted else int(splats.counts[2])
-    if image.pixels is None:
-        lists, composited_lists = lists_of(rendered, math.prod(lead), project, ready, count)
+    if ready is not None:
+        size = (project.width, project.height, project.tile_size)
+        lists = composited_lists = Lists(ready.isect_splats, ready.tile_offsets, *size)
+    elif image.pixels is None:
+        uncounted = compiling or job is not None or groups[0].covariances is not None
+        count = -1 if uncounted else int(splats.counts[2])
+        lists, composited_lists = lists_of(rendered, math.prod(lead), project, count)
     else:
         lists, composited_lists = lists_of_pixels(rendered, math.prod(lead), project, image.pixels)
     renders, alphas = rasterize(
@@ -104,22 +111,24 @@ def render(
             check_intrinsics(gaussians.named["Ks"])
             suspects_cameras = True
         watch_for_non_finite(gaussians, layout, function, colours, suspects_cameras)
-    size, alphas = (*lead, project.height, project.width), alphas.unsqueeze(-1)
+    alphas = alphas.unsqueeze(-1)
     if image.pixels is not None:
         renders, alphas = (t.flatten(0, 2).index_select(0, image.pixels.numbers) for t in (renders, alphas))
-    renders, beside = split_channels(renders, gaussians, image)
+    others: dict[str, Tensor] = {}
+    if beside:
+        renders, others = split_channels(renders, gaussians, image)
     if image.median:
-        beside["render_median"] = _median_depths(rendered, composited_lists, math.prod(lead), image.pixels)
+        others["render_median"] = _median_depths(rendered, composited_lists, math.prod(lead), image.pixels)
     if image.render_mode.endswith("ED"):
         # Autograd saves the divisor. It is a copy, so that the caller may change alphas in place.
         covered = alphas.clone().clamp_(min=1e-10)
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / covered], dim=-1)
     if len(lead) > 1 and image.pixels is None:
-        renders, alphas = renders.view(*size, renders.shape[-1]), alphas.view(*size, 1)
-        beside = {key: values.view(*size, values.shape[-1]) for key, values in beside.items()}
-    meta = make_meta(gaussians, layout, arranged, lists, lead, None if job is None else rendered)
-    meta.update(beside)
-    return renders, alphas, meta
+        shape = (*lead, project.height, project.width)
+        renders, alphas = renders.view(*shape, renders.shape[-1]), alphas.view(*shape, 1)
+        others = {key: values.view(*shape, values.shape[-1]) for key, values in others.items()}
+    arrived = None if job is None else rendered
+    return renders, alphas, make_meta(gaussians, layout, {**arranged, **others}, lists, lead, arrived)
 
 
 def _median_depths(splats: ProjectedSplats, lists: Lists, images: int, pixels: Pixels | None) -> Tensor:

@@ -79,7 +79,8 @@ def contributions(
     )
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {})
-    warn_of_gradient("contributions", Ks)
+    if Ks.requires_grad:
+        warn_of_gradient("contributions")
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     gaussians = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, "D")

@@ -21,14 +21,13 @@ _LEAST_SKEW = 1e-6
 WRAPPED = {"raw_rasterization": 1}
 
 
-def warn_of_gradient(function: str, Ks: Tensor) -> None:  # noqa: N803
-    """Warn, once, if intrinsics require a gradient: they get none, as in gsplat.
+def warn_of_gradient(function: str) -> None:
+    """Warn, once, that intrinsics which require a gradient get none, as in gsplat.
 
     Args:
         function: name of the public function.
-        Ks: [..., 3, 3].
     """
-    if Ks.requires_grad and not torch.compiler.is_compiling() and torch.is_grad_enabled():
+    if not torch.compiler.is_compiling() and torch.is_grad_enabled():
         _warn_of_gradient(function)
 
 

@@ -27,39 +27,21 @@ class Layout:
         places: where each splat is in `meta`; None: the order is unchanged.
     """
 
-    def __init__(self, splats: ProjectedSplats, lead: tuple[int, ...], count: int, packed: bool) -> None:
+    def __init__(self, splats: ProjectedSplats, shape: tuple[int, ...], packed: bool) -> None:
         """Compute the arrangement.
 
         Args:
             splats: as the attribute.
-            lead: batch dimensions, and C.
-            count: Gaussians N of a scene.
+            shape: batch dimensions, C, and the Gaussians N of a scene.
             packed: as the attribute.
         """
         self.splats, self.packed = splats, packed
-        self._images: Tensor | None = None
-        self._gaussians: Tensor | None = None
         self.places: Places | None = None
         if not packed:
-            self.places = Places((splats.camera_ids, splats.gaussian_ids), (*lead, count))
-        elif math.prod(lead) > 1:
+            self.places = Places((splats.camera_ids, splats.gaussian_ids), shape)
+        elif math.prod(shape[:-1]) > 1:
             order = torch.sort(splats.camera_ids, stable=True)[1]
             self.places = Places((order,), tuple(order.shape))
-
-    # Computed on first use. functools.cached_property takes a lock, which torch.compile cannot trace.
-    @property
-    def images(self) -> Tensor:
-        """The image of each splat, int64 [P]."""
-        if self._images is None:
-            self._images = self.splats.camera_ids.long()
-        return self._images
-
-    @property
-    def gaussians(self) -> Tensor:
-        """The Gaussian of each splat in its scene, int64 [P]."""
-        if self._gaussians is None:
-            self._gaussians = self.splats.gaussian_ids.long()
-        return self._gaussians
 
     def arrange(self, *columns: Tensor, under: Tensor | None = None) -> tuple[Tensor, ...]:
         """Arrange columns of splats as `Places.arrange` does."""

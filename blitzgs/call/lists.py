@@ -10,7 +10,6 @@ from torch import Tensor
 
 from blitzgs.call.groups import CUDA_TILE_SIZE
 from blitzgs.call.pixels import Pixels
-from blitzgs.call.queued import Rendered
 from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 
@@ -54,7 +53,7 @@ class Lists:
 
 
 def lists_of(
-    splats: ProjectedSplats, images: int, project: ProjectionOptions, ready: Rendered | None, count: int
+    splats: ProjectedSplats, images: int, project: ProjectionOptions, count: int
 ) -> tuple[Lists, Lists]:
     """Return the tile lists for meta, and those to composite.
 
@@ -62,13 +61,9 @@ def lists_of(
         splats: the splats of all images.
         images: number of images I.
         project: the size of the images, and the caller's tile size.
-        ready: what `render_queued` returned, which has the lists; None: they must be made.
         count: number of entries of the lists for meta; -1: unknown.
     """
     width, height, tile_size = project.width, project.height, project.tile_size
-    if ready is not None:
-        lists = Lists(ready.isect_splats, ready.tile_offsets, width, height, tile_size)
-        return lists, lists
 
     def listed_by(size: int, n_isects: int) -> Lists:
         isect_splats, offsets = torch.ops.blitzgs.intersect(

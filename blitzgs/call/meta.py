@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,27 +17,38 @@ from blitzgs.call.layout import Layout
 from blitzgs.call.lists import Lists
 from blitzgs.ops.projection_types import ProjectedSplats
 
-
-class Later:
-    """A value that `LazyDict` computes when it is first read."""
-
-    __slots__ = ("compute",)
-
-    def __init__(self, compute: Callable[[], Any]) -> None:
-        self.compute = compute
+# In place of a value that is computed when it is first read.
+LATER = object()
+# The keys of `meta`, in this order.
+_KEYS = (
+    "batch_ids", "camera_ids", "gaussian_ids", "radii", "means2d", "conics", "opacities", "depths",
+    "tile_width", "tile_height", "tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets",
+    "width", "height", "tile_size", "n_batches", "n_cameras",
+)  # fmt: skip
+_NOTHING_KNOWN = dict.fromkeys((*_KEYS, "non_finite"), LATER)
 
 
 class LazyDict(dict[str, Any]):
-    """A dict whose `Later` values are replaced by what they compute when they are first read.
+    """A dict with values that are computed when they are first read.
 
-    In every other way it is a dict: readers never see a `Later`, copies and pickles are plain dicts, and any
+    In every other way it is a dict: readers find values only, copies and pickles are plain dicts, and any
     value may be replaced or deleted.
     """
 
+    def __init__(self, given: Mapping[str, Any], compute: Callable[[str], Any]) -> None:
+        """Begin with some values.
+
+        Args:
+            given: the values by key; `LATER` where they are not known.
+            compute: returns the value of such a key.
+        """
+        super().__init__(given)
+        self._compute = compute
+
     def __getitem__(self, key: str) -> Any:
         value = super().__getitem__(key)
-        if isinstance(value, Later):
-            value = self[key] = value.compute()
+        if value is LATER:
+            value = self[key] = self._compute(key)
         return value
 
     def __iter__(self) -> Iterator[str]:
@@ -134,7 +145,7 @@ for _class in (LazyDict, LateMapping):
 def make_meta(
     gaussians: Gaussians,
     layout: Layout,
-    arranged: dict[str, Tensor],
+    known: Mapping[str, Tensor],
     lists: Lists,
     lead: tuple[int, ...],
     arrived: ProjectedSplats | None,
@@ -146,50 +157,88 @@ def make_meta(
     Args:
         gaussians: the checked arguments of the call.
         layout: arrangement of the splats.
-        arranged: the rendered columns in this arrangement.
+        known: the rendered columns in this arrangement, and further images.
         lists: the tile lists.
         lead: batch dimensions, and the number of views that are rendered here.
         arrived: the splats that `lists` refers to, if ranks have exchanged splats; None: those of `layout`.
     """
-    splats, packed = layout.splats, layout.packed
-    views = gaussians.views
-
-    def flatten_ids() -> Tensor:
-        if layout.places is None or arrived is not None:
-            return lists.listed()
-        return layout.places.flat().index_select(0, lists.listed()).int()
-
-    def batch_ids() -> Tensor:
-        if len(gaussians.scenes) == 1:
-            return torch.zeros_like(splats.camera_ids, dtype=torch.int64)
-        return layout.arrange(layout.images // views)[0]
-
-    def camera_ids() -> Tensor:
-        ids = splats.camera_ids.long()
-        return layout.arrange(ids if len(gaussians.scenes) == 1 else ids % views)[0]
-
-    entries: dict[str, Any] = {
-        "batch_ids": Later(batch_ids) if packed else None,
-        "camera_ids": Later(camera_ids) if packed else None,
-        "gaussian_ids": Later(lambda: layout.arrange(layout.gaussians)[0]) if packed else None,
-        "radii": Later(lambda: layout.arrange(splats.radii)[0]),
-        **arranged,
-        "tile_width": lists.tiles_x,
-        "tile_height": lists.tiles_y,
-        "tiles_per_gauss": Later(lambda: layout.arrange(splats.tiles_touched)[0]),
-        "isect_ids": Later(lambda: _isect_ids((arrived or splats).depths, lists, math.prod(lead))),
-        "flatten_ids": Later(flatten_ids),
-        "isect_offsets": Later(lambda: lists.offsets[:-1].reshape(*lead, lists.tiles_y, lists.tiles_x)),
-        "width": lists.width,
-        "height": lists.height,
-        "tile_size": lists.tile_size,
-        "n_batches": len(gaussians.scenes),
-        "n_cameras": lead[-1],
-    }
+    entries = _Entries(gaussians, layout, lists, lead, arrived)
     if torch.compiler.is_compiling():
-        return {key: value.compute() if isinstance(value, Later) else value for key, value in entries.items()}
-    entries["non_finite"] = LateMapping(lambda: non_finite(gaussians))
-    return LazyDict(entries)
+        return {**{key: known[key] if key in known else entries.of(key) for key in _KEYS}, **known}
+    return LazyDict({**_NOTHING_KNOWN, **known}, entries.of)
+
+
+class _Entries(NamedTuple):
+    """Computes entries of `meta`, each by the method of its name, from arguments of `make_meta`."""
+
+    gaussians: Gaussians
+    layout: Layout
+    lists: Lists
+    lead: tuple[int, ...]
+    arrived: ProjectedSplats | None
+
+    def of(self, key: str) -> Any:
+        return getattr(self, key)()
+
+    def batch_ids(self) -> Tensor | None:
+        images = self.layout.splats.camera_ids.long()
+        single = len(self.gaussians.scenes) == 1
+        return self._of_packed(torch.zeros_like(images) if single else images // self.gaussians.views)
+
+    def camera_ids(self) -> Tensor | None:
+        images = self.layout.splats.camera_ids.long()
+        return self._of_packed(images if len(self.gaussians.scenes) == 1 else images % self.gaussians.views)
+
+    def gaussian_ids(self) -> Tensor | None:
+        return self._of_packed(self.layout.splats.gaussian_ids.long())
+
+    def _of_packed(self, column: Tensor) -> Tensor | None:
+        return self.layout.arrange(column)[0] if self.layout.packed else None
+
+    def radii(self) -> Tensor:
+        return self.layout.arrange(self.layout.splats.radii)[0]
+
+    def tiles_per_gauss(self) -> Tensor:
+        return self.layout.arrange(self.layout.splats.tiles_touched)[0]
+
+    def isect_ids(self) -> Tensor:
+        splats = self.layout.splats if self.arrived is None else self.arrived
+        return _isect_ids(splats.depths, self.lists, math.prod(self.lead))
+
+    def flatten_ids(self) -> Tensor:
+        listed, places = self.lists.listed(), self.layout.places
+        return (
+            listed
+            if places is None or self.arrived is not None
+            else places.flat().index_select(0, listed).int()
+        )
+
+    def isect_offsets(self) -> Tensor:
+        return self.lists.offsets[:-1].reshape(*self.lead, self.lists.tiles_y, self.lists.tiles_x)
+
+    def tile_width(self) -> int:
+        return self.lists.tiles_x
+
+    def tile_height(self) -> int:
+        return self.lists.tiles_y
+
+    def width(self) -> int:
+        return self.lists.width
+
+    def height(self) -> int:
+        return self.lists.height
+
+    def tile_size(self) -> int:
+        return self.lists.tile_size
+
+    def n_batches(self) -> int:
+        return len(self.gaussians.scenes)
+
+    def n_cameras(self) -> int:
+        return self.lead[-1]
+
+    def non_finite(self) -> LateMapping:
+        return LateMapping(lambda: non_finite(self.gaussians))
 
 
 def _isect_ids(depths: Tensor, lists: Lists, images: int) -> Tensor:

@@ -10,17 +10,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs._torch import saved_tensors_are_hooked
+from blitzgs._torch import hooks_on_saved_tensors
 from blitzgs.call.arguments import Gaussians
 from blitzgs.call.channels import ImageOptions, channels_of
-from blitzgs.frame.capacity import NoEstimate
 from blitzgs.frame.run import run
 from blitzgs.frame.transport.local import LocalExchange, LocalTransport
 from blitzgs.frame.transport.protocol import Exchange
 from blitzgs.ops.project_gradient import TableRows
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, first_rows
 
-_EXACT = LocalTransport(NoEstimate())
+_EXACT = LocalTransport(exact=True)
 # What the op `render` returns before the colours and rows.
 _LISTS, _IMAGES = 2, 8
 
@@ -60,11 +59,9 @@ class ShTables(NamedTuple):
 
 def render_queued(
     inputs: ProjectionInputs,
-    channels: Callable[[ProjectedSplats], Tensor],
-    with_depth: bool,
-    backgrounds: Tensor | None,
-    backward_follows: bool,
-    exact: bool,
+    gaussians: Gaussians,
+    image: ImageOptions,
+    plain: bool,
     tables: ShTables | None = None,
 ) -> Rendered:
     """Render without gradients; the differentiable ops take this result instead of computing it again.
@@ -74,17 +71,19 @@ def render_queued(
 
     Args:
         inputs: inputs of `project_splats`.
-        channels: returns the values to composite, [P, D], from P splats. P may exceed the number of valid
-            splats, and `counts` of these splats is None. Not called if `tables` have SH.
-        with_depth: whether depths are composited beside the colours of `tables`.
-        backgrounds: [B, D] or None.
-        backward_follows: see the op `rasterize_fwd`.
-        exact: wait for the number of splats, so that no column has spare capacity meanwhile.
+        gaussians: the Gaussians and views.
+        image: options of compositing.
+        plain: whether the colours that the projection computes are all channels.
         tables: the SH, if they are not part of `inputs`.
     """
-    options, means = inputs.options, inputs.gaussians[0]
-    gaussians, sh = ((), ()) if tables is None else (inputs.gaussians, tables.parts)
+    options, means, signals = inputs.options, inputs.gaussians[0], gaussians.signals
+    rows_of, sh = ((), ()) if tables is None else (inputs.gaussians, tables.parts)
+    # Hooks on saved tensors (checkpointing) need the same shapes each time, without spare capacity.
+    exact = not means.is_cuda or hooks_on_saved_tensors(True) is not None
     transport = _EXACT if exact else _transport(means.device, means.shape[0], inputs.n_views)
+    read = [*inputs.gaussians, *inputs.cameras, gaussians.colors, *sh, signals and signals.values]
+    needed = [t for t in read if t is not None and t.requires_grad] if torch.is_grad_enabled() else []
+    backward_follows = len(needed) > 0 and not image.absgrad
 
     def composite(exchange: Exchange) -> tuple[LocalExchange, list[Tensor]]:
         assert isinstance(exchange, LocalExchange)
@@ -93,15 +92,19 @@ def render_queued(
         if tables is not None:
             # The low half of the first total, the number of visible Gaussians.
             tables.before(splats.visible_ids, None if totals is None else totals.view(torch.int32)[:1])
+        channels = None
+        if not sh:
+            channels = splats.colors if plain else channels_of(splats, gaussians, image, not exact)
         return exchange, torch.ops.blitzgs.render(
             splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids,
             splats.visible_ids, splats.splat_offsets, splats.radii, splats.tiles_touched,
-            None if sh else channels(splats), with_depth, gaussians, sh, *inputs.cameras, *options,
-            backgrounds, n_isects, backward_follows, totals,
+            channels, image.render_mode != "RGB", rows_of, sh, *inputs.cameras, *options,
+            image.backgrounds, n_isects, backward_follows, totals,
         )  # fmt: skip
 
-    result, (exchange, outputs) = run(transport, lambda _: inputs, None, composite)
-    splats, (visible, count, isects, *rest) = result.projected, exchange.totals()
+    result, (exchange, outputs) = run(transport, inputs, None, composite)
+    assert exchange.totals is not None
+    splats, (visible, count, isects, *rest) = result.projected, exchange.totals
     isect_splats, tile_offsets, *images = outputs[: _LISTS + _IMAGES]
     of_rows = outputs[_LISTS + _IMAGES :]
     if isect_splats.shape[0] > isects or (of_rows and of_rows[1].shape[0] > visible):
@@ -115,28 +118,6 @@ def render_queued(
         rows = TableRows(inputs._replace(gaussians=found), numbers, indices, sh)
     has_blank_view = 0 in rest[VIEW_TOTALS - 3 :]
     return Rendered(splats, isect_splats, tile_offsets, images, rows, has_blank_view)
-
-
-def queued(
-    inputs: ProjectionInputs, gaussians: Gaussians, image: ImageOptions, tables: ShTables | None
-) -> Rendered:
-    """Queue all work, on CUDA before the host knows the number of splats."""
-    # Hooks on saved tensors (checkpointing) need the same shapes each time, without spare capacity.
-    hooked = saved_tensors_are_hooked()
-    exact = hooked or not inputs.gaussians[0].is_cuda
-    signals = None if gaussians.signals is None else gaussians.signals.values
-    read = [*inputs.gaussians, *inputs.cameras, gaussians.colors, signals]
-    read += () if tables is None else tables.parts
-    differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in read)
-    return render_queued(
-        inputs,
-        lambda splats: channels_of(splats, gaussians, image, with_spare=not exact),
-        image.render_mode != "RGB",
-        image.backgrounds,
-        differentiable and not image.absgrad,
-        exact,
-        tables,
-    )
 
 
 @lru_cache(maxsize=16)

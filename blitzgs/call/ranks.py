@@ -72,8 +72,7 @@ def gather_views(gaussians: Gaussians, absgrad: bool, same: Sequence[Any]) -> tu
     viewmats = _all_poses(scene.viewmats, job)
     Ks = _gathered(scene.Ks.detach(), job)
     scene = scene._replace(viewmats=viewmats, Ks=Ks)
-    gathered = replace(gaussians, scenes=(scene,), lead=(job.size * job.views,), given=gaussians.named)
-    return gathered, job
+    return replace(gaussians, scenes=(scene,), lead=(job.size * job.views,)), job
 
 
 def _require_same(given: tuple[Any, ...], device: torch.device) -> None:

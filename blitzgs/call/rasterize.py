@@ -23,7 +23,7 @@ from blitzgs.call.intrinsics import warn_of_gradient
 from blitzgs.call.pixels import checked_pixels
 from blitzgs.call.ranks import gather_views
 from blitzgs.ops.projection_types import ProjectionOptions
-from blitzgs.util.memory import explaining_memory
+from blitzgs.util.memory import explain_memory
 
 # Colours of networks under autocast, and of SH tables in half precision.
 _HALF = (torch.float16, torch.bfloat16)
@@ -162,7 +162,8 @@ def rasterization(
         RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
         NotEnoughMemoryError: the images or what they need do not fit into memory.
     """
-    check_further("rasterization", further)
+    if further:
+        check_further("rasterization", further)
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
     check_options(
         width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, render_mode,
@@ -182,7 +183,8 @@ def rasterization(
         "extra_signals": extra_signals,
     }
     check_tensors(required, optional)
-    warn_of_gradient("rasterization", Ks)
+    if Ks.requires_grad:
+        warn_of_gradient("rasterization")
     if covars is not None:
         # Placeholders, which the decomposition of the covariances replaces.
         quats, scales = (means.new_zeros(()).expand(*means.shape[:-1], length) for length in (4, 3))
@@ -213,8 +215,9 @@ def rasterization(
         antialiased,
         False,
     )
-    background = background_rows(backgrounds, gaussians, render_mode, return_normals)
-    listed = None
+    background = listed = None
+    if backgrounds is not None:
+        background = background_rows(backgrounds, gaussians, render_mode, return_normals)
     if pixels is not None:
         if distributed or torch.compiler.is_compiling():
             raise ValueError("pixels support neither distributed=True nor torch.compile; leave one out")
@@ -230,6 +233,8 @@ def rasterization(
         signals = None if gaussians.signals is None else gaussians.signals.channels
         same = (width, height, tile_size, render_mode, channels, signals, return_normals)
         gaussians, job = gather_views(gaussians, absgrad, same)
-    views = gaussians.views * len(gaussians.scenes)
-    with explaining_memory(views, width, height, means.shape[-2], means.device):
+    try:
         return render("rasterization", gaussians, project, image, job=job)
+    except (RuntimeError, MemoryError) as error:
+        explain_memory(error, gaussians.images, width, height, means.shape[-2], means.device)
+        raise

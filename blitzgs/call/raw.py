@@ -118,7 +118,8 @@ def raw_rasterization(
             the others; or a parameter is not a leaf, but would get a sparse gradient. The message names it.
         RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
     """
-    check_further("raw_rasterization", further, RAW_DEFAULTS)
+    if further:
+        check_further("raw_rasterization", further, RAW_DEFAULTS)
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
     check_options(
         width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, render_mode,
@@ -126,7 +127,8 @@ def raw_rasterization(
     )  # fmt: skip
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {"shN": shN, "backgrounds": backgrounds})
-    warn_of_gradient("raw_rasterization", Ks)
+    if Ks.requires_grad:
+        warn_of_gradient("raw_rasterization")
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     harmonics = [sh0] if shN is None else [sh0, shN]
@@ -155,9 +157,8 @@ def raw_rasterization(
     named = {name: (tensor,) for name, tensor in given.items() if tensor is not None}
     colors, degree = (sh0, sh_degree) if shaded else (None, None)
     gaussians = Gaussians(whole.scenes, colors, opacities, degree, False, whole.lead, True, named)
-    image = ImageOptions(
-        render_mode, background_rows(backgrounds, gaussians, render_mode), True, sparse_grad, absgrad
-    )
+    background = None if backgrounds is None else background_rows(backgrounds, gaussians, render_mode)
+    image = ImageOptions(render_mode, background, True, sparse_grad, absgrad)
 
     def catch_up_sh(rows: Tensor, count: Tensor | None) -> None:
         for optimizer in lazy:

@@ -15,33 +15,25 @@ from blitzgs.ops.projection_types import Sizes
 
 
 class CapacityEstimate:
-    """Estimates the sizes that the next frame needs from the largest recent ones. Threads may share it."""
+    """Estimates the sizes that the next frame needs from the largest recent ones. Threads may share it.
+
+    Attributes:
+        sizes: the present estimate; None before the first frame has ended.
+    """
 
     def __init__(self, sizes: Sizes | None = None) -> None:
         """Begin with an estimate, or with none; without one the first attempt waits for its sizes."""
-        self._sizes = None if sizes is None else Sizes._make(max(1, size) for size in sizes)
+        self.sizes = None if sizes is None else Sizes._make(max(1, size) for size in sizes)
         self._lock = threading.Lock()
-
-    @property
-    def sizes(self) -> Sizes | None:
-        """The present estimate; None before the first frame has ended."""
-        return self._sizes
 
     def learn(self, needed: Sequence[int]) -> None:
         """Update the estimate with the sizes that a frame needed."""
         with self._lock:
-            before = self._sizes or Sizes(0, 0, 0)
+            before = self.sizes or Sizes(0, 0, 0)
             # Views differ, so the estimate exceeds the largest recent size, and it shrinks slowly.
-            self._sizes = Sizes(
+            self.sizes = Sizes(
                 *[
                     max(1, n * 9 // 8, size - size // 256)
                     for n, size in zip(Sizes(*needed), before, strict=True)
                 ]
             )
-
-
-class NoEstimate(CapacityEstimate):
-    """Lets every frame wait for its sizes."""
-
-    def learn(self, needed: Sequence[int]) -> None:
-        """Learn nothing."""

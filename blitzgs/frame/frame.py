@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -30,7 +30,7 @@ from blitzgs.frame.transport import (
     open_transport,
     unmarked,
 )
-from blitzgs.ops.blocks import ActiveRows
+from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import (
     ProjectedSplats,
@@ -40,7 +40,7 @@ from blitzgs.ops.projection_types import (
     Splats,
 )
 from blitzgs.ops.rasterize import RasterizeSaved
-from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients, absolute_column
+from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients
 from blitzgs.table.table import GaussianTable
 
 
@@ -113,6 +113,17 @@ class RenderOptions:
             antialiased=self.antialiased,
             fade=self.fade,
         )
+
+
+class ViewFilter(Protocol):
+    """What the views of a batch leave out before projection; frames and steps know no more of it."""
+
+    @property
+    def columns(self) -> Sequence[int]:
+        """The views' columns in the table's cull matrix; empty: no view has a mask."""
+
+    def rules(self, table: GaussianTable) -> GateRules:
+        """Return the rules for a table, as the ops take them."""
 
 
 class Frame(NamedTuple):
@@ -270,16 +281,13 @@ def _backgrounds(colour: tuple[float, float, float], count: int, device: torch.d
     return torch.tensor(colour, device=device).repeat(count, 1) if any(colour) else None
 
 
-def backward_splats(
-    frame: Frame, v_renders: Tensor, mark: Mark = unmarked, absolute: bool = False
-) -> SplatGradients:
+def backward_splats(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> SplatGradients:
     """Compute the gradients of this rank's projected splats from the gradients of the images.
 
     Args:
         frame: from `forward`.
         v_renders: gradient of the loss by the images, [B, H, W, 3]; only this rank's tiles are read.
         mark: called at the end of each stage: "raster back", "exchange back".
-        absolute: also sum the absolute values of the pixels' gradients of means2d.
 
     Raises:
         RuntimeError: the ranks share memory, and a later frame has overwritten this frame's splats.
@@ -292,14 +300,14 @@ def backward_splats(
     if v_renders.is_cuda:
         packed = frame.gradients.take(frame.splats.means2d)
         torch.ops.blitzgs.rasterize_bwd(
-            *frame.saved, v_renders, None, *grid, absolute, options.deterministic, packed
+            *frame.saved, v_renders, None, *grid, False, options.deterministic, packed
         )
-        gradients = SplatGradients([packed], None, absolute_column(packed) if absolute else None)
+        gradients = SplatGradients([packed])
     else:
-        *parts, v_abs = torch.ops.blitzgs.rasterize_bwd(
-            *frame.saved, v_renders, None, *grid, absolute, options.deterministic
+        *parts, _ = torch.ops.blitzgs.rasterize_bwd(
+            *frame.saved, v_renders, None, *grid, False, options.deterministic
         )
-        gradients = SplatGradients(parts, None, v_abs if absolute else None)
+        gradients = SplatGradients(parts)
     mark("raster back")
     if way_back is not None:
         gradients = way_back.return_gradients(gradients)

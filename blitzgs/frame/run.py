@@ -22,7 +22,7 @@ Consumed = TypeVar("Consumed")
 
 def run(
     transport: Transport,
-    inputs: Callable[[Sizes | None], ProjectionInputs],
+    inputs: ProjectionInputs | Callable[[Sizes | None], ProjectionInputs],
     assignment: TileAssignment | None,
     consume: Callable[[Exchange], Consumed],
     mark: Mark = unmarked,
@@ -31,8 +31,8 @@ def run(
 
     Args:
         transport: sends the splats, and estimates the sizes.
-        inputs: returns the inputs of the projection, given the estimated sizes; None: the sizes are not
-            known, and the work waits for them.
+        inputs: of the projection; or a function that returns them, given the estimated sizes (None: the
+            sizes are not known, and the work waits for them).
         assignment: the tiles of each rank; None: one rank composites all.
         consume: queues the work with the splats that have arrived.
         mark: called at the end of the stages "project" and "exchange".
@@ -45,14 +45,15 @@ def run(
             needed.
     """
     for _ in range(MAX_ATTEMPTS):
-        sizes = transport.capacity.sizes
-        given = inputs(sizes)
+        sizes = None if transport.capacity is None else transport.capacity.sizes
+        given = inputs(sizes) if callable(inputs) else inputs
         # Skip autograd: for an op with a registered gradient formula, its Python takes 20 us of host time.
         with below_autograd():
             exchange = transport.project_and_send(given, assignment, sizes, mark)
             consumed = consume(exchange)
             needed, result = exchange.finish()
-        transport.capacity.learn(needed)
+        if transport.capacity is not None:
+            transport.capacity.learn(needed)
         if result is not None:
             return result, consumed
     raise RuntimeError(

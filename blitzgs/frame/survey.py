@@ -71,7 +71,7 @@ def survey(
         )
         return torch.ops.blitzgs.contributions(*geometry, *lists, *grid, n_splats, squares)
 
-    result, sums = run(transport, lambda _: inputs, assignment, measure)
+    result, sums = run(transport, inputs, assignment, measure)
     columns = [column[: len(result.splats.depths)] for column in (sums if squares else sums[:2])]
     if result.way_back is not None:
         returned = result.way_back.return_sums(torch.stack([column.long() for column in columns], 1))

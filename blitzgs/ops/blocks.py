@@ -159,7 +159,7 @@ def cull_blocks(
         pending: as given to `update_block_bounds_`.
         level_ranges: uint8 [ceil(N / 256), 2], coarsest and finest level of each block; needed for `rules`.
         rules: also drop the rows that these rules leave out wherever their pending steps may move them;
-            `blitzgs.ops.view_gate.gate_views_` decides about the remaining rows. None: no rules.
+            `gate_views_` decides about the remaining rows. None: no rules.
         capacity_blocks: capacity of the lists, in blocks of 256 rows, at least 1. None: exactly as many
             blocks as the views may see; the host then waits for this number.
 
@@ -182,8 +182,28 @@ def cull_blocks(
     return ActiveRows(ids, views, length, blocks)
 
 
+def gate_views_(active: ActiveRows, means: Tensor, viewmats: Tensor, rules: GateRules) -> None:
+    """Clear the bits of `active.views` for the (row, view) pairs that B views leave out; no row is removed.
+
+    Args:
+        active: rows of the table; their views are changed in place.
+        means: float32 [N, 3], of which the listed rows are caught up.
+        viewmats: float32 [B, 4, 4], rigid, world to camera, B <= 32.
+        rules: which rows each view leaves out.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes, more than 32 views, no level, finer levels that reach farther,
+            or a column that the cull matrix lacks.
+    """
+    level, reach, lod_views, cull, columns = rules
+    with below_autograd():
+        torch.ops.blitzgs.gate_views_(
+            active.ids, active.views, active.length, means, level, viewmats, reach, lod_views, cull, columns
+        )
+
+
 def _rows(means: Tensor, scales: Tensor, pending: PendingSteps | None) -> list[Tensor]:
-    """Return the group `rows` of the ops (`hold_rows` of csrc/active/blocks_op.cpp)."""
+    """Return the group `rows` of the ops (`hold_rows` of csrc/active/active_op.cpp)."""
     return [means, scales, *(pending or ())]
 
 
@@ -207,3 +227,8 @@ def _(bounds: Tensor, *_args: object, capacity_blocks: int | None = None) -> tup
     return tuple(
         bounds.new_empty(n, dtype=torch.int32) for n in (blocks * BLOCK_ROWS, blocks * BLOCK_ROWS, 1, 1)
     )
+
+
+@torch.library.register_fake("blitzgs::gate_views_")
+def _(*_args: object) -> None:
+    return None

@@ -5,16 +5,18 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from blitzgs._library import without_autograd
-from blitzgs.ops.arrange_splats import Places
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.intersect import TileGrid, pixels_of_tiles
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, GradientBuffer, gradient_columns
+
+if TYPE_CHECKING:
+    from blitzgs.ops.arrange_splats import Places
 
 rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
 # For alphas = 1 - transmittances. With the number 1, torch would first make a tensor of it, which takes 5 us

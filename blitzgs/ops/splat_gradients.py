@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -43,11 +44,6 @@ def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     )
 
 
-def absolute_column(packed: Tensor) -> Tensor:
-    """View the sums over pixels of the absolute gradients of means2d, [P, 2], in a table that has them."""
-    return packed[:, _MEAN2D_ABS : _MEAN2D_ABS + 2]
-
-
 def packed_table(columns: Sequence[Tensor | None]) -> Tensor | None:
     """Return the table of which `columns` are the `gradient_columns`; None if they are not of one table.
 
@@ -79,13 +75,10 @@ class SplatGradients(NamedTuple):
         places: int64 [ceil(P / 32), M], the position of each splat in each rank's part of the table, as
             `scatter_splats` returns it. Such gradients are valid until the next frame, or the next backward
             pass of this one.
-        means2d_abs: sums over pixels of the absolute gradients of means2d, [P, 2]; None: they were not
-            requested, or their parts are at several ranks.
     """
 
     parts: Sequence[Tensor]
     places: Tensor | None = None
-    means2d_abs: Tensor | None = None
 
     @property
     def means2d(self) -> Tensor | None:
@@ -96,10 +89,7 @@ class SplatGradients(NamedTuple):
         return first[:, _MEAN2D : _MEAN2D + 2] if len(self.parts) == 1 else first
 
     def side_by_side(self) -> Tensor:
-        """Return all columns, and `means2d_abs` if it is there, as one [P, F].
-
-        For gradients without `places`.
-        """
+        """Return all columns as one [P, 9]; for gradients without `places`."""
         flat = [column.reshape(len(column), math.prod(column.shape[1:])) for column in self._columns()]
         return torch.cat(flat, 1)
 
@@ -117,14 +107,13 @@ class SplatGradients(NamedTuple):
         columns = self._columns()
         widths = [math.prod(column.shape[1:]) for column in columns]
         sums = sum_splats(values, places, group_sizes, splats, widths)
-        parts = [total.reshape(-1, *like.shape[1:]) for total, like in zip(sums, columns, strict=True)]
-        absolute = parts.pop() if self.means2d_abs is not None else None
-        return SplatGradients(parts, None, absolute)
+        return SplatGradients(
+            [total.reshape(-1, *like.shape[1:]) for total, like in zip(sums, columns, strict=True)]
+        )
 
-    def _columns(self) -> list[Tensor]:
-        """Return the four columns, and `means2d_abs` if it is there."""
-        columns = gradient_columns(self.parts[0]) if len(self.parts) == 1 else self.parts
-        return [*columns, *([] if self.means2d_abs is None else [self.means2d_abs])]
+    def _columns(self) -> Sequence[Tensor]:
+        """Return the four columns."""
+        return gradient_columns(self.parts[0]) if len(self.parts) == 1 else self.parts
 
 
 def sum_splats(
@@ -149,29 +138,28 @@ def sum_splats(
     return torch.ops.blitzgs.sum_splats(values, places, list(group_sizes), splats, list(widths))
 
 
+@dataclass
 class GradientBuffer:
     """Memory in which the CUDA backward pass sums the gradients of splats; the forward pass has zeroed it.
 
     It serves one backward pass; each later one gets other memory.
+
+    Attributes:
+        zeros: [P or more, 12], the last output of `rasterize_fwd`; [0, 12] or None if there is none.
+        others: returns zeroed memory for later backward passes. If it is None or returns None, memory is
+            allocated instead.
     """
 
-    def __init__(self, zeros: Tensor | None, others: Callable[[], Tensor | None] | None = None) -> None:
-        """Take over the zeroed memory.
-
-        Args:
-            zeros: [P or more, 12], the last output of `rasterize_fwd`; [0, 12] or None if there is none.
-            others: returns zeroed memory for later backward passes. If it is None or returns None, memory is
-                allocated instead.
-        """
-        self._zeros, self._others = zeros, others
+    zeros: Tensor | None
+    others: Callable[[], Tensor | None] | None = None
 
     def take(self, means2d: Tensor) -> Tensor:
         """Return zeros [P, 12] for the P splats."""
-        zeros, self._zeros = self._zeros, None
+        zeros, self.zeros = self.zeros, None
         count = means2d.shape[0]
         if zeros is not None and zeros.shape[0] >= count:
             return zeros if zeros.shape[0] == count else zeros[:count]
-        others = None if self._others is None else self._others()
+        others = None if self.others is None else self.others()
         return means2d.new_zeros(count, SPLAT_GRADIENT) if others is None else others
 
 

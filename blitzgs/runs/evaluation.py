@@ -23,7 +23,7 @@ from blitzgs.frame.pixels import collect_images
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.ops.photometric import ssim
 from blitzgs.runs.previews import Previews
-from blitzgs.util.memory import explaining_memory
+from blitzgs.util.memory import explain_memory
 from blitzgs.util.output import OutputFolder
 from blitzgs.util.progress import Report
 from blitzgs.view.gate import SceneGate
@@ -123,11 +123,14 @@ def render_view(
     """
     picked, ranks = views.pick([index]), owners.ranks
     table, active, _ = finder.find(*picked.as_arguments(), options.limits)
-    with explaining_memory(1, picked.width, picked.height, len(table), ranks.device):
+    try:
         if ranks.world_size == 1:
             return pipeline.forward(table, picked, options, active).renders[0]
         ranges = owners.divide([index], picked.width, picked.height, options.tile_size)
         frame = pipeline.forward(table, picked, options, active, TileAssignment(ranks, ranges))
+    except (RuntimeError, MemoryError) as error:
+        explain_memory(error, 1, picked.width, picked.height, len(table), ranks.device)
+        raise
     owners.record([index], frame.tile_work, ranges)
     collect_images(frame.renders, ranges, ranks, destination)
     return frame.renders[0] if ranks.rank == destination else None

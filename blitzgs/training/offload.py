@@ -11,7 +11,7 @@ from torch import Tensor
 
 from blitzgs.config.fields import LossConfig
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.frame.frame import Frame, RenderOptions
+from blitzgs.frame.frame import Frame, RenderOptions, ViewFilter
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.transport import Mark, unmarked
 from blitzgs.ops.host import to_device
@@ -24,7 +24,6 @@ from blitzgs.training.batch import Batch
 from blitzgs.training.loss import LossTerms
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
-from blitzgs.view.gate import ViewGate
 from blitzgs.view.views import ViewSet
 
 
@@ -132,16 +131,16 @@ class OffloadingStepper(Stepper):
         options: RenderOptions,
         batch: Batch,
         mark: Mark = unmarked,
-        view_gate: ViewGate | None = None,
+        view_filter: ViewFilter | None = None,
     ) -> tuple[Frame, LossTerms, HostSum]:
         """See `Stepper.forward`."""
         self._up_to_date_at = None
         cameras = self._upcoming.cameras(step, options.limits)
-        if view_gate is None or not view_gate.columns:
+        if view_filter is None or not view_filter.columns:
             cameras = cameras._replace(columns=None)
         self._blocks = self._pool.load_for_step(step, cameras, self._upcoming.batch_size)
         mark("other")
-        rendered = super().forward(step, options, batch, mark, view_gate)
+        rendered = super().forward(step, options, batch, mark, view_filter)
         self._pool.prefetch(step + 1)
         return rendered
 

@@ -10,12 +10,11 @@ from torch import Tensor
 
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import Frame, RenderOptions
+from blitzgs.frame.frame import Frame, RenderOptions, ViewFilter
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import Mark, open_transport, unmarked
-from blitzgs.ops.blocks import ActiveRows
+from blitzgs.ops.blocks import ActiveRows, gate_views_
 from blitzgs.ops.projection_types import Sizes
-from blitzgs.ops.view_gate import gate_views_
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.training.loss import LossTerms, loss_terms
 
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from blitzgs.table.table import GaussianTable
     from blitzgs.training.batch import Batch
     from blitzgs.training.exposure import Exposures
-    from blitzgs.view.gate import ViewGate
     from blitzgs.view.visible import Scene
 
 
@@ -92,7 +90,7 @@ class Stepper:
         options: RenderOptions,
         batch: Batch,
         mark: Mark = unmarked,
-        view_gate: ViewGate | None = None,
+        view_filter: ViewFilter | None = None,
     ) -> tuple[Frame, LossTerms, HostSum]:
         """Apply pending steps of the rows that the views may see, render, and compare with the photographs.
 
@@ -101,14 +99,14 @@ class Stepper:
             options: how to render.
             batch: B views, their photographs, and the tiles of each rank.
             mark: called at the end of each stage with the stage's name.
-            view_gate: LOD gate and cull mask of the views; None: neither.
+            view_filter: what the views leave out; None: nothing.
 
         Returns:
             The frame, the loss's terms, and the sums of its `LossTerms.parts` over all ranks, which
             begin with [2 B].
         """
         table, ranks, views = self.table, self._owners.ranks, batch.views
-        rules = None if view_gate is None else view_gate.rules(table)
+        rules = None if view_filter is None else view_filter.rules(table)
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
         on_gpu = views.viewmats.is_cuda
 

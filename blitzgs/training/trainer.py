@@ -258,9 +258,9 @@ class Trainer:
             raise PhotographError(str(error)) from error
         degree = schedule.sh_degree(begin, config.model.sh_degree)
         view_level.follow_schedule(state, begin)
-        view_gate = view_level.batch_gate(state, batch.indices)
+        view_filter = view_level.batch_gate(state, batch.indices)
         options = render_options(config, state.space, degree, lod_gate(config, state.progress))
-        frame, terms, sums = state.stepper.forward(step, options, batch, view_gate=view_gate)
+        frame, terms, sums = state.stepper.forward(step, options, batch, view_filter=view_filter)
         self._write_record()  # whose figures were copied meanwhile
         names = [state.capture.cameras[i].name for i in batch.indices]
         self._guard.check(step, names, sums, state.stepper.table, frame)

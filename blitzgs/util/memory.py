@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
-from collections.abc import Iterator
 
 import psutil
 import torch
@@ -27,28 +25,24 @@ def is_lack_of_memory(error: BaseException) -> bool:
     return isinstance(error, RuntimeError) and _MESSAGES.search(str(error)) is not None
 
 
-@contextlib.contextmanager
-def explaining_memory(
-    views: int, width: int, height: int, gaussians: int, device: torch.device
-) -> Iterator[None]:
-    """Explain failed allocations while images are rendered.
+def explain_memory(
+    error: BaseException, views: int, width: int, height: int, gaussians: int, device: torch.device
+) -> None:
+    """Explain an error with which rendering ended, if it is that of a failed allocation.
 
     Raises:
-        NotEnoughMemoryError: instead of the error of an allocation that failed inside the context.
+        NotEnoughMemoryError: it is.
     """
-    try:
-        yield
-    except (RuntimeError, MemoryError) as error:
-        if isinstance(error, NotEnoughMemoryError) or not is_lack_of_memory(error):
-            raise
-        # A pixel has three colours, an opacity and the number of its last splat.
-        needed = views * width * height * 5 * 4
-        count = "1 view" if views == 1 else f"{views:,} views"
-        raise NotEnoughMemoryError(
-            f"not enough memory to render {count} of {width:,} x {height:,} pixels with {gaussians:,} "
-            f"Gaussians: the pixels alone take {needed / 1e9:,.2f} GB, and {_free(device) / 1e9:,.2f} GB are "
-            f"free on {device}. Render smaller views, or fewer at once"
-        ) from error
+    if isinstance(error, NotEnoughMemoryError) or not is_lack_of_memory(error):
+        return
+    # A pixel has three colours, an opacity and the number of its last splat.
+    needed = views * width * height * 5 * 4
+    count = "1 view" if views == 1 else f"{views:,} views"
+    raise NotEnoughMemoryError(
+        f"not enough memory to render {count} of {width:,} x {height:,} pixels with {gaussians:,} "
+        f"Gaussians: the pixels alone take {needed / 1e9:,.2f} GB, and {_free(device) / 1e9:,.2f} GB are "
+        f"free on {device}. Render smaller views, or fewer at once"
+    ) from error
 
 
 def _free(device: torch.device) -> int:

@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.ops.blocks import ActiveRows, GateRules
+from blitzgs.ops.blocks import ActiveRows, GateRules, gate_views_
 from blitzgs.ops.counter_random import uniform
-from blitzgs.ops.view_gate import gate_views_
 from blitzgs.table.layouts import CULL, sectors_in
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.levels import farthest
@@ -84,7 +83,7 @@ class LodGate:
 
 @dataclass(frozen=True)
 class ViewGate:
-    """LOD gate and cull mask of the views of one batch.
+    """LOD gate and cull mask of the views of one batch (`blitzgs.frame.frame.ViewFilter`).
 
     Attributes:
         reach: `LodGate.reach`.
@@ -97,7 +96,7 @@ class ViewGate:
     columns: Sequence[int] = ()
 
     def rules(self, table: GaussianTable) -> GateRules:
-        """Return the rules for a table, as the ops take them."""
+        """See `blitzgs.frame.frame.ViewFilter.rules`."""
         mask = table.columns.get(CULL)
         sectors = None if mask is None else sectors_in(mask)
         return GateRules(table["level"], list(self.reach), self.lod_views, sectors, list(self.columns))

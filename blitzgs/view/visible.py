@@ -9,8 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.view_gate import gate_views_
+from blitzgs.ops.blocks import ActiveRows, gate_views_
 from blitzgs.table.block_visibility import Cameras
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.pool import Pool

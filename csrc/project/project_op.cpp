@@ -1,8 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "project/project_op.h"
+#include "project/project.h"
 
 #include <algorithm>
+#include <optional>
 #include <tuple>
+#include <vector>
+
+#include "adam/lazy_adam_op.h"
+#include "common/op.h"
+#include "exchange/places_op.h"
+#include "project/project_op.h"
 
 namespace blitzgs {
 namespace {
@@ -150,6 +157,188 @@ Projected project_fwd(const TensorList& gaussians, const Tensor& viewmats, const
 }
 
 }  // namespace
+
+class HeldSplatGradients {
+ public:
+  // splats: P. sums: none, or [P, 2], to which the kernel writes the gradients of means2d summed over ranks.
+  HeldSplatGradients(const char* op, ScalarType dtype, std::int64_t splats,
+                     const std::vector<Tensor>& v_splats, const std::optional<Tensor>& v_depths,
+                     const std::optional<Tensor>& places, const std::optional<Tensor>& sums)
+      : held_(v_splats), depths_(v_depths), in_tables_(places || v_splats.size() == 1) {
+#ifndef BLITZGS_BACKEND_CUDA
+    STD_TORCH_CHECK(!in_tables_, "blitzgs::", op, ": tables of gradients need CUDA; give columns");
+#endif
+    STD_TORCH_CHECK(places || !sums, "blitzgs::", op, ": means2d_sums needs gradients at ranks");
+    if (in_tables_) {
+      STD_TORCH_CHECK(!v_depths, "blitzgs::", op, ": v_depths needs gradients in columns");
+      for (const Tensor& table : held_) check_table(op, table);
+      if (!places) check_shape(op, "v_splats[0]", held_[0], {splats, kSplatGradient});
+      if (places) hold_ranks(op, splats, *places, sums);
+      return;
+    }
+    STD_TORCH_CHECK(v_splats.size() == 3 || v_splats.size() == 4, "blitzgs::", op,
+                    ": v_splats must be v_means2d, v_conics, v_opacities[, v_colors] or one table, got ",
+                    v_splats.size(), " tensors");
+    held_[0] = checked(op, "v_means2d", held_[0], dtype, {splats, 2});
+    held_[1] = checked(op, "v_conics", held_[1], dtype, {splats, 3});
+    held_[2] = checked(op, "v_opacities", held_[2], dtype, {splats});
+    if (held_.size() == 4) held_[3] = checked(op, "v_colors", held_[3], dtype, {splats, 3});
+    depths_ = checked(op, "v_depths", depths_, dtype, {splats});
+  }
+
+  // The source that the kernels read. It points to tensors that this object holds.
+  template <class T>
+  SplatGradientSource<T> source() const {
+#ifdef BLITZGS_BACKEND_CUDA
+    if (places_) return ranks_;
+    if (in_tables_) return PackedSplatGradients{table(held_[0])};
+#endif
+    return SplatGradientColumns<T>{data<T>(held_[0]), data<T>(held_[1]), data_or_null<T>(depths_),
+                                   data<T>(held_[2]), held_.size() == 4 ? data<T>(held_[3]) : nullptr};
+  }
+
+ private:
+  static const SplatGradient* table(const Tensor& tensor) {
+    return reinterpret_cast<const SplatGradient*>(data<float>(tensor));
+  }
+
+  static void check_table(const char* op, const Tensor& tensor) {
+    check_in_place(op, "a table of v_splats", tensor, ScalarType::Float, {-1, kSplatGradient});
+    STD_TORCH_CHECK(reinterpret_cast<std::uintptr_t>(tensor.const_data_ptr()) % alignof(SplatGradient) == 0,
+                    "blitzgs::", op, ": a table of v_splats must begin at a multiple of 16 bytes");
+  }
+
+  void hold_ranks(const char* op, std::int64_t splats, const Tensor& places,
+                  const std::optional<Tensor>& sums) {
+    const auto n_ranks = static_cast<std::int64_t>(held_.size());
+    STD_TORCH_CHECK(n_ranks >= 1 && n_ranks <= kMaxPeers, "blitzgs::", op, ": 1 to ", kMaxPeers,
+                    " ranks can hold gradients, got ", n_ranks);
+    places_ = checked_places(op, places, splats, n_ranks);
+    ranks_.places = places_in(*places_);
+    ranks_.n_ranks = static_cast<int>(n_ranks);
+    for (std::int64_t m = 0; m < n_ranks; ++m) {
+      ranks_.tables[m] = table(held_[m]);
+      ranks_.sizes[m] = static_cast<std::int32_t>(held_[m].size(0));
+    }
+    if (!sums) return;
+    check_in_place(op, "means2d_sums", *sums, ScalarType::Float, {splats, 2});
+    ranks_.means2d = const_cast<float*>(data<float>(*sums));
+  }
+
+  std::vector<Tensor> held_;
+  std::optional<Tensor> depths_, places_;
+  bool in_tables_;
+  RankSplatGradients ranks_{};
+};
+
+namespace {
+
+// The outputs of the forward pass that both ops read, and the weights of the regularisers for each view. The
+// object holds the tensors, so that the raw pointers stay valid.
+struct BackwardSplats {
+  Tensor camera_ids, visible_ids, splat_offsets;
+  OptionalTensor scale_reg, opacity_reg;
+
+  BackwardSplats(const char* op, const ProjectArguments& p, const Tensor& camera_ids_in,
+                 const Tensor& visible_ids_in, const Tensor& splat_offsets_in,
+                 const OptionalTensor& scale_reg_in, const OptionalTensor& opacity_reg_in) {
+    camera_ids = checked(op, "camera_ids", camera_ids_in, ScalarType::Int, {-1});
+    visible_ids = checked(op, "visible_ids", visible_ids_in, ScalarType::Int, {-1});
+    splat_offsets = checked(op, "splat_offsets", splat_offsets_in, ScalarType::Int, {visible() + 1});
+    const ScalarType dtype = p.means.scalar_type();
+    scale_reg = checked(op, "scale_reg", scale_reg_in, dtype, {p.n_views});
+    opacity_reg = checked(op, "opacity_reg", opacity_reg_in, dtype, {p.n_views});
+  }
+
+  std::int64_t visible() const { return visible_ids.numel(); }
+  std::int64_t count() const { return camera_ids.numel(); }
+  SplatIndex pointers() const {
+    return {data<std::int32_t>(camera_ids), data<std::int32_t>(visible_ids),
+            data<std::int32_t>(splat_offsets), visible()};
+  }
+  template <class T>
+  Regularisers<T> regularisers() const {
+    return {data_or_null<T>(scale_reg), data_or_null<T>(opacity_reg)};
+  }
+};
+
+using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
+                            const OptionalTensor& scale_reg, const OptionalTensor& opacity_reg,
+                            const Tensor& camera_ids, const Tensor& visible_ids, const Tensor& splat_offsets,
+                            const OptionalTensor& level, std::int64_t width, std::int64_t height,
+                            std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
+                            double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
+                            const FloatList& fade, const TensorList& v_splats, const OptionalTensor& v_depths,
+                            bool need_viewmats, bool dense) {
+  constexpr const char* kOp = "project_bwd";
+  const ProjectArguments p(kOp, gaussians, viewmats, Ks,
+                           checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
+                                           eps2d, radius_clip, antialiased, raw, fade),
+                           fade, level);
+  const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
+  const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
+                             std::nullopt);
+  const std::int64_t length = dense ? p.count : b.visible();
+  Tensor v_means = make_empty(p.means, {length, 3}), v_quats = make_empty(p.means, {length, 4}),
+         v_scales = make_empty(p.means, {length, 3}), v_opacities = make_empty(p.means, {length}),
+         v_sh = make_empty(p.means, {length, p.sh_stride, 3}),
+         v_viewmats = make_empty(p.means, {need_viewmats ? p.n_views : 0, 4, 4});
+  DeviceScope scope(p.means);
+  dispatch_floating(p.means, [&](auto zero) {
+    using T = decltype(zero);
+    if (dense) {
+      backend::zero_arrays(
+          ZeroedArrays<T>{{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),
+                           mutable_data<T>(v_opacities), mutable_data<T>(v_sh)},
+                          {3 * length, 4 * length, 3 * length, length, 3 * p.sh_stride * length}},
+          scope.stream);
+    }
+    backend::project_bwd(
+        p.inputs<T>(), b.pointers(), v.source<T>(), b.regularisers<T>(),
+        ProjectGradients<T>{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),
+                            mutable_data<T>(v_opacities), p.sh ? mutable_data<T>(v_sh) : nullptr,
+                            need_viewmats ? mutable_data<T>(v_viewmats) : nullptr, dense},
+        scope.workspace, scope.stream);
+  });
+  return {v_means, v_quats, v_scales, v_opacities, v_sh, v_viewmats};
+}
+
+void project_bwd_step(const TensorList& state_in, const TensorList& tables, std::int64_t step,
+                      std::int64_t explicit_steps, double beta1, double beta2, double eps,
+                      const Tensor& viewmats, const Tensor& Ks, const OptionalTensor& scale_reg,
+                      const OptionalTensor& opacity_reg, const Tensor& camera_ids, const Tensor& visible_ids,
+                      const Tensor& splat_offsets, const OptionalTensor& level, std::int64_t width,
+                      std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
+                      double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
+                      const FloatList& fade, const TensorList& v_splats, const OptionalTensor& places,
+                      const OptionalTensor& means2d_sums) {
+  constexpr const char* kOp = "project_bwd_step_";
+  AdamTensors state(kOp, state_in, tables, {step, explicit_steps, beta1, beta2, eps});
+  state.check_takes_step();
+  const ProjectArguments p(kOp, state.params, viewmats, Ks,
+                           checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
+                                           eps2d, radius_clip, antialiased, raw, fade),
+                           fade, level);
+  const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
+  const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt, places,
+                             means2d_sums);
+  if (b.visible() == 0) return;
+  DeviceScope scope(p.means);
+  dispatch_floating(p.means, [&](auto zero) {
+    using T = decltype(zero);
+    backend::project_bwd_step(p.inputs<T>(), b.pointers(), v.source<T>(), b.regularisers<T>(),
+                              state.arguments<T>(data<std::int32_t>(b.visible_ids), b.visible()),
+                              scope.workspace, scope.stream);
+  });
+}
+
+}  // namespace
 }  // namespace blitzgs
 
-BLITZGS_REGISTER(m) { m.impl("project_fwd", TORCH_BOX(&blitzgs::project_fwd)); }
+BLITZGS_REGISTER(m) {
+  m.impl("project_fwd", TORCH_BOX(&blitzgs::project_fwd));
+  m.impl("project_bwd", TORCH_BOX(&blitzgs::project_bwd));
+  m.impl("project_bwd_step_", TORCH_BOX(&blitzgs::project_bwd_step));
+}

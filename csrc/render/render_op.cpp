@@ -1,18 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
-// Colours, tile lists, compositing and alphas in one op, because each call of an op takes the host
-// microseconds.
 #include "render/render.h"
 
+#include <functional>
+#include <numeric>
 #include <optional>
 #include <tuple>
 #include <vector>
 
+#include "common/op.h"
 #include "project/color_rows.h"
 #include "project/project_op.h"
-#include "render/gather_rows_op.h"
+#include "render/arrange_splats.h"
+#include "render/gather_rows.h"
 
 namespace blitzgs {
-
+// Colours, tile lists, compositing and alphas in one op, because each call of an op takes the host
+// microseconds.
 // Defined in intersect_op.cpp and rasterize_op.cpp.
 std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics,
                                      const Tensor& splat_opacities, const Tensor& depths,
@@ -30,16 +33,108 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd
 
 namespace {
 
-constexpr const char* kOp = "render";
+constexpr const char* kRender = "render";
+
+// The first `length` rows of a tensor, or all if it has no more.
+Tensor rows_of(const Tensor& tensor, std::int64_t length) {
+  std::vector<std::int64_t> shape, strides;
+  for (std::int64_t axis = 0; axis < tensor.dim(); ++axis) {
+    shape.push_back(tensor.size(axis));
+    strides.push_back(tensor.stride(axis));
+  }
+  shape[0] = std::min(shape[0], length);
+  return view_of(tensor, shape, strides, 0);
+}
+
+// Words of 4 bytes in the elements of a row behind its first `axis` dimensions.
+std::int64_t words_behind(const Tensor& column, std::int64_t axis) {
+  std::int64_t words = static_cast<std::int64_t>(column.element_size()) / 4;
+  for (; axis < column.dim(); ++axis) words *= column.size(axis);
+  return words;
+}
+
+void check_column(const char* op, const Tensor& column) {
+  STD_TORCH_CHECK(column.dim() >= 1 && column.element_size() % 4 == 0, "blitzgs::", op,
+                  ": columns must have rows and elements of 4 or 8 bytes, got ", shape_of(column), " of ",
+                  column.element_size(), " bytes");
+  STD_TORCH_CHECK(words_behind(column, 1) < (1 << 16), "blitzgs::", op,
+                  ": rows must be shorter than 256 KiB, got ", shape_of(column));
+}
+
+std::vector<std::int64_t> shape_with(const Tensor& column, std::int64_t rows) {
+  std::vector<std::int64_t> shape{rows};
+  for (std::int64_t axis = 1; axis < column.dim(); ++axis) shape.push_back(column.size(axis));
+  return shape;
+}
+
+// The rows `ids` of `columns`, and then of `joined`, side by side along their second dimension. ids: int32
+// [n], contiguous; known: as in GatherRows.
+std::vector<Tensor> gathered_rows(const char* op, const std::vector<Tensor>& columns,
+                                  const std::vector<Tensor>& joined, const Tensor& ids,
+                                  const std::int64_t* known) {
+  STD_TORCH_CHECK(columns.size() + joined.size() <= kMaxGatheredColumns, "blitzgs::", op, ": at most ",
+                  kMaxGatheredColumns, " columns, got ", columns.size() + joined.size());
+  const std::int64_t n = ids.size(0);
+  GatherRows gather{data<std::int32_t>(ids), n, known, 0, {}};
+  std::vector<Tensor> held, found;
+  const auto add = [&](const Tensor& column, std::uint32_t* to, std::int64_t stride) {
+    const Tensor& from = held.emplace_back(as_contiguous(column));
+    const auto width = static_cast<std::uint32_t>(words_behind(from, 1));
+    gather.columns[gather.n_columns++] = {static_cast<const std::uint32_t*>(from.const_data_ptr()), to, width,
+                                          stride, width};
+    return width;
+  };
+  for (const Tensor& column : columns) {
+    check_column(op, column);
+    Tensor& rows = found.emplace_back(make_empty(column, shape_with(column, n)));
+    add(column, static_cast<std::uint32_t*>(rows.mutable_data_ptr()), words_behind(column, 1));
+  }
+  if (!joined.empty()) {
+    std::int64_t length = 0, stride = 0;
+    for (const Tensor& part : joined) {
+      check_column(op, part);
+      check_dtype(op, "joined columns", part, joined[0].scalar_type());
+      STD_TORCH_CHECK(part.dim() >= 2 && part.dim() == joined[0].dim() &&
+                          words_behind(part, 2) == words_behind(joined[0], 2),
+                      "blitzgs::", op, ": joined columns must be alike behind their second dimension, got ",
+                      shape_of(part), " beside ", shape_of(joined[0]));
+      length += part.size(1);
+      stride += words_behind(part, 1);
+    }
+    std::vector<std::int64_t> shape = shape_with(joined[0], n);
+    shape[1] = length;
+    Tensor& rows = found.emplace_back(make_empty(joined[0], shape));
+    auto* to = static_cast<std::uint32_t*>(rows.mutable_data_ptr());
+    for (const Tensor& part : joined) to += add(part, to, stride);
+  }
+  DeviceScope scope(ids);
+  backend::gather_rows(gather, scope.workspace, scope.stream);
+  return found;
+}
+
+std::vector<Tensor> first_rows(const std::vector<Tensor>& columns, const std::vector<std::int64_t>& lengths) {
+  constexpr const char* kOp = "first_rows";
+  STD_TORCH_CHECK(columns.size() == lengths.size(), "blitzgs::", kOp, ": ", columns.size(),
+                  " columns need a length each, got ", lengths.size());
+  std::vector<Tensor> found;
+  for (std::size_t c = 0; c < columns.size(); ++c) {
+    STD_TORCH_CHECK(columns[c].dim() >= 1 && lengths[c] >= 0, "blitzgs::", kOp,
+                    ": columns must have rows, and lengths be at least 0, got ", shape_of(columns[c]),
+                    " and ", lengths[c]);
+    found.push_back(rows_of(columns[c], lengths[c]));
+  }
+  return found;
+}
 
 // The totals of the projection; null: the splats have no spare capacity.
 const std::int64_t* checked_totals(const OptionalTensor& totals) {
   if (!totals) return nullptr;
-  check_in_place(kOp, "totals", *totals, ScalarType::Long, {-1});
-  STD_TORCH_CHECK(totals->size(0) > kTotalSplats, "blitzgs::", kOp,
+  check_in_place(kRender, "totals", *totals, ScalarType::Long, {-1});
+  STD_TORCH_CHECK(totals->size(0) > kTotalSplats, "blitzgs::", kRender,
                   ": totals must be those of project_fwd, got ", shape_of(*totals));
 #ifndef BLITZGS_BACKEND_CUDA
-  STD_TORCH_CHECK(false, "blitzgs::", kOp, ": on the CPU splats have no spare capacity, so give no totals");
+  STD_TORCH_CHECK(false, "blitzgs::", kRender,
+                  ": on the CPU splats have no spare capacity, so give no totals");
 #endif
   return data<std::int64_t>(*totals);
 }
@@ -54,19 +149,19 @@ struct ColoredSplats {
 TensorList color_rows(const TensorList& gaussians, const TensorList& sh, const Tensor& viewmats,
                       const Tensor& Ks, const ProjectOptions<double>& options, const ColoredSplats& splats,
                       const std::int64_t* totals) {
-  check_group(kOp, "gaussians (means, quats, scales, opacities)", gaussians, 4, 4);
-  check_floating(kOp, "means", gaussians[0]);
+  check_group(kRender, "gaussians (means, quats, scales, opacities)", gaussians, 4, 4);
+  check_floating(kRender, "means", gaussians[0]);
   const std::int64_t U = splats.visible_ids.numel(), P = splats.camera_ids.numel();
-  check_in_place(kOp, "visible_ids", splats.visible_ids, ScalarType::Int, {U});
-  check_in_place(kOp, "splat_offsets", splats.splat_offsets, ScalarType::Int, {U + 1});
-  check_in_place(kOp, "camera_ids", splats.camera_ids, ScalarType::Int, {P});
-  check_in_place(kOp, "splat_opacities", splats.opacities, gaussians[0].scalar_type(), {P});
-  check_in_place(kOp, "radii", splats.radii, ScalarType::Int, {P, 2});
-  check_in_place(kOp, "tiles_touched", splats.tiles_touched, ScalarType::Int, {P});
+  check_in_place(kRender, "visible_ids", splats.visible_ids, ScalarType::Int, {U});
+  check_in_place(kRender, "splat_offsets", splats.splat_offsets, ScalarType::Int, {U + 1});
+  check_in_place(kRender, "camera_ids", splats.camera_ids, ScalarType::Int, {P});
+  check_in_place(kRender, "splat_opacities", splats.opacities, gaussians[0].scalar_type(), {P});
+  check_in_place(kRender, "radii", splats.radii, ScalarType::Int, {P, 2});
+  check_in_place(kRender, "tiles_touched", splats.tiles_touched, ScalarType::Int, {P});
   const ProjectCapacity capacity{{U, P}, totals};
   TensorList found =
-      gathered_rows(kOp, gaussians, sh, splats.visible_ids, totals ? totals + kTotalVisible : nullptr);
-  const ProjectArguments p(kOp, found, viewmats, Ks, options);
+      gathered_rows(kRender, gaussians, sh, splats.visible_ids, totals ? totals + kTotalVisible : nullptr);
+  const ProjectArguments p(kRender, found, viewmats, Ks, options);
   Tensor numbers = make_empty(splats.visible_ids, {U}),
          indices = make_empty(splats.visible_ids, {U}, ScalarType::Long);
   Tensor colors = make_empty(p.means, {p.sh ? P : 0, 3});
@@ -116,13 +211,13 @@ TensorList render(const Tensor& means2d, const Tensor& conics, Tensor splat_opac
   if (totals) n_splats = view_of(*totals_in, {1}, {1}, kTotalSplats);
   TensorList rows;
   if (!gaussians.empty()) {
-    const auto options = checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
+    const auto options = checked_options(kRender, width, height, tile_size, sh_degree, near_plane, far_plane,
                                          eps2d, radius_clip, antialiased, raw, fade);
     rows =
         color_rows(gaussians, sh, viewmats, Ks, options,
                    {visible_ids, splat_offsets, camera_ids, splat_opacities, radii, tiles_touched}, totals);
   }
-  STD_TORCH_CHECK(channels_in || !sh.empty(), "blitzgs::", kOp, ": splats without sh need channels");
+  STD_TORCH_CHECK(channels_in || !sh.empty(), "blitzgs::", kRender, ": splats without sh need channels");
   const Tensor channels = channels_in ? *channels_in : with_depth ? joined(rows[0], depths) : rows[0];
   const std::int64_t views = viewmats.size(0);
   const auto lists = intersect(means2d, conics, splat_opacities, depths, camera_ids, std::nullopt, views,
@@ -143,7 +238,141 @@ TensorList render(const Tensor& means2d, const Tensor& conics, Tensor splat_opac
   return found;
 }
 
+constexpr const char* kArrangeSplats = "arrange_splats";
+
+// Where the splats are in the arrangement, which has the dimensions `shape`.
+struct Places {
+  std::vector<Tensor> index;
+  std::vector<std::int64_t> shape;
+  ArrangeSplats moves{};
+
+  Places(const std::vector<Tensor>& places, const std::vector<std::int64_t>& dimensions) : shape(dimensions) {
+    STD_TORCH_CHECK(places.size() == 1 || places.size() == 2, "blitzgs::", kArrangeSplats,
+                    ": places must be (order) or (images, gaussians), got ", places.size(), " tensors");
+    const bool ordered = places.size() == 1;
+    STD_TORCH_CHECK(shape.size() >= (ordered ? 1u : 2u), "blitzgs::", kArrangeSplats,
+                    ": shape has too few dimensions");
+    for (const Tensor& tensor : places) {
+      check_dtype(kArrangeSplats, ordered ? "order" : "images and gaussians", tensor,
+                  ordered ? ScalarType::Long : ScalarType::Int);
+      check_shape(kArrangeSplats, "places", tensor, {places[0].size(0)});
+      index.push_back(as_contiguous(tensor));
+    }
+    moves.n = index[0].size(0);
+    moves.count = shape.back();
+    STD_TORCH_CHECK(!ordered || entries() == moves.n, "blitzgs::", kArrangeSplats, ": an arrangement of ",
+                    entries(), " entries cannot be an order of ", moves.n, " splats");
+    moves.order = ordered ? data<std::int64_t>(index[0]) : nullptr;
+    moves.images = ordered ? nullptr : data<std::int32_t>(index[0]);
+    moves.gaussians = ordered ? nullptr : data<std::int32_t>(index[1]);
+  }
+
+  std::int64_t entries() const {
+    return std::accumulate(shape.begin(), shape.end(), std::int64_t{1}, std::multiplies<>());
+  }
+  bool has_empty_entries() const { return moves.order == nullptr; }
+};
+
+// Whether the elements of each row follow one another.
+bool rows_are_contiguous(const Tensor& column, std::int64_t row_axis) {
+  std::int64_t expected = 1;
+  for (std::int64_t axis = column.dim() - 1; axis >= row_axis; --axis) {
+    if (column.size(axis) != 1 && column.stride(axis) != expected) return false;
+    expected *= column.size(axis);
+  }
+  return true;
+}
+
+// Allocates the targets of columns whose rows are indexed by the first `from` dimensions, with the dimensions
+// `to` in place of these, and lists both in `moves`. `held` keeps the sources alive.
+std::vector<Tensor> make_targets(const std::vector<Tensor>& columns, std::size_t from,
+                                 const std::vector<std::int64_t>& to, std::vector<Tensor>& held,
+                                 ArrangeSplats& moves) {
+  STD_TORCH_CHECK(columns.size() <= kMaxArranged, "blitzgs::", kArrangeSplats, ": at most ", kMaxArranged,
+                  " columns, got ", columns.size());
+  std::vector<Tensor> targets;
+  for (const Tensor& column : columns) {
+    // Rows of a splat's gradient lie in a longer table: a column of it is read as it is.
+    const bool strided = from == 1 && rows_are_contiguous(column, 1);
+    held.push_back(strided ? column : as_contiguous(column));
+    const auto element_words = static_cast<std::int64_t>(column.element_size()) / 4;
+    STD_TORCH_CHECK(column.element_size() % 4 == 0, "blitzgs::", kArrangeSplats,
+                    ": columns must have elements of 4 or 8 bytes, got ",
+                    torch::headeronly::toString(column.scalar_type()));
+    std::vector<std::int64_t> shape = to;
+    std::int64_t words = element_words;
+    for (auto axis = static_cast<std::int64_t>(from); axis < column.dim(); ++axis) {
+      shape.push_back(column.size(axis));
+      words *= column.size(axis);
+    }
+    targets.push_back(make_empty(column, shape));
+    moves.columns[moves.n_columns++] = {static_cast<const std::uint32_t*>(held.back().const_data_ptr()),
+                                        static_cast<std::uint32_t*>(targets.back().mutable_data_ptr()), words,
+                                        strided ? column.stride(0) * element_words : words};
+  }
+  return targets;
+}
+
+std::vector<Tensor> arrange_splats(const std::vector<Tensor>& columns, const std::vector<Tensor>& places_in,
+                                   const std::vector<std::int64_t>& shape,
+                                   const std::optional<Tensor>& under) {
+  Places places(places_in, shape);
+  std::vector<Tensor> held;
+  if (columns.empty()) return {};
+  for (const Tensor& column : columns) {
+    STD_TORCH_CHECK(column.dim() >= 1 && column.size(0) == places.moves.n, "blitzgs::", kArrangeSplats,
+                    ": columns must have ", places.moves.n, " rows, got ", shape_of(column));
+  }
+  std::vector<Tensor> arranged = make_targets(columns, 1, shape, held, places.moves);
+  std::optional<Tensor> below;
+  const std::int64_t views = places.has_empty_entries() ? shape[shape.size() - 2] : 1;
+  if (under) {
+    const Tensor& last = columns.back();
+    STD_TORCH_CHECK(places.has_empty_entries() && last.dim() == 1, "blitzgs::", kArrangeSplats,
+                    ": `under` is for a last column of numbers and an arrangement of all Gaussians");
+    check_dtype(kArrangeSplats, "under", *under, last.scalar_type());
+    STD_TORCH_CHECK(under->numel() * views == places.entries(), "blitzgs::", kArrangeSplats,
+                    ": under must have ", places.entries() / std::max<std::int64_t>(views, 1),
+                    " values, got ", shape_of(*under));
+    below = as_contiguous(*under);
+  }
+  DeviceScope scope(columns[0]);
+  for (int c = 0; places.has_empty_entries() && c < places.moves.n_columns; ++c) {
+    const bool over = below && c == places.moves.n_columns - 1;
+    backend::fill_entries({places.moves.columns[c], places.entries(), places.moves.count, views,
+                           over ? static_cast<const std::uint32_t*>(below->const_data_ptr()) : nullptr},
+                          scope.stream);
+  }
+  backend::arrange_splats(places.moves, /*back=*/false, scope.stream);
+  return arranged;
+}
+
+std::vector<Tensor> splats_of_arranged(const std::vector<Tensor>& arranged,
+                                       const std::vector<Tensor>& places_in,
+                                       const std::vector<std::int64_t>& shape) {
+  Places places(places_in, shape);
+  std::vector<Tensor> held;
+  if (arranged.empty()) return {};
+  for (const Tensor& column : arranged) {
+    bool fits = column.dim() >= static_cast<std::int64_t>(shape.size());
+    for (std::size_t axis = 0; fits && axis < shape.size(); ++axis) {
+      fits = column.size(static_cast<std::int64_t>(axis)) == shape[axis];
+    }
+    STD_TORCH_CHECK(fits, "blitzgs::", kArrangeSplats,
+                    ": columns must begin with the dimensions of the arrangement, got ", shape_of(column));
+  }
+  std::vector<Tensor> splats = make_targets(arranged, shape.size(), {places.moves.n}, held, places.moves);
+  DeviceScope scope(arranged[0]);
+  backend::arrange_splats(places.moves, /*back=*/true, scope.stream);
+  return splats;
+}
+
 }  // namespace
 }  // namespace blitzgs
 
-BLITZGS_REGISTER(m) { m.impl("render", TORCH_BOX(&blitzgs::render)); }
+BLITZGS_REGISTER(m) {
+  m.impl("render", TORCH_BOX(&blitzgs::render));
+  m.impl("first_rows", TORCH_BOX(&blitzgs::first_rows));
+  m.impl("arrange_splats", TORCH_BOX(&blitzgs::arrange_splats));
+  m.impl("splats_of_arranged", TORCH_BOX(&blitzgs::splats_of_arranged));
+}

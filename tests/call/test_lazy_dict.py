@@ -8,7 +8,7 @@ import pickle
 import pytest
 from torch.utils._pytree import tree_map
 
-from blitzgs.call.meta import LateMapping, Later, LazyDict
+from blitzgs.call.meta import LATER, LateMapping, LazyDict
 
 PLAIN = {"image": 1, "ids": [2, 3], "mask": None}
 READERS = {
@@ -42,10 +42,11 @@ def lazy():
     """A `LazyDict` that reads as PLAIN, and the keys it has computed so far."""
     computed = []
 
-    def later(key):
-        return Later(lambda: computed.append(key) or PLAIN[key])
+    def compute(key):
+        computed.append(key)
+        return PLAIN[key]
 
-    return LazyDict(image=1, ids=later("ids"), mask=later("mask")), computed
+    return LazyDict({"image": 1, "ids": LATER, "mask": LATER}, compute), computed
 
 
 @pytest.mark.parametrize("reader", READERS.values(), ids=READERS)
@@ -100,7 +101,7 @@ LATE_READERS = (
 def test_a_mapping_is_computed_once_and_only_when_it_is_looked_into(reader):
     computed, plain = [], dict(PLAIN)
     late = LateMapping(lambda: computed.append(0) or PLAIN)
-    whole = LazyDict(found=late)
+    whole = LazyDict({"found": late}, PLAIN.get)
     assert list(whole.values())[0] is late and computed == []
     result = reader(late)
     assert type(result) is dict and list(result.items()) == list(PLAIN.items())

@@ -4,8 +4,7 @@
 import pytest
 import torch
 
-from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.view_gate import gate_views_
+from blitzgs.ops.blocks import ActiveRows, gate_views_
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import ViewGate
 from tests.table.test_blocks import make_views

@@ -63,7 +63,7 @@ def scratch_of_a_step(unseen: int, device: str) -> int:
     options, gate = RenderOptions(0, 0.05, 100.0), ViewGate([1e3], 1)
 
     def step(number: int) -> None:
-        frame, terms, sums = stepper.forward(number, options, batch, view_gate=gate)
+        frame, terms, sums = stepper.forward(number, options, batch, view_filter=gate)
         stepper.backward(number, frame, terms, keep_means2d=True)
         sums.read()
 

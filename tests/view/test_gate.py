@@ -14,8 +14,7 @@ from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.ops.blocks import ActiveRows, GateRules
-from blitzgs.ops.view_gate import gate_views_
+from blitzgs.ops.blocks import ActiveRows, GateRules, gate_views_
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.importance import ViewBatch, is_culled, sweep
 from blitzgs.table.blocks import BlockIndex
@@ -182,7 +181,7 @@ def test_training_behind_the_gate_is_dense_adams(device, smooth):
             batch = Batch([0, 1], views, targets.to(device), None, samples, None)
             # Sums in another order would make two trainings diverge.
             options = RenderOptions(0, 0.05, 100.0, deterministic=True, fade=lod.fade())
-            frame, terms, _ = stepper.forward(step, options, batch, view_gate=gate)
+            frame, terms, _ = stepper.forward(step, options, batch, view_filter=gate)
             stepper.backward(step, frame, terms)
             splats = frame.projected
             pairs = zip(splats.gaussian_ids.tolist(), splats.camera_ids.tolist(), strict=True)

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 class LocalTransport:
     """The transport for one rank; with an estimate, the host queues compositing before it waits."""
 
-    def __init__(self, capacity: CapacityEstimate | None = None) -> None:
-        """Use a capacity estimate; None: a new one without any sizes."""
-        self.capacity = capacity or CapacityEstimate()
+    def __init__(self, capacity: CapacityEstimate | None = None, exact: bool = False) -> None:
+        """Use a capacity estimate; None: a new one without any sizes; or none at all if `exact`."""
+        self.capacity = None if exact else capacity or CapacityEstimate()
 
     def project_and_send(
         self,
@@ -41,6 +41,7 @@ class LocalExchange:
 
     Attributes:
         projected: the projection, of which `arrived` has the columns that compositing reads.
+        totals: `ProjectionOutputs.totals`; None until the host has waited for them.
     """
 
     def __init__(self, inputs: ProjectionInputs, sizes: Sizes | None, mark: Mark) -> None:
@@ -48,31 +49,29 @@ class LocalExchange:
         # On the CPU the sizes are known at once, so no estimate is needed.
         self._capacity = sizes if inputs.gaussians[0].is_cuda else None
         self.projected = projected = inputs.run(self._capacity)
-        self._n_views = inputs.n_views
-        self._totals: list[int] | None = None
-        splats = projected.for_compositing
-        self._copy = HostCopy(projected.totals)
+        self.gradient_table: Tensor | None = None
+        splats, host = projected.for_compositing, projected.totals
+        self._copy = HostCopy(host) if host.is_cuda else None
+        self.totals: list[int] | None = None
         mark("project")
         if self._capacity is None:
-            self.arrived = Arrived(splats, None, self.totals()[2])
+            self._host = host if self._copy is None else self._copy.read()
+            self.totals = self._host.tolist()
+            self.arrived = Arrived(splats, None, self.totals[2])
         else:
             self.arrived = Arrived(splats, projected.n_splats, self._capacity.isects)
-        self.gradient_table: Tensor | None = None
         mark("exchange")
-
-    def totals(self) -> list[int]:
-        """Wait for `ProjectionOutputs.totals`."""
-        if self._totals is None:
-            self._totals = self._copy.read().tolist()
-        return self._totals
 
     def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """See `Exchange.finish`."""
-        needed = Sizes(*self.totals()[:VIEW_TOTALS])
+        if self.totals is None:
+            assert self._copy is not None
+            self._host = self._copy.read()
+            self.totals = self._host.tolist()
+        needed, projected = Sizes(*self.totals[:VIEW_TOTALS]), self.projected
         if self._capacity is not None and not self._capacity.holds(needed):
             return needed, None  # the splats are undefined
-        counts, projected = self._copy.read()[:3], self.projected
-        visible = projected.totals[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
+        counts, visible = self._host[:3], projected.totals[VIEW_TOTALS:]
         if self._capacity is None:
             splats = projected.splats._replace(counts=counts)
             return needed, ExchangeResult(splats, self.arrived.splats, visible, None, None)

@@ -175,13 +175,11 @@ class WayBack(Protocol):
 
 
 class Transport(Protocol):
-    """Sends the splats of many frames, one after the other.
+    """Sends the splats of many frames, one after the other."""
 
-    Attributes:
-        capacity: estimate of the sizes of a frame; the same on all ranks if the transport needs equal sizes.
-    """
-
-    capacity: CapacityEstimate
+    @property
+    def capacity(self) -> CapacityEstimate | None:
+        """Estimate of a frame's sizes, the same on ranks that need equal sizes; None: each frame waits."""
 
     def project_and_send(
         self,

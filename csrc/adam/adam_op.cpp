@@ -1,6 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "adam/lazy_adam_op.h"
 
+#include "adam/position_noise.h"
+#include "common/op.h"
+
 namespace blitzgs {
 namespace {
 
@@ -49,6 +52,41 @@ Tensor lazy_adam_final_rules(const Tensor& table, const Tensor& like, std::int64
   return *rules;
 }
 
+constexpr const char* kPositionNoise = "position_noise_";
+
+void position_noise_(Tensor means, const Tensor& quats_in, const Tensor& scales_in,
+                     const Tensor& opacities_in, const Tensor& ids_in, const Tensor& visible_ids_in,
+                     std::int64_t seed, std::int64_t step, double threshold, double strength) {
+  check_floating(kPositionNoise, "means", means);
+  const ScalarType dtype = means.scalar_type();
+  check_in_place(kPositionNoise, "means", means, dtype, {-1, 3});
+  const std::int64_t rows = means.size(0);
+  const Tensor quats = checked(kPositionNoise, "quats", quats_in, dtype, {rows, 4}),
+               scales = checked(kPositionNoise, "scales", scales_in, dtype, {rows, 3}),
+               opacities = checked(kPositionNoise, "opacities", opacities_in, dtype, {rows}),
+               ids = checked(kPositionNoise, "ids", ids_in, ScalarType::Long, {rows}),
+               visible_ids = checked(kPositionNoise, "visible_ids", visible_ids_in, ScalarType::Int, {-1});
+  const std::int64_t visible = visible_ids.size(0);
+  if (visible == 0 || strength == 0) return;
+
+  DeviceScope scope(means);
+  dispatch_floating(means, [&](auto zero) {
+    using T = decltype(zero);
+    const PositionNoiseArgs<T> args{mutable_data<T>(means),
+                                    data<T>(quats),
+                                    data<T>(scales),
+                                    data<T>(opacities),
+                                    data<std::int64_t>(ids),
+                                    data<std::int32_t>(visible_ids),
+                                    visible,
+                                    seed,
+                                    step,
+                                    threshold,
+                                    strength};
+    backend::position_noise(args, scope.workspace, scope.stream);
+  });
+}
+
 }  // namespace
 }  // namespace blitzgs
 
@@ -56,4 +94,5 @@ BLITZGS_REGISTER(m) {
   m.impl("lazy_adam_step_", TORCH_BOX(&blitzgs::lazy_adam_step));
   m.impl("lazy_adam_final_rules", TORCH_BOX(&blitzgs::lazy_adam_final_rules));
   m.impl("lazy_adam_catch_up_", TORCH_BOX(&blitzgs::lazy_adam_catch_up));
+  m.impl("position_noise_", TORCH_BOX(&blitzgs::position_noise_));
 }

@@ -2,9 +2,12 @@
 #include "loss/photometric.h"
 
 #include <cmath>
+#include <optional>
 #include <tuple>
+#include <vector>
 
 #include "common/op.h"
+#include "loss/loss_of_sums.h"
 #include "loss/report.h"
 
 namespace blitzgs {
@@ -134,9 +137,6 @@ Tensor photometric_bwd(const Tensor& renders, const Tensor& targets, const std::
               .v_renders;
 }
 
-}  // namespace
-
-// Not in the unnamed namespace, because l1_ssim_op.cpp calls it, too.
 std::tuple<Tensor, Tensor, Tensor, Tensor> photometric_fwd_bwd(
     const Tensor& renders, const Tensor& targets, const std::optional<Tensor>& masks,
     const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size, std::int64_t tile_begin,
@@ -148,10 +148,64 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> photometric_fwd_bwd(
   return {*out.parts, *out.v_renders, *out.scale_reg, *out.opacity_reg};
 }
 
+std::tuple<Tensor, Tensor> l1_ssim_fwd_bwd(const Tensor& renders, const Tensor& targets,
+                                           const Tensor& l1_weights, const Tensor& ssim_weights,
+                                           const Tensor& samples, double l1_factor, double ssim_factor,
+                                           double offset) {
+  const auto outputs = photometric_fwd_bwd(renders, targets, std::nullopt, l1_weights, ssim_weights, 16, 0,
+                                           -1, samples, std::nullopt, 0, 0);
+  const Tensor &parts = std::get<0>(outputs), &v_renders = std::get<1>(outputs);
+  const double* sums = data<double>(parts);
+  const std::int64_t n = parts.size(0) * parts.size(1);
+  Tensor loss = make_empty(renders, {});
+  DeviceScope scope(renders);
+  dispatch_floating(renders, [&](auto zero) {
+    using T = decltype(zero);
+    const LossOfSums<T> args{sums, n, l1_factor, ssim_factor, offset, mutable_data<T>(loss)};
+    backend::loss_of_sums(args, scope.workspace, scope.stream);
+  });
+  return {loss, v_renders};
+}
+
+void report_(const std::optional<Tensor>& parts_in, const std::optional<Tensor>& tile_work_in,
+             std::int64_t tile_begin, std::int64_t tile_end, std::int64_t rank, std::int64_t n_ranks,
+             std::vector<Tensor> targets) {
+  constexpr const char* kOp = "report_";
+  Report<float> report{};
+  const auto parts = checked(kOp, "parts", parts_in, ScalarType::Double, {-1, -1, 2});
+  if (parts) {
+    report.views = parts->size(0);
+    report.n_parts = parts->size(1);
+    report.parts = data<double>(*parts);
+  }
+  const auto tile_work = checked(kOp, "tile_work", tile_work_in, ScalarType::Int, {-1});
+  report.tile_work = data_or_null<std::int32_t>(tile_work);
+  const std::int64_t tiles = tile_work ? tile_work->size(0) : 0;
+  check_tile_range(kOp, tile_begin, tile_end, tiles);
+  report.tile_begin = tile_begin;
+  report.tile_end = tile_end;
+  STD_TORCH_CHECK(rank >= 0 && rank < n_ranks, "blitzgs::", kOp, ": rank must be in [0, ", n_ranks, "), got ",
+                  rank);
+  const auto count = static_cast<std::int64_t>(targets.size());
+  STD_TORCH_CHECK(count > 0 && count <= kMaxReportTargets, "blitzgs::", kOp, ": 1 to ", kMaxReportTargets,
+                  " targets are supported, got ", count);
+  for (Tensor& target : targets) {
+    check_in_place(kOp, "a target", target, ScalarType::Float, {2 * report.views * n_ranks + tiles});
+    float* sums = mutable_data<float>(target);
+    float* mine = sums + 2 * report.views * rank;
+    report.targets[report.n_targets++] = {mine, mine + report.views, sums + 2 * report.views * n_ranks};
+  }
+  DeviceScope scope(parts ? *parts : tile_work ? *tile_work : targets[0]);
+  backend::report(report, scope.workspace, scope.stream);
+}
+
+}  // namespace
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
   m.impl("photometric_fwd", TORCH_BOX(&blitzgs::photometric_fwd));
   m.impl("photometric_bwd", TORCH_BOX(&blitzgs::photometric_bwd));
   m.impl("photometric_fwd_bwd", TORCH_BOX(&blitzgs::photometric_fwd_bwd));
+  m.impl("l1_ssim_fwd_bwd", TORCH_BOX(&blitzgs::l1_ssim_fwd_bwd));
+  m.impl("report_", TORCH_BOX(&blitzgs::report_));
 }

@@ -1,0 +1,308 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "active/blocks.h"
+
+#include <algorithm>
+#include <optional>
+#include <tuple>
+#include <vector>
+
+#include "active/cull_mask.h"
+#include "active/morton_keys.h"
+#include "active/pool.h"
+#include "active/view_gate.h"
+#include "common/op.h"
+
+namespace blitzgs {
+namespace {
+
+// The checked rules, and the tensors that they point to, which must live during the call.
+struct HeldRules {
+  Tensor level;
+  std::optional<Tensor> cull;
+  GateRules rules{};
+};
+
+void set_reach(const char* op, const std::vector<double>& reach, GateRules& rules) {
+  STD_TORCH_CHECK(!reach.empty() && reach.size() <= kMaxLevels, "blitzgs::", op, ": 1 to ", kMaxLevels,
+                  " levels are supported, got ", reach.size());
+  rules.n_levels = static_cast<int>(reach.size());
+  for (int level = 0; level < rules.n_levels; ++level) {
+    STD_TORCH_CHECK(level == 0 || reach[level] <= reach[level - 1], "blitzgs::", op,
+                    ": finer levels reach no farther, got ", reach[level - 1], " and ", reach[level],
+                    " for the levels ", level - 1, " and ", level);
+    rules.table.reach2[level] = reach[level] < 0 ? -1.0f : static_cast<float>(reach[level] * reach[level]);
+  }
+}
+
+void set_columns(const char* op, const std::vector<std::int64_t>& columns, bool has_cull, GateRules& rules) {
+  if (columns.empty()) return;
+  STD_TORCH_CHECK(static_cast<int>(columns.size()) == rules.n_views, "blitzgs::", op, ": ", rules.n_views,
+                  " views need as many columns of the cull matrix, got ", columns.size());
+  STD_TORCH_CHECK(has_cull, "blitzgs::", op, ": columns need a cull matrix");
+  for (int view = 0; view < rules.n_views; ++view) {
+    STD_TORCH_CHECK(columns[view] < rules.cull_columns, "blitzgs::", op, ": the cull matrix has ",
+                    rules.cull_columns, " columns, got column ", columns[view]);
+    rules.table.columns[view] = static_cast<std::int32_t>(columns[view]);
+    if (columns[view] >= 0) rules.cull_views |= 1u << view;
+  }
+}
+
+HeldRules hold_rules(const char* op, std::int64_t rows, int views, const Tensor& level,
+                     const std::vector<double>& reach, std::int64_t lod_views,
+                     const std::optional<Tensor>& cull, const std::vector<std::int64_t>& columns) {
+  HeldRules held{checked(op, "level", level, ScalarType::Byte, {rows}),
+                 checked(op, "cull", cull, ScalarType::Int, {blocks_of(rows), -1, kSectorWords})};
+  if (held.cull) held.rules.cull_columns = held.cull->size(1);
+  held.rules.level = data<std::uint8_t>(held.level);
+  held.rules.cull = data_or_null<std::int32_t>(held.cull);
+  held.rules.n_rows = rows;
+  held.rules.n_views = views;
+  held.rules.lod_views = static_cast<std::uint32_t>(lod_views);
+  set_reach(op, reach, held.rules);
+  set_columns(op, columns, cull.has_value(), held.rules);
+  return held;
+}
+
+// The columns of the table, checked. `held` keeps the tensors alive during the call.
+struct HeldRows {
+  std::vector<Tensor> held;
+  BlockRows rows{};
+};
+
+// rows: (means, scales), and if steps may be pending also the moments (exp_avg and exp_avg_sq of the means,
+// then of the scales), last_step, moment_step and table. blitzgs/ops/blocks.py builds this group.
+HeldRows hold_rows(const char* op, const std::vector<Tensor>& rows) {
+  STD_TORCH_CHECK(rows.size() == 2 || rows.size() == 9, "blitzgs::", op,
+                  ": rows must be (means, scales) or, with pending steps, (means, scales, exp_avg_means, "
+                  "exp_avg_sq_means, exp_avg_scales, exp_avg_sq_scales, last_step, moment_step, table), got ",
+                  rows.size(), " tensors");
+  const std::int64_t n = rows[0].size(0);
+  STD_TORCH_CHECK(n < (std::int64_t{1} << 31) - kBlockRows, "blitzgs::", op, ": fewer than 2^31 - ",
+                  kBlockRows, " rows are supported, got ", n);
+  HeldRows held;
+  const auto hold = [&]<class T>(const T*& column, const char* name, std::size_t at, ScalarType dtype,
+                                 std::initializer_list<std::int64_t> shape) {
+    column = data<T>(held.held.emplace_back(checked(op, name, rows[at], dtype, shape)));
+  };
+  held.rows.n = n;
+  hold(held.rows.means, "means", 0, ScalarType::Float, {n, 3});
+  hold(held.rows.scales, "scales", 1, ScalarType::Float, {n, 3});
+  if (rows.size() == 2) return held;
+  hold(held.rows.exp_avg_means, "exp_avg of means", 2, ScalarType::Float, {n, 3});
+  hold(held.rows.exp_avg_sq_means, "exp_avg_sq of means", 3, ScalarType::Float, {n, 3});
+  hold(held.rows.exp_avg_scales, "exp_avg of scales", 4, ScalarType::Float, {n, 3});
+  hold(held.rows.exp_avg_sq_scales, "exp_avg_sq of scales", 5, ScalarType::Float, {n, 3});
+  hold(held.rows.last_step, "last_step", 6, ScalarType::Int, {n});
+  hold(held.rows.moment_step, "moment_step", 7, ScalarType::Int, {n});
+  hold(held.rows.table, "table", 8, ScalarType::Double, {-1, kAdamTable});
+  return held;
+}
+
+void check_bounds(const char* op, const Tensor& bounds, std::int64_t rows) {
+  check_in_place(op, "bounds", bounds, ScalarType::Float, {blocks_of(rows), kBlockBounds});
+}
+
+void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in,
+                          const std::vector<Tensor>& rows) {
+  const char* op = "update_block_bounds_";
+  const HeldRows held = hold_rows(op, rows);
+  check_bounds(op, bounds, held.rows.n);
+  const std::optional<Tensor> ids = checked(op, "ids", ids_in, ScalarType::Int, {-1});
+  // An empty tensor may have a null pointer, which would mean all rows.
+  if (ids && ids->size(0) == 0) return;
+  DeviceScope scope(bounds);
+  backend::update_block_bounds(held.rows, data_or_null<std::int32_t>(ids), ids ? ids->size(0) : 0,
+                               mutable_data<float>(bounds), scope.workspace, scope.stream);
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
+    const Tensor& bounds, const std::vector<Tensor>& rows, const Tensor& viewmats_in, const Tensor& Ks_in,
+    std::int64_t width, std::int64_t height, double near_plane, double far_plane, double eps2d,
+    const std::optional<Tensor>& level_ranges_in, const std::optional<Tensor>& level,
+    const std::vector<double>& reach, std::int64_t lod_views, const std::optional<Tensor>& cull,
+    const std::vector<std::int64_t>& columns, std::optional<std::int64_t> capacity_in) {
+  const char* op = "cull_blocks";
+  const HeldRows held = hold_rows(op, rows);
+  check_bounds(op, bounds, held.rows.n);
+  const Tensor viewmats = checked(op, "viewmats", viewmats_in, ScalarType::Float, {-1, 4, 4});
+  const std::int64_t views = viewmats.size(0);
+  STD_TORCH_CHECK(views <= kMaxViews, "blitzgs::", op, ": at most ", kMaxViews, " views at once, got ",
+                  views);
+  const Tensor Ks = checked(op, "Ks", Ks_in, ScalarType::Float, {views, 3, 3});
+  const CullCamera camera{data<float>(viewmats),          data<float>(Ks),
+                          static_cast<int>(width),        static_cast<int>(height),
+                          static_cast<float>(near_plane), static_cast<float>(far_plane),
+                          static_cast<float>(eps2d)};
+  STD_TORCH_CHECK(level_ranges_in.has_value() == level.has_value(), "blitzgs::", op,
+                  ": a gate needs level_ranges and level");
+  BlockGate gate{};
+  std::optional<HeldRules> rules;
+  const std::optional<Tensor> level_ranges =
+      checked(op, "level_ranges", level_ranges_in, ScalarType::Byte, {blocks_of(held.rows.n), 2});
+  if (level) {
+    rules = hold_rules(op, held.rows.n, static_cast<int>(views), *level, reach, lod_views, cull, columns);
+    gate = {rules->rules, data<std::uint8_t>(*level_ranges)};
+  }
+  DeviceScope scope(bounds);
+  const CullInputs in{held.rows, data<float>(bounds), camera, static_cast<int>(views), gate};
+  STD_TORCH_CHECK(!capacity_in || *capacity_in > 0, "blitzgs::", op,
+                  ": capacity_blocks must be for 1 block or more, got ", *capacity_in);
+  const std::int64_t capacity = capacity_in ? std::min(*capacity_in, blocks_of(held.rows.n))
+                                            : backend::count_active_blocks(in, scope.workspace, scope.stream);
+  Tensor active_ids = make_empty(bounds, {capacity * kBlockRows}, ScalarType::Int);
+  Tensor active_views = make_empty(bounds, {capacity * kBlockRows}, ScalarType::Int);
+  Tensor count = make_empty(bounds, {1}, ScalarType::Int),
+         n_blocks = make_empty(bounds, {1}, ScalarType::Int);
+  const ActiveList list{mutable_data<std::int32_t>(active_ids), mutable_data<std::int32_t>(active_views),
+                        mutable_data<std::int32_t>(count), mutable_data<std::int32_t>(n_blocks), capacity};
+  backend::cull_blocks(in, list, scope.workspace, scope.stream);
+  return {active_ids, active_views, count, n_blocks};
+}
+
+Tensor sectors_of_rows(const Tensor& rows_in) {
+  check_dtype("sectors_of_rows", "rows", rows_in, ScalarType::Int);
+  check_shape("sectors_of_rows", "rows", rows_in, {-1, -1});
+  Tensor rows = as_contiguous(rows_in);
+  const std::int64_t n = rows.size(0), words = rows.size(1);
+  Tensor sectors = make_empty(rows, {blocks_of(n), 32 * words, kSectorWords});
+  DeviceScope scope(rows);
+  backend::sectors_of_rows({mutable_data<std::int32_t>(rows), mutable_data<std::int32_t>(sectors), n, words},
+                           scope.stream);
+  return sectors;
+}
+
+Tensor rows_of_sectors(const Tensor& sectors_in, std::int64_t n) {
+  constexpr const char* kOp = "rows_of_sectors";
+  check_dtype(kOp, "sectors", sectors_in, ScalarType::Int);
+  check_shape(kOp, "sectors", sectors_in, {blocks_of(n), -1, kSectorWords});
+  STD_TORCH_CHECK(sectors_in.size(1) % 32 == 0, "blitzgs::", kOp,
+                  ": sectors must be of a multiple of 32 columns, got ", sectors_in.size(1));
+  Tensor sectors = as_contiguous(sectors_in);
+  const std::int64_t words = sectors.size(1) / 32;
+  Tensor rows = make_empty(sectors, {n, words});
+  DeviceScope scope(sectors);
+  backend::rows_of_sectors({mutable_data<std::int32_t>(rows), mutable_data<std::int32_t>(sectors), n, words},
+                           scope.stream);
+  return rows;
+}
+
+constexpr const char* kGateViews = "gate_views_";
+
+void gate_views_(const Tensor& ids_in, Tensor views, const std::optional<Tensor>& count,
+                 const Tensor& means_in, const Tensor& level_in, const Tensor& viewmats_in,
+                 const std::vector<double>& reach, std::int64_t lod_views,
+                 const std::optional<Tensor>& cull_in, const std::vector<std::int64_t>& columns) {
+  const Tensor ids = checked(kGateViews, "ids", ids_in, ScalarType::Int, {-1});
+  const std::int64_t capacity = ids.size(0);
+  check_in_place(kGateViews, "views", views, ScalarType::Int, {capacity});
+  const Tensor means = checked(kGateViews, "means", means_in, ScalarType::Float, {-1, 3});
+  const Tensor viewmats = checked(kGateViews, "viewmats", viewmats_in, ScalarType::Float, {-1, 4, 4});
+  STD_TORCH_CHECK(viewmats.size(0) <= kMaxViews, "blitzgs::", kGateViews, ": at most ", kMaxViews,
+                  " views at once, got ", viewmats.size(0));
+  const HeldRules held = hold_rules(kGateViews, means.size(0), static_cast<int>(viewmats.size(0)), level_in,
+                                    reach, lod_views, cull_in, columns);
+  if (!leaves_out_any(held.rules)) return;
+  const ViewGateArgs args{data<std::int32_t>(ids),
+                          mutable_data<std::int32_t>(views),
+                          max_listed(kGateViews, count, capacity),
+                          data_or_null<std::int32_t>(count),
+                          data<float>(means),
+                          data<float>(viewmats),
+                          held.rules};
+  DeviceScope scope(views);
+  backend::gate_views(args, scope.workspace, scope.stream);
+}
+
+Tensor seen_blocks(const Tensor& bounds, const Tensor& viewmats_in, const Tensor& Ks_in,
+                   const Tensor& sizes_in, double near_plane, double far_plane, double eps2d) {
+  constexpr const char* kOp = "seen_blocks";
+  check_dtype(kOp, "bounds", bounds, ScalarType::Float);
+  check_shape(kOp, "bounds", bounds, {-1, kBlockBounds});
+  check_dtype(kOp, "viewmats", viewmats_in, ScalarType::Float);
+  check_shape(kOp, "viewmats", viewmats_in, {-1, 4, 4});
+  const std::int64_t views = viewmats_in.size(0);
+  STD_TORCH_CHECK(views <= kMaxViews, "blitzgs::", kOp, ": at most ", kMaxViews, " views at once, got ",
+                  views);
+  check_dtype(kOp, "Ks", Ks_in, ScalarType::Float);
+  check_shape(kOp, "Ks", Ks_in, {views, 3, 3});
+  check_dtype(kOp, "sizes", sizes_in, ScalarType::Int);
+  check_shape(kOp, "sizes", sizes_in, {views, 2});
+  const Tensor boxes = as_contiguous(bounds), viewmats = as_contiguous(viewmats_in);
+  const Tensor Ks = as_contiguous(Ks_in), sizes = as_contiguous(sizes_in);
+  Tensor seen = make_empty(boxes, {boxes.size(0)}, ScalarType::Int);
+  DeviceScope scope(boxes);
+  backend::seen_blocks(
+      {data<float>(boxes), boxes.size(0), data<float>(viewmats), data<float>(Ks), data<std::int32_t>(sizes),
+       static_cast<int>(views), static_cast<float>(near_plane), static_cast<float>(far_plane),
+       static_cast<float>(eps2d), mutable_data<std::int32_t>(seen)},
+      scope.workspace, scope.stream);
+  return seen;
+}
+
+// Checks a column of the pool and of the table, and returns the bytes of a block of this column.
+std::int64_t check_pair(const char* op, const Tensor& pool, const Tensor& table) {
+  STD_TORCH_CHECK(pool.dim() >= 1 && pool.dim() == table.dim(), "blitzgs::", op,
+                  ": columns must have rows, and as many axes in pool and table; got ", shape_of(pool),
+                  " and ", shape_of(table));
+  check_dtype(op, "a column of the pool", pool, table.scalar_type());
+  std::int64_t elements = 1;
+  for (std::int64_t axis = 1; axis < pool.dim(); ++axis) {
+    STD_TORCH_CHECK(pool.size(axis) == table.size(axis), "blitzgs::", op,
+                    ": rows of pool and table must be alike, got ", shape_of(pool), " and ", shape_of(table));
+    elements *= pool.size(axis);
+  }
+  for (const Tensor* column : {&pool, &table}) check_contiguous(op, "columns", *column);
+  STD_TORCH_CHECK(table.is_cpu(), "blitzgs::", op, ": the table must be in the memory of the host");
+  return kBlockRows * elements * static_cast<std::int64_t>(pool.element_size());
+}
+
+void swap_blocks_(std::vector<Tensor> pool, std::vector<Tensor> table, std::int64_t n_written,
+                  const Tensor& slots, const Tensor& leaving, const Tensor& coming) {
+  constexpr const char* kOp = "swap_blocks_";
+  const auto n_columns = static_cast<std::int64_t>(pool.size());
+  STD_TORCH_CHECK(n_columns <= kMaxSwapColumns && table.size() == pool.size(), "blitzgs::", kOp,
+                  ": pool and table must have the same columns, at most ", kMaxSwapColumns, "; got ",
+                  n_columns, " and ", table.size());
+  SwapBlocks swap{};
+  swap.n = slots.size(0);
+  for (const auto& [name, list] :
+       {std::pair{"slots", &slots}, std::pair{"leaving", &leaving}, std::pair{"coming", &coming}}) {
+    check_in_place(kOp, name, *list, ScalarType::Int, {swap.n});
+  }
+  for (std::int64_t c = 0; c < n_columns; ++c) {
+    const std::int64_t bytes = check_pair(kOp, pool[c], table[c]);
+    if (bytes == 0) continue;
+    swap.columns[swap.n_columns++] = {static_cast<std::byte*>(pool[c].mutable_data_ptr()),
+                                      static_cast<std::byte*>(table[c].mutable_data_ptr()), bytes,
+                                      c < n_written};
+  }
+  swap.slots = data<std::int32_t>(slots);
+  swap.leaving = data<std::int32_t>(leaving);
+  swap.coming = data<std::int32_t>(coming);
+  if (swap.n == 0 || n_columns == 0) return;
+  DeviceScope scope(slots);
+  backend::swap_blocks(swap, scope.workspace, scope.stream);
+}
+
+Tensor morton_keys(const Tensor& points) {
+  const Tensor rows = checked("morton_keys", "points", points, ScalarType::Float, {-1, 3});
+  Tensor keys = make_empty(rows, {rows.size(0)}, ScalarType::Long);
+  DeviceScope scope(rows);
+  backend::morton_keys(data<float>(rows), rows.size(0), mutable_data<std::int64_t>(keys), scope.workspace,
+                       scope.stream);
+  return keys;
+}
+
+}  // namespace
+}  // namespace blitzgs
+
+BLITZGS_REGISTER(m) {
+  m.impl("update_block_bounds_", TORCH_BOX(&blitzgs::update_block_bounds_));
+  m.impl("cull_blocks", TORCH_BOX(&blitzgs::cull_blocks));
+  m.impl("sectors_of_rows", TORCH_BOX(&blitzgs::sectors_of_rows));
+  m.impl("rows_of_sectors", TORCH_BOX(&blitzgs::rows_of_sectors));
+  m.impl("gate_views_", TORCH_BOX(&blitzgs::gate_views_));
+  m.impl("seen_blocks", TORCH_BOX(&blitzgs::seen_blocks));
+  m.impl("swap_blocks_", TORCH_BOX(&blitzgs::swap_blocks_));
+  m.impl("morton_keys", TORCH_BOX(&blitzgs::morton_keys));
+}

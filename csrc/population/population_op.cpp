@@ -1,0 +1,248 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "population/density_stats.h"
+
+#include "common/op.h"
+#include "population/find_non_finite.h"
+#include "population/knn.h"
+#include "population/spawn_features.h"
+#include "population/take_rows.h"
+#include "population/tree_sums.h"
+#include "population/voxel_keys.h"
+
+namespace blitzgs {
+namespace {
+
+constexpr const char* kDensityStats = "density_stats_";
+
+void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const Tensor& visible_ids_in,
+                    const Tensor& splat_offsets_in, const Tensor& v_means2d_in, const Tensor& conics_in,
+                    const std::optional<Tensor>& phi_in, std::int64_t width, std::int64_t height,
+                    double weight) {
+  check_floating(kDensityStats, "grad_sum", grad_sum);
+  const ScalarType dtype = grad_sum.scalar_type();
+  const std::int64_t rows = grad_sum.numel();
+  check_in_place(kDensityStats, "grad_sum", grad_sum, dtype, {rows});
+  check_in_place(kDensityStats, "grad_count", grad_count, ScalarType::Int, {rows});
+  check_in_place(kDensityStats, "max_radii", max_radii, dtype, {rows});
+  const Tensor visible_ids = checked(kDensityStats, "visible_ids", visible_ids_in, ScalarType::Int, {-1});
+  const std::int64_t visible = visible_ids.size(0);
+  const Tensor splat_offsets =
+      checked(kDensityStats, "splat_offsets", splat_offsets_in, ScalarType::Int, {visible + 1});
+  const Tensor conics = checked(kDensityStats, "conics", conics_in, dtype, {-1, 3});
+  const std::optional<Tensor> phi = checked(kDensityStats, "phi", phi_in, dtype, {rows});
+  check_dtype(kDensityStats, "v_means2d", v_means2d_in, dtype);
+  check_shape(kDensityStats, "v_means2d", v_means2d_in, {conics.size(0), 2});
+  if (visible == 0) return;
+  // If v_means2d is a part of the rows of a gradient table, the kernel reads it there, without a copy.
+  const Tensor v_means2d = v_means2d_in.stride(1) == 1 ? v_means2d_in : as_contiguous(v_means2d_in);
+
+  DeviceScope scope(grad_sum);
+  dispatch_floating(grad_sum, [&](auto zero) {
+    using T = decltype(zero);
+    const DensityStatsArgs<T> args{mutable_data<T>(grad_sum),
+                                   mutable_data<std::int32_t>(grad_count),
+                                   mutable_data<T>(max_radii),
+                                   data<std::int32_t>(visible_ids),
+                                   data<std::int32_t>(splat_offsets),
+                                   data<T>(v_means2d),
+                                   v_means2d.stride(0),
+                                   data<T>(conics),
+                                   data_or_null<T>(phi),
+                                   visible,
+                                   static_cast<T>(width) / 2,
+                                   static_cast<T>(height) / 2,
+                                   static_cast<T>(weight)};
+    backend::density_stats(args, scope.workspace, scope.stream);
+  });
+}
+
+std::int64_t row_elements(const Tensor& column) {
+  std::int64_t elements = 1;
+  for (std::int64_t axis = 1; axis < column.dim(); ++axis) elements *= column.size(axis);
+  return elements;
+}
+
+Tensor take_rows(const Tensor& column, const Tensor& rows, const std::optional<Tensor>& fresh) {
+  constexpr const char* kOp = "take_rows";
+  STD_TORCH_CHECK(column.dim() >= 1, "blitzgs::take_rows: column must have rows, got ", shape_of(column));
+  check_shape(kOp, "rows", rows, {-1});
+  check_dtype(kOp, "rows", rows, ScalarType::Long);
+  const Tensor old = as_contiguous(column), places = as_contiguous(rows);
+  std::optional<Tensor> added;
+  if (fresh) {
+    check_dtype(kOp, "fresh", *fresh, column.scalar_type());
+    STD_TORCH_CHECK(fresh->dim() == column.dim() && row_elements(*fresh) == row_elements(column),
+                    "blitzgs::take_rows: rows of fresh must be like those of column, got ", shape_of(*fresh),
+                    " for ", shape_of(column));
+    added = as_contiguous(*fresh);
+  }
+  std::vector<std::int64_t> shape{places.size(0)};
+  for (std::int64_t axis = 1; axis < column.dim(); ++axis) shape.push_back(column.size(axis));
+  Tensor out = make_empty(old, shape);
+  const auto row_bytes = row_elements(old) * static_cast<std::int64_t>(old.element_size());
+  STD_TORCH_CHECK(row_bytes < (1 << 16), "blitzgs::take_rows: rows must be shorter than 64 KiB, got ",
+                  row_bytes, " bytes");
+  DeviceScope scope(old);
+  backend::take_rows({static_cast<const std::byte*>(old.const_data_ptr()), data_or_null<std::byte>(added),
+                      static_cast<std::byte*>(out.mutable_data_ptr()), data<std::int64_t>(places),
+                      places.size(0), old.size(0), row_bytes},
+                     scope.workspace, scope.stream);
+  return out;
+}
+
+Tensor find_non_finite(const std::vector<Tensor>& columns_in, const std::vector<Tensor>& nonzero_in) {
+  constexpr const char* kOp = "find_non_finite";
+  STD_TORCH_CHECK(!columns_in.empty(), "blitzgs::", kOp, ": there must be columns");
+  std::vector<Tensor> columns;
+  for (const std::vector<Tensor>* list : {&columns_in, &nonzero_in}) {
+    for (const Tensor& column : *list) {
+      check_floating(kOp, "a column", column);
+      check_dtype(kOp, "a column", column, columns_in[0].scalar_type());
+      columns.push_back(as_contiguous(column));
+    }
+  }
+  Tensor bad = make_empty(columns[0], {}, ScalarType::Int);
+  DeviceScope scope(columns[0]);
+  backend::clear_flag(mutable_data<std::int32_t>(bad), scope.stream);
+  dispatch_floating(columns[0], [&](auto zero) {
+    using T = decltype(zero);
+    for (std::size_t first = 0; first < columns.size(); first += kMaxCheckedColumns) {
+      CheckedColumns<T> checked{{}, 0, mutable_data<std::int32_t>(bad)};
+      for (std::size_t c = first; c < columns.size() && checked.n < kMaxCheckedColumns; ++c) {
+        checked.columns[checked.n++] = {data<T>(columns[c]), columns[c].numel(), c >= columns_in.size()};
+      }
+      backend::check_columns(checked, scope.stream);
+    }
+  });
+  return bad;
+}
+
+constexpr const char* kTreeSums = "tree_sums";
+constexpr std::int64_t kMaxFeatures = 32;  // the features of a block's rows are in shared memory
+
+Tensor tree_sums(const Tensor& features_in, const Tensor& roots_in, const Tensor& nodes_in,
+                 const Tensor& leaves_in, std::int64_t depth) {
+  check_dtype(kTreeSums, "features", features_in, ScalarType::Float);
+  check_shape(kTreeSums, "features", features_in, {-1, -1});
+  check_dtype(kTreeSums, "roots", roots_in, ScalarType::Int);
+  check_shape(kTreeSums, "roots", roots_in, {-1});
+  check_dtype(kTreeSums, "nodes", nodes_in, ScalarType::Int);
+  check_shape(kTreeSums, "nodes", nodes_in, {-1, 4});
+  check_dtype(kTreeSums, "leaves", leaves_in, ScalarType::Long);
+  check_shape(kTreeSums, "leaves", leaves_in, {nodes_in.size(0)});
+  const std::int64_t rows = features_in.size(0), n_features = features_in.size(1);
+  STD_TORCH_CHECK(n_features <= kMaxFeatures, "blitzgs::", kTreeSums, ": at most ", kMaxFeatures,
+                  " features, got ", n_features);
+  STD_TORCH_CHECK(depth >= 0, "blitzgs::", kTreeSums, ": depth must not be negative, got ", depth);
+  const Tensor features = as_contiguous(features_in), roots = as_contiguous(roots_in);
+  const Tensor nodes = as_contiguous(nodes_in), leaves = as_contiguous(leaves_in);
+  Tensor sums = make_empty(features, {rows}, ScalarType::Long);
+  DeviceScope scope(features);
+  const TreeSumsArgs args{data<float>(features),
+                          data<std::int32_t>(roots),
+                          reinterpret_cast<const TreeNode*>(data<std::int32_t>(nodes)),
+                          data<std::int64_t>(leaves),
+                          rows,
+                          n_features,
+                          static_cast<int>(roots.numel()),
+                          static_cast<int>(depth),
+                          mutable_data<std::int64_t>(sums)};
+  backend::tree_sums(args, scope.stream);
+  return sums;
+}
+
+constexpr const char* kSpawnOp = "spawn_features";
+
+Tensor spawn_features(const std::vector<Tensor>& columns, const Tensor& rows_in, const Tensor& is_split_in,
+                      std::int64_t time, double extent, std::int64_t level_count) {
+  STD_TORCH_CHECK(columns.size() == 7, "blitzgs::", kSpawnOp,
+                  ": columns must be (grad_sum, grad_count, opacities, scales, birth, level, "
+                  "exp_avg_sq.sh), got ",
+                  columns.size(), " tensors");
+  const std::int64_t n = columns[0].size(0);
+  const auto column = [&](int i, const char* name, ScalarType dtype,
+                          std::initializer_list<std::int64_t> shape) {
+    return checked(kSpawnOp, name, columns[i], dtype, shape);
+  };
+  const Tensor grad_sum = column(0, "grad_sum", ScalarType::Float, {n}),
+               grad_count = column(1, "grad_count", ScalarType::Int, {n}),
+               opacities = column(2, "opacities", ScalarType::Float, {n}),
+               scales = column(3, "scales", ScalarType::Float, {n, 3}),
+               birth = column(4, "birth", ScalarType::Int, {n}),
+               level = column(5, "level", ScalarType::Byte, {n}),
+               moments = column(6, "exp_avg_sq.sh", ScalarType::Float, {n, -1, 3});
+  STD_TORCH_CHECK(moments.size(1) > 0, "blitzgs::", kSpawnOp, ": exp_avg_sq.sh must have coefficients");
+  STD_TORCH_CHECK(extent > 0, "blitzgs::", kSpawnOp, ": extent must be positive, got ", extent);
+  STD_TORCH_CHECK(level_count > 0, "blitzgs::", kSpawnOp, ": level_count must be positive, got ",
+                  level_count);
+  const Tensor rows = checked(kSpawnOp, "rows", rows_in, ScalarType::Long, {-1}),
+               is_split = checked(kSpawnOp, "is_split", is_split_in, ScalarType::Bool, {rows.size(0)});
+  Tensor features = make_empty(grad_sum, {rows.size(0), kSpawnFeatures});
+  DeviceScope scope(grad_sum);
+  const SpawnFeaturesArgs args{data<float>(grad_sum),
+                               data<std::int32_t>(grad_count),
+                               data<float>(opacities),
+                               data<float>(scales),
+                               data<std::int32_t>(birth),
+                               data<std::uint8_t>(level),
+                               data<float>(moments),
+                               3 * moments.size(1),
+                               data<std::int64_t>(rows),
+                               data<bool>(is_split),
+                               rows.size(0),
+                               time,
+                               extent,
+                               static_cast<int>(level_count),
+                               mutable_data<float>(features)};
+  backend::spawn_features(args, scope.stream);
+  return features;
+}
+
+Tensor knn_distances(const Tensor& points, std::int64_t k) {
+  check_floating("knn_distances", "points", points);
+  check_shape("knn_distances", "points", points, {-1, 3});
+  STD_TORCH_CHECK(k >= 1 && k <= kKnnMaxK, "blitzgs::knn_distances: k must be in [1, ", kKnnMaxK, "], got ",
+                  k);
+  const std::int64_t n = points.size(0);
+  STD_TORCH_CHECK(n < (std::int64_t{1} << 31) - kKnnFan, "blitzgs::knn_distances: at most 2^31 points, got ",
+                  n);
+  const Tensor rows = as_contiguous(points);
+  Tensor distances = make_empty(rows, {n, k});
+  DeviceScope scope(rows);
+  dispatch_floating(rows, [&](auto zero) {
+    using T = decltype(zero);
+    backend::knn_distances(data<T>(rows), static_cast<std::int32_t>(n), static_cast<int>(k),
+                           mutable_data<T>(distances), scope.workspace, scope.stream);
+  });
+  return distances;
+}
+
+Tensor voxel_keys(const Tensor& points, const std::vector<double>& origin, double voxel_size) {
+  check_floating("voxel_keys", "points", points);
+  check_shape("voxel_keys", "points", points, {-1, 3});
+  STD_TORCH_CHECK(origin.size() == 3, "blitzgs::voxel_keys: origin must have 3 values, got ", origin.size());
+  STD_TORCH_CHECK(voxel_size > 0, "blitzgs::voxel_keys: voxel_size must be positive, got ", voxel_size);
+  const Tensor rows = as_contiguous(points);
+  Tensor keys = make_empty(rows, {rows.size(0)}, ScalarType::Long);
+  DeviceScope scope(rows);
+  const VoxelGrid grid{{origin[0], origin[1], origin[2]}, voxel_size};
+  dispatch_floating(rows, [&](auto zero) {
+    using T = decltype(zero);
+    backend::voxel_keys(data<T>(rows), rows.size(0), grid, mutable_data<std::int64_t>(keys), scope.workspace,
+                        scope.stream);
+  });
+  return keys;
+}
+
+}  // namespace
+}  // namespace blitzgs
+
+BLITZGS_REGISTER(m) {
+  m.impl("density_stats_", TORCH_BOX(&blitzgs::density_stats_));
+  m.impl("take_rows", TORCH_BOX(&blitzgs::take_rows));
+  m.impl("find_non_finite", TORCH_BOX(&blitzgs::find_non_finite));
+  m.impl("tree_sums", TORCH_BOX(&blitzgs::tree_sums));
+  m.impl("spawn_features", TORCH_BOX(&blitzgs::spawn_features));
+  m.impl("knn_distances", TORCH_BOX(&blitzgs::knn_distances));
+  m.impl("voxel_keys", TORCH_BOX(&blitzgs::voxel_keys));
+}
