@@ -23,6 +23,8 @@ GEOCENTRIC = "EPSG:4978"
 # The smaller spread of points, as a share of the larger, from which a similarity has no free turn left.
 _LEAST_WIDTH = 1e-3
 _MAX_BYTES = 1 << 20
+# WGS 84: the major axis in metres, and the square of the eccentricity.
+_AXIS, _E2 = 6378137.0, (2 - 1 / 298.257223563) / 298.257223563
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +71,13 @@ class WorldFrame:
         if match := re.match(r'\s*\w+\[\s*"([^"]+)"', self.crs):
             return match[1]
         return self.crs or "local coordinates"
+
+    def label(self, position: Float64) -> str:
+        """Return a position [3] of the capture in the world, for people."""
+        if self.crs == GEOCENTRIC:
+            latitude, longitude, height = geodetic(self.to_world(position))
+            return f"{latitude:.7f}\N{DEGREE SIGN} {longitude:.7f}\N{DEGREE SIGN} {height:.2f} m (WGS 84)"
+        return "E {:.2f} N {:.2f} h {:.2f}".format(*self.to_world(position)) + f" ({self.name})"
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of the file `geo.json`."""
@@ -177,6 +186,12 @@ def read_offset(path: Path, prj: list[Path]) -> WorldFrame:
     return WorldFrame(crs, translation=offset, source=path.name)
 
 
+def utm_of_text(text: str) -> str:
+    """Return the code of a zone that OpenDroneMap writes as "WGS84 UTM 33N"; empty: it is none."""
+    zone = re.fullmatch(r"WGS84 UTM (\d{1,2})([NS])", text.strip())
+    return f"EPSG:{(32600 if zone[2] == 'N' else 32700) + int(zone[1])}" if zone else ""
+
+
 def enu_frame(latitude: float, longitude: float, altitude: float, source: str) -> WorldFrame:
     """Return the frame of a capture whose axes are east, north and up at a place of WGS 84.
 
@@ -189,13 +204,24 @@ def enu_frame(latitude: float, longitude: float, altitude: float, source: str) -
     if not (abs(latitude) <= 90 and abs(longitude) <= 360 and abs(altitude) < 1e6):  # NaN too
         raise ValueError(f"{source}: no place on earth: {latitude}, {longitude}, {altitude}")
     lat, lon = math.radians(latitude), math.radians(longitude)
-    a, f = 6378137.0, 1 / 298.257223563
-    e2 = f * (2 - f)
-    n = a / math.sqrt(1 - e2 * math.sin(lat) ** 2)
+    n = _AXIS / math.sqrt(1 - _E2 * math.sin(lat) ** 2)
     up = np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
     east = np.array([-math.sin(lon), math.cos(lon), 0.0])
-    origin = (n + altitude) * up - np.array([0, 0, n * e2 * math.sin(lat)])
+    origin = (n + altitude) * up - np.array([0, 0, n * _E2 * math.sin(lat)])
     return WorldFrame(GEOCENTRIC, 1.0, np.stack([east, np.cross(up, east), up], axis=1), origin, source)
+
+
+def geodetic(position: Float64) -> tuple[float, float, float]:
+    """Return latitude and longitude in degrees and the height above WGS 84 of a geocentric position [3]."""
+    x, y, z = position.tolist()
+    across = math.hypot(x, y)
+    latitude = math.atan2(z, across * (1 - _E2))
+    for _ in range(10):  # converges by a factor of 300 a step near the ground
+        n = _AXIS / math.sqrt(1 - _E2 * math.sin(latitude) ** 2)
+        latitude = math.atan2(z + _E2 * n * math.sin(latitude), across)
+    up = across * math.cos(latitude) + z * math.sin(latitude)
+    height = up - _AXIS * math.sqrt(1 - _E2 * math.sin(latitude) ** 2)
+    return math.degrees(latitude), math.degrees(math.atan2(y, x)), height
 
 
 def pyproj_module() -> Any:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `blitzgs train | eval | render | view | export | gate | synth`, one file per command.
+"""The command line: `blitzgs train | eval | render | view | export | align | gate | synth`, a file each.
 
 A command's file is imported when the command is used: `blitzgs --help` needs no torch.
 """
@@ -42,6 +42,7 @@ COMMANDS = {
     "render": ("blitzgs.cli.render", "render the views of a run to files (needs no photographs)"),
     "view": ("blitzgs.cli.view", "look at a model in the browser"),
     "export": ("blitzgs.cli.export", "write the model of a run as a PLY file for viewers"),
+    "align": ("blitzgs.cli.align", "find out where a model lies in the world: control points, GPS, a CRS"),
     "gate": ("blitzgs.cli.gate", "fit and evaluate spawn gates, which make smaller models"),
     "synth": (
         "blitzgs.cli.synth",

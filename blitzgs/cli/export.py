@@ -13,6 +13,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import check_replaces_ply
 from blitzgs.runs.export import COORDINATES, Exported, export_ply, without_antialiasing
 from blitzgs.runs.folder import open_run
+from blitzgs.runs.world import in_world, load_frame
 
 HELP = """\
 Write the model of a run as a PLY file in INRIA's layout, which most viewers read.
@@ -39,10 +40,11 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser.add_argument("--ply", type=named_path, required=True, metavar="FILE", help="file to write")
     parser.add_argument(
         "--coordinates",
-        choices=COORDINATES,
+        choices=(*COORDINATES, "world"),
         default="auto",
         help="capture: the capture's coordinates; centred: relative to the model's origin; auto: the "
-        "capture's if float32 can hold them (default: %(default)s)",
+        "capture's if float32 can hold them; world: those of RUN/geo.json (`blitzgs align`), as auto "
+        "(default: %(default)s)",
     )
     parser.add_argument(
         "--classic",
@@ -63,8 +65,16 @@ def run(args: argparse.Namespace) -> int:
         if args.classic and antialiased:
             stored = folder.cameras()
             model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
+        crs, coordinates = "", args.coordinates
+        if coordinates == "world":
+            frame = load_frame(args.folder)
+            if frame is None:
+                raise FileNotFoundError(
+                    f"{args.folder} has no geo.json, so its place in the world is unknown: use blitzgs align"
+                )
+            model, crs, coordinates = in_world(model, frame), frame.crs, "auto"
         args.ply.parent.mkdir(parents=True, exist_ok=True)
-        exported = export_ply(model, args.ply, args.coordinates)
+        exported = export_ply(model, args.ply, coordinates, crs)
     print(f"{args.ply}: {len(model):,} Gaussians, {args.ply.stat().st_size / 1e6:.1f} MB")
     _explain(exported, antialiased, args)
     return 0

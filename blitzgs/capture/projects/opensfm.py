@@ -15,7 +15,6 @@ Conventions (OpenSfM's documentation on geometric models and on reconstructions;
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -36,7 +35,7 @@ from blitzgs.capture.projects.project import (
     read_json,
     size_of,
 )
-from blitzgs.capture.world import WorldFrame, enu_frame, read_small
+from blitzgs.capture.world import WorldFrame, enu_frame, read_small, utm_of_text
 
 NAME = "reconstruction.json"
 _ORIGINAL = "reconstruction.topocentric.json"
@@ -132,12 +131,11 @@ def _frame(path: Path, part: Mapping[str, Any]) -> WorldFrame | None:
 def _odm_offset(path: Path) -> WorldFrame:
     """Read the offset of OpenDroneMap, for example "WGS84 UTM 33N" and "324190 6006088"."""
     lines = read_small(path).splitlines()[:2]
-    zone = re.fullmatch(r"WGS84 UTM (\d{1,2})([NS])", lines[0].strip()) if len(lines) == 2 else None
-    if zone is None:
+    crs = utm_of_text(lines[0]) if len(lines) == 2 else ""
+    if not crs:
         raise ValueError(f"{path}: line 1: expected a zone such as 'WGS84 UTM 33N'; run OpenDroneMap again")
     offset = numbers(lines[1], None, f"{path}: line 2")
     if len(offset) < 2:
         raise ValueError(f"{path}: line 2: expected east and north, got {lines[1]!r:.40}")
-    code = (32600 if zone[2] == "N" else 32700) + int(zone[1])
     translation = np.array([offset[0], offset[1], 0.0])
-    return WorldFrame(f"EPSG:{code}", translation=translation, source="coords.txt of OpenDroneMap")
+    return WorldFrame(crs, translation=translation, source="coords.txt of OpenDroneMap")
