@@ -109,7 +109,7 @@ def set_up(
         save_config(config, folder / run_files.CONFIG)
         if restored is None or not (folder / CAMERAS).exists():
             save_cameras(folder, capture, run_id)
-            if capture.about.source.frame is not None:
+            if restored is None and capture.about.source.frame is not None:
                 save_frame(folder, capture.about.source.frame)
     optimiser = TableAdam(config.optimiser, schedule, space.extent, ranks.device)
     owners = _tile_owners(ranks, progress, restored)

@@ -2,6 +2,7 @@
 """The command `blitzgs align`: control points, GPS and reference systems of a run."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,15 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from blitzgs.capture.capture import load_capture
+from blitzgs.capture.world import geodetic
 from blitzgs.cli import main
+from blitzgs.distributed.group import Ranks
 from blitzgs.runs.world import load_frame
+from blitzgs.viewer.overlay import overlay
+from blitzgs.viewer.studio import open_model
+from blitzgs.viewer.world import Stance, World
+from tests.capture import project_files as files
+from tests.training.tiny import OVERRIDES, as_flags
 
 TURN = Rotation.from_euler("z", 65, degrees=True).as_matrix()
 SHIFT = np.array([465_000.0, 5_250_000.0, 430.0])
@@ -96,6 +104,34 @@ def test_positions_in_exif_give_the_world(trained, survey, tmp_path, monkeypatch
     assert frame.scale == pytest.approx(12.5, rel=1e-3)
     centre = capture.offset
     np.testing.assert_allclose(frame.to_world(centre), 12.5 * TURN @ centre + SHIFT, atol=0.05)
+
+
+def test_a_training_of_a_project_knows_its_world_and_resuming_keeps_an_alignment(tmp_path, capsys):
+    posed = files.Posed()
+    files.opensfm(posed, posed.write_images(tmp_path / "site") / "reconstruction.json", (47.5, 8.25, 432.0))
+    run = tmp_path / "run"
+    flags = ["--out", str(run), "--schedule.scale=0.05", *as_flags("config=defaults", *OVERRIDES)]
+    assert main(["train", "--data", str(tmp_path / "site" / "reconstruction.json"), *flags]) == 0
+    frame = load_frame(run)
+    assert frame.crs == "EPSG:4978" and frame.scale == 1
+    place = frame.to_world(np.zeros(3))
+    np.testing.assert_allclose(geodetic(place), [47.5, 8.25, 432.0], atol=1e-8)
+    opened = open_model(run, Ranks())
+    visitor = SimpleNamespace(
+        world=World(opened.exhibit.space, opened.exhibit.cameras), exhibit=opened.exhibit, motion="orbit",
+        client=SimpleNamespace(camera=SimpleNamespace(look_at=(0, 0, 1), position=(0, 0, 0), aspect=1.5)),
+    )  # fmt: skip
+    visitor.stance = Stance(visitor.world.page_position(np.zeros(3)), np.eye(3), 0.8)
+    picture = SimpleNamespace(gaussians=1, milliseconds=1.0)
+    ask = SimpleNamespace(look=SimpleNamespace(width=3, height=2, mode="RGB"), camera=None)
+    shown = SimpleNamespace(ask=ask, picture=picture, psnr=None, low=None, high=None)
+    assert "47.5000000\N{DEGREE SIGN} 8.2500000\N{DEGREE SIGN} 432.00 m (WGS 84)" in overlay(
+        visitor, shown, ""
+    )
+    pytest.importorskip("pyproj")
+    assert main(["align", str(run), "--crs", "EPSG:32632"]) == 0
+    assert main(["train", "--out", str(run), "--extend", "1.2"]) == 0
+    assert load_frame(run).crs == "EPSG:32632"
 
 
 def dms(degrees):
