@@ -53,6 +53,12 @@ def test_metashape(tmp_path):
     np.testing.assert_allclose(source.frame.to_world(local), capture.points, atol=1e-8)
     np.testing.assert_allclose(source.frame.from_world(capture.points), local, atol=1e-8)
     assert any("1 photographs of the project have no pose" in note for note in source.notes)
+    text = (tmp_path / "cameras.xml").read_text()
+    (tmp_path / "cameras.xml").write_text(
+        text.replace(' component_id="2"', "").replace('id="3" ', 'id="3" enabled="false" ')
+    )
+    views, _, again = read(tmp_path)
+    assert len(views) == 5 and again.frame.scale == source.frame.scale
 
 
 def test_metashape_affinity_fourth_radial_and_old_fields(tmp_path):
@@ -246,6 +252,12 @@ def opf_without_calibration(root):
     (root / "project.opf").write_text(json.dumps(content))
 
 
+def opf_that_leads_outside(root):
+    files.opf(files.Posed(), root, UTM)
+    text = (root / "project.opf").read_text().replace("camera-list%201.json", "../secret.json")
+    (root / "project.opf").write_text(text)
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -277,6 +289,7 @@ def opf_without_calibration(root):
         (many_points, "expected the numbers of cameras and points"),
         (cut_pix4d, "58 lines are not 10 for each camera: it is cut off"),
         (opf_without_calibration, r"the project has no application/opf-calibrated-cameras\+json"),
+        (opf_that_leads_outside, "'../secret.json' leads outside the project"),
         (
             edited(files.opensfm, "reconstruction.json", "brown", "spherical"),
             "'spherical' cannot be read; known:",

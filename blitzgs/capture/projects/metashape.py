@@ -61,7 +61,11 @@ def read_metashape(path: Path) -> Project:
     sensors = {str(sensor.get("id")): sensor for sensor in chunk.iter("sensor")}
     views: list[ProjectView] = []
     components = []
-    cameras = [camera for camera in chunk.iter("camera") if camera.find("transform") is not None]
+    cameras = [
+        camera
+        for camera in chunk.iter("camera")
+        if camera.find("transform") is not None and camera.get("enabled", "true") not in ("false", "0")
+    ]
     for camera in cameras:
         where = f"{path}: camera {camera.get('id')} ({camera.get('label')})"
         label, sensor_id = camera.get("label"), str(camera.get("sensor_id"))
@@ -132,7 +136,10 @@ def _lens(sensor: Element, where: str) -> Lens:
 
 def _frame(chunk: Element, component: str | None, path: Path) -> WorldFrame | None:
     """Return the frame of the component's transform, else the chunk's; None: the chunk has no place."""
-    owners = [c for c in chunk.iter("component") if c.get("id") == component] + [chunk]
+    components = list(chunk.iter("component"))
+    if component is not None or len(components) > 1:
+        components = [c for c in components if c.get("id") == component]
+    owners = [*components, chunk]
     transform = next((t for owner in owners if (t := owner.find("transform")) is not None), None)
     if transform is None or transform.find("rotation") is None:
         return None

@@ -87,7 +87,10 @@ def _resources(path: Path) -> dict[str, Path]:
         for resource in _list(item, "resources", path):
             uri, kind = entry(resource, "uri", str, str(path)), entry(resource, "format", str, str(path))
             name = kind.removeprefix("application/opf-").removesuffix("+json")
-            files.setdefault(name, path.parent / unquote(urlparse(uri).path))
+            file = path.parent / unquote(urlparse(uri).path)
+            if not file.resolve().is_relative_to(path.parent.resolve()):
+                raise ValueError(f"{path}: {uri!r:.80} leads outside the project: put the file beside it")
+            files.setdefault(name, file)
     return files
 
 
