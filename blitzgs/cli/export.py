@@ -16,6 +16,7 @@ from blitzgs.formats.web_page import check_replaces_page
 from blitzgs.runs.export import COORDINATES, Exported, export_ply, without_antialiasing
 from blitzgs.runs.files import run_and_checkpoint
 from blitzgs.runs.folder import open_run
+from blitzgs.runs.world import in_world, load_frame
 from blitzgs.util.output import write_file
 
 # Default of --max-mb, and the largest file whose text browsers still hold in one piece.
@@ -61,9 +62,10 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     )
     parser.add_argument(
         "--coordinates",
-        choices=COORDINATES,
+        choices=(*COORDINATES, "world"),
         help="capture: the capture's coordinates; centred: relative to the model's origin; auto: the "
-        "capture's if float32 can hold them (default: auto)",
+        "capture's if float32 can hold them; world: those of RUN/geo.json (`blitzgs align`), as auto "
+        "(default: auto)",
     )
     parser.add_argument(
         "--classic",
@@ -115,8 +117,16 @@ def _export_ply(args: argparse.Namespace) -> int:
         if args.classic and antialiased:
             stored = folder.cameras()
             model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
+        crs, coordinates = "", args.coordinates
+        if coordinates == "world":
+            frame = load_frame(run_folder)
+            if frame is None:
+                raise FileNotFoundError(
+                    f"{run_folder} has no geo.json, so its place in the world is unknown: use blitzgs align"
+                )
+            model, crs, coordinates = in_world(model, frame), frame.crs, "auto"
         args.ply.parent.mkdir(parents=True, exist_ok=True)
-        exported = export_ply(model, args.ply, args.coordinates or "auto")
+        exported = export_ply(model, args.ply, coordinates or "auto", crs)
     print(f"{args.ply}: {len(model):,} Gaussians, {args.ply.stat().st_size / 1e6:.1f} MB")
     _explain(exported, antialiased, args)
     return 0

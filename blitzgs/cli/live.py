@@ -86,6 +86,7 @@ def live_page(state: TrainingState, port: int, host: str) -> Live | None:
         test=capture.test,
         photograph=lambda index: np.asarray(images.get(index).numpy()),
         paths=state.folder / "paths",
+        frame=capture.about.source.frame,
     )
     try:
         page = Live(exhibit, state.schedule.iterations, host, port)

@@ -87,7 +87,9 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         metavar="RECIPE",
         help="name of a recipe, or a YAML file (default: aerial on a GPU, aerial_cpu on a CPU)",
     )
-    parser.add_argument("--data", type=named_path, metavar="DIR", help="folder of the capture")
+    parser.add_argument(
+        "--data", type=named_path, metavar="DIR", help="folder of the capture, or another program's project"
+    )
     parser.add_argument("--out", type=named_path, metavar="RUN", help="folder for the results")
     parser.add_argument(
         "--resume", action="store_true", help="continue from the newest checkpoint in RUN, if any"

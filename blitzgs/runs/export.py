@@ -39,7 +39,7 @@ class Exported:
     rounding: float
 
 
-def export_ply(model: Model, path: Path, coordinates: str = "auto") -> Exported:
+def export_ply(model: Model, path: Path, coordinates: str = "auto", crs: str = "") -> Exported:
     """Write a model in INRIA's layout.
 
     PLY viewers read float32. Georeferenced coordinates such as (500000, 4600000) are then rounded to half a
@@ -51,6 +51,7 @@ def export_ply(model: Model, path: Path, coordinates: str = "auto") -> Exported:
         path: file to write.
         coordinates: "capture" writes the capture's coordinates, "centred" the re-centred ones; "auto" writes
             the capture's if float32 resolves them finely enough.
+        crs: reference system of the capture's coordinates, for the file of the offset; empty: unknown.
 
     Raises:
         ValueError: `coordinates` has another value.
@@ -101,7 +102,8 @@ def export_ply(model: Model, path: Path, coordinates: str = "auto") -> Exported:
             sidecar.unlink()
         return Exported(None, None, rounding)
     meaning = "capture coordinates = coordinates in the file + offset"
-    write_file(sidecar, json.dumps({"file": path.name, "offset": space.offset, "meaning": meaning}, indent=1))
+    content = {"file": path.name, "offset": space.offset, "meaning": meaning} | ({"crs": crs} if crs else {})
+    write_file(sidecar, json.dumps(content, indent=1))
     return Exported(space.offset, sidecar, rounding)
 
 

@@ -29,6 +29,7 @@ from blitzgs.runs.exposure import SHARED
 from blitzgs.runs.files import Progress
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
 from blitzgs.runs.log import LOG, RunLog
+from blitzgs.runs.world import save_frame
 from blitzgs.spawn.lineage import Lineage, initial_births, ledger_of
 from blitzgs.spawn.rules import lineage_subject, open_spawn_gate
 from blitzgs.table.blocks import morton_order
@@ -116,6 +117,8 @@ def set_up(
         save_config(config, folder / run_files.CONFIG)
         if restored is None or not (folder / CAMERAS).exists():
             save_cameras(folder, capture, run_id)
+            if restored is None and capture.about.source.frame is not None:
+                save_frame(folder, capture.about.source.frame)
     optimiser = TableAdam(config.optimiser, schedule, space.extent, ranks.device)
     owners = _tile_owners(ranks, progress, restored)
     views = ViewSet(list(capture.cameras), space, ranks.device)

@@ -46,6 +46,11 @@ def check_worlds(capture: Capture) -> None:
         HopelessCaptureError: see above.
     """
     views = len(capture.cameras)
+    if capture.about.blind == views and capture.about.random_points:
+        raise HopelessCaptureError(
+            f"{capture.root} has no points, and its cameras do not say where the scene is: put the points of "
+            "the reconstruction into the folder (PLY, LAS, LAZ or E57 for another program's project)"
+        )
     if capture.about.blind == views:
         raise HopelessCaptureError(
             f"{views} of {views} views see none of the {len(capture.points):,} points, so there is nothing "

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from blitzgs.capture.world import WorldFrame
 from blitzgs.view.views import CameraLike, Space
 
 
@@ -33,6 +34,7 @@ class Exhibit:
         photograph: returns the photograph of a camera, uint8 [H, W, 3]; None: there are none.
         exposures: gain and bias of photographs by their cameras, float64 [2, 3]; empty: the model has none.
         paths: folder for camera paths and screenshots.
+        frame: where the capture lies in the world; None: unknown.
     """
 
     title: str
@@ -50,3 +52,4 @@ class Exhibit:
     photograph: Callable[[int], npt.NDArray[np.uint8]] | None = None
     exposures: dict[int, npt.NDArray[np.float64]] = field(default_factory=dict)
     paths: Path = field(default_factory=lambda: Path("paths"))
+    frame: WorldFrame | None = None

@@ -29,6 +29,7 @@ def overlay(visitor: Visitor, shown: Shown, memory: str) -> str:
         f"{picture.gaussians:,} Gaussians in view &middot; {picture.milliseconds:.1f} ms &middot; "
         f"{look.width}&times;{look.height}" + (f" &middot; {memory}" if memory else ""),
         "x {:.2f} &nbsp;y {:.2f} &nbsp;z {:.2f}".format(*place),
+        *((_escaped(frame.label(place)),) if (frame := visitor.exhibit.frame) is not None else ()),
     ]
     if ask.camera is not None and shown.psnr is not None:
         name = visitor.exhibit.cameras[ask.camera].name

@@ -3,6 +3,7 @@
 
 import json
 import warnings
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 
 from blitzgs.capture import colmap
 from blitzgs.cli import main
+from blitzgs.training.understood import HopelessCaptureError, check_worlds
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, as_flags, write_tiny_capture
 
 FLAGS = as_flags("config=defaults", *OVERRIDES, "schedule.iterations=10")
@@ -117,6 +119,15 @@ def test_points_of_another_world_stop_the_run(data, capsys, tmp_path):
         shown = " ".join(capsys.readouterr().err.split())
         assert "8 of 8 views see none of the 400 points, so there is nothing to train" in shown
     assert not (tmp_path / "run").exists()
+
+
+def test_views_that_see_no_random_point_ask_for_points():
+    """As in a flight that looks straight down: parallel views do not meet anywhere."""
+    about = SimpleNamespace(blind=3, random_points=True)
+    with pytest.raises(
+        HopelessCaptureError, match="site has no points, .* put the points of the reconstruct"
+    ):
+        check_worlds(SimpleNamespace(cameras=[None] * 3, about=about, root="site"))
 
 
 def test_a_run_keeps_its_near_plane(data, tmp_path, capsys):

@@ -1,0 +1,299 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ground control points: surveyed places marked in photographs, and the similarity that they give."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from blitzgs.capture.cameras import Camera, Float64, camera_centres
+from blitzgs.capture.lens import Lens
+from blitzgs.capture.names import unified
+from blitzgs.capture.world import WorldFrame, fit_similarity, read_small, utm_of_text
+
+# The least angle between two rays to a point, in degrees: below it, its distance is unknown.
+_LEAST_ANGLE = 1.0
+_COLUMNS = ("name", "e", "n", "h", "image", "x", "y")
+_SAME = {"east": "e", "easting": "e", "north": "n", "northing": "n", "height": "h", "up": "h", "z": "h",
+         "alt": "h", "gcp": "name", "label": "name", "photo": "image", "px": "x", "py": "y"}  # fmt: skip
+# Of so many triples of points the best is searched.
+_TRIPLES = 500
+
+
+@dataclass
+class ControlPoint:
+    """A surveyed place and its marks.
+
+    Attributes:
+        name: of the point.
+        world: east, north, height.
+        marks: photograph's name, x and y in its pixels; the corner of the first pixel is (0, 0).
+    """
+
+    name: str
+    world: Float64
+    marks: list[tuple[str, float, float]] = field(default_factory=list)
+
+
+def read_control_points(path: Path) -> tuple[list[ControlPoint], str]:
+    """Read points from CSV (name, E, N, h, image, x, y; a row a mark) or OpenDroneMap's gcp_list.txt.
+
+    Returns:
+        The points, and the reference system that gcp_list.txt names (empty: none).
+
+    Raises:
+        ValueError: the file is damaged, or a point has two places; names the line.
+    """
+    lines = read_small(path).splitlines()
+    head = next((line for line in lines if line.strip()), "")
+    separator = next((s for s in (",", ";", "\t") if s in head), None)
+    columns = [word.strip().lower() for word in head.split(separator)] if separator else []
+    columns = [_SAME.get(column, column) for column in columns]
+    if not set(_COLUMNS) <= set(columns):
+        if separator is not None and not utm_of_text(head):
+            lost = ", ".join(sorted(set(_COLUMNS) - set(columns)))
+            raise ValueError(f"{path}: line 1: the columns {lost} are missing; expected {','.join(_COLUMNS)}")
+        return _gcp_list(path, lines)
+    points: dict[str, ControlPoint] = {}
+    begin = lines.index(head) + 1
+    for number, row in enumerate(csv.reader(lines[begin:], delimiter=separator or ","), start=begin + 1):
+        if not any(cell.strip() for cell in row):
+            continue
+        where = f"{path}: line {number}"
+        if len(row) < len(columns):
+            raise ValueError(f"{where}: {len(row)} values in {len(columns)} columns")
+        cells = dict(zip(columns, (cell.strip() for cell in row), strict=False))
+        _add(points, cells["name"], cells["image"], [cells[key] for key in ("e", "n", "h", "x", "y")], where)
+    return list(points.values()), ""
+
+
+def _gcp_list(path: Path, lines: Sequence[str]) -> tuple[list[ControlPoint], str]:
+    """Read OpenDroneMap's list: the reference system, then `E N h x y image [name]`."""
+    crs = lines[0].strip() if lines else ""
+    points: dict[str, ControlPoint] = {}
+    for number, line in enumerate(lines[1:], start=2):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        where = f"{path}: line {number}"
+        if len(words) < 6:
+            raise ValueError(f"{where}: expected E, N, h, x, y and an image, got {line!r:.60}")
+        _add(points, words[6] if len(words) > 6 else " ".join(words[:3]), words[5], words[:5], where)
+    if not points:
+        raise ValueError(f"{path}: no points: expected the columns {','.join(_COLUMNS)}, or a gcp_list.txt")
+    return list(points.values()), utm_of_text(crs) or crs
+
+
+def _add(points: dict[str, ControlPoint], name: str, image: str, words: Sequence[str], where: str) -> None:
+    try:
+        e, n, h, x, y = (float(word) for word in words)
+    except ValueError as error:
+        raise ValueError(f"{where}: expected numbers ({error})") from error
+    if not np.isfinite([e, n, h, x, y]).all() or not name or not image:
+        raise ValueError(f"{where}: a name, an image or a finite number is missing")
+    point = points.setdefault(name, ControlPoint(name, np.array([e, n, h])))
+    if not np.array_equal(point.world, [e, n, h]):
+        raise ValueError(f"{where}: {name} has another place on a line above: correct one of them")
+    point.marks.append((image, x, y))
+
+
+@dataclass
+class Placed:
+    """A control point in the coordinates of a capture.
+
+    Attributes:
+        point: surveyed place and marks.
+        position: [3] in the capture's own world; None: `problem` says why there is none.
+        problem: why it is not used; empty: it is.
+        cameras: of its marks.
+        pixels: [M, 2] its marks.
+        offset: [3] in world units, the fitted place minus the surveyed one.
+        reprojection: root mean square distance in pixels of the surveyed place from the marks.
+    """
+
+    point: ControlPoint
+    position: Float64 | None = None
+    problem: str = ""
+    cameras: list[Camera] = field(default_factory=list)
+    pixels: Float64 = field(default_factory=lambda: np.zeros((0, 2)))
+    offset: Float64 = field(default_factory=lambda: np.full(3, math.nan))
+    reprojection: float = math.nan
+
+
+def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Float64) -> list[Placed]:
+    """Find the points in the capture by the rays through their marks.
+
+    Args:
+        points: with marks in pixels of the photographs.
+        cameras: of a capture that was loaded without downscaling.
+        origin: `Capture.offset`.
+    """
+    by_name = _by_name(cameras)
+    found = []
+    for point in points:
+        seen = [(by_name.get(_key(image)), image, x, y) for image, x, y in point.marks]
+        known = [(camera, x, y) for camera, _, x, y in seen if camera is not None]
+        placed = Placed(point, None, "", [c for c, _, _ in known], np.array([[x, y] for _, x, y in known]))
+        found.append(placed)
+        if len({camera.name for camera, _, _ in known}) < 2:
+            lost = [image for camera, image, _, _ in seen if camera is None]
+            placed.problem = "marked in fewer than 2 views" + (f" ({lost[0]} is none)" if lost else "")
+            continue
+        try:
+            rays = [normalised(c.rectification.lens, x, y) for c, x, y in known]
+            placed.position = _intersect(placed.cameras, np.array(rays)) + origin
+        except ValueError as error:
+            placed.problem = str(error)
+    return found
+
+
+def _key(name: str) -> str:
+    return PurePosixPath(unified(name).casefold()).name
+
+
+def _by_name(cameras: Sequence[Camera]) -> Mapping[str, Camera]:
+    """Return the cameras by their names without folders, with and without suffix, where these are unique."""
+    named: dict[str, list[Camera]] = {}
+    for camera in cameras:
+        for key in {_key(camera.name), PurePosixPath(_key(camera.name)).stem}:
+            named.setdefault(key, []).append(camera)
+    return {key: some[0] for key, some in named.items() if len(some) == 1}
+
+
+def normalised(lens: Lens, x: float, y: float) -> Float64:
+    """Return the normalised coordinates (u, v) that a lens maps to a pixel, by Newton's method.
+
+    Raises:
+        ValueError: the pixel is outside the photograph, or outside what the lens maps.
+    """
+    if not (0 <= x <= lens.width and 0 <= y <= lens.height):
+        raise ValueError(f"the mark {x:g}, {y:g} is outside a photograph of {lens.width} x {lens.height}")
+    fx, fy, cx, cy = lens.intrinsics
+    at, step = np.array([(x - cx) / fx, (y - cy) / fy]), 1e-6
+    for _ in range(50):
+        around = at[:, None] + step * np.array([[0, 1, -1, 0, 0], [0, 0, 0, 1, -1]])
+        pixels = np.stack(lens.project(around[0], around[1]))
+        error = pixels[:, 0] - [x, y]
+        if np.abs(error).max() < 1e-10 * max(lens.width, lens.height):
+            break
+        jacobian = np.stack([pixels[:, 1] - pixels[:, 2], pixels[:, 3] - pixels[:, 4]], axis=1) / (2 * step)
+        if not np.isfinite(jacobian).all() or abs(np.linalg.det(jacobian)) < 1e-9:
+            break
+        at = at - np.linalg.solve(jacobian, error)
+    if np.abs(error).max() < 1e-6 and _before_fold(lens, at):
+        return at
+    raise ValueError(f"the mark {x:g}, {y:g} is outside what its lens of {lens.width} x {lens.height} maps")
+
+
+def _before_fold(lens: Lens, at: Float64) -> bool:
+    """Tell whether the pixels move outwards all the way from the axis to a direction."""
+    shares = np.linspace(0, 1, 64)
+    path = np.stack(lens.project(shares * at[0], shares * at[1]), axis=1)
+    return bool((np.diff(path @ (at * lens.intrinsics[:2])) >= 0).all())
+
+
+def _intersect(cameras: Sequence[Camera], rays: Float64) -> Float64:
+    """Return the point [3] in the re-centred world that is nearest to rays, by the distances in the images.
+
+    Args:
+        cameras: M cameras.
+        rays: [M, 2] normalised coordinates.
+    """
+    poses = np.stack([camera.world_to_camera for camera in cameras])
+    focal = np.array([camera.rectification.lens.intrinsics[0] for camera in cameras])
+    centres = camera_centres(poses)
+    directions = np.einsum(
+        "mji,mj->mi", poses[:, :3, :3], np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+    )
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    cosines = np.clip(directions @ directions.T, -1, 1)
+    angle = math.degrees(math.acos(float(cosines.min())))
+    if angle < _LEAST_ANGLE:
+        raise ValueError(
+            f"its rays differ by {angle:.2g} degrees only: mark it in views that are farther apart"
+        )
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    at = np.linalg.solve(across.sum(axis=0), np.einsum("mij,mj->i", across, centres))
+    for _ in range(10):  # Gauss-Newton on the distances in the images
+        local = np.einsum("mij,j->mi", poses[:, :3, :3], at) + poses[:, :3, 3]
+        if local[:, 2].min() <= 0:
+            raise ValueError("it lies behind a camera: a mark is in the wrong photograph")
+        projected = local[:, :2] / local[:, 2:]
+        slope = (poses[:, :2, :3] - projected[:, :, None] * poses[:, 2:3, :3]) / local[:, 2:, None]
+        weighted = slope * focal[:, None, None]
+        error = (projected - rays) * focal[:, None]
+        change = np.linalg.lstsq(weighted.reshape(-1, 3), error.ravel(), rcond=None)[0]
+        at = at - change
+        if np.linalg.norm(change) <= 1e-15 * np.linalg.norm(at):
+            break
+    return np.asarray(at)
+
+
+def align(placed: Sequence[Placed], origin: Float64, crs: str, source: str) -> WorldFrame:
+    """Fit the similarity to the points that agree, and write residuals into all that were found.
+
+    Of five points or more, those that contradict the others are left out (least median of squares over
+    triples: P. J. Rousseeuw, JASA 1984); `Placed.problem` says so.
+
+    Raises:
+        ValueError: fewer than three points can be used, or they lie on a line.
+    """
+    used = [point for point in placed if point.position is not None]
+    if len(used) < 3:
+        reasons = "; ".join(f"{p.point.name}: {p.problem}" for p in placed if p.problem)
+        raise ValueError(
+            f"{len(used)} of {len(placed)} control points can be used, and 3 are needed"
+            + f" ({reasons})" * bool(reasons)
+        )
+    capture = np.stack([p.position for p in used if p.position is not None])
+    world = np.stack([p.point.world for p in used])
+    kept = _consensus(capture, world)
+    frame = fit_similarity(capture[kept], world[kept], crs, source)
+    for point, position, good in zip(used, capture, kept, strict=True):
+        point.offset = frame.to_world(position) - point.point.world
+        point.problem = "" if good else "contradicts the others and is left out"
+        surveyed = frame.from_world(point.point.world) - origin
+        point.reprojection = _reprojection(point, surveyed)
+    return frame
+
+
+def _consensus(capture: Float64, world: Float64) -> np.ndarray:
+    """Return which points [N] agree with each other."""
+    n = len(capture)
+    every = np.ones(n, dtype=bool)
+    if n < 5:  # four points cannot outvote one of them
+        return every
+    triples = np.array(list(itertools.islice(itertools.combinations(range(n), 3), 200_000)))
+    triples = triples[np.random.default_rng(0).permutation(len(triples))[:_TRIPLES]]
+    best, distances = math.inf, np.zeros(n)
+    for triple in triples:
+        try:
+            frame = fit_similarity(capture[triple], world[triple])
+        except ValueError:
+            continue
+        found = np.linalg.norm(frame.to_world(capture) - world, axis=1)
+        middle = float(np.partition(found, n // 2 + 1)[n // 2 + 1])
+        if middle < best:
+            best, distances = middle, found
+    if not math.isfinite(best):  # all triples lie on lines, which the fit refuses
+        return every
+    limit = 2.5 * 1.4826 * (1 + 5 / (n - 3)) * best
+    return np.asarray(distances <= max(limit, 1e-9 * float(np.ptp(world, axis=0).max())))
+
+
+def _reprojection(point: Placed, position: Float64) -> float:
+    """Return the root mean square distance of a position [3], re-centred, from a point's marks, in pixels."""
+    squares = []
+    for camera, pixel in zip(point.cameras, point.pixels, strict=True):
+        x, y, z = camera.world_to_camera[:3, :3] @ position + camera.world_to_camera[:3, 3]
+        if z <= 0:
+            return math.inf
+        u, v = camera.rectification.lens.project(np.array([x / z]), np.array([y / z]))
+        squares.append((u[0] - pixel[0]) ** 2 + (v[0] - pixel[1]) ** 2)
+    return math.sqrt(float(np.mean(squares)))

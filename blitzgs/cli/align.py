@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command `blitzgs align`: find out where the model of a run lies in the world."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+
+import numpy as np
+
+from blitzgs.capture.cameras import Float64, camera_centres
+from blitzgs.capture.capture import Capture, load_capture
+from blitzgs.capture.control_points import Placed, align, place, read_control_points
+from blitzgs.capture.gps import gps_positions
+from blitzgs.capture.world import GEOCENTRIC, WorldFrame, converted, fit_similarity, frame_in, pyproj_module
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_run, named_path
+from blitzgs.config.files import load_config
+from blitzgs.runs import files as run_files
+from blitzgs.runs.world import load_frame, save_frame
+from blitzgs.util.terminal import printable
+
+HELP = """\
+Find out where the model of a run lies in the world, and write that to RUN/geo.json, which `blitzgs view` and
+`blitzgs export --coordinates world` use. The photographs must be there; the model is not changed.
+
+  blitzgs align RUN --gcp POINTS.csv --crs EPSG:32633    ground control points
+  blitzgs align RUN --gps --crs EPSG:32633               positions in the photographs' EXIF
+  blitzgs align RUN --crs EPSG:32633                     convert what is known, or name what the capture has
+
+POINTS.csv has the columns name,E,N,h,image,x,y, and a row for each mark of a point in a photograph: x and y
+are pixels of the original photograph, from the corner of its first pixel. OpenDroneMap's gcp_list.txt is read
+too.
+"""
+
+
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
+    """Add the command."""
+    parser = add_command(commands, "align", run, summary, HELP)
+    add_run(parser)
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--gcp", type=named_path, metavar="FILE", help="ground control points and their marks")
+    how.add_argument("--gps", action="store_true", help="use the positions in the photographs' EXIF")
+    parser.add_argument("--crs", metavar="EPSG:N", help="reference system of the points, or wanted")
+    add_capture(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Align a run; returns the exit status."""
+    run_files.check_is_run(args.folder)
+    if not (args.gcp or args.gps or args.crs):
+        args.parser.error("one of the arguments --gcp, --gps, --crs is required")
+    capture = _capture(args)
+    if args.gcp is not None:
+        frame = _by_points(args, capture)
+    elif args.gps:
+        frame = _by_gps(args, capture)
+    else:
+        frame = _converted(args, capture)
+    path = save_frame(args.folder, frame)
+    print(f"{path}: {printable(frame.name)}, scale {frame.scale:.9g}")
+    return 0
+
+
+def _capture(args: argparse.Namespace) -> Capture:
+    """Load the capture of a run at the size of its photographs, to which marks refer."""
+    data = load_config(args.folder / run_files.CONFIG).data
+    if args.data is not None:
+        data = dataclasses.replace(data, path=str(args.data))
+    return load_capture(
+        data.path,
+        images=data.images,
+        split=data.split,
+        masks=False,
+        undistort=data.undistort,
+        exif=data.exif,
+        allow_missing=data.allow_missing,
+        sparse=data.sparse,
+        stray_cameras=data.stray_cameras,
+        inside_only=data.inside_only,
+    )
+
+
+def _by_points(args: argparse.Namespace, capture: Capture) -> WorldFrame:
+    points, crs = read_control_points(args.gcp)
+    crs = args.crs or crs
+    if crs:
+        _check_lengths(crs)
+    placed = place(points, capture.cameras, capture.offset)
+    frame = align(placed, capture.offset, crs, f"{len(placed)} ground control points of {args.gcp.name}")
+    _print_residuals(placed)
+    return frame
+
+
+def _check_lengths(crs: str) -> None:
+    """Refuse a reference system of angles, in which points make no similarity; unknown without pyproj."""
+    try:
+        pyproj = pyproj_module()
+    except ImportError:
+        return
+    try:
+        angles = pyproj.CRS.from_user_input(crs).is_geographic
+    except pyproj.exceptions.CRSError as error:
+        raise ValueError(f"{crs!r:.60} is no reference system: name one such as EPSG:32633") from error
+    if angles:
+        raise ValueError(f"{crs} has angles: convert the points to a projected system, such as a UTM zone")
+
+
+def _print_residuals(placed: list[Placed]) -> None:
+    width = max(5, *(len(p.point.name) for p in placed))
+    print(f"{'point':{width}} marks {'dE':>10} {'dN':>10} {'dh':>10} {'3D':>10} {'px':>8}")
+    for p in placed:
+        values = "".join(f" {value:10.4f}" for value in [*p.offset, float(np.linalg.norm(p.offset))])
+        note = f"  {p.problem}" if p.problem else ""
+        print(printable(f"{p.point.name:{width}} {len(p.pixels):5}{values} {p.reprojection:8.2f}{note}"))
+    used = [p for p in placed if not p.problem]
+    offsets = np.stack([p.offset for p in used])
+    flat, up = (float(np.sqrt((part**2).sum(axis=1).mean())) for part in (offsets[:, :2], offsets[:, 2:]))
+    print(f"{len(used)} of {len(placed)} points used; RMS {flat:.4f} horizontal, {up:.4f} vertical")
+    if len(used) == 3:
+        print("three points leave no check of themselves: a fourth would show a mistake")
+
+
+def _by_gps(args: argparse.Namespace, capture: Capture) -> WorldFrame:
+    known = gps_positions([camera.image_path for camera in capture.cameras])
+    some = [index for index, position in enumerate(known) if position is not None]
+    if len(some) < 3:
+        raise ValueError(f"{len(some)} of {len(known)} photographs have a GPS position, and 3 are needed")
+    world = np.array([known[index] for index in some])
+    centres = _centres(capture)[some]
+    target = args.crs or GEOCENTRIC
+    if args.crs:
+        _check_lengths(args.crs)
+    system = pyproj_module().CRS.from_user_input(target).to_3d()
+    moved = converted(world, "EPSG:4979", system)
+    frame = fit_similarity(centres, moved, target, f"EXIF GPS of {len(some)} photographs")
+    apart = np.linalg.norm(frame.to_world(centres) - moved, axis=1)
+    # A receiver errs by metres: those far beyond the others are left out once.
+    good = apart <= 4 * np.median(apart) + 1e-9
+    if good.sum() >= 3:
+        frame = fit_similarity(centres[good], moved[good], target, f"EXIF GPS of {good.sum()} photographs")
+    apart = np.linalg.norm(frame.to_world(centres[good]) - moved[good], axis=1)
+    print(f"{good.sum()} of {len(known)} positions used; distances: median {np.median(apart):.2f} m, largest "
+          f"{apart.max():.2f} m")  # fmt: skip
+    return frame
+
+
+def _centres(capture: Capture) -> Float64:
+    """Return the positions of the cameras in the capture's own world, [V, 3]."""
+    poses = np.stack([camera.world_to_camera for camera in capture.cameras])
+    return camera_centres(poses) + capture.offset
+
+
+def _converted(args: argparse.Namespace, capture: Capture) -> WorldFrame:
+    known = load_frame(args.folder) or capture.about.source.frame
+    if known is None or not known.crs:
+        _check_lengths(args.crs)
+        frame = known or WorldFrame()
+        return dataclasses.replace(
+            frame, crs=args.crs, source=frame.source or "the capture's own coordinates"
+        )
+    some = capture.points[:: max(1, len(capture.points) // 1000)] + capture.offset
+    places = np.concatenate([_centres(capture), some])
+    frame, error = frame_in(known, args.crs, places)
+    print(
+        f"a similarity instead of the projection is wrong by at most {error:.3g} m at the cameras and points"
+    )
+    return frame
