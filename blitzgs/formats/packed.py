@@ -217,7 +217,7 @@ def read_splat(path: Path) -> Gaussians:
     _check_room(path, size // _SPLAT.itemsize, 0)
     rows = np.fromfile(path, dtype=_SPLAT)
     if not (rows["scale"] >= 0).all():
-        first = int((~(rows["scale"] >= 0)).any(axis=1).nonzero()[0][0])
+        first = int(np.argmin((rows["scale"] >= 0).all(axis=1)))
         raise ValueError(f"{path}: Gaussian {first} has the scale {rows['scale'][first]}")
     colors = rows["color"].astype(np.float64) / 255
     with np.errstate(divide="ignore"):
@@ -233,7 +233,7 @@ def read_splat(path: Path) -> Gaussians:
     )
 
 
-# --- SPZ: fixed-point columns, deflated; y up and z towards the viewer, half a turn about x from PLY files ---
+# --- SPZ: fixed-point columns, deflated; y is up: half a turn about x from PLY files ---
 
 
 def write_spz(path: Path, source: GaussianSource) -> None:
