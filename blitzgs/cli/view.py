@@ -17,7 +17,8 @@ from blitzgs.runs import files as run_files
 from blitzgs.training.inputs import open_capture
 
 HELP = """\
-Look at a model in the browser. MODEL is the folder of a run, a checkpoint in it, or a PLY file of Gaussians.
+Look at a model in the browser. MODEL is the folder of a run, a checkpoint in it, or a file of
+Gaussians of any program (PLY, compressed PLY, SPZ, SOG, .splat).
 The machine that holds the model renders, on its GPU or its CPU; the browser may be on another one:
 
   blitzgs view RUN                               # then open http://localhost:8080
@@ -38,7 +39,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         "--paths",
         type=named_path,
         metavar="DIR",
-        help="folder for camera paths and screenshots (default: RUN/paths, or the folder of the PLY file)",
+        help="folder for camera paths and screenshots (default: RUN/paths, or the folder of the file)",
     )
     add_device(parser)
 
