@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks a reconstruction: errors in pixels, stray cameras, photographs without a pose and why; draws a plan."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.capture.cameras import camera_centres
+from blitzgs.capture.colmap import ColmapModel, Float64, count_images, read_model, world_to_camera
+from blitzgs.capture.layouts import SourceView
+from blitzgs.capture.lengths import find_apart
+from blitzgs.capture.lens import Lens
+from blitzgs.sfm.engine import Job
+from blitzgs.sfm.photographs import Photographs
+from blitzgs.util.output import write_file
+
+UInt8 = npt.NDArray[np.uint8]
+# A photograph with fewer points is held weakly. One whose error is so many times the median is doubtful.
+_FEW_POINTS, _FEW_FEATURES, _DOUBTFUL = 50, 100, 3.0
+_PAIR_IDS = 2147483647  # COLMAP's pair of images a < b is this number times a, plus b
+_SIDE, _BAR, _LINE, _NAMED = 900, 420, 18, 40
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What was reconstructed.
+
+    Attributes:
+        capture: its folder.
+        errors: mean reprojection error of each photograph with a pose, in pixels, by name.
+        points: how many points each of them observes.
+        unregistered: why each other photograph has no pose.
+        doubtful: photographs with a pose that may be wrong, and why.
+        total: number of points.
+        decisions: which pairs were matched, by which mapper, and what positions by GPS were used for.
+        gps_residuals: medians of the distances to GPS, across and up, in metres; None without GPS.
+    """
+
+    capture: Path
+    errors: dict[str, float]
+    points: dict[str, int]
+    unregistered: dict[str, str]
+    doubtful: dict[str, str]
+    total: int
+    decisions: dict[str, str]
+    gps_residuals: tuple[float, float] | None = None
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def error(self) -> float:
+        """Mean reprojection error of all observations, in pixels."""
+        weights = list(self.points.values())
+        return (
+            float(np.average(list(self.errors.values()), weights=weights)) if sum(weights) else float("nan")
+        )
+
+    def lines(self) -> list[str]:
+        """Return the summary for the user."""
+        found, count = len(self.errors), len(self.errors) + len(self.unregistered)
+        observed = float(np.median(list(self.points.values())))
+        lines = [
+            f"{'photographs:':15}{found:,} of {count:,} have a pose ({', '.join(self.decisions.values())})",
+            f"{'points:':15}{self.total:,}; a photograph observes {observed:,.0f} (median)",
+            f"{'error:':15}{self.error:.2f} pixels (mean), {max(self.errors.values()):.2f} in the worst photograph",
+        ]
+        if self.gps_residuals is not None:
+            across, up = self.gps_residuals
+            lines.append(f"{'GPS:':15}median distance {across:.1f} m across, {up:.1f} m up")
+        for title, reasons in (("no pose", self.unregistered), ("doubtful", self.doubtful)):
+            lines += [f"{title + ':':15}{name}: {why}" for name, why in list(reasons.items())[:_NAMED]]
+            if len(reasons) > _NAMED:
+                lines.append(
+                    f"{'':15}and {len(reasons) - _NAMED} others, all in {self.capture / 'sfm/report.json'}"
+                )
+        return lines + self.warnings
+
+
+def examine(
+    capture: Path, work: Path, photographs: Photographs, job: Job, models: Sequence[Path]
+) -> Reconstruction:
+    """Check the largest of several models, and write report.json and cameras.png into the folder `work`."""
+    model = read_model(models[0], points2d=True)
+    lenses = {c.id: Lens(c.model, c.width, c.height, tuple(c.params.tolist())) for c in model.cameras}
+    poses, names = world_to_camera(model.images), model.images.names
+    views = [
+        SourceView(name, photographs.folder / name, None, lenses[camera], pose)
+        for name, camera, pose in zip(names, model.images.camera_ids.tolist(), poses, strict=True)
+    ]
+    errors, points = _errors(model, views)
+    doubtful = {
+        s.name: f"lies at {s.distance:.6g} from the middle, the others within {s.others:.6g}"
+        for s in find_apart(views, model.points.positions)[1]
+    }
+    usual = float(np.median(list(errors.values())))
+    for name, error in errors.items():
+        if not error <= _DOUBTFUL * usual:
+            doubtful.setdefault(name, f"error of {error:.2f} pixels, {error / usual:.1f} times the median")
+        elif points[name] < _FEW_POINTS:
+            doubtful.setdefault(name, f"held by {points[name]} points only")
+    priors, counts = _database(Path(job.database))
+    others = {name: count_images(path) for path in models[1:] for name in read_model(path).images.names}
+    unregistered = dict(photographs.damage)
+    for name in photographs.names:
+        if name not in errors:
+            unregistered[name] = _reason(*counts.get(name, (0, 0, 0)), others.get(name, 0))
+    used = "without GPS" if not job.gps else "GPS" if job.use_altitude else "GPS without its altitudes"
+    decisions = {"pairs": f"pairs: {job.pairs}", "mapper": f"mapper: {job.mapper}", "gps": used}
+    centres = dict(zip(names, camera_centres(poses), strict=True))
+    both = [(centres[name], place) for name, place in priors.items() if name in centres] if job.gps else []
+    residuals = None
+    if both:
+        away = np.array([centre - place for centre, place in both])
+        residuals = (float(np.median(np.hypot(away[:, 0], away[:, 1]))), float(np.median(np.abs(away[:, 2]))))
+    found = Reconstruction(
+        capture, errors, points, unregistered, doubtful, len(model.points.ids), decisions, residuals
+    )
+    found.warnings.extend(_warnings(found, job))
+    lost = {name: priors[name] for name in unregistered if job.gps and name in priors}
+    plan = draw_plan(found, poses, model.points.positions, model.points.colors, lost)
+    write_file(work / "cameras.png", bytes(cv2.imencode(".png", plan)[1]))
+    figures = {name: {"error": errors[name], "points": points[name]} for name in sorted(errors)}
+    content = {"photographs": figures, "error": found.error, "points": found.total, **decisions}
+    content |= {"no_pose": unregistered, "doubtful": doubtful, "gps_residuals": residuals}
+    write_file(work / "report.json", json.dumps(content, indent=1))
+    return found
+
+
+def _errors(model: ColmapModel, views: Sequence[SourceView]) -> tuple[dict[str, float], dict[str, int]]:
+    """Return the mean distance in pixels of each view's observations from their points, and their number."""
+    order = np.argsort(model.points.ids)
+    ids, positions = model.points.ids[order], model.points.positions[order]
+    errors, counts = {}, {}
+    for index, view in enumerate(views):
+        begin, end = model.images.point2d_offsets[index : index + 2].tolist()
+        seen = model.images.point3d_ids[begin:end]
+        pixels = model.images.points2d[begin:end][seen >= 0]
+        world = positions[np.searchsorted(ids, seen[seen >= 0])]
+        x, y, depth = view.world_to_camera[:3, :3] @ world.T + view.world_to_camera[:3, 3:]
+        u, v = view.lens.project(x / depth, y / depth)
+        counts[view.name] = len(pixels)
+        errors[view.name] = (
+            float(np.hypot(u - pixels[:, 0], v - pixels[:, 1]).mean()) if len(pixels) else np.inf
+        )
+    return errors, counts
+
+
+def _database(path: Path) -> tuple[dict[str, Float64], dict[str, tuple[int, int, int]]]:
+    """Return positions by GPS; and features, verified matches and matched photographs of each photograph."""
+    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as connection:
+        names = dict(connection.execute("SELECT image_id, name FROM images"))
+        features = dict(connection.execute("SELECT image_id, rows FROM keypoints"))
+        pairs = connection.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0").fetchall()
+        try:
+            rows = connection.execute("SELECT corr_data_id, position FROM pose_priors").fetchall()
+        except sqlite3.OperationalError:  # before COLMAP 3.10
+            rows = []
+    matches: dict[int, list[int]] = defaultdict(list)
+    for pair, count in pairs:
+        for image in (pair // _PAIR_IDS, pair % _PAIR_IDS):
+            matches[image].append(count)
+    counts = {n: (features.get(i, 0), sum(matches[i]), len(matches[i])) for i, n in names.items()}
+    return {names[i]: np.frombuffer(blob) for i, blob in rows if blob and i in names}, counts
+
+
+def _reason(features: int, matches: int, neighbours: int, part: int) -> str:
+    """Return why a photograph that is not damaged has no pose."""
+    if features < _FEW_FEATURES:
+        return f"{features} features: blurred, dark, masked, or without texture"
+    if part:
+        return f"belongs to {part} photographs that nothing connects with the others"
+    if not neighbours:
+        return f"none of its {features:,} features was found in another photograph: it has no overlap"
+    return f"{matches:,} matches with {neighbours} photographs are too few, or contradict the others"
+
+
+def _warnings(found: Reconstruction, job: Job) -> list[str]:
+    texts = []
+    count = len(found.errors) + len(found.unregistered)
+    if len(found.errors) < 0.9 * count:
+        remedy = "" if job.pairs == "exhaustive" else "; --pairs exhaustive finds more, but takes longer"
+        texts.append(f"warning: {len(found.unregistered)} of {count} photographs have no pose{remedy}")
+    few = sum(points < _FEW_POINTS for points in found.points.values())
+    if few:
+        texts.append(f"warning: {few} photographs observe fewer than {_FEW_POINTS} points")
+    if not found.error < 2:
+        texts.append(
+            f"warning: an error of {found.error:.1f} pixels is large: check lens, sharpness and masks"
+        )
+    return texts
+
+
+def draw_plan(
+    found: Reconstruction, poses: Float64, points: Float64, colors: UInt8, lost: Mapping[str, Float64]
+) -> UInt8:
+    """Draw points and cameras from above, and list the photographs without a pose; BGR [H, W, 3].
+
+    "Above" is the side of the points' plane on which the cameras are. Cameras are coloured by their error,
+    blue to red, doubtful ones crossed out; `lost` are places of photographs without a pose, drawn as squares.
+    """
+    centres = camera_centres(poses)
+    middle = np.median(points, axis=0) if len(points) else centres.mean(axis=0)
+    sample = slice(None, None, max(1, len(points) // 50_000))
+    cloud = points[sample] if len(points) else centres
+    near = np.linalg.norm(cloud - middle, axis=1)
+    axes = (
+        np.linalg.svd(cloud[near <= np.quantile(near, 0.9)] - middle, full_matrices=True)[2]
+        if not lost
+        else np.eye(3)
+    )
+    if (centres - middle).mean(axis=0) @ np.cross(axes[0], axes[1]) < 0:
+        axes = axes[[1, 0, 2]]
+    places = np.array(list(lost.values())).reshape(-1, 3)
+    shown = np.concatenate([centres, places, cloud[near <= np.quantile(near, 0.95)]]) @ axes[:2].T
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    scale = (_SIDE - 80) / max(float((high - low).max()), 1e-12)
+
+    def place(world: Float64) -> npt.NDArray[np.int64]:
+        flat = (world @ axes[:2].T - (low + high) / 2) * scale
+        return np.stack([_SIDE / 2 + flat[:, 0], _SIDE / 2 - flat[:, 1]], axis=1).round().astype(np.int64)
+
+    canvas = np.full((_SIDE, _SIDE + _BAR, 3), 255, dtype=np.uint8)
+    at = place(points[sample])
+    inside = ((at >= 0) & (at < _SIDE)).all(axis=1)
+    canvas[at[inside, 1], at[inside, 0]] = colors[sample][inside][:, ::-1]
+    errors = np.array(list(found.errors.values()))
+    share = np.clip(errors / (2 * np.median(errors)), 0, 1)
+    shades = cv2.applyColorMap((share * 255).astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0].tolist()
+    for name, (x, y), shade in zip(found.errors, place(centres).tolist(), shades, strict=True):
+        cv2.circle(canvas, (x, y), 5, shade, -1, cv2.LINE_AA)
+        if name in found.doubtful:
+            cv2.drawMarker(canvas, (x, y), (0, 0, 255), cv2.MARKER_TILTED_CROSS, 18, 2)
+    for x, y in place(places).tolist():
+        cv2.rectangle(canvas, (x - 5, y - 5), (x + 5, y + 5), (0, 0, 0), 1)
+    texts = [f"{len(found.errors)} of {len(found.errors) + len(found.unregistered)} photographs have a pose"]
+    texts += [f"mean error {found.error:.2f} pixels (blue 0, red {2 * np.median(errors):.2f} or more)", ""]
+    texts += [f"no pose: {name}: {why}" for name, why in found.unregistered.items()]
+    texts += [f"doubtful (cross): {name}: {why}" for name, why in found.doubtful.items()]
+    for row, text in enumerate(texts[: _SIDE // _LINE - 1]):
+        shown_text = text.encode("ascii", "replace").decode()[:70]
+        spot = (_SIDE + 6, _LINE * (row + 1))
+        cv2.putText(canvas, shown_text, spot, cv2.FONT_HERSHEY_SIMPLEX, 0.36, (0, 0, 0), 1, cv2.LINE_AA)
+    return canvas
