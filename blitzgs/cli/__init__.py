@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `blitzgs sfm | train | eval | render | view | export | gate | synth`, one file per command.
+"""The command line: one file for each command (`blitzgs sfm`, `blitzgs train`, ...).
 
 A command's file is imported when the command is used: `blitzgs --help` needs no torch.
 """

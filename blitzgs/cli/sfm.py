@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import os
 import shlex
 import sys
 import time
@@ -11,8 +13,9 @@ from pathlib import Path
 
 from blitzgs.capture.colmap import camera_models
 from blitzgs.cli.arguments import Commands, add_command, named_path
-from blitzgs.sfm.photographs import Photographs, estimate, photograph_folder
-from blitzgs.sfm.reconstruct import MAPPERS, PAIRS, WORK, Settings, reconstruct
+from blitzgs.config.fields import Config
+from blitzgs.sfm.photographs import Photographs, estimate, has_photographs_alone, photograph_folder
+from blitzgs.sfm.reconstruct import MAPPERS, PAIRS, WORK, Settings, is_finished, reconstruct
 from blitzgs.util.terminal import printable
 
 HELP = """\
@@ -78,3 +81,41 @@ def find_poses(folder: Path, capture: Path, settings: Settings) -> None:
     lines = [*found.lines(), f"{'picture:':15}{capture / WORK / 'cameras.png'}"]
     print("\n".join(map(printable, lines)))
     print(f"{'time:':15}{(time.monotonic() - begin) / 60:.1f} minutes", flush=True)
+
+
+def with_poses(config: Config, folder: Path) -> Config:
+    """Return a configuration whose capture has poses: of photographs alone they are found first.
+
+    Under torchrun rank 0 finds them and the others, which have not joined yet, wait for its report; where
+    rank 0 fails, torchrun ends them.
+
+    Args:
+        config: of the training.
+        folder: the capture to write, or to use if it is finished.
+    """
+    root = Path(config.data.path)
+    if not config.data.path or not has_photographs_alone(root, config.data.images):
+        return config
+    first = os.environ.get("RANK", "0") == "0"
+    if is_finished(folder):
+        if first:
+            print(f"poses: those of {folder}, found before (blitzgs sfm adds photographs)", file=sys.stderr)
+    elif first:
+        print(f"{root} has photographs without poses: they are found first, into {folder}", file=sys.stderr)
+        find_poses(photograph_folder(root, config.data.images), folder, Settings())
+    while not is_finished(folder):
+        time.sleep(1.0)
+    data = dataclasses.replace(config.data, path=os.path.realpath(folder), images="images")
+    return dataclasses.replace(config, data=data)
+
+
+def understood_alone(config: Config) -> str | None:
+    """Return what a training would do first with photographs that have no poses; None: they have."""
+    root = Path(config.data.path)
+    if not config.data.path or not has_photographs_alone(root, config.data.images):
+        return None
+    photographs = Photographs.of(photograph_folder(root, config.data.images))
+    return (
+        f"{len(photographs.names):,} photographs without poses: a training finds them first, in about "
+        f"{estimate(photographs.sizes)}; then this command says more (blitzgs sfm finds poses alone)"
+    )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The photographs of a folder: which of them can be used, where their masks are, and which have a position."""
+"""The photographs of a folder: which can be used, their masks, and their positions by GPS."""
 
 from __future__ import annotations
 
@@ -103,18 +103,17 @@ class Photographs:
         return {name: _stamp(self.folder / name) + (_stamp(mask) if mask else []) for name, mask in both}
 
     def write_masks(self, folder: Path) -> Path | None:
-        """Write the masks as COLMAP reads them, NAME.png of the photograph's size; None if there are none."""
+        """Write masks as COLMAP reads them: NAME.png of each photograph's size; None if there are none."""
         if not any(self.masks):
             return None
         for name, size, mask in zip(self.names, self.sizes, self.masks, strict=True):
             path = folder / f"{name}.png"
-            if mask is None or path.exists():
+            if path.exists():
                 continue
-            counted = cv2.resize(
-                decode_mask(read_whole(mask), str(mask)), size, interpolation=cv2.INTER_NEAREST
-            )
+            counted = np.ones((1, 1), np.uint8) if mask is None else decode_mask(read_whole(mask), str(mask))
+            pixels = 255 * cv2.resize(counted, size, interpolation=cv2.INTER_NEAREST)
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_file(path, bytes(cv2.imencode(".png", counted * 255)[1]), sync=False)
+            write_file(path, bytes(cv2.imencode(".png", pixels)[1]), sync=False)
         return folder
 
 

@@ -29,31 +29,43 @@ def features(job: dict[str, Any]) -> None:
     """Find the features of the photographs that have none; photographs of one camera share its parameters."""
     photos = Path(job["photos"])
 
-    def camera(name: str) -> str:
+    def look(name: str) -> tuple[str, float | None, float | None]:
         bitmap = pycolmap.Bitmap.read(photos / name, False)
         if bitmap is None:
-            return ""
+            return "", None, None
         # Without EXIF, cameras of the same size are told apart by their folders.
-        return bitmap.exif_camera_model() or f"{bitmap.width}x{bitmap.height} {Path(name).parent}"
+        camera = bitmap.exif_camera_model() or f"{bitmap.width}x{bitmap.height} {Path(name).parent}"
+        return camera, bitmap.exif_latitude(), bitmap.exif_longitude()
 
     with ThreadPoolExecutor() as pool:
-        cameras = list(pool.map(camera, job["names"]))
+        seen = dict(zip(job["names"], pool.map(look, job["names"]), strict=True))
     groups: dict[str, list[str]] = defaultdict(list)
-    for name, key in zip(job["names"], cameras, strict=True):
-        groups[key].append(name)
+    for name, (camera, _, _) in seen.items():
+        groups[camera].append(name)
     for names in groups.values():
         options = pycolmap.ImageReaderOptions()
         options.camera_model = lens_model(job["camera_model"], len(names))
         if job["masks"]:
             options.mask_path = job["masks"]
         with pycolmap.Database.open(job["database"]) as database:
-            known = (database.read_image_with_name(name) for name in names)
-            # The camera of an interrupted stage.
-            if (image := next(filter(None, known), None)) is not None:
+            before = (database.read_image_with_name(name) for name in names)
+            if (image := next(filter(None, before), None)) is not None:  # of an interrupted stage
                 options.existing_camera_id = image.camera_id
         pycolmap.extract_features(
             job["database"], photos, names, pycolmap.CameraMode.SINGLE, reader_options=options
         )
+    with pycolmap.Database.open(job["database"]) as database:
+        # COLMAP leaves out a position without an altitude.
+        known = {prior.corr_data_id.id: prior for prior in database.read_all_pose_priors()}
+        for image in database.read_all_images():
+            _, latitude, longitude = seen.get(image.name, ("", None, None))
+            prior = known.get(image.image_id)
+            if latitude is None or longitude is None or (prior is not None and prior.has_position()):
+                continue
+            added = prior or pycolmap.PosePrior(corr_data_id=image.data_id)
+            added.position = np.array([latitude, longitude, 0.0])
+            added.coordinate_system = pycolmap.PosePriorCoordinateSystem.WGS84
+            (database.update_pose_prior if prior else database.write_pose_prior)(added)
 
 
 def pairs(job: dict[str, Any]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks a reconstruction: errors in pixels, stray cameras, photographs without a pose and why; draws a plan."""
+"""Checks a reconstruction: errors, stray cameras, photographs without a pose and why; draws a plan."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Reconstruction:
         doubtful: photographs with a pose that may be wrong, and why.
         total: number of points.
         decisions: which pairs were matched, by which mapper, and what positions by GPS were used for.
-        gps_residuals: medians of the distances to GPS, across and up, in metres; None without GPS.
+        gps_residuals: medians of the distances to GPS, across and up, in metres; None where unused.
     """
 
     capture: Path
@@ -53,7 +53,7 @@ class Reconstruction:
     doubtful: dict[str, str]
     total: int
     decisions: dict[str, str]
-    gps_residuals: tuple[float, float] | None = None
+    gps_residuals: tuple[float, float | None] | None = None
     warnings: list[str] = field(default_factory=list)
 
     @property
@@ -71,11 +71,12 @@ class Reconstruction:
         lines = [
             f"{'photographs:':15}{found:,} of {count:,} have a pose ({', '.join(self.decisions.values())})",
             f"{'points:':15}{self.total:,}; a photograph observes {observed:,.0f} (median)",
-            f"{'error:':15}{self.error:.2f} pixels (mean), {max(self.errors.values()):.2f} in the worst photograph",
+            f"{'error:':15}{self.error:.2f} pixels, {max(self.errors.values()):.2f} in the worst photograph",
         ]
         if self.gps_residuals is not None:
             across, up = self.gps_residuals
-            lines.append(f"{'GPS:':15}median distance {across:.1f} m across, {up:.1f} m up")
+            height = "altitudes not used" if up is None else f"{up:.1f} m up"
+            lines.append(f"{'GPS:':15}median distance {across:.1f} m across, {height}")
         for title, reasons in (("no pose", self.unregistered), ("doubtful", self.doubtful)):
             lines += [f"{title + ':':15}{name}: {why}" for name, why in list(reasons.items())[:_NAMED]]
             if len(reasons) > _NAMED:
@@ -120,7 +121,8 @@ def examine(
     residuals = None
     if both:
         away = np.array([centre - place for centre, place in both])
-        residuals = (float(np.median(np.hypot(away[:, 0], away[:, 1]))), float(np.median(np.abs(away[:, 2]))))
+        up = float(np.median(np.abs(away[:, 2]))) if job.use_altitude else None
+        residuals = (float(np.median(np.hypot(away[:, 0], away[:, 1]))), up)
     found = Reconstruction(
         capture, errors, points, unregistered, doubtful, len(model.points.ids), decisions, residuals
     )
@@ -230,8 +232,9 @@ def draw_plan(
 
     canvas = np.full((_SIDE, _SIDE + _BAR, 3), 255, dtype=np.uint8)
     at = place(points[sample])
-    inside = ((at >= 0) & (at < _SIDE)).all(axis=1)
-    canvas[at[inside, 1], at[inside, 0]] = colors[sample][inside][:, ::-1]
+    inside = ((at >= 0) & (at < _SIDE - 1)).all(axis=1)
+    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        canvas[at[inside, 1] + down, at[inside, 0] + right] = colors[sample][inside][:, ::-1]
     errors = np.array(list(found.errors.values()))
     share = np.clip(errors / (2 * np.median(errors)), 0, 1)
     shades = cv2.applyColorMap((share * 255).astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0].tolist()

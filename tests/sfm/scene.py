@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 380.0
 # Height, and the square [x0, y0, x1, y1] that a slab covers.
@@ -58,5 +59,46 @@ def write_photographs(folder: Path, count: int = 8) -> np.ndarray:
     folder.mkdir(parents=True, exist_ok=True)
     placed = poses(count)
     for index, pose in enumerate(placed):
-        assert cv2.imwrite(str(folder / f"view_{index}.jpg"), photograph(pose), [cv2.IMWRITE_JPEG_QUALITY, 95])
+        assert cv2.imwrite(
+            str(folder / f"view_{index}.jpg"), photograph(pose), [cv2.IMWRITE_JPEG_QUALITY, 95]
+        )
     return placed
+
+
+def with_gps(folder: Path, placed: np.ndarray, altitude: bool = True) -> np.ndarray:
+    """Add EXIF with a camera and places in a scene of 15 metres per unit; returns metres east, north, up."""
+    metres = 15 * np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in placed])
+    for index, (east, north, up) in enumerate(metres):
+        path = folder / f"view_{index}.jpg"
+        photo = Image.open(path)
+        exif = photo.getexif()
+        exif[271], exif[272] = "DJI", "FC"
+        exif.get_ifd(0x8769)[41989] = round(FOCAL * 43.27 / np.hypot(WIDTH, HEIGHT))  # of 35 mm film
+        gps = exif.get_ifd(0x8825)
+        gps |= {1: "N", 2: _dms(47 + north / 111_177), 3: "E", 4: _dms(8 + east / 76_057)}
+        if altitude:
+            gps |= {5: b"\0", 6: float(up + 400)}
+        photo.save(path, exif=exif, quality=95)
+    return metres
+
+
+def _dms(degrees: float) -> tuple[float, float, float]:
+    minutes = degrees % 1 * 60
+    return float(int(degrees)), float(int(minutes)), round(minutes % 1 * 60, 6)
+
+
+def aligned(found: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distances of camera centres and the angles in degrees between poses [N, 4, 4].
+
+    The poses found are moved by the similarity that fits their centres best (Umeyama 1991).
+    """
+    a, b = (-np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3]) for poses in (found, truth))
+    a0, b0 = a - a.mean(axis=0), b - b.mean(axis=0)
+    left, sizes, right = np.linalg.svd(b0.T @ a0)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
+    turn = left @ sign @ right
+    scale = (sizes * np.diag(sign)).sum() / (a0**2).sum()
+    away = np.linalg.norm(scale * a0 @ turn.T - b0, axis=1)
+    between = np.einsum("nij,kj,nlk->nil", found[:, :3, :3], turn, truth[:, :3, :3])
+    cosines = (np.trace(between, axis1=1, axis2=2) - 1) / 2
+    return away, np.degrees(np.arccos(np.clip(cosines, -1, 1)))
