@@ -155,7 +155,9 @@ def _commands(program: str, stage: str, job: Job) -> Iterator[list[str]]:
             if job.mapper == "global" and "global_mapper" in _help(program, "help")
             else "mapper"
         )
-        yield [program, mapper, *base, "--image_path", job.photos, "--output_path", job.models]
+        paths = ["--image_path", job.photos, "--output_path", job.models]
+        least = ["--Mapper.min_model_size", str(least_model(len(job.names)))] if mapper == "mapper" else []
+        yield [program, mapper, *base, *paths, *least]
 
 
 def _help(program: str, command: str) -> str:
@@ -192,6 +194,11 @@ def decided(job: Job, gps: bool, use_altitude: bool) -> Job:
         ("incremental" if count <= _MOST_ONE_BY_ONE else "global") if job.mapper == "auto" else job.mapper
     )
     return replace(job, pairs=pairs, mapper=mapper, gps=gps, use_altitude=use_altitude)
+
+
+def least_model(photographs: int) -> int:
+    """Return how many photographs make a model: COLMAP's 10, but fewer of few."""
+    return min(10, max(3, photographs // 2))
 
 
 def lens_model(wanted: str, photographs: int) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 
 from blitzgs.capture.colmap import Float64
-from blitzgs.sfm.engine import lens_model
+from blitzgs.sfm.engine import least_model, lens_model
 
 # The standard deviations of a position by GPS in metres, across and up; the second of an altitude that says
 # nothing. Drones state altitudes by barometer, which drift between flights.
@@ -113,7 +113,7 @@ def cameras(job: dict[str, Any]) -> None:
     gpu = pycolmap.has_cuda
     if job["mapper"] == "incremental":
         options = pycolmap.IncrementalPipelineOptions()
-        options.min_model_size = min(options.min_model_size, max(3, len(job["names"]) // 2))
+        options.min_model_size = least_model(len(job["names"]))
         options.ba_use_gpu = gpu
         options.use_prior_position = options.use_robust_loss_on_prior_position = job["gps"]
         pycolmap.incremental_mapping(job["database"], job["photos"], job["models"], options)

@@ -96,7 +96,7 @@ elif command == "exhaustive_matcher":
     pycolmap.match_exhaustive(database)
 else:
     assert command == "mapper"
-    options = pycolmap.IncrementalPipelineOptions(min_model_size=3)
+    options = pycolmap.IncrementalPipelineOptions(min_model_size=int(flags["--Mapper.min_model_size"]))
     pycolmap.incremental_mapping(database, flags["--image_path"], flags["--output_path"], options)
 """
 
