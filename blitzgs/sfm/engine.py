@@ -7,14 +7,14 @@ import importlib.util
 import json
 import re
 import shutil
-import sqlite3
 import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+
+from blitzgs.sfm.database import camera_of
 
 Report = Callable[[int, int], None]
 STAGES = {"features": "features", "pairs": "matches", "cameras": "poses"}
@@ -139,7 +139,7 @@ def _commands(program: str, stage: str, job: Job) -> Iterator[list[str]]:
             listed.write_text("\n".join(names) + "\n", encoding="utf-8")
             reader = ["--ImageReader.camera_model", lens_model(job.camera_model, len(names))]
             reader += ["--ImageReader.single_camera", "1"]
-            if (known := _camera_of(Path(job.database), names)) is not None:
+            if (known := camera_of(Path(job.database), names)) is not None:
                 reader += ["--ImageReader.existing_camera_id", str(known)]
             if job.masks:
                 reader += ["--ImageReader.mask_path", job.masks]
@@ -173,16 +173,6 @@ def _gpu_flags(program: str, command: str) -> list[str]:
         return []
     names = re.findall(r"--((?:Feature|Sift)(?:Extraction|Matching)\.use_gpu)", _help(program, command))
     return [f"--{names[0]}", "0"] if names else []
-
-
-def _camera_of(database: Path, names: list[str]) -> int | None:
-    """Return the camera that an interrupted stage gave to one of the photographs."""
-    if not database.exists():
-        return None
-    with closing(sqlite3.connect(database)) as connection:
-        rows = connection.execute("SELECT name, camera_id FROM images").fetchall()
-    known = dict(rows)
-    return next((known[name] for name in names if name in known), None)
 
 
 def decided(job: Job, gps: bool, use_altitude: bool) -> Job:

@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import os
 import re
-import sqlite3
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -122,22 +120,8 @@ def _stamp(path: Path) -> list[int]:
     return [status.st_size, status.st_mtime_ns]
 
 
-def positions(database: Path) -> Float64:
-    """Return latitude, longitude (degrees) and altitude (metres) of the photographs that state them, [N, 3].
-
-    Those of EXIF that COLMAP found with the features; metres east, north and up once it has used them.
-    """
-    with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as connection:
-        try:
-            rows = connection.execute("SELECT position FROM pose_priors").fetchall()
-        except sqlite3.OperationalError:  # before COLMAP 3.10
-            return np.zeros((0, 3))
-    found = np.array([np.frombuffer(blob) for (blob,) in rows if blob and len(blob) == 24]).reshape(-1, 3)
-    return np.asarray(found[np.isfinite(found[:, :2]).all(axis=1)])
-
-
 def judge_positions(degrees: Float64, photographs: int) -> tuple[bool, bool]:
-    """Return whether positions by GPS tell neighbours apart, and whether their altitudes can be used.
+    """Return whether positions by GPS [N, 3] tell neighbours apart, and whether their altitudes can be used.
 
     Altitudes mislead if some are missing or all are equal, or if they differ by more than the places do: then
     they are of several references (ground, sea level, ellipsoid).

@@ -16,9 +16,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from blitzgs.capture.colmap import FILES, count_images
+from blitzgs.sfm.database import read_positions
 from blitzgs.sfm.engine import STAGES, Job, StageError, backend, decided, run_stage
-from blitzgs.sfm.photographs import Photographs, judge_positions, positions
+from blitzgs.sfm.photographs import Photographs, judge_positions
 from blitzgs.sfm.report import Reconstruction, examine
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import image_progress
@@ -87,14 +90,14 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
         for stage, what in STAGES.items():
             if stage == "pairs":
                 if "gps" not in state:
-                    found = positions(Path(job.database))
-                    state["gps"], state["altitude"] = judge_positions(found, len(job.names))
+                    places = np.array(list(read_positions(Path(job.database)).values())).reshape(-1, 3)
+                    state["gps"], state["altitude"] = judge_positions(places, len(job.names))
                 job = decided(job, state["gps"], state["altitude"])
             if stage not in state["finished"]:
                 if stage == "cameras":
                     shutil.rmtree(job.models, ignore_errors=True)
                 with image_progress(what) as report:
-                    run_stage(stage, job, work / "log.txt", lock, report)
+                    run_stage(stage, job, work / "colmap.log", lock, report)
                 state["finished"].append(stage)
                 write_file(work / _STATE, json.dumps(state))
         models = sorted(Path(job.models).glob("[0-9]*"), key=count_images, reverse=True)
@@ -107,7 +110,7 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
 def _no_poses(photographs: Photographs, work: Path) -> str:
     return (
         f"no poses were found for the {len(photographs.names)} photographs of {photographs.folder}: do "
-        f"neighbours show the same things, sharp, from places apart? ({work / 'log.txt'} has COLMAP's words)"
+        f"neighbours show the same things, sharp, from places apart? ({work / 'colmap.log'} has COLMAP's words)"
     )
 
 

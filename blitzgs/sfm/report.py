@@ -4,11 +4,8 @@
 from __future__ import annotations
 
 import json
-import sqlite3
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -20,14 +17,16 @@ from blitzgs.capture.colmap import ColmapModel, Float64, count_images, read_mode
 from blitzgs.capture.layouts import SourceView
 from blitzgs.capture.lengths import find_apart
 from blitzgs.capture.lens import Lens
+from blitzgs.sfm.database import Found, read_found, read_positions
 from blitzgs.sfm.engine import Job
 from blitzgs.sfm.photographs import Photographs
 from blitzgs.util.output import write_file
 
 UInt8 = npt.NDArray[np.uint8]
-# A photograph with fewer points is held weakly. One whose error is so many times the median is doubtful.
-_FEW_POINTS, _FEW_FEATURES, _DOUBTFUL = 50, 100, 3.0
-_PAIR_IDS = 2147483647  # COLMAP's pair of images a < b is this number times a, plus b
+# A photograph with fewer points is held weakly. One whose error is so many times the median is doubtful. A
+# warning is given of a mean error from so many pixels on, and if fewer than this share have a pose.
+_MOST = 0.9
+_FEW_POINTS, _FEW_FEATURES, _DOUBTFUL, _LARGE = 50, 100, 3.0, 2.0
 _SIDE, _BAR, _LINE, _NAMED = 900, 420, 18, 40
 
 
@@ -54,15 +53,11 @@ class Reconstruction:
     total: int
     decisions: dict[str, str]
     gps_residuals: tuple[float, float | None] | None = None
-    warnings: list[str] = field(default_factory=list)
 
     @property
     def error(self) -> float:
         """Mean reprojection error of all observations, in pixels."""
-        weights = list(self.points.values())
-        return (
-            float(np.average(list(self.errors.values()), weights=weights)) if sum(weights) else float("nan")
-        )
+        return float(np.average(list(self.errors.values()), weights=list(self.points.values())))
 
     def lines(self) -> list[str]:
         """Return the summary for the user."""
@@ -83,7 +78,18 @@ class Reconstruction:
                 lines.append(
                     f"{'':15}and {len(reasons) - _NAMED} others, all in {self.capture / 'sfm/report.json'}"
                 )
-        return lines + self.warnings
+        if found < _MOST * count:
+            remedy = (
+                ""
+                if "exhaustive" in self.decisions["pairs"]
+                else "; --pairs exhaustive may find more, slowly"
+            )
+            lines.append(f"warning: {count - found} of {count} photographs have no pose{remedy}")
+        if not self.error < _LARGE:
+            lines.append(
+                f"warning: an error of {self.error:.1f} pixels is large: check lens, sharpness, masks"
+            )
+        return lines
 
 
 def examine(
@@ -108,26 +114,24 @@ def examine(
             doubtful.setdefault(name, f"error of {error:.2f} pixels, {error / usual:.1f} times the median")
         elif points[name] < _FEW_POINTS:
             doubtful.setdefault(name, f"held by {points[name]} points only")
-    priors, counts = _database(Path(job.database))
+    counts, priors = read_found(Path(job.database)), read_positions(Path(job.database)) if job.gps else {}
     others = {name: count_images(path) for path in models[1:] for name in read_model(path).images.names}
     unregistered = dict(photographs.damage)
     for name in photographs.names:
         if name not in errors:
-            unregistered[name] = _reason(*counts.get(name, (0, 0, 0)), others.get(name, 0))
+            unregistered[name] = _reason(counts.get(name, Found()), others.get(name, 0))
     used = "without GPS" if not job.gps else "GPS" if job.use_altitude else "GPS without its altitudes"
     decisions = {"pairs": f"pairs: {job.pairs}", "mapper": f"mapper: {job.mapper}", "gps": used}
     centres = dict(zip(names, camera_centres(poses), strict=True))
-    both = [(centres[name], place) for name, place in priors.items() if name in centres] if job.gps else []
     residuals = None
-    if both:
-        away = np.array([centre - place for centre, place in both])
+    if both := [centres[name] - place for name, place in priors.items() if name in centres]:
+        away = np.array(both)
         up = float(np.median(np.abs(away[:, 2]))) if job.use_altitude else None
         residuals = (float(np.median(np.hypot(away[:, 0], away[:, 1]))), up)
     found = Reconstruction(
         capture, errors, points, unregistered, doubtful, len(model.points.ids), decisions, residuals
     )
-    found.warnings.extend(_warnings(found, job))
-    lost = {name: priors[name] for name in unregistered if job.gps and name in priors}
+    lost = {name: priors[name] for name in unregistered if name in priors}
     plan = draw_plan(found, poses, model.points.positions, model.points.colors, lost)
     write_file(work / "cameras.png", bytes(cv2.imencode(".png", plan)[1]))
     figures = {name: {"error": errors[name], "points": points[name]} for name in sorted(errors)}
@@ -151,54 +155,22 @@ def _errors(model: ColmapModel, views: Sequence[SourceView]) -> tuple[dict[str, 
         u, v = view.lens.project(x / depth, y / depth)
         counts[view.name] = len(pixels)
         errors[view.name] = (
-            float(np.hypot(u - pixels[:, 0], v - pixels[:, 1]).mean()) if len(pixels) else np.inf
+            float(np.hypot(u - pixels[:, 0], v - pixels[:, 1]).mean()) if len(pixels) else 0.0
         )
     return errors, counts
 
 
-def _database(path: Path) -> tuple[dict[str, Float64], dict[str, tuple[int, int, int]]]:
-    """Return positions by GPS; and features, verified matches and matched photographs of each photograph."""
-    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as connection:
-        names = dict(connection.execute("SELECT image_id, name FROM images"))
-        features = dict(connection.execute("SELECT image_id, rows FROM keypoints"))
-        pairs = connection.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0").fetchall()
-        try:
-            rows = connection.execute("SELECT corr_data_id, position FROM pose_priors").fetchall()
-        except sqlite3.OperationalError:  # before COLMAP 3.10
-            rows = []
-    matches: dict[int, list[int]] = defaultdict(list)
-    for pair, count in pairs:
-        for image in (pair // _PAIR_IDS, pair % _PAIR_IDS):
-            matches[image].append(count)
-    counts = {n: (features.get(i, 0), sum(matches[i]), len(matches[i])) for i, n in names.items()}
-    return {names[i]: np.frombuffer(blob) for i, blob in rows if blob and i in names}, counts
-
-
-def _reason(features: int, matches: int, neighbours: int, part: int) -> str:
-    """Return why a photograph that is not damaged has no pose."""
-    if features < _FEW_FEATURES:
-        return f"{features} features: blurred, dark, masked, or without texture"
+def _reason(found: Found, part: int) -> str:
+    """Return why a photograph that is not damaged has no pose; `part` is the size of its own model."""
+    if found.features < _FEW_FEATURES:
+        return f"{found.features} features: blurred, dark, masked, or without texture"
     if part:
         return f"belongs to {part} photographs that nothing connects with the others"
-    if not neighbours:
-        return f"none of its {features:,} features was found in another photograph: it has no overlap"
-    return f"{matches:,} matches with {neighbours} photographs are too few, or contradict the others"
-
-
-def _warnings(found: Reconstruction, job: Job) -> list[str]:
-    texts = []
-    count = len(found.errors) + len(found.unregistered)
-    if len(found.errors) < 0.9 * count:
-        remedy = "" if job.pairs == "exhaustive" else "; --pairs exhaustive finds more, but takes longer"
-        texts.append(f"warning: {len(found.unregistered)} of {count} photographs have no pose{remedy}")
-    few = sum(points < _FEW_POINTS for points in found.points.values())
-    if few:
-        texts.append(f"warning: {few} photographs observe fewer than {_FEW_POINTS} points")
-    if not found.error < 2:
-        texts.append(
-            f"warning: an error of {found.error:.1f} pixels is large: check lens, sharpness and masks"
-        )
-    return texts
+    if not found.neighbours:
+        return f"none of its {found.features:,} features was found in another photograph: it has no overlap"
+    return (
+        f"{found.matches:,} matches with {found.neighbours} photographs are too few, or contradict the others"
+    )
 
 
 def draw_plan(
