@@ -86,7 +86,9 @@ def pairs(job: dict[str, Any]) -> None:
 
 def _set_priors(database: Any, georeference: Path, use_altitude: bool) -> None:
     """Replace positions by GPS by metres east, north and up of the first one, with their uncertainty."""
+    names = {image.image_id: image.name for image in database.read_all_images()}
     priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
+    priors.sort(key=lambda prior: names[prior.corr_data_id.id])
     # After an interruption only some are left to be replaced, and the origin is chosen.
     priors = [prior for prior in priors if prior.coordinate_system.name == "WGS84"]
     if not priors:

@@ -154,9 +154,7 @@ def _errors(model: ColmapModel, views: Sequence[SourceView]) -> tuple[dict[str, 
         x, y, depth = view.world_to_camera[:3, :3] @ world.T + view.world_to_camera[:3, 3:]
         u, v = view.lens.project(x / depth, y / depth)
         counts[view.name] = len(pixels)
-        errors[view.name] = (
-            float(np.hypot(u - pixels[:, 0], v - pixels[:, 1]).mean()) if len(pixels) else 0.0
-        )
+        errors[view.name] = float(np.hypot(u - pixels[:, 0], v - pixels[:, 1]).mean()) if len(pixels) else 0.0
     return errors, counts
 
 
