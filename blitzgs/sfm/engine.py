@@ -18,12 +18,12 @@ from blitzgs.sfm.database import camera_of
 
 Report = Callable[[int, int], None]
 STAGES = {"features": "features", "pairs": "matches", "cameras": "poses"}
-# What COLMAP prints as it goes on: done and total, in blocks of two axes, or poses found.
+# What COLMAP prints as it goes on: photographs or blocks of pairs and their total, or poses found.
 _STEP = re.compile(r"\[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]")
 _POSES = re.compile(r"num_reg_frames=(\d+)")
 _MATCHERS = {"gps": "spatial", "sequence": "sequential", "exhaustive": "exhaustive"}
 # Photographs up to which every pair is matched, and poses are found one after the other.
-_MOST_IN_ALL_PAIRS, _MOST_ONE_BY_ONE = 300, 500
+MOST_IN_ALL_PAIRS, _MOST_ONE_BY_ONE = 300, 500
 _MANY = 15
 MISSING = (
     "COLMAP finds out where photographs were taken from, and it is not installed: pip install 'blitzgs[sfm]' "
@@ -82,8 +82,9 @@ def run_stage(stage: str, job: Job, log: Path, lock: int, report: Report) -> Non
     program = backend()
     Path(job.models).mkdir(parents=True, exist_ok=True)
     if program == "pycolmap":
-        text = json.dumps({"stage": stage, **asdict(job)})
-        commands = iter([[sys.executable, "-m", "blitzgs.sfm.pycolmap_stage", text]])
+        file = log.with_name("job.json")  # thousands of names are too long for an argument
+        file.write_text(json.dumps({"stage": stage, **asdict(job)}))
+        commands = iter([[sys.executable, "-m", "blitzgs.sfm.pycolmap_stage", str(file)]])
     else:
         commands = _commands(program, stage, job)
     for command in commands:
@@ -123,7 +124,7 @@ def _progress(line: str, photographs: int, report: Report) -> None:
         report(int(found[1]), photographs)
     elif found := _STEP.search(line):
         done, total, inner, inners = (int(number or 1) for number in found.groups())
-        report((done - 1) * inners + inner, total * inners)
+        report(photographs * ((done - 1) * inners + inner) // (total * inners), photographs)
 
 
 def _commands(program: str, stage: str, job: Job) -> Iterator[list[str]]:
@@ -176,14 +177,29 @@ def _gpu_flags(program: str, command: str) -> list[str]:
 
 
 def decided(job: Job, gps: bool, use_altitude: bool) -> Job:
-    """Return the job with what "auto" means for its photographs."""
+    """Return the job with what "auto" means for its photographs.
+
+    Args:
+        job: as the user wants it.
+        gps: whether the photographs' positions tell neighbours apart; pycolmap also uses them for poses.
+        use_altitude: whether their altitudes can be used.
+
+    Raises:
+        ValueError: the user wants neighbours by GPS, and there are none.
+    """
+    if job.pairs == "gps" and not gps:
+        raise ValueError(
+            "--pairs gps: fewer than 9 of 10 photographs have GPS in EXIF, or all are within 30 metres; "
+            "leave it out, or choose sequence or exhaustive"
+        )
     count = len(job.names)
-    found = "gps" if gps else "exhaustive" if count <= _MOST_IN_ALL_PAIRS else "sequence"
+    found = "gps" if gps else "exhaustive" if count <= MOST_IN_ALL_PAIRS else "sequence"
     pairs = found if job.pairs == "auto" else job.pairs
     mapper = (
         ("incremental" if count <= _MOST_ONE_BY_ONE else "global") if job.mapper == "auto" else job.mapper
     )
-    return replace(job, pairs=pairs, mapper=mapper, gps=gps, use_altitude=use_altitude)
+    prior = gps and backend() == "pycolmap"
+    return replace(job, pairs=pairs, mapper=mapper, gps=prior, use_altitude=prior and use_altitude)
 
 
 def least_model(photographs: int) -> int:

@@ -18,6 +18,7 @@ from blitzgs.capture.image_files import decode_mask, read_header, read_whole
 from blitzgs.capture.masks import find_masks
 from blitzgs.capture.names import IMAGE_SUFFIXES, files_below
 from blitzgs.capture.transforms import find_transforms
+from blitzgs.sfm.engine import MOST_IN_ALL_PAIRS
 from blitzgs.util.output import write_file
 
 # Files and folders of what programs write beside photographs.
@@ -136,18 +137,16 @@ def judge_positions(degrees: Float64, photographs: int) -> tuple[bool, bool]:
     return across > _LEAST_SPREAD, altitude and float(inner[1, 2] - inner[0, 2]) < across
 
 
-def megapixels(sizes: Sequence[tuple[int, int]]) -> float:
-    """Return the mean size of photographs in millions of pixels."""
-    return float(np.mean([width * height for width, height in sizes])) / 1e6
-
-
 def estimate(sizes: Sequence[tuple[int, int]]) -> str:
     """Return roughly how long the reconstruction takes without a GPU."""
     cores, count = len(os.sched_getaffinity(0)), len(sizes)
-    pairs = count * min(count - 1, 100) / 2
-    seconds = (count * megapixels(sizes) * _FEATURES + pairs * _PAIR + count * _POSE) / cores
+    pairs = count * ((count - 1) / 2 if count <= MOST_IN_ALL_PAIRS else _PAIRS_OF_ONE)
+    seconds = (
+        sum(width * height for width, height in sizes) / 1e6 * _FEATURES + pairs * _PAIR + count * _POSE
+    ) / cores
     return f"{max(1, round(seconds / 60)):,} minutes on {cores} CPU cores (rough: within a factor of 3)"
 
 
 # Seconds of a core: for a megapixel, a pair and a pose, measured on 75 photographs of 1.9 megapixels.
-_FEATURES, _PAIR, _POSE = 1.0, 0.3, 1.0
+_FEATURES, _PAIR, _POSE = 1.8, 0.13, 1.0
+_PAIRS_OF_ONE = 30

@@ -2,7 +2,7 @@
 """One stage of a reconstruction with pycolmap: `python -m blitzgs.sfm.pycolmap_stage JOB`.
 
 A stage has a process of its own, so that Ctrl-C stops compiled code at once and an error in it ends only the
-stage. JOB is the JSON of a `blitzgs.sfm.engine.Job`; COLMAP's messages, which tell the progress, are printed.
+stage. JOB is a JSON file of a `blitzgs.sfm.engine.Job`. COLMAP's messages tell the progress.
 """
 
 from __future__ import annotations
@@ -81,7 +81,10 @@ def pairs(job: dict[str, Any]) -> None:
         sequence = pycolmap.SequentialPairingOptions(overlap=20, quadratic_overlap=True)
         pycolmap.match_sequential(job["database"], pairing_options=sequence)
     else:
-        pycolmap.match_exhaustive(job["database"])
+        # Blocks that are small enough to show progress.
+        block = max(2, min(50, len(job["names"]) // 5))
+        every = pycolmap.ExhaustivePairingOptions(block_size=block)
+        pycolmap.match_exhaustive(job["database"], pairing_options=every)
 
 
 def _set_priors(database: Any, georeference: Path, use_altitude: bool) -> None:
@@ -148,5 +151,5 @@ def _place(model: Any, names: list[str], positions: Float64) -> None:
 
 
 if __name__ == "__main__":
-    work = json.loads(sys.argv[1])
+    work = json.loads(Path(sys.argv[1]).read_text())
     {"features": features, "pairs": pairs, "cameras": cameras}[work["stage"]](work)

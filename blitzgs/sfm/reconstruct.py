@@ -110,7 +110,7 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
 def _no_poses(photographs: Photographs, work: Path) -> str:
     return (
         f"no poses were found for the {len(photographs.names)} photographs of {photographs.folder}: do "
-        f"neighbours show the same things, sharp, from places apart? ({work / 'colmap.log'} has COLMAP's words)"
+        f"neighbours show the same things, sharp, from places apart? ({work / 'colmap.log'} says more)"
     )
 
 

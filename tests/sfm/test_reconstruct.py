@@ -4,6 +4,7 @@
 import json
 import shutil
 import sqlite3
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -190,6 +191,25 @@ PLACES = np.array([[47.0, 8.0, 500.0], [47.001, 8.0, 510.0], [47.0, 8.001, 505.0
 def test_positions_are_used_where_they_say_something(places, photographs, expected):
     enough, altitude = judge_positions(places, photographs)
     assert (enough, altitude and enough) == (expected[0], expected[1] and expected[0])
+
+
+@pytest.mark.parametrize(
+    ("count", "gps", "pairs", "mapper"),
+    [
+        (300, False, "exhaustive", "incremental"),
+        (301, False, "sequence", "incremental"),
+        (301, True, "gps", "incremental"),
+        (501, True, "gps", "global"),
+    ],
+)
+def test_pairs_and_mapper_follow_the_photographs(count, gps, pairs, mapper):
+    names = [f"{number}.jpg" for number in range(count)]
+    job = engine.Job("", "", "", "", "", names, [(1, 1)] * count, "auto", "auto", "auto")
+    found = engine.decided(job, gps, True)
+    assert (found.pairs, found.mapper, found.gps, found.use_altitude) == (pairs, mapper, gps, gps)
+    if not gps:
+        with pytest.raises(ValueError, match="--pairs gps: fewer than 9 of 10 photographs"):
+            engine.decided(replace(job, pairs="gps"), gps, True)
 
 
 def test_what_cannot_work_is_said(tmp_path, monkeypatch, capsys):
