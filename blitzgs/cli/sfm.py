@@ -51,7 +51,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     )
     parser.add_argument(
         "--camera-model",
-        choices=("auto", *camera_models()),
+        choices=("auto", *(name for name in camera_models() if name != "EQUIRECTANGULAR")),
         default="auto",
         metavar="MODEL",
         help="COLMAP's name of the lens, such as OPENCV_FISHEYE (default: OPENCV for a camera of 15 or more "

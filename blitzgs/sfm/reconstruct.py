@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.colmap import FILES, count_images
-from blitzgs.sfm.database import read_positions
+from blitzgs.sfm.database import read_found, read_positions
 from blitzgs.sfm.engine import STAGES, Job, StageError, backend, decided, run_stage
 from blitzgs.sfm.photographs import Photographs, judge_positions
 from blitzgs.sfm.report import Reconstruction, examine
@@ -108,9 +108,12 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
 
 
 def _no_poses(photographs: Photographs, work: Path) -> str:
+    found = read_found(work / "database.db").values()
+    features = float(np.median([photograph.features for photograph in found])) if found else 0.0
+    alike = sum(one.neighbours > 0 for one in found)
     return (
-        f"no poses were found for the {len(photographs.names)} photographs of {photographs.folder}: do "
-        f"neighbours show the same things, sharp, from places apart? ({work / 'colmap.log'} says more)"
+        f"no poses were found for the {len(photographs.names)} photographs of {photographs.folder}: they "
+        f"have {features:,.0f} features (median), and {alike} of them show what another shows; are they sharp, and from places apart? ({work / 'colmap.log'} says more)"
     )
 
 

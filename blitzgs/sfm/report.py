@@ -23,10 +23,10 @@ from blitzgs.sfm.photographs import Photographs
 from blitzgs.util.output import write_file
 
 UInt8 = npt.NDArray[np.uint8]
-# A photograph with fewer points is held weakly. One whose error is so many times the median is doubtful. A
-# warning is given of a mean error from so many pixels on, and if fewer than this share have a pose.
-_MOST = 0.9
-_FEW_POINTS, _FEW_FEATURES, _DOUBTFUL, _LARGE = 50, 100, 3.0, 2.0
+# A photograph with fewer points is held weakly. One whose error is so many times the median is doubtful.
+_FEW_POINTS, _FEW_FEATURES, _DOUBTFUL = 50, 100, 3.0
+# A warning is given if a smaller share has a pose, or the mean error is larger, in pixels.
+_MOST, _LARGE = 0.9, 2.0
 _SIDE, _BAR, _LINE, _NAMED = 900, 420, 18, 40
 
 
@@ -75,20 +75,14 @@ class Reconstruction:
         for title, reasons in (("no pose", self.unregistered), ("doubtful", self.doubtful)):
             lines += [f"{title + ':':15}{name}: {why}" for name, why in list(reasons.items())[:_NAMED]]
             if len(reasons) > _NAMED:
-                lines.append(
-                    f"{'':15}and {len(reasons) - _NAMED} others, all in {self.capture / 'sfm/report.json'}"
-                )
+                rest = len(reasons) - _NAMED
+                lines.append(f"{'':15}and {rest} others, all in {self.capture / 'sfm/report.json'}")
         if found < _MOST * count:
-            remedy = (
-                ""
-                if "exhaustive" in self.decisions["pairs"]
-                else "; --pairs exhaustive may find more, slowly"
-            )
+            all_pairs = "exhaustive" in self.decisions["pairs"]
+            remedy = "" if all_pairs else "; --pairs exhaustive may find more, slowly"
             lines.append(f"warning: {count - found} of {count} photographs have no pose{remedy}")
         if not self.error < _LARGE:
-            lines.append(
-                f"warning: an error of {self.error:.1f} pixels is large: check lens, sharpness, masks"
-            )
+            lines.append(f"warning: {self.error:.1f} pixels are much: check lens, sharpness and masks")
         return lines
 
 

@@ -193,6 +193,20 @@ def test_positions_are_used_where_they_say_something(places, photographs, expect
     assert (enough, altitude and enough) == (expected[0], expected[1] and expected[0])
 
 
+def test_photographs_of_nothing_have_no_poses(tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    for number in range(3):
+        grey = np.full((90, 120, 3), 100 + number, np.uint8)
+        assert cv2.imwrite(str(tmp_path / f"photos/{number}.png"), grey)
+    for _ in range(2):
+        assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "capture")]) == 1
+        error = capsys.readouterr().err
+        assert "no poses were found for the 3 photographs" in error
+        assert "they have 0 features (median), and 0 of them" in error
+    assert not (tmp_path / "capture/sparse").exists()
+    assert not reconstruct.is_finished(tmp_path / "capture")
+
+
 @pytest.mark.parametrize(
     ("count", "gps", "pairs", "mapper"),
     [
