@@ -113,7 +113,8 @@ def _no_poses(photographs: Photographs, work: Path) -> str:
     alike = sum(one.neighbours > 0 for one in found)
     return (
         f"no poses were found for the {len(photographs.names)} photographs of {photographs.folder}: they "
-        f"have {features:,.0f} features (median), and {alike} of them show what another shows; are they sharp, and from places apart? ({work / 'colmap.log'} says more)"
+        f"have {features:,.0f} features (median), and {alike} of them show what another shows; are they "
+        f"sharp, and from places apart? ({work / 'colmap.log'} says more)"
     )
 
 
