@@ -178,11 +178,9 @@ def draw_plan(
     sample = slice(None, None, max(1, len(points) // 50_000))
     cloud = points[sample] if len(points) else centres
     near = np.linalg.norm(cloud - middle, axis=1)
-    axes = (
-        np.linalg.svd(cloud[near <= np.quantile(near, 0.9)] - middle, full_matrices=True)[2]
-        if not lost
-        else np.eye(3)
-    )
+    spread = cloud[near <= np.quantile(near, 0.9)] - middle
+    # With GPS the world has its axes; else the points' plane is that of their two largest spreads.
+    axes = np.eye(3) if found.gps_residuals else np.linalg.eigh(spread.T @ spread)[1].T[::-1]
     if (centres - middle).mean(axis=0) @ np.cross(axes[0], axes[1]) < 0:
         axes = axes[[1, 0, 2]]
     places = np.array(list(lost.values())).reshape(-1, 3)
