@@ -94,7 +94,7 @@ def run_stage(stage: str, job: Job, log: Path, lock: int, report: Report) -> Non
 def _run(command: list[str], log: Path, lock: int, heard: Callable[[str], None]) -> None:
     last = ""
     with (
-        log.open("a", encoding="utf-8") as file,
+        log.open("a", buffering=1, encoding="utf-8") as file,
         subprocess.Popen(
             command,
             stdout=subprocess.PIPE,
