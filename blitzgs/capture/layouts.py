@@ -134,10 +134,7 @@ def _hint(root: Path) -> str:
             f"move the model to {root / 'sparse' / '0'}"
         )
     if any(path.suffix.lower() in _PHOTOGRAPH_SUFFIXES for path in [*root.glob("*"), *root.glob("*/*")]):
-        return (
-            "; it has images but not their cameras: run COLMAP on them (colmap automatic_reconstructor "
-            f"--workspace_path {root} --image_path FOLDER_OF_THE_IMAGES --dense 0)"
-        )
+        return f"; it has images but not their cameras: blitzgs sfm {root} CAPTURE finds these"
     return ""
 
 

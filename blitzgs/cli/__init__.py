@@ -24,9 +24,10 @@ from blitzgs.cli.flags import Parser, check_given_once, flag_meant, split_fields
 from blitzgs.util.terminal import Output, printable, surviving_output
 
 HELP = """\
-Train 3D Gaussian Splatting models of photographs with known cameras: models of a desk, or of a whole city.
-These commands lead from a capture (a COLMAP model and its photographs) to pictures and a file for viewers:
+Train 3D Gaussian Splatting models of photographs: models of a desk, or of a whole city.
+These commands lead from photographs to a capture (with cameras), to pictures and a file for viewers:
 
+  blitzgs sfm PHOTOS CAPTURE
   blitzgs train --data CAPTURE --out RUN
   blitzgs view RUN
   blitzgs render RUN --out PICTURES
@@ -37,6 +38,7 @@ blitzgs train --help explains the training; blitzgs train --help FIELD explains 
 
 # For each command the module that has it, and what it does.
 COMMANDS = {
+    "sfm": ("blitzgs.cli.sfm", "find out where photographs were taken from, and write a capture"),
     "train": ("blitzgs.cli.train", "train a model of photographs with known cameras"),
     "eval": ("blitzgs.cli.evaluate", "measure PSNR and SSIM of a run's held-out views"),
     "render": ("blitzgs.cli.render", "render views of a model to pictures, or a path to a film"),

@@ -20,6 +20,7 @@ from rich.table import Table
 from blitzgs.cli.arguments import Commands, add_command, add_device, named_path
 from blitzgs.cli.final_report import kept_warnings, write_final_report
 from blitzgs.cli.live import add_live_page, check_live_page, live_page, say_where_to_look
+from blitzgs.cli.sfm import understood_alone, with_poses
 from blitzgs.config.describe import describe, describe_all, describe_page
 from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, load_config, to_dict
@@ -37,8 +38,9 @@ from blitzgs.util.terminal import printable
 
 HELP = """\
 Train a model of a capture, which is a folder DIR with photographs and their cameras: a COLMAP model
-(DIR/sparse/0 and DIR/images) or a transforms.json. Every 8th view is held out, unless the capture has its
-own split: the model is not trained on these views, and its quality is measured on them at the end.
+(DIR/sparse/0 and DIR/images) or a transforms.json. For photographs alone the cameras are found first, as by
+blitzgs sfm. Every 8th view is held out, unless the capture has its own split: the model is not trained on
+these views, and its quality is measured on them at the end.
 
   blitzgs train --data DIR --out RUN
 
@@ -122,6 +124,13 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         help="read the capture, print what was understood and roughly what the training will take, and stop; "
         "needs no GPU and no --out",
     )
+    parser.add_argument(
+        "--sfm",
+        type=named_path,
+        metavar="DIR",
+        help="folder for the capture that is made of photographs without poses (default: RUN_capture)",
+    )
+    parser.add_argument("--no-sfm", action="store_true", help="refuse photographs without poses")
     add_live_page(parser)
     add_device(parser)
 
@@ -180,6 +189,8 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.check:
         return _check(args, config)
+    if not args.no_sfm:
+        config = with_poses(config, args.sfm or args.out.with_name(f"{args.out.name}_capture"))
     job, laps = config.ranks, Laps(since_start=True)
     laps.lap("imports")
     with (
@@ -219,6 +230,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace, config: Config) -> int:
     """Print what is understood of the capture, and what a training will take."""
+    if not args.no_sfm and (text := understood_alone(config)) is not None:
+        print(text)
+        return 0
     capture, images = open_capture(config, Ranks())
     check_worlds(capture)
     lines = understood(config, capture, images)

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command `blitzgs sfm`: find out where photographs were taken from, and write a capture."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import shlex
+import sys
+import time
+from pathlib import Path
+
+from blitzgs.capture.colmap import camera_models
+from blitzgs.cli.arguments import Commands, add_command, named_path
+from blitzgs.config.fields import Config
+from blitzgs.sfm.photographs import Photographs, estimate, has_photographs_alone, photograph_folder
+from blitzgs.sfm.reconstruct import MAPPERS, PAIRS, WORK, Settings, is_finished, reconstruct
+from blitzgs.util.terminal import printable
+
+HELP = """\
+Find out where photographs were taken from, and write a capture that blitzgs train --data reads.
+
+  blitzgs sfm PHOTOS CAPTURE
+
+PHOTOS is a folder of overlapping photographs, also with subfolders; of a folder with images/ it is that.
+Masks in masks/ (black: not used) keep features away from what moves. COLMAP does the work: pycolmap (pip
+install 'blitzgs[sfm]') or the program colmap, on a GPU if it is built for one.
+
+Photographs of one camera (by EXIF, else by size and folder) share its lens. With GPS in 9 of 10 photographs,
+each is matched with its 50 nearest and the model is in metres east, north and up (sfm/georeference.json);
+altitudes that are missing, equal or contradictory are left out. Without GPS all pairs are matched, or, of
+more than 300 photographs, neighbours by name. More than 500 photographs are placed by the global mapper.
+
+An interrupted command goes on when it is repeated, and later photographs are added. CAPTURE gets sparse/0, a
+link to the photographs, and sfm/: cameras.png (a plan of the cameras), report.json (errors in pixels,
+photographs without a pose and why), and COLMAP's database and messages.
+"""
+
+
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
+    """Add the command."""
+    parser = add_command(commands, "sfm", run, summary, HELP)
+    parser.add_argument("photos", type=named_path, metavar="PHOTOS", help="folder of the photographs")
+    parser.add_argument("capture", type=named_path, metavar="CAPTURE", help="folder to write")
+    parser.add_argument(
+        "--pairs", choices=PAIRS, default="auto", help="which photographs are compared (default: see above)"
+    )
+    parser.add_argument(
+        "--mapper", choices=MAPPERS, default="auto", help="how poses are found (default: see above)"
+    )
+    parser.add_argument(
+        "--camera-model",
+        choices=("auto", *(name for name in camera_models() if name != "EQUIRECTANGULAR")),
+        default="auto",
+        metavar="MODEL",
+        help="COLMAP's name of the lens, such as OPENCV_FISHEYE (default: OPENCV for a camera of 15 or more "
+        "photographs, else SIMPLE_RADIAL)",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Reconstruct; returns the exit status."""
+    find_poses(
+        photograph_folder(args.photos), args.capture, Settings(args.pairs, args.mapper, args.camera_model)
+    )
+    name = shlex.quote(str(args.capture))
+    print(printable(f"next:\n  blitzgs train --data {name} --out RUN"))
+    return 0
+
+
+def find_poses(folder: Path, capture: Path, settings: Settings) -> None:
+    """Reconstruct, and print what will be done and what was found."""
+    photographs = Photographs.of(folder)
+    count = len(photographs.names)
+    for name, problem in photographs.damage.items():
+        print(printable(f"{name} is left out: {problem}"), file=sys.stderr)
+    print(f"poses of {count:,} photographs: about {estimate(photographs.sizes)}", file=sys.stderr, flush=True)
+    begin = time.monotonic()
+    found = reconstruct(photographs, capture, settings)
+    lines = [*found.lines(), f"{'picture:':15}{capture / WORK / 'cameras.png'}"]
+    print("\n".join(map(printable, lines)))
+    print(f"{'time:':15}{(time.monotonic() - begin) / 60:.1f} minutes", flush=True)
+
+
+def with_poses(config: Config, folder: Path) -> Config:
+    """Return a configuration whose capture has poses: of photographs alone they are found first.
+
+    Under torchrun rank 0 finds them and the others, which have not joined yet, wait for its report; where
+    rank 0 fails, torchrun ends them.
+
+    Args:
+        config: of the training.
+        folder: the capture to write, or to use if it is finished.
+    """
+    root = Path(config.data.path)
+    if not config.data.path or not has_photographs_alone(root, config.data.images):
+        return config
+    first = os.environ.get("RANK", "0") == "0"
+    if is_finished(folder):
+        if first:
+            print(f"poses: those of {folder}, found before (blitzgs sfm adds photographs)", file=sys.stderr)
+    elif first:
+        print(f"{root} has photographs without poses: they are found first, into {folder}", file=sys.stderr)
+        find_poses(photograph_folder(root, config.data.images), folder, Settings())
+    while not is_finished(folder):
+        time.sleep(1.0)
+    data = dataclasses.replace(config.data, path=os.path.realpath(folder), images="images")
+    return dataclasses.replace(config, data=data)
+
+
+def understood_alone(config: Config) -> str | None:
+    """Return what a training would do first with photographs that have no poses; None: they have."""
+    root = Path(config.data.path)
+    if not config.data.path or not has_photographs_alone(root, config.data.images):
+        return None
+    photographs = Photographs.of(photograph_folder(root, config.data.images))
+    return (
+        f"{len(photographs.names):,} photographs without poses: a training finds them first, in about "
+        f"{estimate(photographs.sizes)}; then this command says more (blitzgs sfm finds poses alone)"
+    )

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs the stages of a reconstruction in processes of their own: by pycolmap, or by the program `colmap`."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from blitzgs.sfm.database import camera_of
+
+Report = Callable[[int, int], None]
+STAGES = {"features": "features", "pairs": "matches", "cameras": "poses"}
+# What COLMAP prints as it goes on: photographs or blocks of pairs and their total, or poses found.
+_STEP = re.compile(r"\[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]")
+_POSES = re.compile(r"num_reg_frames=(\d+)")
+_MATCHERS = {"gps": "spatial", "sequence": "sequential", "exhaustive": "exhaustive"}
+# Photographs up to which every pair is matched, and poses are found one after the other.
+MOST_IN_ALL_PAIRS, _MOST_ONE_BY_ONE = 300, 500
+_MANY = 15
+MISSING = (
+    "COLMAP finds out where photographs were taken from, and it is not installed: pip install 'blitzgs[sfm]' "
+    "(pycolmap; with an NVIDIA GPU also pycolmap-cuda12), or install the program colmap"
+)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What the stages need to know; the fields are paths as text, and what was decided."""
+
+    database: str
+    photos: str
+    masks: str
+    models: str
+    georeference: str
+    names: list[str]
+    sizes: list[tuple[int, int]]
+    camera_model: str
+    pairs: str
+    mapper: str
+    gps: bool = False
+    use_altitude: bool = False
+
+
+class StageError(ValueError):
+    """COLMAP could not do a stage."""
+
+
+def backend() -> str:
+    """Return "pycolmap", or the path of the program `colmap`.
+
+    Raises:
+        ImportError: neither is installed.
+    """
+    if importlib.util.find_spec("pycolmap") is not None:
+        return "pycolmap"
+    if (program := shutil.which("colmap")) is None:
+        raise ImportError(MISSING)
+    return program
+
+
+def run_stage(stage: str, job: Job, log: Path, lock: int, report: Report) -> None:
+    """Do a stage; what COLMAP says is added to the file `log`.
+
+    Args:
+        stage: a key of `STAGES`.
+        job: what to do.
+        log: file to append to.
+        lock: descriptor of a locked file, which the processes hold until they end.
+        report: called with what is done, and the total.
+
+    Raises:
+        StageError: COLMAP failed; has its last words.
+    """
+    program = backend()
+    Path(job.models).mkdir(parents=True, exist_ok=True)
+    if program == "pycolmap":
+        file = log.with_name("job.json")  # thousands of names are too long for an argument
+        file.write_text(json.dumps({"stage": stage, **asdict(job)}))
+        commands = iter([[sys.executable, "-m", "blitzgs.sfm.pycolmap_stage", str(file)]])
+    else:
+        commands = _commands(program, stage, job)
+    for command in commands:
+        _run(command, log, lock, lambda line: _progress(line, len(job.names), report))
+
+
+def _run(command: list[str], log: Path, lock: int, heard: Callable[[str], None]) -> None:
+    last = ""
+    with (
+        log.open("a", buffering=1, encoding="utf-8") as file,
+        subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            pass_fds=[lock],
+        ) as process,
+    ):
+        assert process.stdout is not None
+        try:
+            for line in process.stdout:
+                file.write(line)
+                last = line.strip() or last
+                heard(line)
+        except BaseException:
+            process.kill()
+            raise
+    if process.returncode:
+        how = f"signal {-process.returncode}" if process.returncode < 0 else f"status {process.returncode}"
+        memory = " (the memory may not suffice: use smaller photographs)" if process.returncode == -9 else ""
+        raise StageError(f"COLMAP ended with {how}{memory}: {last} ({log} has all that it said)")
+
+
+def _progress(line: str, photographs: int, report: Report) -> None:
+    if found := _POSES.search(line):
+        report(int(found[1]), photographs)
+    elif found := _STEP.search(line):
+        done, total, inner, inners = (int(number or 1) for number in found.groups())
+        report(photographs * ((done - 1) * inners + inner) // (total * inners), photographs)
+
+
+def _commands(program: str, stage: str, job: Job) -> Iterator[list[str]]:
+    """Yield the commands of a stage for the program `colmap`, from 3.8 on."""
+    base = ["--database_path", job.database]
+    if stage == "features":
+        gpu = _gpu_flags(program, "feature_extractor")
+        groups: dict[tuple[tuple[int, int], Path], list[str]] = defaultdict(list)
+        for name, size in zip(job.names, job.sizes, strict=True):
+            groups[size, Path(name).parent].append(name)
+        for names in groups.values():
+            listed = Path(job.models) / "photographs.txt"
+            listed.write_text("\n".join(names) + "\n", encoding="utf-8")
+            reader = ["--ImageReader.camera_model", lens_model(job.camera_model, len(names))]
+            reader += ["--ImageReader.single_camera", "1"]
+            if (known := camera_of(Path(job.database), names)) is not None:
+                reader += ["--ImageReader.existing_camera_id", str(known)]
+            if job.masks:
+                reader += ["--ImageReader.mask_path", job.masks]
+            paths = ["--image_path", job.photos, "--image_list_path", str(listed)]
+            yield [program, "feature_extractor", *base, *paths, *reader, *gpu]
+    elif stage == "pairs":
+        matcher = _MATCHERS[job.pairs]
+        far = ["--SpatialMatching.max_distance", "1e9"] if job.pairs == "gps" else []
+        yield [program, f"{matcher}_matcher", *base, *far, *_gpu_flags(program, f"{matcher}_matcher")]
+    else:
+        mapper = (
+            "global_mapper"
+            if job.mapper == "global" and "global_mapper" in _help(program, "help")
+            else "mapper"
+        )
+        paths = ["--image_path", job.photos, "--output_path", job.models]
+        least = ["--Mapper.min_model_size", str(least_model(len(job.names)))] if mapper == "mapper" else []
+        yield [program, mapper, *base, *paths, *least]
+
+
+def _help(program: str, command: str) -> str:
+    result = subprocess.run(
+        [program, command, *(["-h"] if command != "help" else [])], capture_output=True, text=True
+    )
+    return result.stdout + result.stderr
+
+
+def _gpu_flags(program: str, command: str) -> list[str]:
+    """Return the flag that keeps a `colmap` without CUDA from looking for a display."""
+    if "with CUDA" in _help(program, "help"):
+        return []
+    names = re.findall(r"--((?:Feature|Sift)(?:Extraction|Matching)\.use_gpu)", _help(program, command))
+    return [f"--{names[0]}", "0"] if names else []
+
+
+def decided(job: Job, gps: bool, use_altitude: bool) -> Job:
+    """Return the job with what "auto" means for its photographs.
+
+    Args:
+        job: as the user wants it.
+        gps: whether the photographs' positions tell neighbours apart; pycolmap also uses them for poses.
+        use_altitude: whether their altitudes can be used.
+
+    Raises:
+        ValueError: the user wants neighbours by GPS, and there are none.
+    """
+    if job.pairs == "gps" and not gps:
+        raise ValueError(
+            "--pairs gps: fewer than 9 of 10 photographs have GPS in EXIF, or all are within 30 metres; "
+            "leave it out, or choose sequence or exhaustive"
+        )
+    count = len(job.names)
+    found = "gps" if gps else "exhaustive" if count <= MOST_IN_ALL_PAIRS else "sequence"
+    pairs = found if job.pairs == "auto" else job.pairs
+    mapper = (
+        ("incremental" if count <= _MOST_ONE_BY_ONE else "global") if job.mapper == "auto" else job.mapper
+    )
+    prior = gps and backend() == "pycolmap"
+    return replace(job, pairs=pairs, mapper=mapper, gps=prior, use_altitude=prior and use_altitude)
+
+
+def least_model(photographs: int) -> int:
+    """Return how many photographs make a model: COLMAP's 10, but fewer of few."""
+    return min(10, max(3, photographs // 2))
+
+
+def lens_model(wanted: str, photographs: int) -> str:
+    """Return the camera model for a camera that took so many photographs: many determine a full lens."""
+    if wanted != "auto":
+        return wanted
+    return "OPENCV" if photographs >= _MANY else "SIMPLE_RADIAL"

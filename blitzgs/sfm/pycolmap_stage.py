@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One stage of a reconstruction with pycolmap: `python -m blitzgs.sfm.pycolmap_stage JOB`.
+
+A stage has a process of its own, so that Ctrl-C stops compiled code at once and an error in it ends only the
+stage. JOB is a JSON file of a `blitzgs.sfm.engine.Job`. COLMAP's messages tell the progress.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from blitzgs.capture.colmap import Float64
+from blitzgs.sfm.engine import least_model, lens_model
+
+# The standard deviations of a position by GPS in metres, across and up; the second of an altitude that says
+# nothing. Drones state altitudes by barometer, which drift between flights.
+_ACROSS, _UP, _UNKNOWN = 3.0, 15.0, 1e4
+
+
+def features(job: dict[str, Any]) -> None:
+    """Find the features of the photographs that have none; photographs of one camera share its parameters."""
+    photos = Path(job["photos"])
+
+    def look(name: str) -> tuple[str, float | None, float | None]:
+        bitmap = pycolmap.Bitmap.read(photos / name, False)
+        if bitmap is None:
+            return "", None, None
+        # Without EXIF, cameras of the same size are told apart by their folders.
+        camera = bitmap.exif_camera_model() or f"{bitmap.width}x{bitmap.height} {Path(name).parent}"
+        return camera, bitmap.exif_latitude(), bitmap.exif_longitude()
+
+    with ThreadPoolExecutor() as pool:
+        seen = dict(zip(job["names"], pool.map(look, job["names"]), strict=True))
+    groups: dict[str, list[str]] = defaultdict(list)
+    for name, (camera, _, _) in seen.items():
+        groups[camera].append(name)
+    for names in groups.values():
+        options = pycolmap.ImageReaderOptions()
+        options.camera_model = lens_model(job["camera_model"], len(names))
+        if job["masks"]:
+            options.mask_path = job["masks"]
+        with pycolmap.Database.open(job["database"]) as database:
+            before = (database.read_image_with_name(name) for name in names)
+            if (image := next(filter(None, before), None)) is not None:  # of an interrupted stage
+                options.existing_camera_id = image.camera_id
+        pycolmap.extract_features(
+            job["database"], photos, names, pycolmap.CameraMode.SINGLE, reader_options=options
+        )
+    with pycolmap.Database.open(job["database"]) as database:
+        # COLMAP leaves out a position without an altitude.
+        known = {prior.corr_data_id.id: prior for prior in database.read_all_pose_priors()}
+        for image in database.read_all_images():
+            _, latitude, longitude = seen.get(image.name, ("", None, None))
+            prior = known.get(image.image_id)
+            if latitude is None or longitude is None or (prior is not None and prior.has_position()):
+                continue
+            added = prior or pycolmap.PosePrior(corr_data_id=image.data_id)
+            added.position = np.array([latitude, longitude, 0.0])
+            added.coordinate_system = pycolmap.PosePriorCoordinateSystem.WGS84
+            (database.update_pose_prior if prior else database.write_pose_prior)(added)
+
+
+def pairs(job: dict[str, Any]) -> None:
+    """Match features of pairs of photographs, without those that were matched before."""
+    with pycolmap.Database.open(job["database"]) as database:
+        if job["gps"]:
+            _set_priors(database, Path(job["georeference"]), job["use_altitude"])
+    if job["pairs"] == "gps":
+        # The number of neighbours limits the pairs: the flying height decides on a good distance.
+        spatial = pycolmap.SpatialPairingOptions(ignore_z=True, max_distance=1e9)
+        pycolmap.match_spatial(job["database"], pairing_options=spatial)
+    elif job["pairs"] == "sequence":
+        sequence = pycolmap.SequentialPairingOptions(overlap=20, quadratic_overlap=True)
+        pycolmap.match_sequential(job["database"], pairing_options=sequence)
+    else:
+        # Blocks that are small enough to show progress.
+        block = max(2, min(50, len(job["names"]) // 5))
+        every = pycolmap.ExhaustivePairingOptions(block_size=block)
+        pycolmap.match_exhaustive(job["database"], pairing_options=every)
+
+
+def _set_priors(database: Any, georeference: Path, use_altitude: bool) -> None:
+    """Replace positions by GPS by metres east, north and up of the first one, with their uncertainty."""
+    names = {image.image_id: image.name for image in database.read_all_images()}
+    priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
+    priors.sort(key=lambda prior: names[prior.corr_data_id.id])
+    # After an interruption only some are left to be replaced, and the origin is chosen.
+    priors = [prior for prior in priors if prior.coordinate_system.name == "WGS84"]
+    if not priors:
+        return
+    degrees = np.stack([prior.position for prior in priors])
+    if not use_altitude:
+        degrees[:, 2] = 0.0
+    if not georeference.exists():
+        origin = dict(zip(("latitude", "longitude", "altitude"), degrees[0].tolist(), strict=True))
+        georeference.write_text(json.dumps({"axes": "metres east, north and up of the origin", **origin}))
+    place = json.loads(georeference.read_text())
+    metres = pycolmap.GPSTransform().ellipsoid_to_enu(
+        degrees, place["latitude"], place["longitude"], place["altitude"]
+    )
+    variance = np.diag([_ACROSS**2, _ACROSS**2, (_UP if use_altitude else _UNKNOWN) ** 2])
+    for prior, position in zip(priors, metres, strict=True):
+        prior.position, prior.position_covariance = position, variance
+        prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
+        database.update_pose_prior(prior)
+
+
+def cameras(job: dict[str, Any]) -> None:
+    """Find poses, lenses and points from the matches; writes one model for each connected part."""
+    gpu = pycolmap.has_cuda
+    if job["mapper"] == "incremental":
+        options = pycolmap.IncrementalPipelineOptions()
+        options.min_model_size = least_model(len(job["names"]))
+        options.ba_use_gpu = gpu
+        options.use_prior_position = options.use_robust_loss_on_prior_position = job["gps"]
+        pycolmap.incremental_mapping(job["database"], job["photos"], job["models"], options)
+        return
+    with pycolmap.Database.open(job["database"]) as database:
+        guessed = not all(camera.has_prior_focal_length for camera in database.read_all_cameras())
+        known = {
+            database.read_image(prior.corr_data_id.id).name: prior.position
+            for prior in database.read_all_pose_priors()
+            if job["gps"] and prior.has_position()
+        }
+    if guessed:
+        pycolmap.calibrate_view_graph(job["database"])
+    wide = pycolmap.GlobalPipelineOptions()
+    wide.mapper.global_positioning.use_gpu = wide.mapper.bundle_adjustment.ceres.use_gpu = gpu
+    models = pycolmap.global_mapping(job["database"], job["photos"], job["models"], wide)
+    for number, model in models.items():
+        # The global mapper knows no priors: its result is moved, turned and scaled to them.
+        names = [image.name for image in model.images.values() if image.name in known]
+        if len(names) >= 3:
+            _place(model, names, np.stack([known[name] for name in names]))
+            model.write(Path(job["models"]) / str(number))
+
+
+def _place(model: Any, names: list[str], positions: Float64) -> None:
+    robust = pycolmap.RANSACOptions(max_error=5 * _ACROSS)
+    moved = pycolmap.align_reconstruction_to_locations(model, names, positions, 3, robust)
+    if moved is not None:
+        model.transform(moved)
+
+
+if __name__ == "__main__":
+    work = json.loads(Path(sys.argv[1]).read_text())
+    {"features": features, "pairs": pairs, "cameras": cameras}[work["stage"]](work)

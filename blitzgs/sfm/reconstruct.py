@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Makes a capture of photographs: stages that are kept, so that an interrupted reconstruction goes on.
+
+The folder `sfm/` of the capture has COLMAP's database, its messages, what is finished, and the report.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blitzgs.capture.colmap import FILES, count_images
+from blitzgs.sfm.database import read_found, read_positions
+from blitzgs.sfm.engine import STAGES, Job, StageError, backend, decided, run_stage
+from blitzgs.sfm.photographs import Photographs, judge_positions
+from blitzgs.sfm.report import Reconstruction, examine
+from blitzgs.util.output import write_file
+from blitzgs.util.progress import image_progress
+
+PAIRS = ("auto", "gps", "sequence", "exhaustive")
+MAPPERS = ("auto", "incremental", "global")
+WORK = "sfm"
+_STATE = "state.json"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to reconstruct; see `blitzgs sfm --help`."""
+
+    pairs: str = "auto"
+    mapper: str = "auto"
+    camera_model: str = "auto"
+
+
+def is_finished(capture: Path) -> bool:
+    """Tell whether `reconstruct` finished a capture."""
+    return (capture / WORK / "report.json").is_file()
+
+
+def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> Reconstruction:
+    """Find the poses of photographs and write a capture, whose `images` is a link to their folder.
+
+    Stages that an earlier call finished for the same photographs and settings are left out. New photographs
+    are added to what is there; after any other change the work begins anew.
+
+    Args:
+        photographs: what to find the poses of.
+        capture: folder to write. Nothing in it that another program wrote is replaced.
+        settings: what not to leave to the photographs.
+
+    Raises:
+        BlockingIOError: another process is at it.
+        FileExistsError: the capture has a model or images that this function did not make.
+        ValueError: no poses were found, or the capture is in the folder of the photographs.
+        ImportError: COLMAP is not installed.
+    """
+    backend()
+    folder = photographs.folder
+    if capture.resolve().is_relative_to(folder.resolve()):
+        raise ValueError(f"{capture} is in the folder of the photographs: choose a folder outside {folder}")
+    work = capture / WORK
+    if not work.is_dir() and (capture / "sparse").exists():
+        raise FileExistsError(
+            f"{capture} has a model that blitzgs sfm did not make: choose another folder for the capture"
+        )
+    work.mkdir(parents=True, exist_ok=True)
+    with _locked(work / "lock") as lock:
+        state = _state(work, photographs, settings)
+        masks = photographs.write_masks(work / "masks")
+        paths = [str((work / name).absolute()) for name in ("database.db", "models", "georeference.json")]
+        job = Job(
+            database=paths[0],
+            photos=str(folder.absolute()),
+            masks=str(masks.absolute()) if masks else "",
+            models=paths[1],
+            georeference=paths[2],
+            names=photographs.names,
+            sizes=photographs.sizes,
+            **asdict(settings),
+        )
+        for stage, what in STAGES.items():
+            if stage == "pairs":
+                if "gps" not in state:
+                    places = np.array(list(read_positions(Path(job.database)).values())).reshape(-1, 3)
+                    state["gps"], state["altitude"] = judge_positions(places, len(job.names))
+                job = decided(job, state["gps"], state["altitude"])
+            if stage not in state["finished"]:
+                if stage == "cameras":
+                    shutil.rmtree(job.models, ignore_errors=True)
+                with image_progress(what) as report:
+                    run_stage(stage, job, work / "colmap.log", lock, report)
+                state["finished"].append(stage)
+                write_file(work / _STATE, json.dumps(state))
+        models = sorted(Path(job.models).glob("[0-9]*"), key=count_images, reverse=True)
+        if not models or not count_images(models[0]):
+            raise StageError(_no_poses(photographs, work))
+        _write_capture(models[0], photographs, capture)
+        return examine(capture, work, photographs, job, models)
+
+
+def _no_poses(photographs: Photographs, work: Path) -> str:
+    found = read_found(work / "database.db").values()
+    features = float(np.median([photograph.features for photograph in found])) if found else 0.0
+    alike = sum(one.neighbours > 0 for one in found)
+    return (
+        f"no poses were found for the {len(photographs.names)} photographs of {photographs.folder}: they "
+        f"have {features:,.0f} features (median), and {alike} of them show what another shows; are they "
+        f"sharp, and from places apart? ({work / 'colmap.log'} says more)"
+    )
+
+
+def _state(work: Path, photographs: Photographs, settings: Settings) -> dict[str, Any]:
+    """Return what is finished; without what a change of photographs or settings makes invalid."""
+    identity, chosen = photographs.identity(), asdict(settings)
+    path = work / _STATE
+    before = json.loads(path.read_text()) if path.exists() else {}
+    if not before:
+        before = {"photographs": identity, "settings": chosen, "finished": []}
+    old = before["photographs"]
+    (work / "report.json").unlink(missing_ok=True)
+    if any(identity.get(name) != stamp for name, stamp in old.items()) or (
+        chosen["camera_model"] != before["settings"]["camera_model"]
+    ):
+        for name in ("database.db", "database.db-wal", "database.db-shm", "georeference.json"):
+            (work / name).unlink(missing_ok=True)
+        shutil.rmtree(work / "masks", ignore_errors=True)
+        before = {"finished": []}
+    elif len(identity) > len(old):
+        before["finished"] = []
+    elif chosen["pairs"] != before["settings"]["pairs"]:
+        before["finished"] = [stage for stage in before["finished"] if stage == "features"]
+    elif chosen["mapper"] != before["settings"]["mapper"]:
+        before["finished"] = [stage for stage in before["finished"] if stage != "cameras"]
+    state = {**before, "photographs": identity, "settings": chosen}
+    write_file(path, json.dumps(state))
+    return state
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[int]:
+    """Hold a lock, which COLMAP's processes inherit: one that outlives this process keeps others out."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BlockingIOError(
+                f"another blitzgs sfm is at work in {path.parent}: wait for its end"
+            ) from None
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _write_capture(model: Path, photographs: Photographs, capture: Path) -> None:
+    """Write the model, and links to the photographs and their masks."""
+    folder = photographs.folder
+    links = {"images": folder}
+    if any(photographs.masks):
+        links["masks"] = next(root / "masks" for root in (folder, folder.parent) if (root / "masks").is_dir())
+    for name, target in links.items():
+        link = capture / name
+        if link.exists() and link.samefile(target):
+            continue
+        if link.exists():
+            raise FileExistsError(f"{link} is not {target}: choose another folder for the capture")
+        link.unlink(missing_ok=True)
+        link.symlink_to(target.resolve(), target_is_directory=True)
+    sparse = capture / "sparse" / "0"
+    sparse.mkdir(parents=True, exist_ok=True)
+    for name in FILES:
+        write_file(sparse / f"{name}.bin", (model / f"{name}.bin").read_bytes())
