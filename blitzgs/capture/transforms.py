@@ -78,15 +78,15 @@ def find_transforms(root: Path) -> list[Path]:
     return [path for path in files if path.is_file()]
 
 
-def read_transforms(root: Path) -> Transforms:
-    """Read every frame of a capture.
+def read_transforms(root: Path, files: Sequence[Path] | None = None) -> Transforms:
+    """Read every frame of a capture, or of the given files, whose images are relative to `root`.
 
     Raises:
         ValueError: a field is missing or makes no sense; names the file, the frame and the field.
     """
     frames: list[Frame] = []
     points_path, applied = None, None
-    files = find_transforms(root)
+    files = find_transforms(root) if files is None else list(files)
     notes: dict[str, None] = {}
     ignored: dict[str, None] = {}
     split: list[str] = []

@@ -39,9 +39,9 @@ blitzgs train --help explains the training; blitzgs train --help FIELD explains 
 COMMANDS = {
     "train": ("blitzgs.cli.train", "train a model of photographs with known cameras"),
     "eval": ("blitzgs.cli.evaluate", "measure PSNR and SSIM of a run's held-out views"),
-    "render": ("blitzgs.cli.render", "render the views of a run to files (needs no photographs)"),
+    "render": ("blitzgs.cli.render", "render views of a model to pictures, or a path to a film"),
     "view": ("blitzgs.cli.view", "look at a model in the browser"),
-    "export": ("blitzgs.cli.export", "write the model of a run as a PLY file for viewers"),
+    "export": ("blitzgs.cli.export", "write a model as a PLY file for viewers, or as one HTML file to send"),
     "gate": ("blitzgs.cli.gate", "fit and evaluate spawn gates, which make smaller models"),
     "synth": (
         "blitzgs.cli.synth",

@@ -52,6 +52,11 @@ def add_run(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_model(parser: argparse.ArgumentParser) -> None:
+    """Add the argument MODEL: the folder of a run, a checkpoint in it, or a PLY file."""
+    parser.add_argument("model", type=named_path, metavar="MODEL", help="run, checkpoint or PLY file")
+
+
 def add_capture(parser: argparse.ArgumentParser) -> None:
     """Add the flag --data, the present folder of a run's capture."""
     parser.add_argument(
@@ -94,17 +99,15 @@ def add_split(parser: argparse.ArgumentParser, verb: str) -> None:
     )
 
 
-def chosen_views(args: argparse.Namespace, cameras: Capture | RunCameras) -> Sequence[int]:
+def chosen_views(split: str, cameras: Capture | RunCameras, folder: Path) -> Sequence[int]:
     """Return the cameras that --split names, as indices.
 
     Raises:
-        ValueError: there are none.
+        ValueError: there are none; names the run's folder.
     """
-    indices: Sequence[int] = (
-        range(len(cameras.cameras)) if args.split == "all" else getattr(cameras, args.split)
-    )
+    indices: Sequence[int] = range(len(cameras.cameras)) if split == "all" else getattr(cameras, split)
     if not indices:
-        raise ValueError(f"{args.folder} has no {args.split} views: choose another --split")
+        raise ValueError(f"{folder} has no {split} views: choose another --split")
     return indices
 
 

@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
             config = dataclasses.replace(config, data=data)
         capture, images = open_capture(config, ranks, "--allow-missing")
         check_capture(model.space, capture, args.folder)
-        indices = chosen_views(args, capture)
+        indices = chosen_views(args.split, capture, args.folder)
         folder = args.out or args.folder / run_files.EVALUATION / args.split
         with image_progress("Comparing", ranks.rank == 0) as report:
             result = evaluate(

@@ -1,21 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command `blitzgs export`: write the model of a run as PLY."""
+"""The command `blitzgs export`: write a model as PLY, or as an HTML file with its viewer."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from pathlib import Path
 
-from blitzgs.cli.arguments import Commands, add_command, add_device, add_run, named_path
+from blitzgs.cli.arguments import Commands, add_command, add_device, add_model, named_path
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import check_replaces_ply
+from blitzgs.formats.web_page import check_replaces_page
 from blitzgs.runs.export import COORDINATES, Exported, export_ply, without_antialiasing
+from blitzgs.runs.files import run_and_checkpoint
 from blitzgs.runs.folder import open_run
+from blitzgs.util.output import write_file
+
+# Default of --max-mb, and the largest file whose text browsers still hold in one piece.
+MAX_MB, LARGEST_MB = 50, 500
 
 HELP = """\
-Write the model of a run as a PLY file in INRIA's layout, which most viewers read.
+Write a model as a PLY file in INRIA's layout, which most viewers read, or as one HTML file to send:
+
+  blitzgs export RUN --ply MODEL.ply
+  blitzgs export RUN|CHECKPOINT|FILE.ply --html SCENE.html
+
+The HTML file has the model and a viewer in it; a browser opens it from the disk, without a server. The
+model is compressed. Where it would be larger than --max-mb, the SH degree is reduced, then the Gaussians
+that contribute least are left out; the page and the output of this command say how many.
 
 Georeferenced models are written around their own origin, because the file's float32 numbers cannot hold large
 coordinates. The offset is in the header (`comment offset X Y Z`) and in FILE.offset.json.
@@ -34,15 +48,22 @@ of the training views; at other distances it is an approximation.
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "export", run, summary, HELP)
-    add_run(parser)
+    add_model(parser)
     add_device(parser)
-    parser.add_argument("--ply", type=named_path, required=True, metavar="FILE", help="file to write")
+    kind = parser.add_mutually_exclusive_group(required=True)
+    kind.add_argument("--ply", type=named_path, metavar="FILE", help="PLY file to write")
+    kind.add_argument("--html", type=named_path, metavar="FILE", help="HTML file to write")
+    parser.add_argument(
+        "--max-mb",
+        type=_megabytes,
+        metavar="MB",
+        help=f"with --html: largest size of the file in megabytes (default: {MAX_MB})",
+    )
     parser.add_argument(
         "--coordinates",
         choices=COORDINATES,
-        default="auto",
         help="capture: the capture's coordinates; centred: relative to the model's origin; auto: the "
-        "capture's if float32 can hold them (default: %(default)s)",
+        "capture's if float32 can hold them (default: auto)",
     )
     parser.add_argument(
         "--classic",
@@ -55,19 +76,60 @@ def run(args: argparse.Namespace) -> int:
     """Export the model of a run; returns the exit status."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise ValueError("export writes one file from one process: run it without torchrun")
-    _check_format(args.ply)
+    return _export_html(args) if args.html else _export_ply(args)
+
+
+def _export_html(args: argparse.Namespace) -> int:
+    from blitzgs.viewer.studio import open_model
+    from blitzgs.viewer.web import web_file
+
+    for flag, given in (("--coordinates", args.coordinates), ("--classic", args.classic)):
+        if given:
+            raise ValueError(f"{flag} is for --ply; an HTML file needs no such choice")
+    path: Path = args.html
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"{path}: choose a --html that ends in .html")
+    check_replaces_page(path)
     with Ranks.from_environment(args.device) as ranks:
-        folder = open_run(args.folder)
-        model = folder.model(ranks.device)
+        page = web_file(open_model(args.model, ranks), round(1e6 * (args.max_mb or MAX_MB)))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, page.text)
+    size = path.stat().st_size / 1e6
+    print(f"{path}: {page.gaussians:,} of {page.of:,} Gaussians, {size:.1f} MB; open it in a browser")
+    if page.left_out:
+        print(page.left_out)
+    return 0
+
+
+def _export_ply(args: argparse.Namespace) -> int:
+    if args.max_mb:
+        raise ValueError("--max-mb is for --html; a PLY file has the whole model")
+    if args.model.is_file():
+        raise ValueError(f"{args.model} is a file: --ply takes the folder of a run, or a checkpoint in it")
+    _check_format(args.ply)
+    run_folder, checkpoint = run_and_checkpoint(args.model)
+    with Ranks.from_environment(args.device) as ranks:
+        folder = open_run(run_folder)
+        model = folder.model(ranks.device, checkpoint)
         antialiased = model.config.model.antialiased
         if args.classic and antialiased:
             stored = folder.cameras()
             model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
         args.ply.parent.mkdir(parents=True, exist_ok=True)
-        exported = export_ply(model, args.ply, args.coordinates)
+        exported = export_ply(model, args.ply, args.coordinates or "auto")
     print(f"{args.ply}: {len(model):,} Gaussians, {args.ply.stat().st_size / 1e6:.1f} MB")
     _explain(exported, antialiased, args)
     return 0
+
+
+def _megabytes(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value <= LARGEST_MB:
+        raise argparse.ArgumentTypeError(f"must be a number of megabytes up to {LARGEST_MB}, got {text}")
+    return value
 
 
 def _check_format(path: Path) -> None:

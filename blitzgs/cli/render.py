@@ -1,122 +1,277 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command `blitzgs render`: render the views of a run to files."""
+"""The command `blitzgs render`: render views of a model to pictures, or a path to a film."""
 
 from __future__ import annotations
 
 import argparse
 import io
-from collections.abc import Sequence
+import itertools
+import json
+import math
+import re
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 from torch import Tensor
 
-from blitzgs.capture.pictures import encode_image
+from blitzgs.capture.cameras import camera_centres
+from blitzgs.capture.pictures import encode_image, to_uint8
 from blitzgs.cli.arguments import (
     Commands,
     add_command,
     add_device,
+    add_model,
     add_pool,
-    add_run,
     add_split,
-    chosen_views,
     named_path,
 )
+from blitzgs.cli.rendered import Rendered, open_rendered
 from blitzgs.distributed.group import Ranks
+from blitzgs.formats.film import SUFFIX, check_film, new_film
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import files as run_files
-from blitzgs.runs.cameras import CAMERAS, RunCameras, input_files, load_cameras
 from blitzgs.runs.evaluation import render_view
-from blitzgs.runs.lod import lod_gate, scene_gate
-from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.util.output import OutputFolder
 from blitzgs.util.progress import image_progress
-from blitzgs.view.views import CameraLike, ViewSet, render_options
+from blitzgs.view.draw import Drawer
+from blitzgs.view.look import MAX_PIXELS, Look, Mode
+from blitzgs.view.views import ViewSet, viewmat
 from blitzgs.view.visible import VisibleFinder
+from blitzgs.viewer.film import Film, read_film
+
+# What may be written beside the colours.
+MEASURED: tuple[Mode, ...] = ("depth", "alpha")
+
+HELP = """\
+Render views of a model to pictures, or a camera path to a film:
+
+  blitzgs render RUN --out PICTURES                       # the held-out views of a run
+  blitzgs render RUN --cameras FILE --out PICTURES        # views of a transforms.json or a COLMAP model
+  blitzgs render RUN --path PATH.json --out FILM.mp4      # a path of `blitzgs view` or of nerfstudio
+  blitzgs render RUN --path orbit --out FILM.mp4          # also flight and spline
+  blitzgs render RUN --path orbit --depth --out PICTURES  # each frame as a picture, with its depth
+
+MODEL is the folder of a run, a checkpoint in it, or a PLY file. Films need the package av:
+pip install "blitzgs[film]".
+"""
 
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "render", run, summary)
-    add_run(parser)
+    parser = add_command(commands, "render", run, summary, HELP)
+    add_model(parser)
     parser.add_argument(
         "--data", type=named_path, metavar="DIR", help="take the cameras from this capture, not from the run"
     )
     add_device(parser, shares_gpus=True)
     add_pool(parser)
     add_split(parser, "render")
-    parser.add_argument("--out", type=named_path, required=True, metavar="DIR", help="folder for the images")
+    parser.add_argument(
+        "--cameras",
+        type=named_path,
+        metavar="FILE",
+        help="render the cameras of this transforms file or folder of a COLMAP model, in the capture's "
+        "coordinates; no photographs are needed",
+    )
+    parser.add_argument(
+        "--path",
+        metavar="PATH",
+        help="render the frames of a camera path: a file, or orbit (around the scene), flight (across it) or "
+        "spline (along the run's cameras)",
+    )
+    parser.add_argument(
+        "--size", type=_size, metavar="WxH", help="with --path: pixels (default: the file's, else 1920x1080)"
+    )
+    parser.add_argument(
+        "--fps", type=_positive, help="with --path: frames a second (default: the file's, else 30)"
+    )
+    parser.add_argument(
+        "--seconds", type=_positive, help="with --path: duration (default: the file's, else 10)"
+    )
+    parser.add_argument(
+        "--dataparser",
+        type=named_path,
+        metavar="FILE",
+        help="with --path: dataparser_transforms.json of the nerfstudio training that the path was made for",
+    )
+    parser.add_argument(
+        "--out",
+        type=named_path,
+        required=True,
+        metavar="OUT",
+        help=f"folder for pictures, or FILE{SUFFIX}",
+    )
     parser.add_argument(
         "--exposure",
         action="store_true",
         help="show training views with the exposure of their photographs (model.exposure), not with the mean",
     )
     parser.add_argument(
+        "--depth",
+        action="store_true",
+        help="also write NAME.depth.png, 16 bits; depth.json says how to convert it to the capture's unit",
+    )
+    parser.add_argument("--alpha", action="store_true", help="also write NAME.alpha.png, 16 bits")
+    parser.add_argument(
         "--raw",
         action="store_true",
-        help="write float32 arrays [H, W, 3] as .npy, not clamped, instead of PNG",
+        help="write float32 arrays as .npy, colours [H, W, 3] not clamped, instead of PNG",
     )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Render the views of a run; returns the exit status."""
+    """Render views; returns the exit status."""
+    film = _film(args)
+    is_film = args.out.suffix.lower() == SUFFIX
+    if film is not None and is_film:
+        check_film(args.out, film.width, film.height)
     with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
-        model = run_files.open_model(args.folder, ranks, args.data, args.resident_gb)
-        stored = _cameras(args, model, ranks)
-        cameras: Sequence[CameraLike] = stored.cameras
-        indices = chosen_views(args, stored)
-        exposures = _exposures(model, stored) if args.exposure else {}
-        views = ViewSet(list(cameras), model.space, ranks.device)
-        gate = lod_gate(model.config, model.progress)
-        options = render_options(model.config, model.space, model.progress.sh_degree, gate)
-        lod = scene_gate(model.config, model.progress, model.table, ranks)
-        finder, owners = VisibleFinder(model.scene(ranks.device), lod), TileOwners(ranks)
-        output = OutputFolder(args.out, stored.inputs)
-        # Names for all views, so that a view's file has the same name whichever split is rendered.
-        paths = output.paths([camera.name for camera in cameras], ".npy" if args.raw else ".png")
-        args.out.mkdir(parents=True, exist_ok=True)
-        with image_progress("Rendering", ranks.rank == 0) as report:
-            for position, index in enumerate(indices):
-                # The ranks take turns at writing.
-                destination = position % ranks.world_size
-                render = render_view(finder, views, index, options, owners, destination)
-                report(position + 1, len(indices))
-                if render is None:
-                    continue
-                if index in exposures:
-                    gain, bias = exposures[index].to(render.device)
-                    render = render * gain + bias
-                output.write(paths[index], _npy(render) if args.raw else encode_image(render, ".png"))
+        opened = open_rendered(args, film, ranks)
+        if is_film and film is not None:
+            _render_film(args.out, opened, film, ranks)
+        else:
+            _render_pictures(args, opened, ranks)
         if ranks.rank == 0:
-            print(f"{args.out}: {len(indices)} images")
+            count, what = len(opened.indices), "frames" if is_film else "images"
+            print(f"{args.out}: {count} {what}")
     return 0
 
 
-def _exposures(model: run_files.TrainedModel, stored: RunCameras) -> dict[int, Tensor]:
-    """Return gain and bias, float32 [2, 3], of each training view, by its index among the cameras.
+def _film(args: argparse.Namespace) -> Film | None:
+    """Return what --path asks for; None: the command has no --path.
 
     Raises:
-        ValueError: the run has no exposures, or those of other cameras.
+        ValueError: flags contradict each other; names them.
     """
-    if model.exposures is None:
-        raise ValueError("--exposure: the run was trained without model.exposure")
-    if len(model.exposures) != len(stored.train):
-        raise ValueError(
-            f"--exposure: the run has {len(model.exposures)} photographs, not {len(stored.train)}"
-        )
-    return dict(zip(stored.train, model.exposures.float(), strict=True))
+    is_film = args.out.suffix.lower() == SUFFIX
+    if args.path is None:
+        for name in ("size", "fps", "seconds", "dataparser"):
+            if getattr(args, name) is not None:
+                raise ValueError(f"--{name} needs --path")
+        if args.exposure and args.cameras is not None:
+            raise ValueError("--exposure is for the run's own views, not for --cameras")
+        if is_film:
+            raise ValueError(f"{args.out}: a film needs --path; pictures of views need a folder as --out")
+        return None
+    for name, given in (("cameras", args.cameras), ("exposure", args.exposure)):
+        if given:
+            raise ValueError(f"--{name} and --path exclude each other")
+    if is_film and (args.depth or args.alpha or args.raw):
+        raise ValueError("a film has only colours: for --depth, --alpha and --raw, give a folder as --out")
+    return read_film(args.path, args.size, args.fps, args.seconds, args.dataparser)
 
 
-def _cameras(args: argparse.Namespace, model: run_files.TrainedModel, ranks: Ranks) -> RunCameras:
-    """Return the cameras of the given capture; without one, those that the run stored, else its capture's."""
-    if args.data is None and (args.folder / CAMERAS).exists():
-        return load_cameras(args.folder)
-    capture, images = open_capture(model.config, ranks)
-    images.close()
-    check_capture(model.space, capture, args.folder)
-    return RunCameras(capture.cameras, capture.train, capture.test, input_files(capture))
+def _renders(
+    opened: Rendered, ranks: Ranks, destination: Callable[[int], int]
+) -> Iterator[tuple[int, Tensor | None]]:
+    """Render the views, and yield the index of each and its colours, float32 [H, W, 3], on one rank.
+
+    Args:
+        opened: model and views.
+        ranks: the job; every rank goes through all views.
+        destination: returns the rank that gets a view, by its position; the others get None.
+    """
+    views, subject = ViewSet(list(opened.cameras), opened.space, ranks.device), opened.subject
+    finder, owners = VisibleFinder(subject.scene, subject.lod), TileOwners(ranks)
+    for position, index in enumerate(opened.indices):
+        yield index, render_view(finder, views, index, subject.options, owners, destination(position))
 
 
-def _npy(render: Tensor) -> bytes:
+def _render_film(path: Path, opened: Rendered, film: Film, ranks: Ranks) -> None:
+    """Render all frames; rank 0 writes them."""
+    with ExitStack() as stack:
+        append: Callable[[npt.NDArray[np.uint8]], None] | None = None
+        if ranks.rank == 0:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            append = stack.enter_context(new_film(path, film.width, film.height, film.fps))
+        report = stack.enter_context(image_progress("Rendering", ranks.rank == 0))
+        for position, (_, render) in enumerate(_renders(opened, ranks, lambda _: 0), 1):
+            if append is not None and render is not None:
+                append(to_uint8(render))
+            report(position, len(opened.indices))
+
+
+def _render_pictures(args: argparse.Namespace, opened: Rendered, ranks: Ranks) -> None:
+    """Render all views; the ranks take turns at writing colours, and rank 0 writes depth and alpha."""
+    suffix = ".npy" if args.raw else ".png"
+    output = OutputFolder(args.out, opened.inputs)
+    # Names for all views, so that a view's file has the same name whichever split is rendered.
+    names = [camera.name for camera in opened.cameras]
+    modes: list[Mode] = [mode for mode in MEASURED if getattr(args, mode)]
+    paths = {mode: output.paths(names, f".{mode}{suffix}") for mode in modes}
+    colours = output.paths(names, suffix)
+    args.out.mkdir(parents=True, exist_ok=True)
+    step = _depth_step(opened)
+    if "depth" in modes and not args.raw and ranks.rank == 0:
+        output.write(args.out / "depth.json", _explained(step))
+    drawer = Drawer(opened.subject, TileOwners(ranks)) if modes else None
+    with image_progress("Rendering", ranks.rank == 0) as report:
+        turns = _renders(opened, ranks, lambda position: position % ranks.world_size)
+        for position, (index, render) in enumerate(turns, 1):
+            if render is not None:
+                if index in opened.exposures:
+                    gain, bias = opened.exposures[index].to(render.device)
+                    render = render * gain + bias
+                content = _npy(render.cpu().numpy()) if args.raw else encode_image(render, ".png")
+                output.write(colours[index], content)
+            for mode in modes:
+                picture = drawer.draw(_look(opened, index, mode)) if drawer else None
+                if picture is not None:
+                    values = picture.values.astype(np.float32)
+                    full = 65535.0 if mode == "alpha" else 1 / step
+                    output.write(paths[mode][index], _npy(values) if args.raw else _png16(values * full))
+            report(position, len(opened.indices))
+
+
+def _look(opened: Rendered, index: int, mode: Mode) -> Look:
+    camera = opened.cameras[index]
+    return Look(viewmat(camera, opened.space), np.asarray(camera.K), camera.width, camera.height, mode)
+
+
+def _depth_step(opened: Rendered) -> float:
+    """Return the depth of one step of a 16-bit picture, for which the farthest corner of the box fits."""
+    corners = np.array(list(itertools.product(*opened.box.T)))
+    centres = camera_centres(np.stack([viewmat(opened.cameras[i], opened.space) for i in opened.indices]))
+    farthest = max(float(np.linalg.norm(corners - centre, axis=1).max()) for centre in centres)
+    return farthest * opened.space.unit / 65534
+
+
+def _explained(step: float) -> bytes:
+    meaning = (
+        "depth in the capture's unit = value * scale; 0: nothing is there; 65535: this far or farther. The "
+        "depth is along the axis of view, the mean of what a pixel shows."
+    )
+    return (json.dumps({"scale": step, "meaning": meaning}, indent=1) + "\n").encode()
+
+
+def _png16(values: npt.NDArray[np.float32]) -> bytes:
+    written, data = cv2.imencode(".png", np.rint(values).clip(0, 65535).astype(np.uint16))
+    assert written
+    return bytes(data)
+
+
+def _npy(values: npt.NDArray[np.float32]) -> bytes:
     buffer = io.BytesIO()
-    np.save(buffer, render.cpu().numpy())
+    np.save(buffer, values)
     return buffer.getvalue()
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"must be a positive number, got {text}")
+    return value
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    sides = tuple(int(side) for side in found.groups()) if found else (0, 0)
+    if not all(1 <= side <= MAX_PIXELS for side in sides):
+        raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT, each 1 to {MAX_PIXELS}, got {text}")
+    return sides[0], sides[1]

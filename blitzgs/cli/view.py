@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, named_path
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_model, named_path
 from blitzgs.distributed.group import Ranks, resolve_device
 from blitzgs.runs import files as run_files
 from blitzgs.training.inputs import open_capture
@@ -31,7 +31,7 @@ Needs the package viser: pip install "blitzgs[view]".
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "view", run, summary, HELP)
-    parser.add_argument("model", type=named_path, metavar="MODEL", help="run, checkpoint or PLY file")
+    add_model(parser)
     add_address(parser)
     add_capture(parser)
     parser.add_argument(
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     device, _ = resolve_device(args.device, local_rank=0, local_world_size=1, share_gpus=False)
     ranks = Ranks(device=device)
     model: Path = args.model
-    photograph = None if model.is_file() else photographs(_run_of(model), args.data)
+    photograph = None if model.is_file() else photographs(run_files.run_and_checkpoint(model)[0], args.data)
     studio = Studio(open_model(model, ranks, photograph, args.paths), args.host, args.port)
     print(f"{model}: open {studio.page.url} (Ctrl-C ends)", flush=True)
     try:
@@ -74,12 +74,6 @@ def run(args: argparse.Namespace) -> int:
     finally:
         studio.close()
     return 0
-
-
-def _run_of(model: Path) -> Path:
-    """Return the folder of the run of a run's folder or a checkpoint."""
-    inside = model.resolve().parent
-    return inside.parent if inside.name == run_files.CHECKPOINTS else model
 
 
 def photographs(folder: Path, data: Path | None) -> Callable[[int], npt.NDArray[np.uint8]] | None:

@@ -228,6 +228,12 @@ def _problem_of_columns(columns: dict[str, torch.Tensor]) -> str | None:
     return bad_column(GaussianTable(columns))
 
 
+def run_and_checkpoint(path: Path) -> tuple[Path, str | None]:
+    """Return the folder of a run and the name of a checkpoint, for either's folder; None: the newest."""
+    inside = path.resolve()
+    return (inside.parent.parent, inside.name) if inside.parent.name == CHECKPOINTS else (path, None)
+
+
 def check_is_run(folder: Path) -> None:
     """Check that a folder looks like a run.
 

@@ -131,22 +131,64 @@ def from_json(text: str) -> CameraPath:
     """Read a path; one without keyframes has its frames as keyframes.
 
     Raises:
-        ValueError: it is no camera path; the message says why.
+        ValueError: it is no camera path; the message says where and why.
     """
+    content = _content(text)
+    keys = _viewpoints(content, "keyframes") or _viewpoints(content, "camera_path")
+    if not keys:
+        raise ValueError(f"{_NO_PATH}: it has neither keyframes nor camera_path")
+    return CameraPath(
+        keys,
+        round(_number(content, "render_width", 1920, 1)),
+        round(_number(content, "render_height", 1080, 1)),
+        _number(content, "fps", 24.0, 0.01),
+        _number(content, "seconds", 4.0, 0.0),
+        bool(content.get("is_cycle", False)),
+    )
+
+
+def frames_from_json(text: str) -> list[Keyframe]:
+    """Return the frames that a path has as its program computed them; empty if it has only keyframes.
+
+    Raises:
+        ValueError: as `from_json`.
+    """
+    return _viewpoints(_content(text), "camera_path")
+
+
+_NO_PATH = "this is no camera path in the layout of nerfstudio"
+
+
+def _content(text: str) -> dict[str, Any]:
     try:
-        content: dict[str, Any] = json.loads(text)
-        found = content.get("keyframes") or content["camera_path"]
-        keys = [_keyframe(entry) for entry in found]
-        return CameraPath(
-            keys,
-            int(content.get("render_width", 1920)),
-            int(content.get("render_height", 1080)),
-            float(content.get("fps", 24.0)),
-            float(content.get("seconds", 4.0)),
-            bool(content.get("is_cycle", False)),
-        )
-    except (LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        raise ValueError(f"this is no camera path in the layout of nerfstudio: {error}") from error
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{_NO_PATH}: no JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{_NO_PATH}: its content is no object")
+    if (kind := content.get("camera_type", "perspective")) != "perspective":
+        raise ValueError(f"{_NO_PATH}: camera_type is {kind!r:.40}, and only 'perspective' is rendered")
+    return content
+
+
+def _viewpoints(content: dict[str, Any], name: str) -> list[Keyframe]:
+    entries = content.get(name) or []
+    if not isinstance(entries, list):
+        raise ValueError(f"{_NO_PATH}: {name} is no list")
+    found = []
+    for index, entry in enumerate(entries):
+        try:
+            found.append(_keyframe(entry))
+        except (TypeError, AttributeError, ValueError, RecursionError) as error:
+            raise ValueError(f"{_NO_PATH}: {name}[{index}]: {error}") from error
+    return found
+
+
+def _number(fields: dict[str, Any], name: str, default: float, least: float) -> float:
+    value = fields.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value < 1e9:
+        raise ValueError(f"{name} must be a number of at least {least:g}, got {value!r:.40}")
+    return float(value)
 
 
 def _rows(key: Keyframe) -> list[float]:
@@ -155,11 +197,22 @@ def _rows(key: Keyframe) -> list[float]:
 
 
 def _keyframe(entry: dict[str, Any]) -> Keyframe:
-    matrix = entry["matrix"] if "matrix" in entry else entry["camera_to_world"]
+    name = next((name for name in ("matrix", "camera_to_world") if name in entry), None)
+    if name is None:
+        raise ValueError("matrix is missing")
+    matrix = entry[name]
     if isinstance(matrix, str):  # files of old versions have the matrix as text, column by column
-        pose = np.array(json.loads(matrix), dtype=np.float64).reshape(4, 4).T
+        flat = np.array(json.loads(matrix), dtype=np.float64).ravel()
+        flat = flat.reshape(4, 4).T.ravel() if len(flat) == 16 else flat
     else:
-        pose = np.array(matrix, dtype=np.float64).reshape(4, 4)
-    if not np.isfinite(pose).all():
-        raise ValueError("a matrix is not finite")
-    return Keyframe(pose @ _FLIP, float(entry.get("fov", 50.0)), float(entry.get("aspect", 16 / 9)))
+        flat = np.array(matrix, dtype=np.float64).ravel()
+    if len(flat) != 16 or not np.isfinite(flat).all():
+        raise ValueError(f"{name} must be 16 finite numbers, got {len(flat)} numbers: {str(matrix):.60}")
+    pose = flat.reshape(4, 4)
+    turn = pose[:3, :3]
+    if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
+        raise ValueError(f"{name} is no rotation with a position")
+    fov = _number(entry, "fov", 50.0, 0.1)
+    if fov >= 179:
+        raise ValueError(f"fov must be below 179 degrees, got {fov:g}")
+    return Keyframe(pose @ _FLIP, fov, _number(entry, "aspect", 16 / 9, 1e-3))

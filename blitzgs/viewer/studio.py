@@ -65,9 +65,7 @@ def open_model(
     """
     if path.is_file():
         return _open_ply(path, ranks, paths or path.parent)
-    checkpoint = None
-    if path.resolve().parent.name == run_files.CHECKPOINTS:
-        checkpoint, path = path.resolve().name, path.resolve().parent.parent
+    path, checkpoint = run_files.run_and_checkpoint(path)
     model = open_run(path).model(str(ranks.device), checkpoint)
     columns = {name: getattr(model, name) for name in (*PARAMETERS, "level")}
     table = table_of_parameters(columns)

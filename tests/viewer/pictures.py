@@ -24,6 +24,7 @@ from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.folder import open_run
 from blitzgs.viewer.studio import Studio, open_model
+from blitzgs.viewer.web import web_file
 from blitzgs.viewer.world import looking
 from tests.browser import Browser, wait_for
 
@@ -66,6 +67,19 @@ def at_rest(run: Path, data: Path | None) -> None:
     studio.close()
 
 
+def sent(run: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "scene.html"
+        page = web_file(open_model(run, Ranks()), 50_000_000)
+        file.write_text(page.text)
+        with Browser(file.as_uri(), 1280, 720) as browser:
+            wait_for(lambda: browser.evaluate("window.blitzgs?.scene.count"), 60, "the page's program")
+            browser.evaluate("blitzgs.ready")
+            browser.drag((700, 300), (560, 290))
+            time.sleep(3)
+            save(browser, "scene_page.jpg")
+
+
 def live(data: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
@@ -99,6 +113,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path)
     args = parser.parse_args()
     at_rest(args.run, args.data)
+    sent(args.run)
     live(args.data or Path(open_run(args.run).config().data.path))
 
 

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A model and its viewer as one HTML file, which needs no server and no network.
+
+The Gaussians are planes of bytes, one after the other, deflated and in base64. First come the ranges of each
+block of 256 Gaussians, float32 (least, step): 3 of positions, 3 of log scales, 3 of colours. Then follow for
+all Gaussians, a byte each: positions (3 low bytes, 3 high bytes), log scales (3), DC coefficients (3), the
+unit quaternion (32 bits: the three smaller components in 10 bits each, then which one is left out),
+opacity * 255, the octree level where there are levels, and the other SH coefficients as signed multiples of
+`HARMONIC`, coefficient by coefficient.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import zlib
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.util.output import check_replaceable
+
+BLOCK = 256
+# Value of one step of a quantised SH coefficient. Coefficients beyond 127 steps are cut off.
+HARMONIC = 1 / 64
+_PARTS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag", "sorter.js", "viewer.js")
+# Gaussians of which the size of all is estimated.
+_SAMPLE = 1 << 16
+
+Array = npt.NDArray[np.float64]
+Bytes = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class WebSplats:
+    """N Gaussians in an order that puts neighbours in space next to each other.
+
+    Attributes:
+        means: float32 [N, 3].
+        quats: float32 [N, 4], w, x, y, z, of any length.
+        scales: float32 [N, 3], logarithms.
+        opacities: float32 [N] in [0, 1].
+        sh: float32 [N, K, 3].
+        levels: octree levels, uint8 [N]; None: there are none.
+    """
+
+    means: npt.NDArray[np.float32]
+    quats: npt.NDArray[np.float32]
+    scales: npt.NDArray[np.float32]
+    opacities: npt.NDArray[np.float32]
+    sh: npt.NDArray[np.float32]
+    levels: Bytes | None = None
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def degree(self) -> int:
+        """The spherical-harmonics degree."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    def rows(self, rows: npt.NDArray[np.int64] | slice) -> WebSplats:
+        """Return some of the Gaussians."""
+        levels = None if self.levels is None else self.levels[rows]
+        means, quats, scales = self.means[rows], self.quats[rows], self.scales[rows]
+        return WebSplats(means, quats, scales, self.opacities[rows], self.sh[rows], levels)
+
+    def of_degree(self, degree: int) -> WebSplats:
+        """Return the Gaussians with a lower SH degree."""
+        return replace(self, sh=self.sh[:, : (degree + 1) ** 2])
+
+
+@dataclass(frozen=True)
+class WebLevels:
+    """How views leave out Gaussians by their octree levels; see `blitzgs.view.gate.SceneGate`.
+
+    Attributes:
+        reach: distance up to which views keep each level; None: any; negative: none.
+        slope: f / (f - 1) for levels that fade; 0: they are cut off.
+        most: share of all Gaussians from which on a view has no gate; None: it always has.
+        least: share of all Gaussians below which a view has no gate.
+    """
+
+    reach: list[float | None]
+    slope: float
+    most: float | None
+    least: float
+
+
+@dataclass(frozen=True)
+class WebScene:
+    """What the page knows besides the Gaussians; lengths in the unit of the means.
+
+    Attributes:
+        near: near plane.
+        far: far plane.
+        blur: screen-space blur, pixels squared.
+        antialiased: compensate that blur in the opacities.
+        background: RGB in [0, 1].
+        up: upward direction.
+        eye: position of the first view.
+        target: point that it looks at, and that it turns about.
+        fov: vertical field of view in radians.
+        lod: octree levels; None: views leave out nothing.
+    """
+
+    near: float
+    far: float
+    blur: float
+    antialiased: bool
+    background: tuple[float, float, float]
+    up: tuple[float, float, float]
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float]
+    fov: float
+    lod: WebLevels | None = None
+
+
+def check_replaces_page(path: Path) -> None:
+    """Check that writing a page replaces no file of another program.
+
+    Raises:
+        FileExistsError: there is a file that is not empty and no page of ours.
+        OSError: `path` is no regular file.
+    """
+    check_replaceable(path)
+    if path.exists():
+        with open(path, "rb") as file:
+            start = file.read(2000)
+        if start and b'<meta name="generator" content="BlitzGS">' not in start:
+            raise FileExistsError(f"{path} exists, and blitzgs did not write it: choose another name")
+
+
+def packed(splats: WebSplats) -> bytes:
+    """Return the Gaussians as the page reads them, without base64."""
+    blocks = -(-len(splats) // BLOCK)
+    places, box = _quantised(splats.means, blocks, 65535)
+    sizes, sizes_range = _quantised(splats.scales, blocks, 255)
+    tints, tints_range = _quantised(splats.sh[:, 0], blocks, 255)
+    planes: list[npt.NDArray[np.generic]] = [box, sizes_range, tints_range]
+    planes += [places & 255, places >> 8, sizes, tints, _quaternion_bytes(splats.quats)]
+    planes.append(np.rint(splats.opacities[:, None].astype(np.float64) * 255))
+    if splats.levels is not None:
+        planes.append(splats.levels[:, None])
+    rest = splats.sh[:, 1:].reshape(len(splats), -1)
+    planes.append(np.rint(rest / HARMONIC).clip(-127, 127).astype(np.int8).view(np.uint8))
+    content = b"".join(
+        (plane if plane.dtype == np.float32 else plane.astype(np.uint8).T).tobytes() for plane in planes
+    )
+    return zlib.compress(content, 6)
+
+
+def _quantised(
+    values: npt.NDArray[np.float32], blocks: int, steps: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float32]]:
+    """Return codes [N, 3] of values [N, 3], and least value and step of each block, float32 [3, B, 2]."""
+    filled = np.pad(values.astype(np.float64), ((0, blocks * BLOCK - len(values)), (0, 0)), mode="edge")
+    by_block = filled.reshape(blocks, BLOCK, 3)
+    least = by_block.min(axis=1).astype(np.float32)
+    step = ((by_block.max(axis=1) - least) / steps).astype(np.float32)
+    codes = (by_block - least[:, None]) / np.where(step > 0, step, 1)[:, None].astype(np.float64)
+    codes = np.rint(codes).clip(0, steps).astype(np.int64).reshape(-1, 3)[: len(values)]
+    return codes, np.stack([least.T, step.T], axis=-1)
+
+
+def _quaternion_bytes(quats: npt.NDArray[np.float32]) -> Bytes:
+    """Return the rotations as 4 bytes each, [N, 4]; a zero quaternion is the identity."""
+    unit = quats.astype(np.float64)
+    unit[~unit.any(axis=1), 0] = 1
+    unit /= np.abs(unit).max(axis=1, keepdims=True)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    left_out = np.abs(unit).argmax(axis=1)
+    unit *= np.sign(np.take_along_axis(unit, left_out[:, None], axis=1))
+    others = np.arange(4)[None] != left_out[:, None]
+    codes = np.rint((unit[others].reshape(-1, 3) * 2**0.5 + 1) / 2 * 1023).clip(0, 1023).astype(np.uint32)
+    words = codes[:, 0] | codes[:, 1] << 10 | codes[:, 2] << 20 | left_out.astype(np.uint32) << 30
+    return words.astype("<u4").view(np.uint8).reshape(-1, 4)
+
+
+def estimated_bytes(splats: WebSplats) -> int:
+    """Estimate the size of the Gaussians in the file from some blocks of them."""
+    blocks = -(-len(splats) // BLOCK)
+    chosen = np.unique(np.linspace(0, blocks - 1, min(blocks, _SAMPLE // BLOCK)).astype(np.int64))
+    rows = (chosen[:, None] * BLOCK + np.arange(BLOCK)).ravel()
+    some = splats.rows(rows[rows < len(splats)])
+    return int(len(packed(some)) * 4 / 3 * len(splats) / max(1, len(some)))
+
+
+@cache
+def _part(name: str) -> str:
+    return resources.files("blitzgs.formats").joinpath("web", name).read_text(encoding="utf-8")
+
+
+def frame_bytes() -> int:
+    """Return about how many bytes the page has besides the Gaussians."""
+    return sum(len(_part(name)) for name in ("page.html", *_PARTS)) + 2000
+
+
+def web_page(splats: WebSplats, scene: WebScene, title: str, left_out: str = "") -> str:
+    """Return the page.
+
+    Args:
+        splats: at least one Gaussian.
+        scene: how they are shown.
+        title: heading.
+        left_out: what the file lacks of the model, for the reader of the page; empty: nothing.
+    """
+    known = asdict(scene) | {"count": len(splats), "degree": splats.degree, "harmonic": HARMONIC}
+    fields = {
+        "title": html.escape(title),
+        "left_out": html.escape(left_out),
+        # No text in a script element may look like a tag.
+        "scene": json.dumps(known, allow_nan=False).replace("<", "\\u003c"),
+        "model": base64.b64encode(packed(splats)).decode(),
+    }
+    pieces = _part("page.html").split("{{")
+    for index, piece in enumerate(pieces[1:], 1):
+        name, _, text = piece.partition("}}")
+        pieces[index] = (fields[name] if name in fields else _part(name)) + text
+    return "".join(pieces)

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs render` along paths and from cameras of one's own."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("av", reason="the extra film is not installed")
+
+import av
+
+from blitzgs.cli import main
+from blitzgs.runs.folder import open_run
+from blitzgs.viewer.paths import CameraPath, Keyframe, to_json
+from tests.distributed.rank_harness import run_ranks
+
+
+def test_a_film_of_a_path_shows_its_views(trained, tmp_path, capsys):
+    run, file, film = open_run(trained[1]), tmp_path / "p.json", tmp_path / "new" / "p.mp4"
+    model, cameras = run.model(), run.cameras().cameras
+    keys, views = [], []
+    grey = np.array([0.2126, 0.7152, 0.0722])  # colours have half the resolution in a film
+    for camera in cameras[:3]:
+        pose = np.linalg.inv(camera.world_to_camera)
+        pose[:3, 3] += model.space.offset
+        keys.append(Keyframe(pose, float(np.degrees(2 * np.arctan(16 / 41))), 1.5))
+        centred = model.camera([[41, 0, 24], [0, 41, 16], [0, 0, 1]], np.linalg.inv(pose), 48, 32)
+        views.append(model.render(centred).clamp(0, 1).numpy() * 255 @ grey)
+    file.write_text(to_json(CameraPath(keys, width=48, height=32, fps=5, seconds=1)))
+    assert main(["render", str(trained[1]), "--path", str(file), "--out", str(film)]) == 0
+    assert f"{film}: 5 frames" in capsys.readouterr().out
+    with av.open(str(film)) as container:
+        stream = container.streams.video[0]
+        assert (stream.width, stream.height, float(stream.average_rate)) == (48, 32, 5)
+        frames = [frame.to_ndarray(format="rgb24").astype(float) for frame in container.decode(stream)]
+    assert len(frames) == 5
+    for place, key in ((0, 0), (2, 1), (4, 2)):
+        errors = [np.abs(frames[place] @ grey - view).mean() for view in views]
+        assert errors[key] < 3 and all(errors[key] < 0.3 * errors[other] for other in {0, 1, 2} - {key})
+    assert sorted(path.name for path in film.parent.iterdir()) == ["p.mp4"]
+
+
+def test_depth_and_alpha_come_back_from_16_bits(trained, tmp_path):
+    flags = ["render", str(trained[1]), "--path", "orbit", "--size", "48x32", "--seconds", "1", "--fps", "3"]
+    assert main([*flags, "--depth", "--alpha", "--out", str(tmp_path / "png")]) == 0
+    assert main([*flags, "--depth", "--alpha", "--raw", "--out", str(tmp_path / "raw")]) == 0
+    scale = json.loads((tmp_path / "png" / "depth.json").read_text())["scale"]
+    names = sorted(path.name for path in (tmp_path / "raw").glob("*.npy"))
+    assert names == [f"frame_0000{n}{kind}.npy" for n in (1, 2, 3) for kind in (".alpha", ".depth", "")]
+    for number in (1, 2, 3):
+        for kind, step in (("depth", scale), ("alpha", 1 / 65535)):
+            stem = f"frame_0000{number}.{kind}"
+            stored = cv2.imread(str(tmp_path / "png" / f"{stem}.png"), cv2.IMREAD_UNCHANGED)
+            exact = np.load(tmp_path / "raw" / f"{stem}.npy")
+            assert stored.dtype == np.uint16 and stored.shape == (32, 48) and exact.max() > 100 * step
+            held = stored < 65535
+            assert held.mean() > 0.5
+            assert np.abs(stored * step - exact)[held].max() <= 0.51 * step
+            assert (exact[~held] >= 65534 * step).all()
+
+
+def test_depth_is_that_of_the_model(trained, tmp_path):
+    flags = ["render", str(trained[1]), "--split", "all", "--depth", "--raw", "--out", str(tmp_path)]
+    assert main(flags) == 0
+    model = open_run(trained[1]).model()
+    wanted = model.render(2, "ED", alpha=True).numpy()
+    found, opaque = np.load(tmp_path / "02.depth.npy"), wanted[..., 1] > 0.06
+    np.testing.assert_allclose(found[opaque], wanted[..., 0][opaque], rtol=1e-4)
+    assert opaque.mean() > 0.3 and (found[wanted[..., 1] < 0.04] == 0).all()
+
+
+def test_cameras_of_a_file_are_rendered(trained, tmp_path):
+    run = open_run(trained[1])
+    camera, space = run.cameras().cameras[3], run.model().space
+    pose = np.linalg.inv(camera.world_to_camera)
+    pose[:3, 3] += space.offset
+    frame = {"file_path": "view/mine", "transform_matrix": (pose @ np.diag([1.0, -1, -1, 1])).tolist()}
+    K = camera.K  # noqa: N806
+    lens = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": 48, "h": 32}
+    file = tmp_path / "my cameras.json"
+    file.write_text(json.dumps(lens | {"frames": [frame]}))
+    out = tmp_path / "out"
+    assert main(["render", str(trained[1]), "--cameras", str(file), "--raw", "--out", str(out)]) == 0
+    found = np.load(out / "view" / "mine.npy")
+    np.testing.assert_allclose(found, run.model().render(3).numpy(), atol=1e-5)
+
+
+def test_a_ply_file_has_no_cameras_of_its_own(trained, tmp_path, capsys):
+    ply, out = tmp_path / "m.ply", str(tmp_path / "out")
+    assert main(["export", str(trained[1]), "--ply", str(ply)]) == 0
+    assert main(["render", str(ply), "--out", out]) == 1
+    assert "has no cameras: use --path, --cameras" in capsys.readouterr().err
+    flags = ["--path", "orbit", "--size", "48x32", "--seconds", "1", "--fps", "2"]
+    assert main(["render", str(ply), *flags, "--out", out]) == 0
+    pictures = [cv2.imread(str(path)) for path in sorted((tmp_path / "out").glob("*.png"))]
+    assert len(pictures) == 2 and all(picture.std() > 5 for picture in pictures)
+    assert np.abs(pictures[0].astype(int) - pictures[1]).mean() > 3
+
+
+@pytest.mark.parametrize(
+    ("flags", "reason"),
+    [
+        (["--out", "f.mp4"], "a film needs --path"),
+        (["--fps", "3", "--out", "d"], "--fps needs --path"),
+        (["--path", "orbit", "--depth", "--out", "f.mp4"], "give a folder as --out"),
+        (["--path", "orbit", "--size", "31x20", "--out", "f.mp4"], "even sides, got 31x20"),
+        (["--path", "orbit", "--exposure", "--out", "d"], "--exposure and --path exclude each other"),
+        (["--path", "nowhere.json", "--out", "d"], "there is no such file; orbit, flight, spline need none"),
+        (["--cameras", "nowhere", "--out", "d"], "nowhere: there is no such transforms file"),
+        (["--cameras", "x", "--exposure", "--out", "d"], "not for --cameras"),
+    ],
+)
+def test_wrong_flags_are_named(trained, tmp_path, monkeypatch, capsys, flags, reason):
+    monkeypatch.chdir(tmp_path)
+    assert main(["render", str(trained[1]), *flags]) == 1
+    assert reason in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_film_leaves_nothing(trained, tmp_path, monkeypatch):
+    from blitzgs.cli import render
+
+    real, calls = render.render_view, []
+
+    def interrupted(*arguments):
+        calls.append(0)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    monkeypatch.setattr(render, "render_view", interrupted)
+    flags = ["--path", "orbit", "--size", "48x32", "--out", str(tmp_path / "f.mp4")]
+    assert main(["render", str(trained[1]), *flags]) == 130
+    assert len(calls) == 3 and list(tmp_path.iterdir()) == []
+
+
+def _command(rank, arguments):
+    return main(arguments)
+
+
+@pytest.mark.slow
+def test_several_ranks_make_the_same_film(trained, tmp_path):
+    flags = ["render", str(trained[1]), "--path", "orbit", "--size", "64x48", "--seconds", "1", "--fps", "4"]
+    films = []
+    for world_size in (1, 2):
+        film, out = tmp_path / f"{world_size}.mp4", tmp_path / str(world_size)
+        assert run_ranks(_command, world_size, [*flags, "--out", str(film)], join=False) == [0] * world_size
+        arguments = [*flags, "--depth", "--alpha", "--out", str(out)]
+        assert run_ranks(_command, world_size, arguments, join=False) == [0] * world_size
+        films.append([film, *sorted(out.rglob("*.*"))])
+    assert len(films[0]) == len(films[1]) > 12
+    for one, two in zip(*films, strict=True):
+        assert one.read_bytes() == two.read_bytes(), two
