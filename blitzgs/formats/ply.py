@@ -21,34 +21,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from blitzgs.formats.gaussians import Gaussians, GaussianSource
 from blitzgs.formats.native import native_io
-from blitzgs.util.arguments import check_tensor
 from blitzgs.util.output import check_replaceable, new_file
 
 LEVEL = "level"
 _REST_TO_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
-
-
-@dataclass
-class GaussianPly:
-    """N Gaussians as stored, float32 CPU tensors."""
-
-    means: Tensor
-    """[N, 3]."""
-    quats: Tensor
-    """[N, 4] w, x, y, z, unnormalised."""
-    scales: Tensor
-    """[N, 3] logarithms."""
-    opacities: Tensor
-    """[N] logits."""
-    sh: Tensor
-    """[N, K, 3], K = (degree + 1)^2; coefficient 0 is the DC."""
-    normals: Tensor
-    """[N, 3]; not used, kept so that a file can be written again unchanged."""
-    comments: list[str]
-    """Header lines "comment ..." and "obj_info ..."."""
-    levels: Tensor | None = None
-    """[N] octree levels, where the file has them."""
 
 
 def _property_names(coefficients: int) -> list[str]:
@@ -62,7 +40,7 @@ def _read_table(path: Path) -> tuple[list[str], npt.NDArray[np.void]]:
     return comments, np.frombuffer(rows, dtype=np.dtype(properties), count=count)
 
 
-def read_ply(path: Path | str) -> GaussianPly:
+def read_ply(path: Path | str) -> Gaussians:
     """Read Gaussians; properties may come in any order, and normals may be missing.
 
     Raises:
@@ -90,7 +68,7 @@ def read_ply(path: Path | str) -> GaussianPly:
     sh[:, 0] = columns("f_dc_0", "f_dc_1", "f_dc_2")
     for channel in range(3):
         sh[:, 1:, channel] = columns(*(f"f_rest_{channel * (k - 1) + i}" for i in range(k - 1)))
-    return GaussianPly(
+    return Gaussians(
         means=columns("x", "y", "z"),
         quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
         scales=columns("scale_0", "scale_1", "scale_2"),
@@ -136,46 +114,47 @@ def write_ply(
         FileNotFoundError: there is no such folder.
         OSError: the file cannot be written, or `path` is no regular file; an existing file is unchanged.
     """
-    path = Path(path)
+    found = Gaussians(means, quats, scales, opacities, sh, normals, comments or [], levels)
+    found.check()
+    save_ply(Path(path), found, offset)
+
+
+def save_ply(path: Path, source: GaussianSource, offset: npt.NDArray[np.float64] | None = None) -> None:
+    """Write Gaussians block by block; see `write_ply`."""
     check_replaces_ply(path)
-    tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
-    optional = {"normals": normals, "levels": levels}
-    for name, tensor in (tensors | {name: t for name, t in optional.items() if t is not None}).items():
-        check_tensor(name, tensor)
-        _check_values(name, tensor)
-    n, k = len(means), sh.shape[1] if sh.ndim == 3 else 0
-    shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}
-    given = dict(tensors)
-    if levels is not None:
-        shapes["levels"], given["levels"] = (n,), levels
-    if k not in _REST_TO_COEFFICIENTS.values():
-        raise ValueError(f"sh has the shape {list(sh.shape)}, expected [N, K, 3] with K = 1, 4, 9 or 16")
-    for name, shape in shapes.items():
-        if tuple(given[name].shape) != shape:
-            raise ValueError(f"{name} has the shape {list(given[name].shape)}, expected {list(shape)}")
-    names = _property_names(k)
-    end = len(names)
-    if levels is not None:
-        names.append(LEVEL)
-    rows = np.zeros((n, len(names)), dtype="<f4")
-    rows[:, 0:3] = _moved(means, offset)
-    if normals is not None:
-        rows[:, 3:6] = _array(normals)
-    coefficients = _array(sh)
-    rows[:, 6:9] = coefficients[:, 0]
-    rows[:, 9 : 9 + 3 * (k - 1)] = coefficients[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (k - 1))
-    rows[:, end - 8] = _array(opacities)
-    rows[:, end - 7 : end - 4] = _array(scales)
-    rows[:, end - 4 : end] = _array(quats)
-    if levels is not None:
-        rows[:, end] = _array(levels)
+    names = _property_names((source.degree + 1) ** 2) + [LEVEL] * source.has_levels
     properties = [(name, "f4") for name in names]
     with new_file(path) as partial:
         try:
-            native_io().write_ply(os.fsencode(partial), comments or [], properties, n, rows.view(np.uint8))
+            # The header of an empty file, with the number that it is to have.
+            native_io().write_ply(os.fsencode(partial), source.comments, properties, 0, np.empty(0, np.uint8))
+            header = partial.read_bytes()
+            with open(partial, "wb") as file:
+                file.write(header.replace(b"\nelement vertex 0\n", b"\nelement vertex %d\n" % len(source)))
+                for block in source.blocks():
+                    block.check()
+                    file.write(_rows(block, len(names), offset).data)
         except OSError as error:
-            reason = str(error).rpartition(": ")[2]
+            reason = error.strerror or str(error).rpartition(": ")[2]
             raise OSError(f"{path} cannot be written: {reason}") from error
+
+
+def _rows(block: Gaussians, width: int, offset: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float32]:
+    """Return the bytes of a block, float32 [N, width]."""
+    n, rest = len(block), 3 * (block.sh.shape[1] - 1)
+    rows = np.zeros((n, width), dtype="<f4")
+    rows[:, 0:3] = _moved(block.means, offset)
+    if block.normals is not None:
+        rows[:, 3:6] = _array(block.normals)
+    coefficients, end = _array(block.sh), 17 + rest
+    rows[:, 6:9] = coefficients[:, 0]
+    rows[:, 9 : 9 + rest] = coefficients[:, 1:].transpose(0, 2, 1).reshape(n, rest)
+    rows[:, end - 8] = _array(block.opacities)
+    rows[:, end - 7 : end - 4] = _array(block.scales)
+    rows[:, end - 4 : end] = _array(block.quats)
+    if block.levels is not None:
+        rows[:, end] = _array(block.levels)
+    return rows
 
 
 def check_replaces_ply(path: Path) -> None:
@@ -194,18 +173,6 @@ def check_replaces_ply(path: Path) -> None:
             raise FileExistsError(f"{path} exists and is not a PLY file: choose another name")
     elif not path.parent.is_dir():
         raise FileNotFoundError(f"{path.parent} is not a folder: make it first, or choose another one")
-
-
-def _check_values(name: str, tensor: Tensor) -> None:
-    """Refuse values that no viewer can show: NaN, and positions at infinity."""
-    bad = ~tensor.isfinite() if name == "means" else tensor.isnan()
-    if bool(bad.any()):
-        rows = bad.flatten(1).any(dim=1) if bad.dim() > 1 else bad
-        first = int(rows.nonzero()[0])
-        raise ValueError(
-            f"{name} has NaN or infinite values in {int(rows.sum()):,} Gaussians, the first is number "
-            f"{first}: leave these Gaussians out"
-        )
 
 
 def _array(tensor: Tensor) -> npt.NDArray[np.float32]:

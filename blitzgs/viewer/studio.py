@@ -17,7 +17,8 @@ from torch import Tensor
 
 from blitzgs.config.fields import Config, ModelConfig
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.ply import GaussianPly, read_ply
+from blitzgs.formats.gaussians import Gaussians
+from blitzgs.formats.ply import read_ply
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import CAMERAS, load_cameras
@@ -143,14 +144,14 @@ def _open_ply(path: Path, ranks: Ranks, paths: Path) -> Opened:
     return Opened(exhibit, Subject(table, options, space.unit, lod), table, ranks)
 
 
-def _numbers(found: GaussianPly, pattern: str) -> tuple[float, ...] | None:
+def _numbers(found: Gaussians, pattern: str) -> tuple[float, ...] | None:
     for line in found.comments:
         if match := re.fullmatch(pattern, line.strip()):
             return tuple(float(text) for text in match.groups())
     return None
 
 
-def _gate(found: GaussianPly, unit: float) -> LodGate | None:
+def _gate(found: Gaussians, unit: float) -> LodGate | None:
     """Return the LOD gate that `blitzgs export` writes into a header; None: there is none."""
     pattern = r"comment lod reference_distance (\S+) fork (\S+) levels (\d+) finest (\d+)(?: smooth)?"
     values = _numbers(found, pattern)

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gaussians as files hold them, whole or block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from blitzgs.util.arguments import check_tensor
+
+# Writers take so many Gaussians at a time: 62 MB at SH degree 3.
+BLOCK = 1 << 18
+# Name of a header line that viewers look for (Brush, PlayCanvas and others).
+MIP = "comment SplatRenderMode: mip"
+
+
+class GaussianSource(Protocol):
+    """N Gaussians that need not be in memory at once."""
+
+    @property
+    def degree(self) -> int:
+        """The spherical-harmonics degree."""
+
+    @property
+    def comments(self) -> list[str]:
+        """Header lines, each "comment ..." or "obj_info ..."."""
+
+    @property
+    def has_levels(self) -> bool:
+        """Whether the Gaussians have octree levels."""
+
+    def __len__(self) -> int:
+        """Return N."""
+
+    def blocks(self) -> Iterator[Gaussians]:
+        """Yield all Gaussians in order, at most `BLOCK` at a time; may be called again."""
+
+
+@dataclass
+class Gaussians:
+    """N Gaussians as stored, float32 CPU tensors."""
+
+    means: Tensor
+    """[N, 3]."""
+    quats: Tensor
+    """[N, 4] w, x, y, z, unnormalised."""
+    scales: Tensor
+    """[N, 3] logarithms."""
+    opacities: Tensor
+    """[N] logits."""
+    sh: Tensor
+    """[N, K, 3], K = (degree + 1)^2; coefficient 0 is the DC."""
+    normals: Tensor | None = None
+    """[N, 3]; not used, kept so that a PLY file can be written again unchanged."""
+    comments: list[str] = field(default_factory=list)
+    """Header lines "comment ..." and "obj_info ..."."""
+    levels: Tensor | None = None
+    """[N] octree levels, where the file has them."""
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def degree(self) -> int:
+        """The spherical-harmonics degree."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    @property
+    def has_levels(self) -> bool:
+        """Whether the Gaussians have octree levels."""
+        return self.levels is not None
+
+    def rows(self, rows: Tensor | slice) -> Gaussians:
+        """Return some of the Gaussians."""
+        return replace(
+            self,
+            means=self.means[rows],
+            quats=self.quats[rows],
+            scales=self.scales[rows],
+            opacities=self.opacities[rows],
+            sh=self.sh[rows],
+            normals=None if self.normals is None else self.normals[rows],
+            levels=None if self.levels is None else self.levels[rows],
+        )
+
+    def blocks(self) -> Iterator[Gaussians]:
+        """Yield all Gaussians in order, at most `BLOCK` at a time."""
+        for start in range(0, len(self), BLOCK):
+            yield self.rows(slice(start, start + BLOCK))
+
+    def check(self) -> None:
+        """Check shapes and values.
+
+        Raises:
+            TypeError: a field is not a tensor.
+            ValueError: shapes disagree, or a value is NaN (or a mean infinite).
+        """
+        n, k = len(self.means), self.sh.shape[1] if isinstance(self.sh, Tensor) and self.sh.ndim == 3 else 0
+        shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}
+        shapes |= {"normals": (n, 3), "levels": (n,)}
+        given = {name: getattr(self, name) for name in shapes if getattr(self, name) is not None}
+        for name, tensor in given.items():
+            check_tensor(name, tensor)
+            _check_values(name, tensor)
+        if k not in (1, 4, 9, 16):
+            raise ValueError(
+                f"sh has the shape {list(self.sh.shape)}, expected [N, K, 3] with K = 1, 4, 9 or 16"
+            )
+        for name, tensor in given.items():
+            if tuple(tensor.shape) != shapes[name]:
+                raise ValueError(f"{name} has the shape {list(tensor.shape)}, expected {list(shapes[name])}")
+
+
+def is_antialiased(source: GaussianSource) -> bool:
+    """Tell whether the Gaussians are to be shown with the compensation of the screen-space blur."""
+    return any(line.strip() == MIP for line in source.comments)
+
+
+def _check_values(name: str, tensor: Tensor) -> None:
+    """Refuse values that no viewer can show: NaN, and positions at infinity."""
+    bad = ~tensor.isfinite() if name == "means" else tensor.isnan()
+    if bool(bad.any()):
+        rows = bad.flatten(1).any(dim=1) if bad.dim() > 1 else bad
+        first = int(rows.nonzero()[0])
+        raise ValueError(
+            f"{name} has NaN or infinite values in {int(rows.sum()):,} Gaussians, the first is number "
+            f"{first}: leave these Gaussians out"
+        )
+
+
+def unit_quats(quats: Tensor) -> Tensor:
+    """Return unit quaternions, float64 [N, 4]; a zero quaternion becomes the identity."""
+    unit = quats.double().clone()
+    unit[~unit.any(dim=1), 0] = 1
+    unit /= unit.abs().amax(dim=1, keepdim=True)
+    return unit / torch.linalg.vector_norm(unit, dim=1, keepdim=True)

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Binary glTF 2.0 with the ratified extension KHR_gaussian_splatting.
+
+One primitive of points: POSITION, KHR_gaussian_splatting:ROTATION (unit quaternion x, y, z, w), SCALE
+(linear), OPACITY (after the sigmoid), SH_DEGREE_d_COEF_n (RGB), and COLOR_0 for viewers that know only
+points. Colours are display-referred sRGB. glTF's +Y is up, so the node has the rotation that turns the
+model's up there; the coordinates themselves stay unchanged. What the format has no field for is in
+`asset.extras`: the header lines of the PLY file of the same model (antialiasing, offset, levels). Octree
+levels are the attribute _LEVEL.
+
+The columns follow each other, so that each is contiguous; a block of Gaussians is written into all of them.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.formats.gaussians import Gaussians, GaussianSource, unit_quats
+from blitzgs.util.output import check_replaceable, new_file
+
+_PREFIX = "KHR_gaussian_splatting:"
+_FLOAT, _BYTE = 5126, 5121
+_SH_C0 = 0.28209479177387814
+# A chunk's length has 32 bits.
+_LARGEST = (1 << 32) - 1
+# Up in the PLY files of most trainers, whose world is that of the first camera.
+COLMAP_UP = (0.0, -1.0, 0.0)
+
+Array = npt.NDArray[np.generic]
+
+
+@dataclass(frozen=True)
+class _Column:
+    name: str
+    type: str  # of the accessor
+    component: int
+    offset: int  # in the binary chunk
+    width: int  # bytes of a Gaussian
+
+
+def glb_bytes(count: int, degree: int, has_levels: bool = False) -> int:
+    """Return the size of a file without its JSON."""
+    columns = _columns(count, degree, has_levels)
+    return columns[-1].offset + columns[-1].width * count
+
+
+def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float] = COLMAP_UP) -> None:
+    """Write Gaussians as a GLB file; it appears under its name only when it is complete.
+
+    Args:
+        path: file to write, in a folder that exists. Only an empty file or a GLB is replaced.
+        source: at least one Gaussian; read once, block by block.
+        up: upward direction in the coordinates of the Gaussians.
+
+    Raises:
+        ValueError: there is no Gaussian, a value is not finite, or the file would exceed 4 GiB.
+        FileExistsError: there is a file of another format.
+        OSError: the file cannot be written, or `path` is no regular file; an existing file is unchanged.
+    """
+    check_replaces_glb(path)
+    count, columns = len(source), _columns(len(source), source.degree, source.has_levels)
+    size = glb_bytes(count, source.degree, source.has_levels)
+    if count == 0:
+        raise ValueError(f"{path}: the model has no Gaussian, and glTF has no empty primitives")
+    if size > _LARGEST - (1 << 20):
+        raise ValueError(
+            f"{path}: {count:,} Gaussians of SH degree {source.degree} take {size / 2**30:.1f} GiB, and a "
+            "GLB file holds 4: choose a lower --sh-degree, --most, or tiles"
+        )
+    box = np.array([[-3.4e38] * 3, [3.4e38] * 3])
+    # Numbers of a box have at most so many more characters than the two above.
+    room = len(_json(source, columns, size, box, up)) + 200
+    room += -room % 4
+    box = np.array([[np.inf] * 3, [-np.inf] * 3])
+    with new_file(path) as partial, open(partial, "r+b") as file:
+        start, body = 0, 20 + room + 8
+        for block in source.blocks():
+            block.check()
+            box = np.stack(
+                [
+                    np.minimum(box[0], block.means.amin(0).double().numpy()),
+                    np.maximum(box[1], block.means.amax(0).double().numpy()),
+                ]
+            )
+            for column, values in zip(columns, _values(block, path), strict=True):
+                file.seek(body + column.offset + column.width * start)
+                file.write(np.ascontiguousarray(values).data)
+            start += len(block)
+        if start != count:
+            raise ValueError(f"{path}: {count:,} Gaussians were announced, {start:,} came")
+        text = _json(source, columns, size, box, up).ljust(room)
+        file.seek(0)
+        file.write(struct.pack("<4sIIII", b"glTF", 2, body + size, room, 0x4E4F534A))
+        file.write(text)
+        file.write(struct.pack("<II", size, 0x004E4942))
+
+
+def check_replaces_glb(path: Path) -> None:
+    """Check that writing a GLB file replaces no file of another format; see `check_replaceable`."""
+    check_replaceable(path)
+    if path.exists():
+        with open(path, "rb") as file:
+            start = file.read(4)
+        if start not in (b"", b"glTF"):
+            raise FileExistsError(f"{path} exists and is not a GLB file: choose another name")
+
+
+def _columns(count: int, degree: int, has_levels: bool) -> list[_Column]:
+    kinds = [("POSITION", "VEC3", _FLOAT, 12), (f"{_PREFIX}ROTATION", "VEC4", _FLOAT, 16)]
+    kinds += [(f"{_PREFIX}SCALE", "VEC3", _FLOAT, 12), (f"{_PREFIX}OPACITY", "SCALAR", _FLOAT, 4)]
+    kinds += [("COLOR_0", "VEC4", _BYTE, 4)]
+    kinds += [
+        (f"{_PREFIX}SH_DEGREE_{d}_COEF_{n}", "VEC3", _FLOAT, 12)
+        for d in range(degree + 1)
+        for n in range(2 * d + 1)
+    ]
+    if has_levels:
+        kinds.append(("_LEVEL", "SCALAR", _FLOAT, 4))
+    columns, offset = [], 0
+    for name, type_, component, width in kinds:
+        columns.append(_Column(name, type_, component, offset, width))
+        offset += width * count
+    return columns
+
+
+def _values(block: Gaussians, path: Path) -> list[Array]:
+    """Return the columns of a block in the order of `_columns`."""
+    opacities = block.opacities.double().sigmoid().numpy()
+    scales = block.scales.exp().numpy()
+    sh = block.sh.numpy()
+    for name, values in (("scales", scales), ("sh", sh)):
+        if not np.isfinite(values).all():
+            raise ValueError(f"{path}: {name} are not finite in float32, which glTF requires")
+    colors = np.concatenate([0.5 + _SH_C0 * sh[:, 0], opacities[:, None]], axis=1)
+    columns: list[Array] = [
+        block.means.numpy(),
+        unit_quats(block.quats)[:, [1, 2, 3, 0]].float().numpy(),
+        scales,
+        opacities.astype(np.float32),
+        np.rint(colors.clip(0, 1) * 255).astype(np.uint8),
+        *(sh[:, k] for k in range(sh.shape[1])),
+    ]
+    if block.levels is not None:
+        columns.append(block.levels.float().numpy())
+    return columns
+
+
+def _json(
+    source: GaussianSource,
+    columns: list[_Column],
+    size: int,
+    box: npt.NDArray[np.float64],
+    up: tuple[float, float, float],
+) -> bytes:
+    count = len(source)
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": i, "componentType": column.component, "count": count, "type": column.type}
+        for i, column in enumerate(columns)
+    ]
+    accessors[0] |= {"min": box[0].tolist(), "max": box[1].tolist()}
+    for column, accessor in zip(columns, accessors, strict=True):
+        if column.component == _BYTE:
+            accessor["normalized"] = True
+    extension = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    primitive = {
+        "mode": 0,
+        "attributes": {column.name: i for i, column in enumerate(columns)},
+        "extensions": {"KHR_gaussian_splatting": extension},
+    }
+    content = {
+        "asset": {"version": "2.0", "generator": "BlitzGS", "extras": {"comments": source.comments}},
+        "extensionsUsed": ["KHR_gaussian_splatting"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": _rotation_to_y(up)}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": c.offset, "byteLength": c.width * count, "target": 34962}
+            for c in columns
+        ],
+        "buffers": [{"byteLength": size}],
+    }
+    return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _rotation_to_y(up: tuple[float, float, float]) -> list[float]:
+    """Return the shortest rotation from `up` to +Y as x, y, z, w; half a turn about x from -Y."""
+    x, y, z = np.array(up, dtype=np.float64) / np.linalg.norm(up)
+    if y < -1 + 1e-12:
+        return [1.0, 0.0, 0.0, 0.0]
+    # The half-way quaternion: (up x Y, 1 + up . Y), normalised.
+    quat = np.array([-z, 0.0, x, 1 + y])
+    return [float(value) for value in quat / np.linalg.norm(quat)]
