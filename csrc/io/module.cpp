@@ -189,20 +189,21 @@ void write_points(const std::string& path, const py::dict& columns) {
 
 constexpr const char* kNumpyTypes[] = {"i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"};
 
-py::tuple read_ply(const std::string& path) {
-  auto table = from_file(path, [&](std::istream& in) { return io::read_ply(in, path); });
+py::tuple read_ply(const std::string& path, std::uint64_t first, std::uint64_t most) {
+  auto table = from_file(path, [&](std::istream& in) { return io::read_ply(in, path, first, most); });
   py::list properties;
   for (const io::PlyProperty& property : table.properties) {
     properties.append(
         py::make_tuple(to_names({property.name})[0], kNumpyTypes[static_cast<int>(property.type)]));
   }
-  return py::make_tuple(to_names(table.comments), properties, table.count, to_array(std::move(table.rows)));
+  return py::make_tuple(to_names(table.comments), properties, table.count, to_array(std::move(table.rows)),
+                        table.total);
 }
 
 void write_ply(const std::string& path, const py::list& comments,
                const std::vector<std::pair<std::string, std::string>>& properties, std::uint64_t count,
                const Column<std::uint8_t>& rows) {
-  io::PlyTable table{from_names(comments), {}, count, {}};
+  io::PlyTable table{from_names(comments), {}, count, {}, count};
   for (const auto& [name, type] : properties) {
     const auto found = std::find(std::begin(kNumpyTypes), std::end(kNumpyTypes), type);
     if (found == std::end(kNumpyTypes)) throw std::invalid_argument("ply: unknown type " + type);
@@ -303,6 +304,6 @@ PYBIND11_MODULE(_io, m) {
   m.def("decode_qoi", &decode_qoi, "data"_a);
   m.def("set_flag", &set_flag, "flags"_a.noconvert(), "index"_a);
   m.def("flag_is_set", &flag_is_set, "flags"_a.noconvert(), "index"_a);
-  m.def("read_ply", &read_ply, "path"_a);
+  m.def("read_ply", &read_ply, "path"_a, "first"_a = 0, "most"_a = std::numeric_limits<std::uint64_t>::max());
   m.def("write_ply", &write_ply, "path"_a, "comments"_a, "properties"_a, "count"_a, "rows"_a);
 }
