@@ -35,6 +35,7 @@ from blitzgs.capture.lens import Lens
 from blitzgs.capture.masks import excluded_share, find_masks
 from blitzgs.capture.names import check_inside
 from blitzgs.capture.points import SourcePoints
+from blitzgs.capture.projects.find import FoundProject, folder_of, project_at
 from blitzgs.capture.splits import split_capture, without_unused
 from blitzgs.capture.undistort import Rectification, rectify
 from blitzgs.capture.usable import (
@@ -135,7 +136,8 @@ def load_capture(
 
     Args:
         path: folder with a COLMAP sparse model (sparse/0, sparse, ...; or train/ and val/ folders that have
-            one each) or transforms.json / transforms_train.json.
+            one each), transforms.json / transforms_train.json, or another program's project; or the file of
+            such a project.
         images: folder of the images, relative to `path`; not used for transforms.json, which has paths.
         downscale: reduce both sides of the camera model's size by this factor. A folder such as images_4 is
             used for 4 if it contains every image at the right size; otherwise images are downscaled by
@@ -163,7 +165,7 @@ def load_capture(
         FileNotFoundError: the folder has no capture, or images are missing on disk (`MissingImagesError`).
         ValueError: a file is damaged, or sizes, poses or options are invalid.
     """
-    root = Path(path)
+    root, project = _root_of(Path(path), images)
     check_number("downscale", downscale)
     if not downscale >= 1:  # NaN too
         raise ValueError(f"downscale must be at least 1, got {downscale}")
@@ -174,7 +176,7 @@ def load_capture(
     ):
         if value not in allowed:
             raise ValueError(f"{option} must be one of {', '.join(allowed)}, got {value!r}")
-    views, points, source = read_layout(root, images, downscale, sparse)
+    views, points, source = read_layout(root, images, downscale, sparse, project)
     if not views:
         raise ValueError(f"{root}: its COLMAP model or transforms.json lists no images")
     listed = len(views)
@@ -253,6 +255,23 @@ def load_capture(
             damaged=len(damage),
         ),
     )
+
+
+def _root_of(path: Path, images: str) -> tuple[Path, FoundProject | None]:
+    """Return the folder of a capture, and the project that was named instead of it.
+
+    Raises:
+        FileNotFoundError: the file is no project.
+    """
+    if not path.is_file():
+        return path, None
+    project = project_at(path)
+    if project is None:
+        raise FileNotFoundError(
+            f"{path} is no project that can be read (docs/captures.md lists them): name the folder of the "
+            "capture (images and a COLMAP model) with --data"
+        )
+    return folder_of(path, images), project
 
 
 def _with_files(

@@ -22,6 +22,8 @@ from blitzgs.formats.native import native_io
 Float64 = npt.NDArray[np.float64]
 FILES = ("cameras", "images", "points3D")
 _SUFFIXES = (".bin", ".txt")
+# Files that may be in the place of a model's points.
+POINT_SUFFIXES = (".ply", ".las", ".laz", ".e57")
 
 
 def _empty(dtype: str, *shape: int) -> Any:
@@ -89,7 +91,7 @@ class ColmapModel:
     images: ColmapImages = field(default_factory=ColmapImages)
     points: ColmapPoints = field(default_factory=ColmapPoints)
     points_path: Path | None = None
-    """The file of the points. If it is a PLY, `points` is empty, and the caller reads it."""
+    """The file of the points. With a suffix of `POINT_SUFFIXES`, `points` is empty: the caller reads it."""
 
 
 @cache
@@ -139,11 +141,11 @@ def _has(folder: Path, enough: Callable[[Iterable[bool]], bool]) -> bool:
 
 
 def _file(folder: Path, name: str, suffix: str) -> Path:
-    """Return a file of a model; programs that change a model may leave its points as points3D.ply alone."""
+    """Return a file of a model; its points may be in points3D.ply alone, or in a file of another program."""
     path = folder / (name + suffix)
     others = [folder / (name + other) for other in (".bin", ".txt")]
     if name == "points3D" and not any(other.is_file() for other in others):
-        path = path.with_suffix(".ply") if path.with_suffix(".ply").is_file() else path
+        path = next((p for s in POINT_SUFFIXES if (p := path.with_suffix(s)).is_file()), path)
     return path
 
 
@@ -177,11 +179,13 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
     for path in paths.values():
         if not path.is_file():
             raise FileNotFoundError(f"{path} is missing: {folder} is not a complete COLMAP sparse model")
-    io, in_ply = native_io(), paths["points3D"].suffix == ".ply"
+    io, elsewhere = native_io(), paths["points3D"].suffix in POINT_SUFFIXES
     return ColmapModel(
         [ColmapCamera(*row) for row in io.read_cameras(os.fsencode(paths["cameras"]))],
         ColmapImages(**io.read_images(os.fsencode(paths["images"]), points2d)),
-        ColmapPoints() if in_ply else ColmapPoints(**io.read_points(os.fsencode(paths["points3D"]), tracks)),
+        ColmapPoints()
+        if elsewhere
+        else ColmapPoints(**io.read_points(os.fsencode(paths["points3D"]), tracks)),
         paths["points3D"],
     )
 

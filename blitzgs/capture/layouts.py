@@ -16,7 +16,9 @@ from blitzgs.capture import colmap, transforms
 from blitzgs.capture.cameras import Float64
 from blitzgs.capture.files import ImageFinder
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.points import SourcePoints, ply_points, transforms_points
+from blitzgs.capture.points import SourcePoints, file_points, transforms_points
+from blitzgs.capture.projects.find import FoundProject, find_project, read_project
+from blitzgs.capture.world import WorldFrame, frame_beside
 
 _PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 # What programs write beside the images of a synthetic capture.
@@ -48,10 +50,12 @@ class Source:
     """What the reader decided between fields or files, and what has no effect."""
     without_camera: int = 0
     """Photographs beside those of the views that have no camera."""
+    frame: WorldFrame | None = None
+    """Where the capture lies in the world; None: the files do not say."""
 
 
 def read_layout(
-    root: Path, images: str, downscale: float, sparse: str = "largest"
+    root: Path, images: str, downscale: float, sparse: str = "largest", project: FoundProject | None = None
 ) -> tuple[list[SourceView], SourcePoints, Source]:
     """Read the views and points of a folder in any of the layouts of docs/captures.md.
 
@@ -60,6 +64,7 @@ def read_layout(
         images: folder of the images, relative to `root`.
         downscale: see `load_capture`; decides which folder of images is used.
         sparse: see `load_capture`.
+        project: file of another program's project to read; None: whatever the folder has.
 
     Raises:
         FileNotFoundError: the folder has no capture.
@@ -69,6 +74,9 @@ def read_layout(
         raise FileNotFoundError(
             f"{root} is not a folder: name the folder of the capture (images and a COLMAP model) with --data"
         )
+    if project is not None:
+        views, points, source = _read_project(root, project, images, downscale)
+        return views, points, _with_photographs(root, source, views)
     models, notes = _models(root, sparse)
     folder = models[0] if models else None
     parts = [part for part in ("train", "val") if colmap.find_model(root / part)]
@@ -85,18 +93,35 @@ def read_layout(
         found = [_read_colmap(root / p, _model_in(root / p), images, downscale, part=p) for p in parts]
         views, points = [view for views, _ in found for view in views], found[0][1]
         source = Source(" and ".join(str(_model_in(root / p).relative_to(root)) for p in parts))
+    elif (project := find_project(root)) is not None:
+        views, points, source = _read_project(root, project, images, downscale)
     else:
         incomplete = colmap.find_incomplete_model(root)
         if incomplete is not None:
             _read_colmap(root, incomplete, images, downscale)  # raises an error that names the missing file
         raise _no_capture(root)
+    if source.frame is None:
+        source = replace(source, frame=frame_beside(root))
     return views, points, _with_photographs(root, source, views)
+
+
+def _read_project(
+    root: Path, project: FoundProject, images: str, downscale: float
+) -> tuple[list[SourceView], SourcePoints, Source]:
+    names, paths, lenses, content, points = read_project(root, project, images, downscale)
+    views = [
+        SourceView(name, path, None, lens, view.world_to_camera)
+        for name, path, lens, view in zip(names, paths, lenses, content.views, strict=True)
+    ]
+    file = project.file.relative_to(root) if project.file.is_relative_to(root) else project.file
+    cameras = f"{file} ({project.kind.program})"
+    return views, points, Source(cameras, notes=tuple(content.notes), frame=content.frame)
 
 
 def _no_capture(root: Path) -> FileNotFoundError:
     return FileNotFoundError(
         f"{root} holds no capture: expected a COLMAP model (sparse/0 with cameras, images and points3D as "
-        f".bin or .txt), or transforms.json{_hint(root)}"
+        f".bin or .txt), transforms.json, or a project of another program{_hint(root)}"
     )
 
 
@@ -240,8 +265,8 @@ def _read_colmap(
         SourceView(prefix + name, path, None, lens, pose)
         for name, path, lens, pose in zip(names, paths, lens_of, poses, strict=True)
     ]
-    if model.points_path is not None and model.points_path.suffix == ".ply":
-        return views, ply_points(model.points_path)
+    if model.points_path is not None and model.points_path.suffix in colmap.POINT_SUFFIXES:
+        return views, file_points(model.points_path)
     p = model.points
     path = model.points_path
     return views, SourcePoints(

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera models: map directions to pixels, for every camera model of COLMAP.
+"""Camera models: map directions to pixels, for every camera model of COLMAP, and Brown's in full.
 
 A lens maps normalised coordinates (u, v) = (x/z, y/z) of a point in front of the camera to pixels:
 (fx u' + cx, fy v' + cy) with (u', v') = distort(u, v). The formulas are those that COLMAP documents for its
-camera models; parameters keep COLMAP's order. Pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+camera models; parameters keep COLMAP's order. BROWN, which photogrammetry programs have and COLMAP has not,
+is OPENCV with k3 and k4 and, after all, u' + skew v' in the place of u'. Pixel (i, j) has its centre at
+(i + 0.5, j + 0.5).
 """
 
 from __future__ import annotations
@@ -17,12 +19,13 @@ import numpy.typing as npt
 from blitzgs.capture.colmap import camera_models
 
 Array = npt.NDArray[np.float64]
+_OWN_MODELS = {"BROWN": ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "skew"]}
 _Distort = Callable[[Array, Array, Sequence[float]], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera model with its image size (pixels) and parameters in COLMAP's order."""
+    """A camera model with its image size (pixels) and parameters in COLMAP's order, or BROWN's."""
 
     model: str
     width: int
@@ -30,9 +33,10 @@ class Lens:
     params: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        names = camera_models().get(self.model)
+        known = camera_models() | _OWN_MODELS
+        names = known.get(self.model)
         if names is None:
-            raise ValueError(f"unknown camera model {self.model!r}; known: {', '.join(camera_models())}")
+            raise ValueError(f"unknown camera model {self.model!r}; known: {', '.join(known)}")
         if self.model == "EQUIRECTANGULAR":
             raise ValueError(
                 "EQUIRECTANGULAR images show all directions and cannot be made into one perspective image; "
@@ -47,7 +51,7 @@ class Lens:
 
     @property
     def _shared_focal(self) -> bool:
-        return camera_models()[self.model][0] == "f"
+        return (_OWN_MODELS.get(self.model) or camera_models()[self.model])[0] == "f"
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float]:
@@ -157,6 +161,13 @@ def _opencv(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
     return u * scale + du, v * scale + dv
 
 
+def _brown(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
+    scale = _polynomial(u * u + v * v, k[:4])
+    du, dv = _tangential(u, v, k[4], k[5])
+    u, v = u * scale + du, v * scale + dv
+    return u + k[6] * v, v
+
+
 def _full_opencv(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
     r2 = u * u + v * v
     scale = _polynomial(r2, (k[0], k[1], k[4])) / _polynomial(r2, k[5:8])
@@ -219,6 +230,7 @@ _DISTORT: dict[str, _Distort] = {
     "RADIAL": _radial,
     "OPENCV": _opencv,
     "FULL_OPENCV": _full_opencv,
+    "BROWN": _brown,
     "FOV": _fov,
     "OPENCV_FISHEYE": _fisheye,
     "SIMPLE_RADIAL_FISHEYE": _fisheye,
@@ -231,7 +243,9 @@ _DISTORT: dict[str, _Distort] = {
     "DIVISION": _division,
     "EUCM": _eucm,
 }
-_ZERO_IS_PINHOLE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "FOV", "SIMPLE_DIVISION", "DIVISION")
+_ZERO_IS_PINHOLE = (
+    "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "BROWN", "FOV", "SIMPLE_DIVISION", "DIVISION"
+)  # fmt: skip
 # Models with one focal length, and the one that holds their distortion with two (zeros appended).
 _WITH_TWO_FOCALS = {
     "SIMPLE_PINHOLE": "PINHOLE",

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,7 @@ import numpy.typing as npt
 from blitzgs.capture import colmap
 from blitzgs.capture.cameras import Float64, camera_centres
 from blitzgs.capture.names import unified
+from blitzgs.capture.point_files import SUFFIXES, read_points
 from blitzgs.capture.transforms import Frame, Transforms
 from blitzgs.formats.ply import read_point_cloud
 
@@ -35,17 +37,27 @@ class SourcePoints:
     """The file or model that has them; None: there are none."""
     colors_from: str = ""
     """What in it gives the colours; empty: nothing."""
+    crs: Any = None
+    """The reference system that the file names (pyproj's); None: it names none."""
 
 
-def ply_points(path: Path) -> SourcePoints:
-    """Read the points of a PLY; warn if they have no colours.
+def file_points(path: Path) -> SourcePoints:
+    """Read the points of a PLY, LAS, LAZ or E57 file; warn if they have no colours.
 
     Raises:
         FileNotFoundError: there is no such file.
+        ImportError: the package that reads the format is not installed.
         ValueError: the file is damaged, or has no points.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path} is missing: put the file of points there, or correct its name")
+    if path.suffix.lower() in SUFFIXES:
+        positions, colors, crs = read_points(path)
+        if colors is None:
+            warnings.warn(f"{path}: the points have no colours and start grey", stacklevel=4)
+            colors = np.full(positions.shape, 128, dtype=np.uint8)
+            return SourcePoints(positions, colors, path=path, crs=crs)
+        return SourcePoints(positions, colors, path=path, colors_from="red, green, blue", crs=crs)
     cloud = read_point_cloud(path)
     if not cloud.colors_from and len(cloud.positions):
         warnings.warn(
@@ -65,11 +77,11 @@ def transforms_points(root: Path, content: Transforms, model: Path | None) -> So
         model: the COLMAP model beside it, if there is one.
     """
     if content.points_path is not None:
-        return ply_points(content.points_path)
+        return file_points(content.points_path)
     plys = sorted(path for path in root.iterdir() if path.suffix.lower() == ".ply" and path.is_file())
     for path in plys:
         if path.name.lower() in _BESIDE:
-            return ply_points(path)
+            return file_points(path)
     if model is not None and (found := _model_points(root, content, model)) is not None:
         return found
     if plys:
@@ -95,8 +107,8 @@ def _model_points(root: Path, content: Transforms, folder: Path) -> SourcePoints
         )
         return None
     points = model.points
-    if model.points_path is not None and model.points_path.suffix == ".ply":
-        read = ply_points(model.points_path)
+    if model.points_path is not None and model.points_path.suffix in colmap.POINT_SUFFIXES:
+        read = file_points(model.points_path)
         read.positions = content.moved(read.positions)
         return read
     return SourcePoints(moved, points.colors, points.track_lengths, points.errors, folder, "the model")

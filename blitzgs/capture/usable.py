@@ -98,6 +98,7 @@ def finite_points(points: SourcePoints) -> SourcePoints:
         points.errors[finite] if points.errors is not None else None,
         points.path,
         points.colors_from,
+        points.crs,
     )
 
 

@@ -9,6 +9,7 @@ order of level and then of the model. Memory holds one block and the counts of t
 
 from __future__ import annotations
 
+import errno
 import math
 import re
 import shutil
@@ -22,7 +23,7 @@ import torch
 
 from blitzgs.formats.gaussians import Gaussians, GaussianSource
 
-# Cells of the grid along an axis, as a power of two. A cell's key has the digits of an octree, 3 bits a level.
+# Cells of the grid along an axis, as a power of two. A cell's key has the digits of an octree, 3 bits each.
 BITS = 8
 # A splat touches no pixel farther away than so many standard deviations (docs/image.md: alpha >= 1/255).
 REACH = math.sqrt(2 * math.log(255))
@@ -79,8 +80,10 @@ class Partition:
         free = shutil.disk_usage(folder).free
         if free < 2 * needed:
             raise OSError(
-                f"{folder.parent}: {2 * needed / 1e9:.1f} GB are needed for the files and their temporary copy, "
-                f"and {free / 1e9:.1f} GB are free"
+                errno.ENOSPC,
+                f"{2 * needed / 1e9:.1f} GB are needed for the files and a temporary copy, and {free / 1e9:.1f} "
+                "GB are free",
+                str(folder),
             )
         with open(self._places, "wb") as file:
             for block in source.blocks():
@@ -236,12 +239,13 @@ class Parts:
 def extents(gaussians: Gaussians) -> Array:
     """Return the box of all that a view can show of Gaussians, float64 [2, 3]."""
     w, x, y, z = torch.nn.functional.normalize(gaussians.quats.double(), dim=1).T.numpy()
-    scales = gaussians.scales.double().exp().numpy()
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    rotations = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
     )
-    half = REACH * np.stack([np.sqrt(sum((r * s) ** 2 for r, s in zip(row, scales.T))) for row in rows], 1)
+    half = REACH * np.linalg.norm(rotations * gaussians.scales.double().exp().numpy().T, axis=1).T
     means = gaussians.means.double().numpy()
     return np.stack([(means - half).min(axis=0), (means + half).max(axis=0)])

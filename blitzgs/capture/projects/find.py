@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds the project of another program in a folder, and reads it as views and points."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from blitzgs.capture.files import ImageFinder
+from blitzgs.capture.image_files import read_header
+from blitzgs.capture.lens import Lens
+from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, unified
+from blitzgs.capture.points import SourcePoints
+from blitzgs.capture.projects.beside import points_beside
+from blitzgs.capture.projects.bundler import is_bundler, read_bundler
+from blitzgs.capture.projects.metashape import is_metashape, read_metashape
+from blitzgs.capture.projects.opensfm import NAME, read_opensfm
+from blitzgs.capture.projects.opf import read_opf
+from blitzgs.capture.projects.pix4d import SUFFIX, read_pix4d
+from blitzgs.capture.projects.project import Project
+from blitzgs.capture.projects.realitycapture import is_realitycapture, read_realitycapture
+from blitzgs.capture.world import frame_beside
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """How the file of a program is found and read."""
+
+    program: str
+    patterns: tuple[str, ...]
+    read: Callable[[Path], Project]
+    is_one: Callable[[Path], bool] = lambda _: True
+
+
+_KINDS = (
+    _Kind("Metashape", ("*.xml",), read_metashape, is_metashape),
+    _Kind("OPF", ("*.opf", "*/*.opf"), read_opf),
+    _Kind("Pix4D", tuple(f"{at}*{SUFFIX}" for at in ("", "params/", "*/params/", "*/*/params/")), read_pix4d),
+    _Kind("RealityCapture", ("*.csv",), read_realitycapture, is_realitycapture),
+    _Kind("OpenSfM", (NAME, f"opensfm/{NAME}", "reconstruction.topocentric.json"), read_opensfm),
+    _Kind("Bundler", ("*.out",), read_bundler, is_bundler),
+)
+# Folders above a project's file that may be the capture's: opensfm/, or 1_initial/params/.
+_FOLDERS_ABOVE = 3
+
+
+@dataclass(frozen=True)
+class FoundProject:
+    """A project: its program and its file."""
+
+    kind: _Kind
+    file: Path
+
+
+def project_at(path: Path) -> FoundProject | None:
+    """Return the project of a file; None: it is none."""
+    for kind in _KINDS:
+        if any(PurePosixPath(path.name).match(Path(p).name) for p in kind.patterns) and kind.is_one(path):
+            return FoundProject(kind, path)
+    return None
+
+
+def find_project(root: Path) -> FoundProject | None:
+    """Return the project in a folder; None: there is none.
+
+    A reconstruction of Bundler beside another project has its points, and is not a project of its own.
+
+    Raises:
+        ValueError: there are several.
+    """
+    found = [
+        FoundProject(kind, file)
+        for kind in _KINDS
+        for file in sorted({f for pattern in kind.patterns for f in root.glob(pattern)})
+        if file.is_file() and kind.is_one(file)
+    ]
+    files = {project.file for project in found}
+    found = [p for p in found if p.file.name == NAME or p.file.with_name(NAME) not in files]
+    main = [project for project in found if project.kind.read is not read_bundler] or found
+    if len(main) > 1:
+        shown = ", ".join(str(project.file.relative_to(root)) for project in main[:5])
+        raise ValueError(f"{root} has {len(main)} projects ({shown}): name one of these files with --data")
+    return main[0] if main else None
+
+
+def folder_of(file: Path, images: str) -> Path:
+    """Return the folder of the capture of a project's file: the nearest one that has the images' folder."""
+    above = [file.parent, *file.parent.parents][:_FOLDERS_ABOVE]
+    return next((folder for folder in above if (folder / images).is_dir()), file.parent)
+
+
+def read_project(
+    root: Path, found: FoundProject, images: str, downscale: float
+) -> tuple[list[str], list[Path], list[Lens], Project, SourcePoints]:
+    """Read a project: names, files, lenses, the project itself, and its points.
+
+    Raises:
+        FileNotFoundError: no photograph is there, so that the size of none is known.
+        ValueError: the project is damaged.
+    """
+    project = found.kind.read(found.file)
+    if not project.views:
+        raise ValueError(
+            f"{found.file} has no photograph with a pose: align the photographs, and export again"
+        )
+    project.frame = project.frame or frame_beside(root)
+    finder = ImageFinder(root, images)
+    names = _with_suffixes(root / images, root, [_relative(view.name) for view in project.views])
+    if len(set(names)) < len(names):
+        twice = next(name for name, count in Counter(names).items() if count > 1)
+        raise ValueError(f"{found.file}: there are two photographs called {twice}")
+    lenses = _lenses(found, project, names, finder)
+    paths = finder.find_all(names, lenses, downscale)
+    if project.lost:
+        project.notes.append(f"{project.lost} photographs of the project have no pose and are left out")
+    for note in project.notes:
+        warnings.warn(f"{found.file}: {note}", stacklevel=5)
+    return names, paths, lenses, project, _points(root, found, project, lenses)
+
+
+def _relative(name: str) -> str:
+    """Return a name without the drive and folders of the machine that wrote it."""
+    name = unified(name)
+    return PurePosixPath(name).name if name.startswith("/") or name[1:3] == ":/" else name
+
+
+def _with_suffixes(folder: Path, root: Path, names: Sequence[str]) -> list[str]:
+    """Complete names without a suffix, as Metashape's labels are, where one file fits."""
+    if all(PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
+        return list(names)
+    base = folder if folder.is_dir() else root
+    stems: defaultdict[str, list[str]] = defaultdict(list)
+    for file in files_below(base):
+        path = PurePosixPath(file)
+        if path.suffix.lower() in IMAGE_SUFFIXES:
+            for key in {str(path.with_suffix("")), path.stem}:
+                stems[key].append(file)
+    fits = {
+        name: stems[name][0]
+        for name in names
+        if len(stems.get(name, ())) == 1 and PurePosixPath(name).suffix.lower() not in IMAGE_SUFFIXES
+    }
+    return [fits.get(name, name) for name in names]
+
+
+def _lenses(found: FoundProject, project: Project, names: Sequence[str], finder: ImageFinder) -> list[Lens]:
+    if all(isinstance(view.lens, Lens) for view in project.views):
+        return [view.lens for view in project.views if isinstance(view.lens, Lens)]
+    one = Lens("PINHOLE", 1, 1, (1.0, 1.0, 0.5, 0.5))
+    paths = finder.find_all(names, [one] * len(names), 1)
+    sizes = [(h.width, h.height) if p.is_file() and (h := read_header(p)) else None for p in paths]
+    common = Counter(size for size in sizes if size is not None).most_common(1)
+    if not common:
+        raise FileNotFoundError(
+            f"{found.file} gives lengths as shares of the image, and none of its {len(names)} photographs "
+            f"(first: {names[0]}) is in {finder.root / finder.images}: put them there, or name their folder "
+            "with --data.images=FOLDER"
+        )
+    # A photograph that is missing is refused or left out later.
+    return [
+        view.lens if isinstance(view.lens, Lens) else view.lens(*(size or common[0][0]))
+        for view, size in zip(project.views, sizes, strict=True)
+    ]
+
+
+def _points(root: Path, found: FoundProject, project: Project, lenses: Sequence[Lens]) -> SourcePoints:
+    """Return the points of the project, else those of a file beside it."""
+    if project.points is not None and len(project.points.positions):
+        return project.points
+    poses = [view.world_to_camera for view in project.views]
+    bundles = [file for file in sorted(root.glob("*.out")) if is_bundler(file) and file != found.file]
+    own = [read_bundler(file).points for file in bundles[:1]]
+    return points_beside(root, own[0] if own else None, project.frame, list(zip(lenses, poses, strict=True)))

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""reconstruction.json of OpenSfM and OpenDroneMap.
+
+Conventions (OpenSfM's documentation on geometric models and on reconstructions; ODM's folders):
+
+- rotation is an angle-axis vector, and x_camera = R x + t with x right, y down, z forward.
+- Lengths are shares of the longer side; the origin of pixels is the centre of the image, with half a pixel
+  accounted for, so c_x = c_y = 0 is the middle of width and height here.
+- perspective has k1, k2; brown adds k3, p1, p2 with OpenCV's meaning; fisheye and fisheye_opencv are
+  equidistant with k1, k2 (k3, k4).
+- The world is x east, y north, z up at reference_lla. OpenDroneMap replaces it by UTM minus the offset of
+  odm_georeferencing/coords.txt, through an affine map, and keeps the original in
+  reconstruction.topocentric.json, which is read instead.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from blitzgs.capture.lens import Lens
+from blitzgs.capture.points import SourcePoints
+from blitzgs.capture.projects.project import (
+    Project,
+    ProjectView,
+    entry,
+    made_lens,
+    number,
+    numbers,
+    pose_of,
+    read_json,
+    size_of,
+)
+from blitzgs.capture.world import WorldFrame, enu_frame, read_small
+
+NAME = "reconstruction.json"
+_ORIGINAL = "reconstruction.topocentric.json"
+_MODELS = {
+    "perspective": ("BROWN", ("k1", "k2")),
+    "simple_radial": ("BROWN", ("k1",)),
+    "radial": ("BROWN", ("k1", "k2")),
+    "brown": ("BROWN", ("k1", "k2", "k3", "p1", "p2")),
+    "fisheye": ("OPENCV_FISHEYE", ("k1", "k2")),
+    "fisheye_opencv": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
+}
+
+
+def read_opensfm(path: Path) -> Project:
+    """Read the largest reconstruction of a file.
+
+    Raises:
+        ValueError: a field is missing or makes no sense; names it.
+    """
+    original = path.with_name(_ORIGINAL)
+    path = original if path.name == NAME and original.is_file() else path
+    content = read_json(path)
+    if not isinstance(content, list) or not all(isinstance(part, Mapping) for part in content) or not content:
+        raise ValueError(f"{path}: expected a list of reconstructions; run OpenSfM again")
+    counts = [len(entry(part, "shots", dict, str(path))) for part in content]
+    best = content[int(np.argmax(counts))]
+    notes = []
+    if len(content) > 1:
+        notes.append(
+            f"of {len(content)} reconstructions, the largest is used: {max(counts)} of {sum(counts)} shots"
+        )
+    lenses = {
+        key: _lens(camera, f"{path}: camera {key!r:.60}")
+        for key, camera in entry(best, "cameras", dict, str(path)).items()
+    }
+    views = []
+    for name, shot in best["shots"].items():
+        where = f"{path}: shot {name!r:.60}"
+        key = entry(shot, "camera", str, where)
+        if key not in lenses:
+            raise ValueError(f"{where}: its camera {key!r:.60} is not there")
+        vector = numbers(shot.get("rotation"), 3, f"{where}: rotation")
+        rotation = np.asarray(cv2.Rodrigues(vector)[0], dtype=np.float64)
+        translation = numbers(shot.get("translation"), 3, f"{where}: translation")
+        views.append(ProjectView(name, lenses[key], pose_of(rotation.T, -rotation.T @ translation, where)))
+    return Project(views, _points(best, path), _frame(path, best), sum(counts) - max(counts), notes)
+
+
+def _lens(camera: Any, where: str) -> Lens:
+    kind = entry(camera, "projection_type", str, where)
+    if kind not in _MODELS:
+        raise ValueError(f"{where}: projection_type {kind!r:.30} cannot be read; known: {', '.join(_MODELS)}")
+    model, known = _MODELS[kind]
+    width, height = size_of(camera.get("width"), camera.get("height"), where)
+    side = max(width, height)
+
+    def value(key: str, default: float | None = None) -> float:
+        return number(camera.get(key, default), f"{where}: {key}")
+
+    fx = value("focal_x" if "focal_x" in camera else "focal")
+    fy = value("focal_y") if "focal_y" in camera else fx
+    k = {key: value(key, 0.0) for key in known}
+    head = (fx * side, fy * side, width / 2 + value("c_x", 0.0) * side, height / 2 + value("c_y", 0.0) * side)
+    radial = [k.get(key, 0.0) for key in ("k1", "k2", "k3", "k4")]
+    rest = [k.get("p1", 0.0), k.get("p2", 0.0), 0.0] if model == "BROWN" else []
+    return made_lens(where, model, width, height, *head, *radial, *rest)
+
+
+def _points(part: Mapping[str, Any], path: Path) -> SourcePoints:
+    points = [p for p in (part.get("points") or {}).values() if isinstance(p, Mapping)]
+    try:
+        positions = np.array([p["coordinates"] for p in points], dtype=np.float64).reshape(len(points), 3)
+        colors = np.array([p.get("color", (128, 128, 128)) for p in points], dtype=np.float64)
+        colors = np.clip(np.nan_to_num(colors.reshape(len(points), 3)), 0, 255)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: points: expected three coordinates and colours each ({error})") from error
+    return SourcePoints(positions, colors.astype(np.uint8), path=path, colors_from="the points' own colours")
+
+
+def _frame(path: Path, part: Mapping[str, Any]) -> WorldFrame | None:
+    coords = path.parent.parent / "odm_georeferencing" / "coords.txt"
+    if path.name == NAME and coords.is_file():
+        return _odm_offset(coords)
+    beside = path.with_name("reference_lla.json")
+    reference = read_json(beside) if beside.is_file() else part.get("reference_lla")
+    if not isinstance(reference, Mapping):
+        return None
+    where = beside.name if beside.is_file() else path.name
+    place = [number(reference.get(key), f"{where}: {key}") for key in ("latitude", "longitude", "altitude")]
+    return enu_frame(place[0], place[1], place[2], where)
+
+
+def _odm_offset(path: Path) -> WorldFrame:
+    """Read the offset of OpenDroneMap, for example "WGS84 UTM 33N" and "324190 6006088"."""
+    lines = read_small(path).splitlines()[:2]
+    zone = re.fullmatch(r"WGS84 UTM (\d{1,2})([NS])", lines[0].strip()) if len(lines) == 2 else None
+    if zone is None:
+        raise ValueError(f"{path}: line 1: expected a zone such as 'WGS84 UTM 33N'; run OpenDroneMap again")
+    offset = numbers(lines[1], None, f"{path}: line 2")
+    if len(offset) < 2:
+        raise ValueError(f"{path}: line 2: expected east and north, got {lines[1]!r:.40}")
+    code = (32600 if zone[2] == "N" else 32700) + int(zone[1])
+    translation = np.array([offset[0], offset[1], 0.0])
+    return WorldFrame(f"EPSG:{code}", translation=translation, source="coords.txt of OpenDroneMap")

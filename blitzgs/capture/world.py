@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a capture lies in the world: the similarity from its coordinates to those of a reference system.
+
+All of it is float64: at 5,000,000 m, neighbouring float32 numbers are half a metre apart.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blitzgs.capture.cameras import Float64
+
+# The file of a run, and of a capture whose world its own files do not say.
+GEO = "geo.json"
+GEOCENTRIC = "EPSG:4978"
+# The smaller spread of points, as a share of the larger, from which a similarity has no free turn left.
+_LEAST_WIDTH = 1e-3
+_MAX_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class WorldFrame:
+    """Maps coordinates of a capture to the world: world = scale * rotation @ capture + translation.
+
+    Attributes:
+        crs: the world's reference system, as "EPSG:32633" or WKT; empty: a local one.
+        scale: world units per unit of the capture.
+        rotation: [3, 3].
+        translation: [3], world units.
+        source: what says so, for messages.
+    """
+
+    crs: str = ""
+    scale: float = 1.0
+    rotation: Float64 = field(default_factory=lambda: np.eye(3))
+    translation: Float64 = field(default_factory=lambda: np.zeros(3))
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        rotation, translation = np.asarray(self.rotation, float), np.asarray(self.translation, float)
+        if rotation.shape != (3, 3) or translation.shape != (3,):
+            raise ValueError(f"{self.source}: rotation must be 3 x 3 and translation 3 numbers")
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+            raise ValueError(f"{self.source}: rotation must be a rotation, got {rotation.tolist()}")
+        if not (math.isfinite(self.scale) and self.scale > 0 and np.isfinite(translation).all()):
+            raise ValueError(
+                f"{self.source}: scale must be positive and translation finite, got {self.scale}, "
+                f"{translation.tolist()}"
+            )
+
+    def to_world(self, positions: Float64) -> Float64:
+        """Return positions [..., 3] of the capture in the world."""
+        return np.asarray(self.scale * positions @ self.rotation.T + self.translation)
+
+    def from_world(self, positions: Float64) -> Float64:
+        """Return positions [..., 3] of the world in the capture."""
+        return np.asarray((positions - self.translation) @ self.rotation / self.scale)
+
+    @property
+    def name(self) -> str:
+        """The reference system in few words."""
+        if match := re.match(r'\s*\w+\[\s*"([^"]+)"', self.crs):
+            return match[1]
+        return self.crs or "local coordinates"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the content of the file `geo.json`."""
+        return {
+            "meaning": "world = scale * rotation @ capture + translation",
+            "crs": self.crs,
+            "scale": float(self.scale),
+            "rotation": np.asarray(self.rotation).tolist(),
+            "translation": np.asarray(self.translation).tolist(),
+            "source": self.source,
+        }
+
+
+def fit_similarity(capture: Float64, world: Float64, crs: str = "", source: str = "") -> WorldFrame:
+    """Return the similarity that maps points of a capture to the world by least squares.
+
+    S. Umeyama, Least-squares estimation of transformation parameters between two point patterns, PAMI 1991.
+
+    Args:
+        capture: [N, 3], N >= 3.
+        world: [N, 3], the same points.
+        crs: see `WorldFrame`.
+        source: see `WorldFrame`.
+
+    Raises:
+        ValueError: there are fewer than three points, or they lie on a line: a turn around it is free.
+    """
+    if len(capture) < 3:
+        raise ValueError(f"a similarity needs at least 3 points, got {len(capture)}: measure more")
+    mean, target = capture.mean(axis=0), world.mean(axis=0)
+    a, b = capture - mean, world - target
+    for name, points in (("in the capture", a), ("in the world", b)):
+        spread = np.linalg.svd(points, compute_uv=False)
+        if not spread[1] > _LEAST_WIDTH * spread[0]:  # NaN too
+            raise ValueError(
+                f"the {len(points)} points lie on a line {name} (spread {spread[0]:.4g} along it and "
+                f"{spread[1]:.4g} across), so a turn around it is free: add a point beside it"
+            )
+    u, singular, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = u * sign @ vt
+    scale = float((singular * sign).sum() / (a * a).sum())
+    return WorldFrame(crs, scale, rotation, target - scale * rotation @ mean, source)
+
+
+def read_frame(path: Path) -> WorldFrame:
+    """Read `geo.json`.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    try:
+        content = json.loads(read_small(path))
+        crs, scale = content.get("crs", ""), content.get("scale", 1.0)
+        if not isinstance(crs, str) or isinstance(scale, bool) or not isinstance(scale, (int, float)):
+            raise TypeError("crs must be text and scale a number")
+        rotation, translation = (
+            np.asarray(content.get(name, default), dtype=np.float64)
+            for name, default in (("rotation", np.eye(3)), ("translation", np.zeros(3)))
+        )
+        return WorldFrame(crs, float(scale), rotation, translation, str(path.name))
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged ({error}): write it again with blitzgs align") from error
+
+
+def read_small(path: Path) -> str:
+    """Return the text of a file of at most a megabyte."""
+    with open(path, "rb") as file:
+        content = file.read(_MAX_BYTES + 1)
+    if len(content) > _MAX_BYTES:
+        raise ValueError(f"{path} is larger than {_MAX_BYTES:,} bytes, which such a file never is")
+    return content.decode("utf-8-sig", errors="replace")
+
+
+def frame_beside(root: Path) -> WorldFrame | None:
+    """Return the frame that a file in the folder of a capture gives; None: there is no such file.
+
+    It is `geo.json`, or an offset (`offset.xyz`, `*_offset.xyz` or `offset.txt`: three numbers to add), with
+    the reference system in a `.prj` beside it, if there is one.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    if (root / GEO).is_file():
+        return read_frame(root / GEO)
+    paths = sorted({*root.glob("*offset.xyz"), *root.glob("offset.txt")})
+    return read_offset(paths[0], sorted(root.glob("*.prj"))) if paths else None
+
+
+def read_offset(path: Path, prj: list[Path]) -> WorldFrame:
+    """Read a file of three numbers that are added to a capture's coordinates.
+
+    Raises:
+        ValueError: there are no three numbers.
+    """
+    words = re.split(r"[\s,;]+", read_small(path).strip())
+    try:
+        offset = np.array([float(word) for word in words])
+        if offset.shape != (3,):
+            raise ValueError(f"{len(words)} values")
+    except ValueError as error:
+        raise ValueError(
+            f"{path} must hold the three numbers of an offset ({error}); correct it, or move it away"
+        ) from error
+    crs = read_small(prj[0]).strip() if prj else ""
+    return WorldFrame(crs, translation=offset, source=path.name)
+
+
+def enu_frame(latitude: float, longitude: float, altitude: float, source: str) -> WorldFrame:
+    """Return the frame of a capture whose axes are east, north and up at a place of WGS 84.
+
+    Args:
+        latitude: degrees.
+        longitude: degrees.
+        altitude: metres above the ellipsoid.
+        source: see `WorldFrame`.
+    """
+    if not (abs(latitude) <= 90 and abs(longitude) <= 360 and abs(altitude) < 1e6):  # NaN too
+        raise ValueError(f"{source}: no place on earth: {latitude}, {longitude}, {altitude}")
+    lat, lon = math.radians(latitude), math.radians(longitude)
+    a, f = 6378137.0, 1 / 298.257223563
+    e2 = f * (2 - f)
+    n = a / math.sqrt(1 - e2 * math.sin(lat) ** 2)
+    up = np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
+    east = np.array([-math.sin(lon), math.cos(lon), 0.0])
+    origin = (n + altitude) * up - np.array([0, 0, n * e2 * math.sin(lat)])
+    return WorldFrame(GEOCENTRIC, 1.0, np.stack([east, np.cross(up, east), up], axis=1), origin, source)
+
+
+def pyproj_module() -> Any:
+    """Return the package pyproj, which knows the reference systems.
+
+    Raises:
+        ImportError: it is not installed.
+    """
+    try:
+        import pyproj
+    except ImportError as error:
+        raise ImportError('this needs the package pyproj: pip install "blitzgs[geo]"') from error
+    return pyproj
+
+
+def converted(positions: Float64, source: Any, target: Any) -> Float64:
+    """Return positions [N, 3] of one reference system in another one, x east and y north.
+
+    Raises:
+        ImportError: pyproj is not installed.
+        ValueError: a reference system is unknown, or a position has no coordinates in it.
+    """
+    pyproj = pyproj_module()
+    try:
+        transformer = pyproj.Transformer.from_crs(source, target, always_xy=True)
+        moved = np.stack(transformer.transform(*positions.T, errcheck=True), axis=1)
+    except pyproj.exceptions.ProjError as error:
+        raise ValueError(f"from {source} to {target}: {error}") from error
+    if not np.isfinite(moved).all():
+        raise ValueError(f"{positions[0].tolist()} of {source} has no coordinates in {target}")
+    return moved
+
+
+def frame_in(frame: WorldFrame, crs: str, places: Float64) -> tuple[WorldFrame, float]:
+    """Return a frame in another reference system, and its largest error.
+
+    A map projection is no similarity of space: the error is what the earth's curvature and the projection's
+    scale make of the difference at the places.
+
+    Args:
+        frame: of the capture.
+        crs: wanted, as "EPSG:32633"; its axes must be lengths.
+        places: positions of the capture where the frame must be right, [N, 3].
+
+    Raises:
+        ImportError: pyproj is not installed.
+        ValueError: the reference system is unknown or has angles, or the places are too few.
+    """
+    pyproj = pyproj_module()
+    try:
+        wanted = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError as error:
+        raise ValueError(f"{crs!r:.60} is no reference system: name one such as EPSG:32633") from error
+    if not (wanted.is_projected or wanted.is_geocentric):
+        raise ValueError(
+            f"{crs} ({wanted.name}) has angles or no place on earth: name a projected one, such as a UTM zone"
+        )
+    if not frame.crs:
+        raise ValueError("the present world has no reference system, so it cannot be converted: use --gcp")
+    # The height counts too: a system of two axes keeps it above the ellipsoid.
+    old, new = (pyproj.CRS.from_user_input(c).to_3d() for c in (frame.crs, crs))
+    around = places.mean(axis=0) + np.ptp(places, axis=0).max() * 0.1 * np.concatenate(
+        [np.eye(3), -np.eye(3)]
+    )
+    every = np.concatenate([places, around])
+    target = converted(frame.to_world(every), old, new)
+    found = fit_similarity(every, target, crs, f"{frame.source}, converted from {frame.name}")
+    largest = np.linalg.norm(found.to_world(places) - target[: len(places)], axis=1).max()
+    return found, float(largest)

@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Projects of other programs give the pixels, points and world of the capture that they were written from."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+
+from blitzgs.capture.capture import load_capture
+from blitzgs.capture.layouts import read_layout
+from blitzgs.capture.projects.metashape import read_metashape
+from blitzgs.capture.projects.realitycapture import read_realitycapture
+from tests.capture import project_files as files
+
+UTM = np.array([412_345.0, 5_654_321.0, 120.0])
+
+
+@pytest.fixture(autouse=True)
+def _quiet():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def residual(capture, views, points=None):
+    """Largest distance in pixels of the capture's points, `points` in the coordinates of the views."""
+    points = capture.points if points is None else points
+    assert [view.name.removesuffix(".JPG") for view in views] == [
+        n.removesuffix(".JPG") for n in capture.names
+    ]
+    worst = 0.0
+    for index, view in enumerate(views):
+        x, y, z = view.world_to_camera[:3, :3] @ points.T + view.world_to_camera[:3, 3:]
+        found = np.stack(view.lens.project(x / z, y / z), axis=1)
+        worst = max(worst, np.abs(found - capture.pixels(index)).max())
+    return worst
+
+
+def read(root):
+    return read_layout(root, "images", 1)
+
+
+def test_metashape(tmp_path):
+    capture = files.Posed(origin=np.array([3_900_000.0, 1_000_000.0, 4_900_000.0]))
+    chunk, scale, shift = files.metashape(capture, capture.write_images(tmp_path) / "cameras.xml")
+    views, points, source = read(tmp_path)
+    assert residual(capture, views, (capture.points - shift) @ chunk / scale) < 1e-5  # float64 at 5e6
+    assert views[0].path == tmp_path / "images" / "DJI_0000.JPG"
+    assert source.cameras == "cameras.xml (Metashape)" and len(points.positions) == 0
+    assert source.frame.crs == "EPSG:4978"
+    local = (capture.points - shift) @ chunk / scale
+    np.testing.assert_allclose(source.frame.to_world(local), capture.points, atol=1e-8)
+    np.testing.assert_allclose(source.frame.from_world(capture.points), local, atol=1e-8)
+    assert any("1 photographs of the project have no pose" in note for note in source.notes)
+
+
+def test_metashape_affinity_fourth_radial_and_old_fields(tmp_path):
+    capture = files.Posed()
+    files.metashape(capture, tmp_path / "cameras.xml", k4=0.004, b1=1.25, b2=-0.75)
+    view = read_metashape(tmp_path / "cameras.xml").views[2]
+    x, y = np.array([0.31, -0.4]), np.array([-0.22, 0.1])
+    r2 = x * x + y * y
+    (k1, k2, k3), k4, (p2, p1) = capture.k, 0.004, capture.p
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
+    xs = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
+    ys = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+    u = capture.cx + xs * capture.fy + xs * 1.25 + ys * -0.75
+    np.testing.assert_allclose(view.lens.project(x, y), [u, capture.cy + ys * capture.fy], atol=1e-9)
+    scaled = view.lens.scaled(2 * files.WIDTH, 2 * files.HEIGHT)
+    np.testing.assert_allclose(scaled.project(x, y)[0], 2 * u, atol=1e-9)
+
+
+def test_metashape_fisheye(tmp_path):
+    capture = files.Posed()
+    files.metashape(capture, tmp_path / "cameras.xml", sensor_type="fisheye")
+    lens = read_metashape(tmp_path / "cameras.xml").views[0].lens
+    theta = np.arctan(np.hypot(0.9, 0.5))
+    x, y = np.array([0.9, 0.5]) / np.hypot(0.9, 0.5) * theta
+    radial = 1 + capture.k[0] * theta**2 + capture.k[1] * theta**4 + capture.k[2] * theta**6
+    u = x * radial + capture.p[1] * (theta**2 + 2 * x * x) + 2 * capture.p[0] * x * y
+    found = lens.project(np.array([0.9]), np.array([0.5]))[0][0]
+    assert found == pytest.approx(capture.cx + capture.fx * u, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2",
+     "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"],
+)  # fmt: skip
+def test_realitycapture_with_the_points_of_a_bundle(tmp_path, header):
+    capture = files.Posed(origin=UTM)
+    files.realitycapture(capture, capture.write_images(tmp_path) / "registration.csv", header)
+    files.bundler(capture, tmp_path / "bundle.out")
+    views, points, source = read(tmp_path)
+    assert residual(capture, views) < 1e-4
+    np.testing.assert_allclose(points.positions, capture.points, atol=1e-8)
+    assert source.cameras == "registration.csv (RealityCapture)"
+
+
+def test_realitycapture_angles_are_those_of_its_help(tmp_path):
+    rows = [
+        ["down.jpg", 0, 0, 0],
+        ["down_east.jpg", 90, 0, 0],
+        ["north.jpg", 0, 90, 0],
+        ["east.jpg", 90, 90, 0],
+    ]
+    text = "#name,heading,pitch,roll,x,y,alt,f\n"
+    text += "".join(",".join(map(str, row)) + ",1,2,3,30\n" for row in rows)
+    (tmp_path / "r.csv").write_text(text)
+    right, down, forward = np.stack(
+        [v.world_to_camera[:3, :3] for v in read_realitycapture(tmp_path / "r.csv").views], axis=1
+    )
+    np.testing.assert_allclose(forward, [[0, 0, -1], [0, 0, -1], [0, 1, 0], [1, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(-down, [[0, 1, 0], [1, 0, 0], [0, 0, 1], [0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(right[:2], [[1, 0, 0], [0, -1, 0]], atol=1e-12)
+
+
+def test_bundler(tmp_path):
+    capture = files.Posed(cx=files.WIDTH / 2, cy=files.HEIGHT / 2, k=(-0.1, 0.02, 0.0), p=(0.0, 0.0))
+    files.bundler(capture, capture.write_images(tmp_path) / "bundle.out")
+    views, points, source = read(tmp_path)
+    assert residual(capture, views) < 1e-9
+    np.testing.assert_array_equal(points.positions, capture.points)
+    np.testing.assert_array_equal(points.colors, capture.colors)
+    assert points.track_lengths.tolist() == [2] * 40
+    assert any("1 photographs of the project have no pose" in note for note in source.notes)
+
+
+def test_pix4d(tmp_path):
+    capture = files.Posed(origin=UTM)
+    files.pix4d(capture, capture.write_images(tmp_path) / "1_initial" / "params", UTM - [7, 8, 9])
+    views, _, source = read(tmp_path)
+    assert residual(capture, views, capture.points - UTM + [7, 8, 9]) < 1e-9
+    np.testing.assert_allclose(source.frame.to_world(np.array([1.0, 2, 3])), UTM + [-6, -6, -6], atol=1e-9)
+    assert source.frame.name == "WGS 84 / UTM zone 33N"
+    parameters = tmp_path / "1_initial" / "params" / "site_calibrated_camera_parameters.txt"
+    loaded = load_capture(parameters)
+    assert loaded.root == tmp_path and len(loaded.cameras) == 6
+
+
+def test_opf(tmp_path):
+    capture = files.Posed(origin=UTM)
+    files.opf(capture, capture.write_images(tmp_path), -UTM)
+    views, _, source = read(tmp_path)
+    assert residual(capture, views, capture.points - UTM) < 1e-7
+    assert source.frame.crs == "EPSG:32633"
+    np.testing.assert_allclose(source.frame.to_world(capture.points - UTM), capture.points, atol=1e-9)
+    assert any("1 photographs of the project have no pose" in note for note in source.notes)
+
+
+def test_opensfm(tmp_path):
+    pyproj = pytest.importorskip("pyproj")
+    capture = files.Posed()
+    files.opensfm(capture, capture.write_images(tmp_path) / "reconstruction.json", (47.5, 8.25, 432.0))
+    views, points, source = read(tmp_path)
+    assert residual(capture, views) < 1e-9
+    np.testing.assert_array_equal(points.positions, capture.points)
+    geodetic = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    place = geodetic.transform(*source.frame.to_world(np.array([0.0, 0.0, 100.0])))
+    np.testing.assert_allclose(place, [8.25, 47.5, 532.0], atol=1e-8)
+    north = geodetic.transform(*source.frame.to_world(np.array([0.0, 100.0, 0.0])))
+    assert north[1] - 47.5 == pytest.approx(100 / 111_178, rel=1e-3) and abs(north[0] - 8.25) < 1e-9
+    assert any("of 2 reconstructions" in note for note in source.notes)
+
+
+def test_opendronemap_offset_or_its_topocentric_original(tmp_path):
+    capture = files.Posed()
+    folder = capture.write_images(tmp_path) / "opensfm"
+    files.opensfm(capture, folder / "reconstruction.json")
+    (tmp_path / "odm_georeferencing").mkdir()
+    (tmp_path / "odm_georeferencing" / "coords.txt").write_text("WGS84 UTM 33S\n412345 5654321\n1 2 3\n")
+    _, _, source = read(tmp_path)
+    assert source.frame.crs == "EPSG:32733"
+    np.testing.assert_array_equal(source.frame.to_world(np.zeros(3)), [412345, 5654321, 0])
+    files.opensfm(capture, folder / "reconstruction.topocentric.json", (47.5, 8.25, 432.0))
+    _, _, source = read(tmp_path)
+    assert source.frame.crs == "EPSG:4978"
+
+
+def test_a_label_without_a_suffix_finds_its_photograph_in_a_folder(tmp_path):
+    capture = files.Posed(names=[f"flight_1/a{i}.JPG" for i in range(6)])
+    files.metashape(
+        capture, capture.write_images(tmp_path) / "export.xml", labels=[f"a{i}" for i in range(6)]
+    )
+    loaded = load_capture(tmp_path / "export.xml")
+    assert [camera.image_path.name for camera in loaded.cameras] == [f"a{i}.JPG" for i in range(6)]
+    assert loaded.cameras[0].name == "flight_1/a0.JPG"
+
+
+def test_several_projects_are_refused_by_name(tmp_path):
+    capture = files.Posed()
+    files.metashape(capture, capture.write_images(tmp_path) / "a.xml")
+    files.realitycapture(capture, tmp_path / "b.csv")
+    with pytest.raises(
+        ValueError, match=r"has 2 projects \(a.xml, b.csv\): name one of these files with --data"
+    ):
+        load_capture(tmp_path)
+    assert len(load_capture(tmp_path / "b.csv").cameras) == 6
+    with pytest.raises(FileNotFoundError, match="DJI_0000.JPG is no project that can be read"):
+        load_capture(tmp_path / "images" / "DJI_0000.JPG")
+
+
+def bomb(root):
+    levels = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10))
+    text = f'<!DOCTYPE d [<!ENTITY e0 "lol">{levels}]><document><chunk>&e9;</chunk></document>'
+    (root / "cameras.xml").write_text(text)
+
+
+def external(root):
+    text = '<!DOCTYPE d [<!ENTITY e SYSTEM "file:///etc/passwd">]><document><chunk>&e;</chunk></document>'
+    (root / "cameras.xml").write_text(text)
+
+
+def edited(write, name, old, new):
+    def damage(root):
+        write(files.Posed(), root / name)
+        text = (root / name).read_text()
+        assert old in text
+        (root / name).write_text(text.replace(old, new))
+
+    return damage
+
+
+def cut_bundle(root):
+    files.bundler(files.Posed(), root / "bundle.out")
+    (root / "bundle.out").write_text("\n".join((root / "bundle.out").read_text().splitlines()[:100]))
+
+
+def many_points(root):
+    files.bundler(files.Posed(), root / "bundle.out")
+    text = (root / "bundle.out").read_text().replace("7 40\n", "7 4000000000\n")
+    (root / "bundle.out").write_text(text)
+
+
+def cut_pix4d(root):
+    files.pix4d(files.Posed(), root / "params", UTM)
+    path = root / "params" / "site_calibrated_camera_parameters.txt"
+    path.write_text("\n".join(path.read_text().splitlines()[:-2]))
+
+
+def opf_without_calibration(root):
+    files.opf(files.Posed(), root, UTM)
+    content = json.loads((root / "project.opf").read_text())
+    content["items"] = content["items"][:2]
+    (root / "project.opf").write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (bomb, r"cameras.xml: line 1: no readable XML \(it defines entities"),
+        (external, r"cameras.xml: line 1: no readable XML \(it defines entities"),
+        (edited(files.metashape, "c.xml", "</cameras>", "</camera>"), r"c.xml: line \d+: no readable XML"),
+        (
+            edited(files.metashape, "c.xml", 'type="frame">', 'type="spherical">'),
+            "sensor 7: type 'spherical' makes",
+        ),
+        (
+            edited(files.metashape, "c.xml", "<f>81.5</f>", "<f>nan</f>"),
+            "sensor 7: f: expected a finite number",
+        ),
+        (
+            edited(files.metashape, "c.xml", 'height="72"/>\n<f>', 'height="1e9"/>\n<f>'),
+            "is no size of an image",
+        ),
+        (
+            edited(files.metashape, "c.xml", '"><transform>', '"><transform>2 '),
+            r"camera 0 .*transform: expected 16 num",
+        ),
+        (
+            edited(files.realitycapture, "r.csv", "DJI_0001.JPG,", "DJI_0001.JPG,x"),
+            "line 4: x: expected numbers",
+        ),
+        (edited(files.realitycapture, "r.csv", "DJI_0001.JPG,", ""), "line 4: 15 values in 16 columns"),
+        (cut_bundle, "bundle.out: 100 lines are too few for 7 cameras and 40 points"),
+        (many_points, "expected the numbers of cameras and points"),
+        (cut_pix4d, "58 lines are not 10 for each camera: it is cut off"),
+        (opf_without_calibration, r"the project has no application/opf-calibrated-cameras\+json"),
+        (
+            edited(files.opensfm, "reconstruction.json", "brown", "spherical"),
+            "'spherical' cannot be read; known:",
+        ),
+        (edited(files.opensfm, "reconstruction.json", '"shots"', '"shot"'), "the field shots is missing"),
+        (edited(files.opensfm, "reconstruction.json", "[{", "["), "reconstruction.json: no JSON"),
+        (
+            edited(files.opensfm, "reconstruction.json", '"width": 96', '"width": Infinity'),
+            "a finite number, got inf",
+        ),
+    ],
+)
+def test_damaged_and_hostile_projects_are_refused(tmp_path, damage, message):
+    files.Posed().write_images(tmp_path)
+    damage(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        load_capture(tmp_path)
