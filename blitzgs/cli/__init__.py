@@ -41,7 +41,10 @@ COMMANDS = {
     "eval": ("blitzgs.cli.evaluate", "measure PSNR and SSIM of a run's held-out views"),
     "render": ("blitzgs.cli.render", "render views of a model to pictures, or a path to a film"),
     "view": ("blitzgs.cli.view", "look at a model in the browser"),
-    "export": ("blitzgs.cli.export", "write a model as a PLY file for viewers, or as one HTML file to send"),
+    "export": (
+        "blitzgs.cli.export",
+        "write a model as PLY, SOG, SPZ, GLB ..., or as one HTML file to send",
+    ),
     "gate": ("blitzgs.cli.gate", "fit and evaluate spawn gates, which make smaller models"),
     "synth": (
         "blitzgs.cli.synth",

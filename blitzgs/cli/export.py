@@ -1,47 +1,64 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command `blitzgs export`: write a model as PLY, or as an HTML file with its viewer."""
+"""The command `blitzgs export`: write a model in a format of other programs, or as an HTML file."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import os
+import re
 import sys
 from pathlib import Path
 
-from blitzgs.cli.arguments import Commands, add_command, add_device, add_model, named_path
+import numpy as np
+import torch
+
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_model, named_path
+from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.ply import check_replaces_ply
+from blitzgs.formats.gaussians import GaussianSource, is_antialiased
+from blitzgs.formats.models import FORMATS, Format, check_replaces, offset_of, read_gaussians
+from blitzgs.formats.selection import Selected, Selection, read_polygon
 from blitzgs.formats.web_page import check_replaces_page
-from blitzgs.runs.export import COORDINATES, Exported, export_ply, without_antialiasing
+from blitzgs.runs.clean import cleaned
+from blitzgs.runs.export import COORDINATES, Exported, export, without_antialiasing
 from blitzgs.runs.files import run_and_checkpoint
-from blitzgs.runs.folder import open_run
+from blitzgs.runs.folder import Model, open_run
+from blitzgs.runs.source import open_source, source_of
 from blitzgs.util.output import write_file
 
 # Default of --max-mb, and the largest file whose text browsers still hold in one piece.
 MAX_MB, LARGEST_MB = 50, 500
 
 HELP = """\
-Write a model as a PLY file in INRIA's layout, which most viewers read, or as one HTML file to send:
+Write a model in a format of other programs, or as one HTML file to send:
 
-  blitzgs export RUN --ply MODEL.ply
-  blitzgs export RUN|CHECKPOINT|FILE.ply --html SCENE.html
+  blitzgs export RUN --ply MODEL.ply                      INRIA's layout, which most viewers read
+  blitzgs export RUN --sog MODEL.sog                      small, for the web
+  blitzgs export RUN|CHECKPOINT|FILE --html SCENE.html    the model and a viewer, opened from the disk
+  blitzgs export FILE.splat --spz MODEL.spz               a model of another program
 
-The HTML file has the model and a viewer in it; a browser opens it from the disk, without a server. The
-model is compressed. Where it would be larger than --max-mb, the SH degree is reduced, then the Gaussians
-that contribute least are left out; the page and the output of this command say how many.
+The guide's page on formats compares them. All but --ply, --glb and --html need packages:
+pip install "blitzgs[formats]".
 
-Georeferenced models are written around their own origin, because the file's float32 numbers cannot hold large
-coordinates. The offset is in the header (`comment offset X Y Z`) and in FILE.offset.json.
+Georeferenced models are written around their own origin, because the files' numbers cannot hold large
+coordinates. The offset is in FILE.offset.json and, where there is one, in the header.
 
-The file of a model trained with view.lod has all its Gaussians, and most viewers show them all. The last
+A PLY file of a model trained with view.lod has all its Gaussians, and most viewers show them all. The last
 property, `level`, is their octree level. The line
 `comment lod reference_distance D fork F levels K finest L` tells a viewer what a view keeps: level l up to
 the distance D * F^(1/2 - l), no level above L, and level 0 at any distance.
 
-A model trained with model.antialiased is marked `comment SplatRenderMode: mip`. For a viewer that does not
-know the mark, --classic multiplies the opacities by the compensation that antialiasing has at the distance
-of the training views; at other distances it is an approximation.
+A model trained with model.antialiased is marked in formats that can say so (PLY: `comment SplatRenderMode:
+mip`). For a viewer that does not know the mark, --classic multiplies the opacities by the compensation that
+antialiasing has at the distance of the training views; at other distances it is an approximation.
+
+--clean leaves out Gaussians that at most K training photographs saw and that are far from the rest or large:
+floaters, and the fringe of the model. It writes a picture of what went (FILE.clean.jpg), and prints the
+held-out PSNR before and after where the photographs are at hand.
+
+An HTML file larger than --max-mb is made smaller: first the SH degree is reduced, then the Gaussians that
+contribute least are left out; the page and the output of this command say how many.
 """
 
 
@@ -50,8 +67,10 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser = add_command(commands, "export", run, summary, HELP)
     add_model(parser)
     add_device(parser)
+    add_capture(parser)
     kind = parser.add_mutually_exclusive_group(required=True)
-    kind.add_argument("--ply", type=named_path, metavar="FILE", help="PLY file to write")
+    for name, found in FORMATS.items():
+        kind.add_argument(f"--{name}", type=named_path, metavar="FILE", help=f"{found.title} file to write")
     kind.add_argument("--html", type=named_path, metavar="FILE", help="HTML file to write")
     parser.add_argument(
         "--max-mb",
@@ -63,29 +82,67 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         "--coordinates",
         choices=COORDINATES,
         help="capture: the capture's coordinates; centred: relative to the model's origin; auto: the "
-        "capture's if float32 can hold them (default: auto)",
+        "capture's if the format can hold them (default: auto)",
     )
     parser.add_argument(
         "--classic",
         action="store_true",
         help="for viewers without antialiasing: write opacities that make up for it",
     )
+    parser.add_argument(
+        "--clean",
+        type=int,
+        nargs="?",
+        const=1,
+        metavar="K",
+        help="leave out floaters and fringes that at most K training photographs saw (default: %(const)s)",
+    )
+    parser.add_argument(
+        "--crop",
+        type=float,
+        nargs=6,
+        metavar=tuple("xyzXYZ"),
+        help="keep this box of the capture's coordinates",
+    )
+    parser.add_argument(
+        "--crop-polygon",
+        type=named_path,
+        metavar="FILE",
+        help='keep this region: a GeoJSON polygon, or lines "x y", in the capture\'s coordinates',
+    )
+    parser.add_argument(
+        "--crop-axes", choices=("xy", "xz", "yz"), help="axes of the polygon's corners (default: xy)"
+    )
+    parser.add_argument(
+        "--min-opacity", type=float, metavar="O", help="keep Gaussians of at least this opacity"
+    )
+    parser.add_argument(
+        "--most",
+        type=int,
+        metavar="N",
+        help="keep the N Gaussians that contribute most to views of the capture (of a file: of the largest "
+        "opacity times length)",
+    )
+    parser.add_argument("--sh-degree", type=int, choices=range(4), help="write at most this SH degree")
+    parser.add_argument(
+        "--levels", type=_levels, metavar="FIRST-LAST", help="keep these octree levels, for example 0-3"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Export the model of a run; returns the exit status."""
+    """Export a model; returns the exit status."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise ValueError("export writes one file from one process: run it without torchrun")
-    return _export_html(args) if args.html else _export_ply(args)
+    return _export_html(args) if args.html else _export_file(args)
 
 
 def _export_html(args: argparse.Namespace) -> int:
     from blitzgs.viewer.studio import open_model
     from blitzgs.viewer.web import web_file
 
-    for flag, given in (("--coordinates", args.coordinates), ("--classic", args.classic)):
-        if given:
-            raise ValueError(f"{flag} is for --ply; an HTML file needs no such choice")
+    for flag in (*_CHOICES, "coordinates", "classic", "clean"):
+        if getattr(args, flag):
+            raise ValueError(f"--{flag.replace('_', '-')} is not for --html: an HTML file has its own choice")
     path: Path = args.html
     if path.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"{path}: choose a --html that ends in .html")
@@ -101,25 +158,112 @@ def _export_html(args: argparse.Namespace) -> int:
     return 0
 
 
-def _export_ply(args: argparse.Namespace) -> int:
+def _export_file(args: argparse.Namespace) -> int:
     if args.max_mb:
-        raise ValueError("--max-mb is for --html; a PLY file has the whole model")
+        raise ValueError("--max-mb is for --html; --most N limits other files")
+    name = next(name for name in FORMATS if getattr(args, name.replace("-", "_")))
+    kind, path = FORMATS[name], getattr(args, name.replace("-", "_"))
+    check_replaces(path, kind)
+    selection = _selection(args)
+    path.parent.mkdir(parents=True, exist_ok=True)
     if args.model.is_file():
-        raise ValueError(f"{args.model} is a file: --ply takes the folder of a run, or a checkpoint in it")
-    _check_format(args.ply)
+        for flag in ("classic", "clean", "coordinates"):
+            if getattr(args, flag):
+                raise ValueError(f"--{flag} needs the folder of a run, and {args.model} is a file")
+        found = read_gaussians(args.model)
+        source: GaussianSource = found
+        if selection is not None:
+            source = Selected(found, selection, offset_of(found.comments))
+        kind.write(path, source)
+        written = Exported(None, None, 0.0)
+    else:
+        source, written = _export_run(args, kind, path, selection)
+    print(f"{path}: {len(source):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB")
+    for line in kind.unstated(source):
+        print(line, file=sys.stderr)
+    _explain(written, is_antialiased(source), kind, args)
+    return 0
+
+
+def _export_run(
+    args: argparse.Namespace, kind: Format, path: Path, selection: Selection | None
+) -> tuple[GaussianSource, Exported]:
+    """Write the model of a run; it is read into memory only if its views have to be rendered for that."""
     run_folder, checkpoint = run_and_checkpoint(args.model)
+    coordinates = args.coordinates or "auto"
+    wants_views = args.classic or args.clean is not None or args.most is not None
+    if not wants_views:
+        opened = open_source(run_folder, checkpoint)
+        source: GaussianSource = (
+            opened if selection is None else Selected(opened, selection, opened.space.offset)
+        )
+        return source, export(source, opened.space, kind, path, coordinates)
+    from blitzgs.viewer.studio import open_model
+    from blitzgs.viewer.web import contributions
+
+    kept, score = None, None
     with Ranks.from_environment(args.device) as ranks:
         folder = open_run(run_folder)
         model = folder.model(ranks.device, checkpoint)
-        antialiased = model.config.model.antialiased
-        if args.classic and antialiased:
+        if args.most is not None:
+            score = contributions(open_model(args.model, ranks)).cpu()
+        if args.clean is not None:
+            kept = _cleaned(model, run_folder, args, path, ranks)
+        if args.classic and model.config.model.antialiased:
             stored = folder.cameras()
             model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
-        args.ply.parent.mkdir(parents=True, exist_ok=True)
-        exported = export_ply(model, args.ply, args.coordinates or "auto")
-    print(f"{args.ply}: {len(model):,} Gaussians, {args.ply.stat().st_size / 1e6:.1f} MB")
-    _explain(exported, antialiased, args)
-    return 0
+    source = Selected(source_of(model), selection or Selection(), model.space.offset, kept, score)
+    return source, export(source, model.space, kind, path, coordinates)
+
+
+def _cleaned(model: Model, folder: Path, args: argparse.Namespace, path: Path, ranks: Ranks) -> torch.Tensor:
+    """Tell which Gaussians --clean keeps; write the picture, and print what it costs."""
+    cameras = open_run(folder).cameras()
+    found = cleaned(model, cameras, args.clean, ranks, photographs(folder, args.data))
+    picture = path.with_name(path.name + ".clean.jpg")
+    found.write_picture(picture)
+    gone = len(model) - int(found.kept.sum())
+    print(f"--clean: {gone:,} of {len(model):,} Gaussians go" + (f", see {picture}" if gone else ""))
+    if found.psnr is not None:
+        before, after = found.psnr
+        print(f"held-out PSNR: {before:.3f} dB before, {after:.3f} dB after")
+    return found.kept
+
+
+# Flags of a `Selection`.
+_CHOICES = ("crop", "crop_polygon", "min_opacity", "most", "sh_degree", "levels")
+
+
+def _selection(args: argparse.Namespace) -> Selection | None:
+    """Return what the flags choose; None: everything."""
+    if args.crop_axes and not args.crop_polygon:
+        raise ValueError("--crop-axes is for --crop-polygon")
+    if all(getattr(args, name) is None for name in _CHOICES):
+        return None
+    box = None if args.crop is None else np.array(args.crop).reshape(2, 3)
+    if box is not None and not (box[0] < box[1]).all():
+        raise ValueError(f"--crop takes the least x y z, then the largest, got {args.crop}")
+    if args.min_opacity is not None and not 0 <= args.min_opacity < 1:
+        raise ValueError(f"--min-opacity must be from 0 to below 1, got {args.min_opacity}")
+    for flag in ("most", "clean"):
+        if getattr(args, flag) is not None and getattr(args, flag) < 1:
+            raise ValueError(f"--{flag} must be at least 1, got {getattr(args, flag)}")
+    return Selection(
+        box=box,
+        polygon=None if args.crop_polygon is None else read_polygon(args.crop_polygon),
+        axes=("xyz".index((args.crop_axes or "xy")[0]), "xyz".index((args.crop_axes or "xy")[1])),
+        min_opacity=args.min_opacity or 0.0,
+        levels=args.levels,
+        sh_degree=args.sh_degree,
+        most=args.most,
+    )
+
+
+def _levels(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,3})(?:-(\d{1,3}))?", text)
+    if match is None or int(match[1]) > int(match[2] or match[1]):
+        raise argparse.ArgumentTypeError(f"must be two levels such as 0-3, or one, got {text}")
+    return int(match[1]), int(match[2] or match[1])
 
 
 def _megabytes(text: str) -> float:
@@ -132,23 +276,7 @@ def _megabytes(text: str) -> float:
     return value
 
 
-def _check_format(path: Path) -> None:
-    """Check that no file of another format is replaced, and that the name promises no other format.
-
-    Raises:
-        ValueError: the name does not end in .ply.
-        FileExistsError: the file is not empty and no PLY.
-        OSError: it is no regular file.
-    """
-    if path.exists() or path.is_symlink():
-        check_replaces_ply(path)
-    if path.suffix.lower() != ".ply":
-        raise ValueError(
-            f"{path}: the file will be a PLY, whatever its name: choose a --ply that ends in .ply"
-        )
-
-
-def _explain(exported: Exported, antialiased: bool, args: argparse.Namespace) -> None:
+def _explain(exported: Exported, antialiased: bool, kind: Format, args: argparse.Namespace) -> None:
     """Print what a user of the file must know: offset, rounding, antialiasing."""
     if exported.offset is not None:
         x, y, z = exported.offset
@@ -159,7 +287,7 @@ def _explain(exported: Exported, antialiased: bool, args: argparse.Namespace) ->
         print("--classic changes nothing: the model was trained without model.antialiased", file=sys.stderr)
     elif args.classic:
         print("antialiasing is baked into the opacities: right at the training views' distance, else nearly")
-    elif antialiased:
+    elif antialiased and kind.title.endswith("PLY"):
         print(
             "the model is antialiased (comment SplatRenderMode: mip): viewers that do not know this show it "
             "too opaque; for those, export with --classic",

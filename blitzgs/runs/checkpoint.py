@@ -192,7 +192,7 @@ def load_latest(
     Raises:
         CheckpointError: checkpoints exist, but none is sound.
     """
-    found = ranks.broadcast_object(_names(Path(directory)) if ranks.rank == 0 else [])
+    found = ranks.broadcast_object(names_of(Path(directory)) if ranks.rank == 0 else [])
     refused = []
     for name in reversed(found) if only is None else [only]:
         try:
@@ -235,12 +235,9 @@ def load(
     path = Path(path)
     manifest, problem = None, None
     try:
-        manifest = _read_manifest(path)
         # Each rank checks some of the files, so that every file is read for its digest once.
         with ranks.watchdog.working("reading a checkpoint"):
-            files = [*manifest.shards, *([manifest.shared] if manifest.shared else [])]
-            for shard in files[ranks.rank :: ranks.world_size]:
-                _verify(path, shard)
+            manifest = verified(path, ranks.rank, ranks.world_size)
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         problem = str(error) or type(error).__name__
     problems = [text for text in ranks.all_gather_object(problem) if text]
@@ -254,7 +251,9 @@ def load(
 
 
 @dataclass
-class _Manifest:
+class Manifest:
+    """The files of a checkpoint, and its state."""
+
     shards: list[Shard]
     shared: Shard | None
     state: dict[str, Any]
@@ -293,7 +292,19 @@ def _opened(path: Path) -> Iterator[Any]:
             yield shard
 
 
-def _read_manifest(path: Path) -> _Manifest:
+def verified(path: Path, part: int = 0, parts: int = 1) -> Manifest:
+    """Read the manifest of a checkpoint, and compare part of the files with their digests.
+
+    Raises:
+        OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError: it is damaged.
+    """
+    manifest = _read_manifest(path)
+    for shard in [*manifest.shards, *([manifest.shared] if manifest.shared else [])][part::parts]:
+        _verify(path, shard)
+    return manifest
+
+
+def _read_manifest(path: Path) -> Manifest:
     try:
         content = json.loads((path / MANIFEST).read_text())
     except FileNotFoundError:
@@ -309,7 +320,7 @@ def _read_manifest(path: Path) -> _Manifest:
     shards = [Shard(**shard) for shard in content["shards"]]
     if not shards:
         raise ValueError(f"{MANIFEST} names no files")
-    return _Manifest(shards, None if shared is None else Shard(**shared), content["state"])
+    return Manifest(shards, None if shared is None else Shard(**shared), content["state"])
 
 
 def _digest(content: Mapping[str, Any]) -> str:
@@ -363,7 +374,7 @@ def _finish(
 
 def _delete_old(directory: Path, keep: int, reached: Callable[[str], None]) -> None:
     """Delete all but the newest `keep`."""
-    for name in _names(directory)[:-keep]:
+    for name in names_of(directory)[:-keep]:
         # Rename first: an interrupted deletion must not leave half a checkpoint under a final name.
         (directory / name).rename(directory / (_UNFINISHED + name))
         reached("old one renamed")
@@ -376,7 +387,7 @@ def _delete_unfinished(directory: Path) -> None:
         shutil.rmtree(leftover, ignore_errors=True)
 
 
-def _names(directory: Path) -> list[str]:
+def names_of(directory: Path) -> list[str]:
     if not directory.is_dir():
         return []
     names = (entry.name for entry in directory.iterdir() if _NAME.fullmatch(entry.name))
@@ -388,7 +399,7 @@ def _number(name: str) -> int:
 
 
 def _next_name(directory: Path) -> str:
-    names = _names(directory)
+    names = names_of(directory)
     return f"checkpoint_{_number(names[-1]) + 1 if names else 0:06d}"
 
 

@@ -204,15 +204,7 @@ def restore(
     check_own(folder, folder / CHECKPOINTS / loaded.name, str(state.get("run", "")), ranks)
     why = "the newest sound one" if loaded.refused else "the newest"
     skipped = f"; {len(loaded.refused)} newer refused" if loaded.refused else ""
-    try:
-        known = {field.name for field in dataclasses.fields(Progress)}
-        progress = Progress(**{name: value for name, value in state["progress"].items() if name in known})
-        space = Space(**(state["space"] | {"offset": tuple(state["space"]["offset"])}))
-        config = from_dict(state["config"])
-    except (LookupError, TypeError, AttributeError, ConfigError) as error:
-        raise CheckpointError(
-            f"checkpoint {folder / CHECKPOINTS / loaded.name} belongs to another version of BlitzGS: {error}"
-        ) from error
+    progress, space, config = parsed(state, folder / CHECKPOINTS / loaded.name)
     return Restored(
         GaussianTable(loaded.columns),
         progress,
@@ -222,6 +214,21 @@ def restore(
         f"{loaded.name} ({why}{skipped})",
         loaded.shared,
     )
+
+
+def parsed(state: Mapping[str, Any], path: Path) -> tuple[Progress, Space, Config]:
+    """Return what the state of a checkpoint says.
+
+    Raises:
+        CheckpointError: it is that of another version of the program.
+    """
+    try:
+        known = {field.name for field in dataclasses.fields(Progress)}
+        progress = Progress(**{name: value for name, value in state["progress"].items() if name in known})
+        space = Space(**(state["space"] | {"offset": tuple(state["space"]["offset"])}))
+        return progress, space, from_dict(state["config"])
+    except (LookupError, TypeError, AttributeError, ConfigError) as error:
+        raise CheckpointError(f"checkpoint {path} belongs to another version of BlitzGS: {error}") from error
 
 
 def _problem_of_columns(columns: dict[str, torch.Tensor]) -> str | None:

@@ -37,10 +37,11 @@ _CHUNK_BYTES = 64 << 20
 
 @dataclass
 class ColumnSpec:
-    """Dtype and shape of one column of a shard file."""
+    """Dtype, shape and first byte of one column of a shard file."""
 
     dtype: torch.dtype
     shape: tuple[int, ...]
+    start: int
 
 
 def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[str], None]) -> tuple[int, str]:
@@ -110,14 +111,30 @@ def _chunks(column: Tensor) -> Iterator[memoryview]:
 
 
 def header_of(path: Path) -> dict[str, ColumnSpec]:
-    """Read the names, dtypes and shapes of the columns in a safetensors file."""
+    """Read the names, dtypes, shapes and places of the columns in a safetensors file."""
     with open(path, "rb") as file:
         head = json.loads(file.read(int.from_bytes(file.read(8), "little")))
+        body = file.tell()
     return {
-        name: ColumnSpec(_BY_NAME[entry["dtype"]], tuple(entry["shape"]))
+        name: ColumnSpec(_BY_NAME[entry["dtype"]], tuple(entry["shape"]), body + entry["data_offsets"][0])
         for name, entry in head.items()
         if name != "__metadata__"
     }
+
+
+def read_rows(path: Path, first: int, last: int) -> dict[str, Tensor]:
+    """Read the rows from `first` to before `last` of all columns in a safetensors file."""
+    columns = {}
+    with open(path, "rb") as file:
+        for name, spec in header_of(path).items():
+            shape = (min(last, spec.shape[0]) - first, *spec.shape[1:])
+            column = torch.empty(shape, dtype=spec.dtype)
+            data = memoryview(column.view(-1).view(torch.uint8).numpy())
+            file.seek(spec.start + first * (len(data) // shape[0]))
+            if file.readinto(data) != len(data):
+                raise ValueError(f"{path} is cut off")
+            columns[name] = column
+    return columns
 
 
 def file_digest(path: Path) -> str:

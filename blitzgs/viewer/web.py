@@ -7,24 +7,21 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from blitzgs.capture.cameras import downscaled_size, scaled_matrix
+from blitzgs.formats.selection import opacity_length
 from blitzgs.formats.web_page import WebLevels, WebScene, WebSplats, estimated_bytes, frame_bytes, web_page
-from blitzgs.frame.frame import Views
-from blitzgs.population.importance import ViewBatch, sweep
+from blitzgs.runs.clean import contributions as measured
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.gate import SceneGate
-from blitzgs.view.views import CameraLike, viewmat
 from blitzgs.viewer.studio import Opened
 from blitzgs.viewer.world import SCALE, World
 
 # A fainter Gaussian touches no pixel (docs/image.md, step 3).
 _FAINTEST = 1 / 255
-# Contributions are measured in so many of the capture's views, at most so wide.
-_VIEWS, _WIDTH = 32, 800
+# Contributions are measured in so many of the capture's views.
+_VIEWS = 32
 
 
 @dataclass(frozen=True)
@@ -105,23 +102,10 @@ def contributions(opened: Opened) -> Tensor:
     """
     table, exhibit, subject = opened.table, opened.exhibit, opened.subject
     if not exhibit.cameras:
-        return table["opacities"].sigmoid().log() + table["scales"].max(dim=1).values
+        return opacity_length(table["opacities"], table["scales"])
     chosen = np.unique(np.linspace(0, len(exhibit.cameras) - 1, _VIEWS).round().astype(int))
-    batches = [_batch(column, exhibit.cameras[index], opened) for column, index in enumerate(chosen)]
-    ranks = opened.ranks
-    return sweep(
-        subject.scene, batches, len(chosen), subject.options, ranks, rule="weight", lod=subject.lod
-    ).score
-
-
-def _batch(column: int, camera: CameraLike, opened: Opened) -> ViewBatch:
-    width, height = downscaled_size(camera.width, camera.height, max(1.0, camera.width / _WIDTH))
-    K = scaled_matrix(camera.K, (camera.width, camera.height), (width, height))  # noqa: N806
-    pose = viewmat(camera, opened.exhibit.space)
-    viewmats, Ks = (  # noqa: N806
-        torch.from_numpy(matrix).float()[None].to(opened.table.device) for matrix in (pose, K)
-    )
-    return ViewBatch([column], Views(viewmats, Ks, width, height))
+    cameras = [exhibit.cameras[index] for index in chosen]
+    return measured(table, cameras, exhibit.space, subject.options, opened.ranks, subject.lod).score
 
 
 def _splats(table: GaussianTable, rows: Tensor, degree: int, levels: bool) -> WebSplats:

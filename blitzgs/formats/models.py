@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models of Gaussians in the formats of other programs: which there are, and how each is read and written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from blitzgs.formats import packed
+from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased
+from blitzgs.formats.glb import write_glb
+from blitzgs.formats.ply import read_ply, save_ply
+from blitzgs.util.output import check_replaceable
+
+_HEADER = 1 << 16
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format that models are written in.
+
+    Attributes:
+        title: what it is.
+        suffix: end of its files' names.
+        write: writes a file; the file appears under its name only when it is complete.
+        starts: how its files begin, of which one is true; empty: nothing tells.
+        states: what its viewers find in the file besides the Gaussians.
+        harmonics: whether it holds SH coefficients beyond the DC.
+        streams: whether it is written in bounded memory.
+    """
+
+    title: str
+    suffix: str
+    write: Callable[[Path, GaussianSource], None]
+    starts: tuple[bytes, ...] = ()
+    states: tuple[str, ...] = ()
+    harmonics: bool = True
+    streams: bool = False
+
+    def unstated(self, source: GaussianSource) -> list[str]:
+        """Return what a viewer of the file will not know of a model, each a sentence without a full stop."""
+        lost = []
+        if is_antialiased(source) and "antialiasing" not in self.states:
+            lost.append(
+                f"{self.title} cannot say that the model is antialiased, so viewers show it too opaque: "
+                "export with --classic"
+            )
+        if source.has_levels and "levels" not in self.states:
+            lost.append(f"{self.title} has no octree levels: viewers show all Gaussians")
+        if source.degree > 0 and not self.harmonics:
+            lost.append(f"{self.title} holds one colour a Gaussian: colours that depend on the view are lost")
+        return lost
+
+
+# By the name of the flag of `blitzgs export`.
+FORMATS = {
+    "ply": Format(
+        "PLY", ".ply", save_ply, (b"ply",), ("antialiasing", "levels"), streams=True
+    ),
+    "compressed-ply": Format(
+        "compressed PLY", ".ply", packed.write_compressed_ply, (b"ply",), ("antialiasing",)
+    ),
+    "splat": Format(".splat", ".splat", packed.write_splat, harmonics=False),
+    "spz": Format("SPZ", ".spz", packed.write_spz, (b"\x1f\x8b", b"NGSP"), ("antialiasing",)),
+    "sog": Format("SOG", ".sog", packed.write_sog, (b"PK",), ("antialiasing",)),
+    "glb": Format("GLB", ".glb", write_glb, (b"glTF",), ("levels",), streams=True),
+}  # fmt: skip
+
+
+def check_replaces(path: Path, kind: Format) -> None:
+    """Check the name of a file to write, and that no file of another format is replaced.
+
+    Raises:
+        ValueError: the name has another suffix than files of the format.
+        FileExistsError: the file is not empty and no file of the format.
+        OSError: it is no regular file.
+    """
+    check_replaceable(path)
+    if path.exists() and kind.starts:
+        with open(path, "rb") as file:
+            start = file.read(4)
+        if start and not start.startswith(kind.starts):
+            raise FileExistsError(f"{path} exists and is not a {kind.title} file: choose another name")
+    if path.suffix.lower() != kind.suffix:
+        raise ValueError(f"{path}: the file will be {kind.title}: choose a name that ends in {kind.suffix}")
+
+
+def read_gaussians(path: Path | str) -> Gaussians:
+    """Read a model that any program wrote: PLY (INRIA's layout or compressed), SPZ, SOG or .splat.
+
+    Formats but INRIA's PLY need the packages of `pip install "blitzgs[formats]"`.
+
+    Raises:
+        ValueError: the file is damaged, no model, or holds values that cannot be shown; names the file.
+        ImportError: a package is missing; says which.
+    """
+    path = Path(path)
+    with open(path, "rb") as file:
+        start = file.read(_HEADER)
+    if start.startswith(b"ply"):
+        header = start.partition(b"end_header")[0]
+        found = packed.read_compressed_ply(path) if b" packed_position" in header else read_ply(path)
+    elif start.startswith((b"\x1f\x8b", b"NGSP")):
+        found = packed.read_spz(path)
+    elif start.startswith(b"PK"):
+        found = packed.read_sog(path)
+    elif path.suffix.lower() == ".splat":
+        found = packed.read_splat(path)
+    else:
+        raise ValueError(f"{path} is no model: PLY, compressed PLY, SPZ, SOG and .splat files are read")
+    try:
+        found.check()
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return found
+
+
+def with_degree(model: Gaussians, degree: int) -> Gaussians:
+    """Return Gaussians with another SH degree: coefficients are left out, or zero."""
+    k = (degree + 1) ** 2
+    sh = torch.zeros(len(model), k, 3)
+    sh[:, : model.sh.shape[1]] = model.sh[:, :k]
+    return replace(model, sh=sh)
+
+
+def offset_of(comments: list[str]) -> tuple[float, float, float]:
+    """Return the offset that `blitzgs export` writes into a header; zero: there is none."""
+    for line in comments:
+        words = line.split()
+        if words[:2] == ["comment", "offset"] and len(words) == 5:
+            x, y, z = (float(word) for word in words[2:])
+            return x, y, z
+    return 0.0, 0.0, 0.0

@@ -1,0 +1,403 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compressed formats, through the packages gsply and gaussforge.
+
+The packages trust what a file says about itself, so counts and sizes are compared with the file and with the
+free memory before they see it. Each file is written with the package whose result both read right: gaussforge
+0.6 orders the SH coefficients of compressed PLY files wrongly, and gsply 0.4 writes no SOG.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import json
+import re
+import struct
+import zipfile
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import psutil
+import torch
+
+from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource, is_antialiased, unit_quats
+from blitzgs.util.output import new_file
+
+# Deflate compresses by at most this factor.
+_DEFLATE = 1040
+_SPZ_MAGIC = 0x5053474E
+_SPZ_ANTIALIASED = 1
+# An SPZ file may end with extensions.
+_SPZ_EXTENSIONS = 1 << 20
+_META_BYTES = 64 << 20
+# Largest palette of SH coefficients, in pixels.
+_PALETTE = 1 << 20
+_SH_C0 = 0.28209479177387814
+_COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
+# Signs of the SH coefficients after half a turn about x, in the order of INRIA's basis.
+_HALF_TURN = torch.tensor([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=torch.float32)
+
+
+def _package(name: str) -> ModuleType:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ImportError(
+            f'this format needs the package {name} ({error}): pip install "blitzgs[formats]"'
+        ) from error
+
+
+def _check_room(path: Path, count: int, degree: int) -> None:
+    """Refuse a number of Gaussians that memory cannot hold, twice, as the packages and torch do."""
+    needed = 2 * 4 * count * (14 + 3 * _COEFFICIENTS[degree])
+    free = psutil.virtual_memory().available
+    if needed > free:
+        raise ValueError(
+            f"{path} says that it holds {count:,} Gaussians: reading them takes {needed / 1e9:,.1f} GB of "
+            f"memory, and {free / 1e9:,.1f} GB are free"
+        )
+
+
+def collected(source: GaussianSource) -> Gaussians:
+    """Return all Gaussians of a source in one piece, with unit quaternions and without normals.
+
+    Raises:
+        ValueError: there is none, or a value cannot be shown.
+    """
+    if len(source) == 0:
+        raise ValueError("the model has no Gaussian, and this format holds no empty model")
+    blocks = [source] if isinstance(source, Gaussians) else list(source.blocks())
+    for block in blocks:
+        block.check()
+    names = ("means", "quats", "scales", "opacities", "sh")
+    columns = {name: torch.cat([getattr(block, name) for block in blocks]) for name in names}
+    columns["quats"] = unit_quats(columns["quats"]).float()
+    return Gaussians(**columns, comments=source.comments)
+
+
+def _write(path: Path, content: bytes) -> None:
+    with new_file(path) as partial:
+        partial.write_bytes(content)
+
+
+# --- gaussforge: bytes of float32 columns, coefficients by Gaussian, then coefficient, then channel ---
+
+
+def _forged(model: Gaussians, kind: str) -> bytes:
+    columns = {
+        "positions": model.means,
+        "scales": model.scales,
+        "rotations": model.quats,
+        "alphas": model.opacities,
+        "colors": model.sh[:, 0],
+        "sh": model.sh[:, 1:],
+    }
+    content: dict[str, Any] = {
+        name: np.ascontiguousarray(column.numpy(), dtype="<f4").tobytes() for name, column in columns.items()
+    }
+    meta = {"shDegree": model.degree, "sourceFormat": "ply", "antialiased": is_antialiased(model)}
+    content |= {"numPoints": len(model), "extras": {}, "meta": meta}
+    result = _package("gaussforge").GaussForge().write(content, kind)
+    if "error" in result:
+        raise ValueError(f"gaussforge cannot write the model as {kind}: {result['error']}")
+    return bytes(result["data"])
+
+
+def _unforged(path: Path, kind: str) -> Gaussians:
+    try:
+        result = _package("gaussforge").GaussForge().read(path.read_bytes(), kind)
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if "error" in result:
+        raise ValueError(f"{path} is damaged: {result['error']}")
+    content = result["data"]
+    count, k = int(content["numPoints"]), _COEFFICIENTS.get(content["meta"]["shDegree"], 0)
+    shapes = {"positions": (3,), "rotations": (4,), "scales": (3,), "alphas": (), "colors": (3,)}
+    shapes |= {"sh": (k - 1, 3)}
+    columns = {}
+    for name, shape in shapes.items():
+        values = np.frombuffer(content[name], dtype="<f4")
+        if k == 0 or values.size != count * int(np.prod(shape)):
+            raise ValueError(f"{path} is damaged: {values.size:,} {name} for {count:,} Gaussians")
+        columns[name] = torch.from_numpy(values.reshape(count, *shape).copy())
+    return Gaussians(
+        means=columns["positions"],
+        quats=columns["rotations"],
+        scales=columns["scales"],
+        opacities=columns["alphas"],
+        sh=torch.cat([columns["colors"][:, None], columns["sh"]], dim=1),
+    )
+
+
+# --- gsply ---
+
+
+def _gsdata(model: Gaussians) -> Any:
+    rest = model.sh[:, 1:].contiguous().numpy()
+    return _package("gsply").GSData.from_arrays(
+        means=model.means.numpy(),
+        scales=model.scales.numpy(),
+        quats=model.quats.numpy(),
+        opacities=model.opacities.numpy(),
+        sh0=model.sh[:, 0].contiguous().numpy(),
+        shN=rest if model.degree > 0 else None,
+        format="ply",
+    )
+
+
+# --- compressed PLY: chunks of 256 Gaussians, as SuperSplat writes them ---
+
+
+def write_compressed_ply(path: Path, source: GaussianSource) -> None:
+    """Write a compressed PLY file, with the header lines of the model."""
+    model = collected(source)
+    content: bytes = _package("gsply").compress_to_bytes(_gsdata(model))
+    first, second, rest = content.split(b"\n", 2)
+    lines = [line.encode() for line in model.comments]
+    _write(path, b"\n".join([first, second, *lines, rest]))
+
+
+def read_compressed_ply(path: Path) -> Gaussians:
+    """Read a compressed PLY file.
+
+    Raises:
+        ValueError: the file is damaged; names the file and the reason.
+    """
+    with open(path, "rb") as file:
+        start = file.read(1 << 16)
+    header, found, _ = start.partition(b"end_header\n")
+    if not found:
+        raise ValueError(f"{path}: the header of the PLY file does not end")
+    text = header.decode("ascii", "replace")
+    elements = {name: int(count) for name, count in re.findall(r"^element (\w+) (\d{1,18})\s*$", text, re.M)}
+    count, chunks = elements.get("vertex", 0), elements.get("chunk", 0)
+    rest = len(re.findall(r"^property uchar f_rest_\d+\s*$", text, re.M)) if "sh" in elements else 0
+    degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(rest)
+    if degree is None:
+        raise ValueError(f"{path}: {rest} f_rest properties fit no SH degree (0, 9, 24 or 45 do)")
+    columns = len(re.findall(r"^property float (?:min|max)_\w+\s*$", text, re.M))
+    if columns not in (12, 18) or chunks != -(-count // 256) or elements.get("sh", count) != count:
+        raise ValueError(
+            f"{path}: {chunks:,} chunks of {columns} numbers and {elements.get('sh', count):,} rows of SH do "
+            f"not fit {count:,} Gaussians"
+        )
+    size = len(header) + len(found) + chunks * columns * 4 + count * (16 + rest)
+    if path.stat().st_size < size:
+        raise ValueError(f"{path} is cut off: {path.stat().st_size:,} of {size:,} bytes")
+    _check_room(path, count, degree)
+    comments = [line for line in text.splitlines() if line.startswith(("comment ", "obj_info "))]
+    return replace(_unforged(path, "compressed.ply"), comments=comments)
+
+
+# --- .splat: 32 bytes a Gaussian, without header ---
+
+_SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
+
+
+def write_splat(path: Path, source: GaussianSource) -> None:
+    """Write a .splat file, which holds no SH coefficients beyond the DC."""
+    model = collected(source)
+    _write(path, _forged(replace(model, sh=model.sh[:, :1]), "splat"))
+
+
+def read_splat(path: Path) -> Gaussians:
+    """Read a .splat file: positions, linear scales, RGB and opacity as bytes, quaternion (w first) as bytes.
+
+    Raises:
+        ValueError: the size fits no number of Gaussians, or a scale is not positive.
+    """
+    size = path.stat().st_size
+    if size % _SPLAT.itemsize:
+        raise ValueError(f"{path} is cut off: {size:,} bytes are no multiple of {_SPLAT.itemsize}")
+    _check_room(path, size // _SPLAT.itemsize, 0)
+    rows = np.fromfile(path, dtype=_SPLAT)
+    if not (rows["scale"] >= 0).all():
+        first = int((~(rows["scale"] >= 0)).any(axis=1).nonzero()[0][0])
+        raise ValueError(f"{path}: Gaussian {first} has the scale {rows['scale'][first]}")
+    colors = rows["color"].astype(np.float64) / 255
+    with np.errstate(divide="ignore"):
+        scales = np.log(rows["scale"])
+    # The opacities 0 and 1 have no logit.
+    opacities = np.clip(colors[:, 3], 1e-4, 1 - 1e-4)
+    return Gaussians(
+        means=torch.from_numpy(rows["mean"].copy()),
+        quats=torch.from_numpy((rows["quat"].astype(np.float32) - 128) / 128),
+        scales=torch.from_numpy(np.maximum(scales, -30)),
+        opacities=torch.from_numpy(np.log(opacities / (1 - opacities))).float(),
+        sh=torch.from_numpy((colors[:, None, :3] - 0.5) / _SH_C0).float(),
+    )
+
+
+# --- SPZ: fixed-point columns, deflated; y up and z towards the viewer, half a turn about x from PLY files ---
+
+
+def write_spz(path: Path, source: GaussianSource) -> None:
+    """Write an SPZ file of version 3, which all its readers know."""
+    model = _half_turn(collected(source))
+    largest = max(float(model.means.abs().max()), 1e-3)
+    # Positions have 24 bits. The step shall be a 16th of the median Gaussian or less, if the range permits.
+    middle = float(model.scales.median(dim=1).values.median().clamp(-15, 15).exp())
+    bits = int(np.clip(np.ceil(np.log2(16 / middle)), 12, 24))
+    bits = max(1, min(bits, int(np.floor(np.log2((2**23 - 1) / largest)))))
+    with new_file(path) as partial:
+        _package("gsply").write_spz(partial, _gsdata(model), fractional_bits=bits)
+        if is_antialiased(model):
+            content = bytearray(zlib.decompress(partial.read_bytes(), wbits=31))
+            content[14] |= _SPZ_ANTIALIASED
+            pack = zlib.compressobj(6, wbits=31)
+            partial.write_bytes(pack.compress(content) + pack.flush())
+
+
+def read_spz(path: Path) -> Gaussians:
+    """Read an SPZ file of version 1 to 4.
+
+    Raises:
+        ValueError: the file is damaged; names the file and the reason.
+    """
+    with open(path, "rb") as file:
+        start = file.read(32)
+    deflated = not start.startswith(b"NGSP")
+    if deflated:
+        start = _inflated(path, 16, None)
+    if len(start) < 16:
+        raise ValueError(f"{path} is cut off: it has no whole header")
+    magic, version, count, degree, _, flags = struct.unpack_from("<IIIBBB", start)
+    if magic != _SPZ_MAGIC or version not in (1, 2, 3, 4):
+        raise ValueError(f"{path} is no SPZ file of version 1 to 4")
+    if degree not in _COEFFICIENTS:
+        raise ValueError(f"{path}: SH degree {degree} is not supported, 0 to 3 are")
+    size = 16 + count * (16 + (4 if version >= 3 else 3) + 3 * (_COEFFICIENTS[degree] - 1))
+    _check_room(path, count, degree)
+    if deflated:
+        if size > _DEFLATE * path.stat().st_size:
+            raise ValueError(f"{path}: {path.stat().st_size:,} bytes cannot hold {count:,} Gaussians")
+        _inflated(path, size, _SPZ_EXTENSIONS)
+    try:
+        found = _package("gsply").read_spz(path)
+    except Exception as error:  # the package raises what its parts raise
+        if isinstance(error, (ImportError, MemoryError)):
+            raise
+        raise ValueError(f"{path} is damaged: {error}") from error
+    sh = torch.from_numpy(found.sh0)[:, None]
+    if degree > 0:
+        sh = torch.cat([sh, torch.from_numpy(found.shN)], dim=1)
+    return _half_turn(
+        Gaussians(
+            means=torch.from_numpy(found.means),
+            quats=torch.from_numpy(found.quats),
+            scales=torch.from_numpy(found.scales),
+            opacities=torch.from_numpy(found.opacities).reshape(-1),
+            sh=sh,
+            comments=[MIP] if flags & _SPZ_ANTIALIASED else [],
+        )
+    )
+
+
+def _inflated(path: Path, size: int, more: int | None) -> bytes:
+    """Return the first bytes of a deflated file; with `more`, check that it has `size` and so many more."""
+    inflate, start, total = zlib.decompressobj(31), b"", 0
+    try:
+        with open(path, "rb") as file:
+            while not inflate.eof and (data := inflate.unconsumed_tail or file.read(1 << 20)):
+                part = inflate.decompress(data, 1 << 20)
+                start, total = start + part[: 16 - len(start)], total + len(part)
+                if more is None and len(start) == 16:
+                    return start
+                if more is not None and total > size + more:
+                    raise ValueError(
+                        f"{path} is damaged: it inflates to more than the {size:,} bytes it names"
+                    )
+    except zlib.error as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if more is not None and (total < size or not inflate.eof):
+        raise ValueError(f"{path} is cut off: {total:,} of {size:,} bytes")
+    return start
+
+
+def _half_turn(model: Gaussians) -> Gaussians:
+    """Return Gaussians after half a turn about x: (x, y, z) -> (x, -y, -z)."""
+    signs = torch.tensor([1.0, 1.0, -1.0, -1.0])
+    sh = model.sh * _HALF_TURN[: model.sh.shape[1], None]
+    return replace(model, means=model.means * signs[1:], quats=model.quats * signs, sh=sh)
+
+
+# --- SOG: WebP pictures of quantised columns in a ZIP archive ---
+
+
+def write_sog(path: Path, source: GaussianSource) -> None:
+    """Write an SOG file; the order of the Gaussians changes."""
+    content = io.BytesIO(_forged(collected(source), "sog"))
+    if is_antialiased(source):
+        # The package has no way to say so.
+        archive, content = zipfile.ZipFile(content), io.BytesIO()
+        with zipfile.ZipFile(content, "w") as marked:
+            for name in archive.namelist():
+                part = archive.read(name)
+                if name == "meta.json":
+                    part = json.dumps(json.loads(part) | {"antialias": True}).encode()
+                marked.writestr(zipfile.ZipInfo(name), part)
+    _write(path, content.getvalue())
+
+
+def read_sog(path: Path) -> Gaussians:
+    """Read an SOG file (a ZIP archive).
+
+    Raises:
+        ValueError: the file is damaged, or inflates to more than its pictures can need.
+    """
+    try:
+        antialiased = _check_sog(path)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    except (LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged: meta.json lacks a field or has one of another kind") from error
+    return replace(_unforged(path, "sog"), comments=[MIP] if antialiased else [])
+
+
+def _check_sog(path: Path) -> bool:
+    """Compare the parts of an SOG file with its count; return whether the model is antialiased."""
+    with zipfile.ZipFile(path) as archive:
+        entries = {entry.filename: entry for entry in archive.infolist()}
+        if "meta.json" not in entries:
+            raise ValueError(f"{path}: the archive has no meta.json")
+        if entries["meta.json"].file_size > _META_BYTES:
+            raise ValueError(f"{path}: meta.json has {entries['meta.json'].file_size:,} bytes")
+        meta = json.loads(archive.read("meta.json"))
+        count = meta["count"] if "version" in meta else meta["means"]["shape"][0]
+        if type(count) is not int or count < 1:
+            raise ValueError(f"{path}: meta.json names {count!r} Gaussians")
+        _check_room(path, count, 3)
+        for part in ("means", "scales", "quats", "sh0", "shN"):
+            if part not in meta and part == "shN":
+                continue
+            for book in [meta[part]["codebook"]] if "codebook" in meta[part] else []:
+                if len(book) != 256 or not np.isfinite(np.array(book, dtype=np.float64)).all():
+                    raise ValueError(f"{path}: the codebook of {part} is not 256 finite numbers")
+            for name in meta[part]["files"]:
+                if name not in entries:
+                    raise ValueError(f"{path}: the archive has no {name}")
+                largest = max(2 * count, _PALETTE) + (1 << 16)
+                if entries[name].file_size > 8 * largest:
+                    raise ValueError(f"{path}: {name} inflates to {entries[name].file_size:,} bytes")
+                width, height = _webp_size(archive.read(name), f"{path}: {name}")
+                least = 1 if "centroids" in name else count
+                if not least <= width * height <= largest:
+                    raise ValueError(f"{path}: {name} has {width} x {height} pixels for {count:,} Gaussians")
+        return bool(meta.get("antialias", False))
+
+
+def _webp_size(data: bytes, where: str) -> tuple[int, int]:
+    """Return width and height of a WebP picture from its first chunk."""
+    head: npt.NDArray[np.uint8] = np.frombuffer(data[:30].ljust(30, b"\0"), np.uint8)
+    kind = data[12:16]
+    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or kind not in (b"VP8L", b"VP8X"):
+        raise ValueError(f"{where} is no lossless WebP picture")
+    if kind == b"VP8L":
+        bits = int.from_bytes(head[21:25].tobytes(), "little")
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    return tuple(int.from_bytes(head[i : i + 3].tobytes(), "little") + 1 for i in (24, 27))  # type: ignore[return-value]
