@@ -81,8 +81,8 @@ class Partition:
         if free < 2 * needed:
             raise OSError(
                 errno.ENOSPC,
-                f"{2 * needed / 1e9:.1f} GB are needed for the files and a temporary copy, and {free / 1e9:.1f} "
-                "GB are free",
+                f"{2 * needed / 1e9:.1f} GB are needed for the files and a temporary copy, and "
+                f"{free / 1e9:.1f} GB are free",
                 str(folder),
             )
         with open(self._places, "wb") as file:
