@@ -53,8 +53,10 @@ def add_run(parser: argparse.ArgumentParser) -> None:
 
 
 def add_model(parser: argparse.ArgumentParser) -> None:
-    """Add the argument MODEL: the folder of a run, a checkpoint in it, or a PLY file."""
-    parser.add_argument("model", type=named_path, metavar="MODEL", help="run, checkpoint or PLY file")
+    """Add the argument MODEL: the folder of a run, a checkpoint in it, or a file of Gaussians."""
+    parser.add_argument(
+        "model", type=named_path, metavar="MODEL", help="run, checkpoint, or file of Gaussians"
+    )
 
 
 def add_capture(parser: argparse.ArgumentParser) -> None:

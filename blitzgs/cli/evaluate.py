@@ -1,37 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command `blitzgs eval`: measure the held-out views of a run."""
+"""The command `blitzgs eval`: measure the held-out views of a run, or a file against a capture."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import json
+import math
 import sys
+from pathlib import Path
 
 from blitzgs.cli.arguments import (
     Commands,
     add_capture,
     add_command,
     add_device,
+    add_model,
     add_pool,
-    add_run,
     add_split,
     chosen_views,
     named_path,
 )
+from blitzgs.config.fields import Config, DataConfig, ModelConfig
 from blitzgs.distributed.group import Ranks
+from blitzgs.formats.gaussians import Gaussians, is_antialiased
+from blitzgs.formats.models import read_gaussians
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import input_files
 from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
+from blitzgs.runs.from_file import gate_of, model_of_file
 from blitzgs.runs.lod import lod_gate, scene_gate
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.util.progress import image_progress
 from blitzgs.util.terminal import printable
-from blitzgs.view.views import ViewSet, render_options
+from blitzgs.view.gate import SceneGate
+from blitzgs.view.views import Space, ViewSet, render_options
 
 HELP = """\
-Compare renders of a run's held-out views with their photographs. Prints the mean PSNR and SSIM as JSON, and
+Compare renders of a run's held-out views with their photographs, or those of a model of another program:
+
+  blitzgs eval RUN
+  blitzgs eval FILE --data CAPTURE     # PLY, compressed PLY, SPZ, SOG or .splat, in the capture's coordinates
+
+Prints the mean PSNR and SSIM as JSON, and
 writes the figures of each view (metrics.json) and some pictures to --out. Held-out views are those that the
 model was not trained on. psnr_corrected is the PSNR after the colours of each render were fitted to its
 photograph.
@@ -41,7 +53,7 @@ photograph.
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "eval", run, summary, HELP)
-    add_run(parser)
+    add_model(parser)
     add_capture(parser)
     add_device(parser, shares_gpus=True)
     add_pool(parser)
@@ -72,15 +84,31 @@ def run(args: argparse.Namespace) -> int:
     if args.pictures < 0:
         raise ValueError(f"--pictures: must be 0 or more, got {args.pictures}")
     with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
-        model = run_files.open_model(args.folder, ranks, args.data, args.resident_gb)
-        config = model.config
+        path: Path = args.model
+        if path.is_file():
+            found = read_gaussians(path)
+            config = _config_of(found, args.data)
+        else:
+            run_folder, checkpoint = run_files.run_and_checkpoint(path)
+            model = run_files.open_model(run_folder, ranks, args.data, args.resident_gb, checkpoint)
+            config = model.config
         if args.allow_missing:
             data = dataclasses.replace(config.data, allow_missing=True)
             config = dataclasses.replace(config, data=data)
         capture, images = open_capture(config, ranks, "--allow-missing")
-        check_capture(model.space, capture, args.folder)
-        indices = chosen_views(args.split, capture, args.folder)
-        folder = args.out or args.folder / run_files.EVALUATION / args.split
+        if path.is_file():
+            model = model_of_file(
+                found, config, Space.of(capture.offset, capture.extent), capture.near, ranks
+            )
+            gate, config = gate_of(found, model.space.unit), model.config
+            lod = None if gate is None else SceneGate(gate, math.inf, model.table, ranks)
+            folder = args.out or path.with_name(f"{path.name}.evaluation") / args.split
+        else:
+            check_capture(model.space, capture, run_folder)
+            gate = lod_gate(config, model.progress)
+            lod = scene_gate(config, model.progress, model.table, ranks)
+            folder = args.out or run_folder / run_files.EVALUATION / args.split
+        indices = chosen_views(args.split, capture, path)
         with image_progress("Comparing", ranks.rank == 0) as report:
             result = evaluate(
                 model.scene(ranks.device),
@@ -88,16 +116,14 @@ def run(args: argparse.Namespace) -> int:
                 capture.cameras,
                 images,
                 indices,
-                render_options(
-                    config, model.space, model.progress.sh_degree, lod_gate(config, model.progress)
-                ),
+                render_options(config, model.space, model.progress.sh_degree, gate),
                 folder,
                 TileOwners(ranks),
                 pictures=args.pictures,
                 lpips=load_lpips(args.lpips),
                 report=report,
                 inputs=input_files(capture),
-                lod=scene_gate(config, model.progress, model.table, ranks),
+                lod=lod,
             )
         if ranks.rank == 0:
             print(json.dumps({name: value for name, value in result.items() if name != "views"}, indent=1))
@@ -106,3 +132,10 @@ def run(args: argparse.Namespace) -> int:
                 print(printable(f"among the worst views: {view} {psnr:.2f} dB"), file=sys.stderr)
             print(f"{folder}: metrics.json and pictures", file=sys.stderr)
     return 0
+
+
+def _config_of(found: Gaussians, data: Path | None) -> Config:
+    """Return the configuration that shows a file in the views of a capture."""
+    if data is None:
+        raise ValueError("a file is compared with a capture: add --data CAPTURE")
+    return Config(data=DataConfig(path=str(data)), model=ModelConfig(antialiased=is_antialiased(found)))

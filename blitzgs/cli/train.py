@@ -86,6 +86,12 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser.add_argument("--data", type=named_path, metavar="DIR", help="folder of the capture")
     parser.add_argument("--out", type=named_path, metavar="RUN", help="folder for the results")
     parser.add_argument(
+        "--start",
+        type=named_path,
+        metavar="FILE",
+        help="begin with the Gaussians of a file (PLY, SPZ, SOG, .splat) in the capture's coordinates",
+    )
+    parser.add_argument(
         "--resume", action="store_true", help="continue from the newest checkpoint in RUN, if any"
     )
     parser.add_argument(
@@ -233,6 +239,9 @@ def _config(args: argparse.Namespace) -> Config:
         config = dataclasses.replace(
             config, data=dataclasses.replace(config.data, path=os.path.realpath(args.data))
         )
+    if args.start is not None:
+        start = os.path.realpath(args.start)
+        config = dataclasses.replace(config, model=dataclasses.replace(config.model, start=start))
     return config
 
 

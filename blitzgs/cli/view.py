@@ -19,8 +19,9 @@ from blitzgs.runs import files as run_files
 from blitzgs.training.inputs import open_capture
 
 HELP = """\
-Look at a model in the browser. MODEL is the folder of a run, a checkpoint in it, a PLY file of Gaussians, or
-a folder that `blitzgs export --tiles` wrote; of the last, the browser loads and draws what it needs.
+Look at a model in the browser. MODEL is the folder of a run, a checkpoint in it, a file of Gaussians of any
+program (PLY, compressed PLY, SPZ, SOG, .splat), or a folder that `blitzgs export --tiles` wrote: of this one,
+the browser loads and draws what it needs.
 The machine that holds the model renders, on its GPU or its CPU; the browser may be on another one:
 
   blitzgs view RUN                               # then open http://localhost:8080
@@ -41,7 +42,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         "--paths",
         type=named_path,
         metavar="DIR",
-        help="folder for camera paths and screenshots (default: RUN/paths, or the folder of the PLY file)",
+        help="folder for camera paths and screenshots (default: RUN/paths, or the folder of the file)",
     )
     add_device(parser)
 

@@ -79,6 +79,8 @@ class ModelConfig:
             refined in training. Views are rendered with the mean exposure (`blitzgs render --exposure`:
             with the photograph's), so held-out photographs are farther from them: `psnr_corrected` compares
             without exposure.
+        start: file of Gaussians of any program to begin with (`blitzgs train --start`), in the capture's
+            coordinates; empty: Gaussians on the capture's points.
     """
 
     sh_degree: int = 3
@@ -87,6 +89,7 @@ class ModelConfig:
     near: float = 0.0
     deterministic: bool = False
     exposure: bool = False
+    start: str = ""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import io
 import json
 import re
 import struct
+import tempfile
 import zipfile
 import zlib
 from dataclasses import replace
@@ -26,6 +27,7 @@ import psutil
 import torch
 
 from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource, is_antialiased, unit_quats
+from blitzgs.formats.ply import read_ply
 from blitzgs.util.output import new_file
 
 # Deflate compresses by at most this factor.
@@ -109,29 +111,18 @@ def _forged(model: Gaussians, kind: str) -> bytes:
 
 
 def _unforged(path: Path, kind: str) -> Gaussians:
+    """Read a file as the PLY file that gaussforge makes of it; its own columns lack those of SH degree 0."""
     try:
-        result = _package("gaussforge").GaussForge().read(path.read_bytes(), kind)
+        result = _package("gaussforge").GaussForge().convert(path.read_bytes(), kind, "ply")
+        if "error" in result:
+            raise ValueError(result["error"])
+        with tempfile.NamedTemporaryFile(suffix=".ply") as file:
+            file.write(result["data"])
+            file.flush()
+            found = read_ply(file.name)
     except (RuntimeError, ValueError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
-    if "error" in result:
-        raise ValueError(f"{path} is damaged: {result['error']}")
-    content = result["data"]
-    count, k = int(content["numPoints"]), _COEFFICIENTS.get(content["meta"]["shDegree"], 0)
-    shapes = {"positions": (3,), "rotations": (4,), "scales": (3,), "alphas": (), "colors": (3,)}
-    shapes |= {"sh": (k - 1, 3)}
-    columns = {}
-    for name, shape in shapes.items():
-        values = np.frombuffer(content[name], dtype="<f4")
-        if k == 0 or values.size != count * int(np.prod(shape)):
-            raise ValueError(f"{path} is damaged: {values.size:,} {name} for {count:,} Gaussians")
-        columns[name] = torch.from_numpy(values.reshape(count, *shape).copy())
-    return Gaussians(
-        means=columns["positions"],
-        quats=columns["rotations"],
-        scales=columns["scales"],
-        opacities=columns["alphas"],
-        sh=torch.cat([columns["colors"][:, None], columns["sh"]], dim=1),
-    )
+    return replace(found, normals=None, comments=[])
 
 
 # --- gsply ---
@@ -217,7 +208,7 @@ def read_splat(path: Path) -> Gaussians:
     _check_room(path, size // _SPLAT.itemsize, 0)
     rows = np.fromfile(path, dtype=_SPLAT)
     if not (rows["scale"] >= 0).all():
-        first = int((~(rows["scale"] >= 0)).any(axis=1).nonzero()[0][0])
+        first = int(np.argmin((rows["scale"] >= 0).all(axis=1)))
         raise ValueError(f"{path}: Gaussian {first} has the scale {rows['scale'][first]}")
     colors = rows["color"].astype(np.float64) / 255
     with np.errstate(divide="ignore"):
@@ -233,7 +224,7 @@ def read_splat(path: Path) -> Gaussians:
     )
 
 
-# --- SPZ: fixed-point columns, deflated; y up and z towards the viewer, half a turn about x from PLY files ---
+# --- SPZ: fixed-point columns, deflated; y is up: half a turn about x from PLY files ---
 
 
 def write_spz(path: Path, source: GaussianSource) -> None:
@@ -367,7 +358,10 @@ def _check_sog(path: Path) -> bool:
             raise ValueError(f"{path}: the archive has no meta.json")
         if entries["meta.json"].file_size > _META_BYTES:
             raise ValueError(f"{path}: meta.json has {entries['meta.json'].file_size:,} bytes")
-        meta = json.loads(archive.read("meta.json"))
+        try:
+            meta = json.loads(archive.read("meta.json"))
+        except ValueError as error:
+            raise ValueError(f"{path}: meta.json is no JSON: {error}") from error
         count = meta["count"] if "version" in meta else meta["means"]["shape"][0]
         if type(count) is not int or count < 1:
             raise ValueError(f"{path}: meta.json names {count!r} Gaussians")

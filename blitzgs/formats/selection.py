@@ -97,12 +97,13 @@ class Selected:
             if kept is not None:
                 met[-1] &= kept[rows]
             if selection.most is not None:
-                scores.append(opacity_length(block.opacities, block.scales) if score is None else score[rows])
+                own = opacity_length(block.opacities, block.scales) if score is None else score[rows]
+                scores.append(own)
         self._met = torch.cat(met) if met else torch.zeros(0, dtype=torch.bool)
         if selection.most is not None and int(self._met.sum()) > selection.most:
-            rows = self._met.nonzero()[:, 0]
-            order = torch.cat(scores)[rows].argsort(descending=True, stable=True)
-            self._met[rows[order[selection.most :]]] = False
+            chosen = self._met.nonzero()[:, 0]
+            order = torch.cat(scores)[chosen].argsort(descending=True, stable=True)
+            self._met[chosen[order[selection.most :]]] = False
         self._count = int(self._met.sum())
         if self._count == 0:
             raise ValueError("no Gaussian meets the conditions: choose a larger region, or lower limits")
@@ -144,7 +145,7 @@ def opacity_length(opacities: Tensor, scales: Tensor) -> Tensor:
 
 
 def _inside(points: Array, polygon: Array) -> npt.NDArray[np.bool_]:
-    """Tell which points [N, 2] are inside a polygon [P, 2]: rays to +x cross its edges an odd number of times."""
+    """Tell which points [N, 2] are inside a polygon [P, 2]: a ray to +x crosses an odd number of edges."""
     inside = np.zeros(len(points), dtype=bool)
     x, y = points.T
     for (ax, ay), (bx, by) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
@@ -156,7 +157,7 @@ def _inside(points: Array, polygon: Array) -> npt.NDArray[np.bool_]:
 
 
 def read_polygon(path: Path) -> Array:
-    """Read the corners of a region, float64 [P, 2]: a GeoJSON polygon, or a text file with "x y" in each line.
+    """Read the corners of a region, float64 [P, 2]: a GeoJSON polygon, or lines of text with "x y".
 
     Raises:
         ValueError: the file has no polygon of finite corners; names it.

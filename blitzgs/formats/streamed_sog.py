@@ -3,8 +3,8 @@
 
 Format: developer.playcanvas.com, "The Streamed SOG Format". `lod-meta.json` has a binary tree over the
 region. A viewer shows one LOD of each leaf: LOD 0 has all its Gaussians, LOD n lacks the n finest octree
-levels of the model. Each LOD of a leaf is an SOG of its own (`meta.json` and WebP files), because the encoder,
-gaussforge, orders the Gaussians itself.
+levels of the model. Each LOD of a leaf is an SOG of its own (`meta.json` and WebP files), because the
+encoder, gaussforge, orders the Gaussians itself.
 """
 
 from __future__ import annotations

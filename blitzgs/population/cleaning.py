@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds floaters and the fringe of a model: Gaussians that hardly any photograph saw, where nothing else is."""
+"""Finds floaters and the fringe of a model: Gaussians that hardly any photograph saw, away from the rest."""
 
 from __future__ import annotations
 
@@ -29,10 +29,9 @@ def views_counting(cull: Tensor, n_views: int) -> Tensor:
 
 
 def floaters(means: Tensor, scales: Tensor, counted: Tensor, most_views: int) -> Tensor:
-    """Tell which Gaussians to remove, bool [N]: few views count them, and they are far from the rest or large.
+    """Tell which Gaussians to remove, bool [N]: few views count them, and they are far or large.
 
-    Few views count the Gaussians at the border of a capture too. Those among the well-seen ones stay: they are
-    details.
+    Small ones among Gaussians that more views count stay: they are details.
 
     Args:
         means: float32 [N, 3].

@@ -388,6 +388,7 @@ def _delete_unfinished(directory: Path) -> None:
 
 
 def names_of(directory: Path) -> list[str]:
+    """Return the names of the checkpoints in a folder, oldest first."""
     if not directory.is_dir():
         return []
     names = (entry.name for entry in directory.iterdir() if _NAME.fullmatch(entry.name))

@@ -129,9 +129,9 @@ def read_rows(path: Path, first: int, last: int) -> dict[str, Tensor]:
         for name, spec in header_of(path).items():
             shape = (min(last, spec.shape[0]) - first, *spec.shape[1:])
             column = torch.empty(shape, dtype=spec.dtype)
-            data = memoryview(column.view(-1).view(torch.uint8).numpy())
+            data = column.view(-1).view(torch.uint8).numpy()
             file.seek(spec.start + first * (len(data) // shape[0]))
-            if file.readinto(data) != len(data):
+            if file.readinto(data.data) != len(data):
                 raise ValueError(f"{path} is cut off")
             columns[name] = column
     return columns

@@ -16,6 +16,7 @@ from blitzgs.config.fields import Config
 from blitzgs.config.files import save_config
 from blitzgs.config.schedule import Schedule, stretched
 from blitzgs.distributed.group import Ranks
+from blitzgs.formats.models import read_gaussians, with_degree
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY, octree_gaussians
@@ -26,6 +27,7 @@ from blitzgs.runs.evaluation import load_lpips
 from blitzgs.runs.exposure import SHARED
 from blitzgs.runs.files import Progress
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
+from blitzgs.runs.from_file import trained_columns
 from blitzgs.runs.log import LOG, RunLog
 from blitzgs.spawn.lineage import Lineage, initial_births, ledger_of
 from blitzgs.spawn.rules import lineage_subject, open_spawn_gate
@@ -46,7 +48,7 @@ from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
 from blitzgs.training.track_gains import differ, track_gains
 from blitzgs.training.view_level import keep_to_views
-from blitzgs.view.levels import measure_levels
+from blitzgs.view.levels import Levels, measure_levels
 from blitzgs.view.views import Space, ViewSet, trained_centres
 
 
@@ -290,7 +292,7 @@ def _origin(restored: run_files.Restored | None, resume: bool, folder: Path, ite
 def first_gaussians(
     config: Config, capture: Capture, space: Space, ranks: Ranks, home: torch.device
 ) -> tuple[GaussianTable, Progress]:
-    """Make the first Gaussians from the capture's points; each rank keeps its share of them at `home`."""
+    """Make the first Gaussians; each rank keeps its share of them at `home`."""
     lod, device = config.lod, ranks.device
     points = torch.from_numpy(capture.points) / space.unit
     # Cameras that are far from the others would stretch the octree over distances that no photograph covers.
@@ -298,6 +300,8 @@ def first_gaussians(
     centres = trained_centres([capture.cameras[i] for i in together], space).to(device)
     levels = measure_levels(points.to(device), centres, lod.fork)
     colors, most = torch.from_numpy(capture.colors), config.population.max_gaussians
+    if config.model.start:
+        return _of_file(config, space, levels, ranks, home)
     first = octree_gaussians(
         points, colors, centres, levels, lod.visible_threshold, most=most, seed=config.seed
     )
@@ -312,5 +316,29 @@ def first_gaussians(
         peak_gaussians=len(first),
         seconds=0.0,
         milestones={"initial": len(first)} | ({"found": first.found} if first.found > len(first) else {}),
+        reference_distance=levels.reference_distance,
+    )
+
+
+def _of_file(
+    config: Config, space: Space, levels: Levels, ranks: Ranks, home: torch.device
+) -> tuple[GaussianTable, Progress]:
+    """Begin with the Gaussians of `model.start`."""
+    path, degree, most = Path(config.model.start), config.model.sh_degree, config.population.max_gaussians
+    found = read_gaussians(path)
+    count, known = len(found), min(found.degree, degree)
+    if count == 0 or 0 < most < count:
+        limit = f"population.max_gaussians is {most:,}" if count else "a training needs some"
+        raise ValueError(f"{path} (model.start) holds {count:,} Gaussians: {limit}")
+    columns = trained_columns(with_degree(found, degree), space, ranks)
+    table = GaussianTable.create({name: column.to(home) for name, column in columns.items()})
+    table.permute(morton_order(table["means"]))
+    return table, Progress(
+        step=0,
+        sh_degree=known,
+        level_count=levels.count,
+        peak_gaussians=count,
+        seconds=0.0,
+        milestones={"initial": count},
         reference_distance=levels.reference_distance,
     )

@@ -223,7 +223,8 @@ class Trainer:
             batch = self.loader.get(step - 1, schedule.steps)
         except (OSError, ValueError) as error:
             raise PhotographError(str(error)) from error
-        degree = schedule.sh_degree(begin, config.model.sh_degree)
+        # Gaussians of a file (model.start) begin with the degree that they have.
+        degree = max(state.progress.sh_degree, schedule.sh_degree(begin, config.model.sh_degree))
         view_level.follow_schedule(state, begin)
         view_gate = view_level.batch_gate(state, batch.indices)
         options = render_options(config, state.space, degree, lod_gate(config, state.progress))

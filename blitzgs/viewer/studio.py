@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import re
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,16 +16,17 @@ from torch import Tensor
 
 from blitzgs.config.fields import Config, ModelConfig
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.gaussians import Gaussians
-from blitzgs.formats.ply import read_ply
+from blitzgs.formats.gaussians import is_antialiased
+from blitzgs.formats.models import offset_of, read_gaussians
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import CAMERAS, load_cameras
 from blitzgs.runs.folder import open_run
+from blitzgs.runs.from_file import gate_of, trained_columns
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.draw import Drawer, Subject, table_of_parameters
-from blitzgs.view.gate import LodGate, SceneGate
+from blitzgs.view.gate import SceneGate
 from blitzgs.view.views import Space, render_options
 from blitzgs.viewer.exhibit import Exhibit
 from blitzgs.viewer.page import Page
@@ -52,7 +52,7 @@ class Opened:
 def open_model(
     path: Path, ranks: Ranks, photograph: Photograph | None = None, paths: Path | None = None
 ) -> Opened:
-    """Open the folder of a run, a checkpoint in it, or a PLY file.
+    """Open the folder of a run, a checkpoint in it, or a file of Gaussians.
 
     Args:
         path: the folder or the file.
@@ -65,7 +65,7 @@ def open_model(
         ValueError: the file is damaged.
     """
     if path.is_file():
-        return _open_ply(path, ranks, paths or path.parent)
+        return _open_file(path, ranks, paths or path.parent)
     path, checkpoint = run_files.run_and_checkpoint(path)
     model = open_run(path).model(str(ranks.device), checkpoint)
     columns = {name: getattr(model, name) for name in (*PARAMETERS, "level")}
@@ -102,29 +102,19 @@ def _exposures(found: Tensor | None, train: Sequence[int]) -> dict[int, npt.NDAr
     return dict(zip(train, found.double().cpu().numpy(), strict=True))
 
 
-def _open_ply(path: Path, ranks: Ranks, paths: Path) -> Opened:
-    found = read_ply(path)
+def _open_file(path: Path, ranks: Ranks, paths: Path) -> Opened:
+    found = read_gaussians(path)
     if len(found.means) == 0:
         raise ValueError(f"{path} holds no Gaussians")
-    offset = _numbers(found, r"comment offset (\S+) (\S+) (\S+)") or (0.0, 0.0, 0.0)
     box = box_of(found.means)
     middle, extent = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
     # Centred, so that float32 resolves the positions of a georeferenced model as finely as the file does.
-    space = Space.of(middle + np.array(offset), max(extent, 1e-6))
-    columns: dict[str, Tensor] = {
-        "means": ((found.means.double() - torch.from_numpy(middle)) / space.unit).float(),
-        "quats": found.quats,
-        "scales": found.scales - math.log(space.unit),
-        "opacities": found.opacities,
-        "sh": found.sh,
-    }
-    if found.levels is not None:
-        columns["level"] = found.levels.clamp(0, 255).to(torch.uint8)
+    space = Space.of(middle + np.array(offset_of(found.comments)), max(extent, 1e-6))
+    columns = trained_columns(found, space, Ranks())
     order = morton_order(columns["means"])
     table = table_of_parameters({name: column[order].to(ranks.device) for name, column in columns.items()})
-    antialiased = any(line.strip() == "comment SplatRenderMode: mip" for line in found.comments)
-    config = Config(model=ModelConfig(antialiased=antialiased, near=1e-3))
-    gate = _gate(found, space.unit)
+    config = Config(model=ModelConfig(antialiased=is_antialiased(found), near=1e-3))
+    gate = gate_of(found, space.unit)
     degree = round(found.sh.shape[1] ** 0.5) - 1
     options = render_options(config, space, degree, gate)
     lod = None if gate is None else SceneGate(gate, math.inf if gate.smooth else 0.95, table, ranks)
@@ -142,23 +132,6 @@ def _open_ply(path: Path, ranks: Ranks, paths: Path) -> Opened:
         paths=paths,
     )
     return Opened(exhibit, Subject(table, options, space.unit, lod), table, ranks)
-
-
-def _numbers(found: Gaussians, pattern: str) -> tuple[float, ...] | None:
-    for line in found.comments:
-        if match := re.fullmatch(pattern, line.strip()):
-            return tuple(float(text) for text in match.groups())
-    return None
-
-
-def _gate(found: Gaussians, unit: float) -> LodGate | None:
-    """Return the LOD gate that `blitzgs export` writes into a header; None: there is none."""
-    pattern = r"comment lod reference_distance (\S+) fork (\S+) levels (\d+) finest (\d+)(?: smooth)?"
-    values = _numbers(found, pattern)
-    if values is None or found.levels is None:
-        return None
-    smooth = any(line.strip().endswith(" smooth") for line in found.comments if "comment lod" in line)
-    return LodGate(values[0] / unit, values[1], int(values[2]), int(values[3]), smooth)
 
 
 def box_of(means: Tensor) -> npt.NDArray[np.float64]:

@@ -1,0 +1,398 @@
+"""Every format against a reader that shares nothing with its writer, and damaged files of each."""
+
+import io
+import json
+import os
+import struct
+import zipfile
+import zlib
+from dataclasses import replace
+
+# The kernels of gsply would be compiled for half a minute; these files are small.
+os.environ.setdefault("NUMBA_DISABLE_JIT", "1")
+
+import cv2
+import numpy as np
+import plyfile
+import pytest
+import torch
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from blitzgs.formats import packed
+from blitzgs.formats.gaussians import MIP, Gaussians
+from blitzgs.formats.models import FORMATS, check_replaces, read_gaussians, with_degree
+from tests.formats.models import some_gaussians
+
+gaussforge = pytest.importorskip("gaussforge")
+gsply = pytest.importorskip("gsply")
+
+PACKED = ("compressed-ply", "splat", "spz", "sog")
+# Largest differences of: means, log scales, angle of the rotation, opacity, DC, other coefficients.
+BOUNDS = {
+    "compressed-ply": (0.02, 0.005, 0.01, 0.003, 0.006, 0.02),
+    "splat": (1e-6, 1e-5, 0.03, 0.005, 0.015, 0),
+    "spz": (1.3e-4, 0.04, 0.01, 0.003, 0.015, 0.01),
+    "sog": (0.002, 0.05, 0.03, 0.003, 0.02, 0.05),
+}
+
+
+def written(tmp_path, name, model):
+    path = tmp_path / f"a{FORMATS[name].suffix}"
+    FORMATS[name].write(path, model)
+    return path
+
+
+def by_gsply(path, read):
+    found = read(path)
+    rest = found.shN if found.shN is not None else np.zeros((len(found.means), 0, 3), np.float32)
+    columns = (found.means, found.quats, found.scales, found.opacities.reshape(-1))
+    means, quats, scales, opacities = (torch.from_numpy(np.array(column)) for column in columns)
+    sh = torch.from_numpy(np.concatenate([found.sh0[:, None], rest], axis=1))
+    return Gaussians(means, quats, scales, opacities, sh)
+
+
+def by_gaussforge(path, kind):
+    content = gaussforge.GaussForge().read(path.read_bytes(), kind)["data"]
+    n = content["numPoints"]
+
+    def column(name, *shape):
+        return torch.from_numpy(np.frombuffer(content[name], "<f4").reshape(n, *shape).copy())
+
+    sh = torch.cat([column("colors", 1, 3), column("sh", -1, 3)], dim=1)
+    return Gaussians(
+        column("positions", 3), column("rotations", 4), column("scales", 3), column("alphas"), sh
+    )
+
+
+def by_hand(path):
+    rows = np.frombuffer(path.read_bytes(), "V32")
+    floats = np.frombuffer(rows.tobytes(), "<f4").reshape(-1, 8)
+    octets = np.frombuffer(rows.tobytes(), "u1").reshape(-1, 32)
+    shade = octets[:, 24:28] / 255
+    return Gaussians(
+        torch.from_numpy(floats[:, :3].copy()),
+        torch.from_numpy((octets[:, 28:] - 128.0) / 128).float(),
+        torch.from_numpy(np.log(floats[:, 3:6])),
+        torch.from_numpy(np.log(shade[:, 3] / (1 - shade[:, 3]).clip(1e-6)).clip(-12)).float(),
+        torch.from_numpy((shade[:, None, :3] - 0.5) / 0.28209479).float(),
+    )
+
+
+def sog_by_hand(path):
+    """Follows the published layout of version 2."""
+    with zipfile.ZipFile(path) as archive:
+        meta = json.loads(archive.read("meta.json"))
+        pictures = {
+            name: cv2.imdecode(np.frombuffer(archive.read(name), "u1"), cv2.IMREAD_UNCHANGED)
+            for name in archive.namelist()
+            if name.endswith(".webp")
+        }
+    n = meta["count"]
+    rgba = {name: picture[..., [2, 1, 0, *range(3, picture.shape[2])]] for name, picture in pictures.items()}
+    rows = {name: pixels.reshape(-1, pixels.shape[2])[:n].astype(int) for name, pixels in rgba.items()}
+    least, most = np.array(meta["means"]["mins"]), np.array(meta["means"]["maxs"])
+    share = (rows["means_l.webp"] + 256 * rows["means_u.webp"])[:, :3] / 65535
+    logs = least + share * (most - least)
+    packed_quats, largest = rows["quats.webp"][:, :3], rows["quats.webp"][:, 3] - 252
+    others = (packed_quats / 255 - 0.5) * 2**0.5
+    quats = np.zeros((n, 4))
+    for i in range(n):
+        quats[i, [k for k in range(4) if k != largest[i]]] = others[i]
+        quats[i, largest[i]] = np.sqrt(max(0, 1 - (others[i] ** 2).sum()))
+    book = np.array(meta["sh0"]["codebook"])
+    alpha = (rows["sh0.webp"][:, 3] / 255).clip(1e-6, 1 - 1e-6)
+    labels = rows["shN_labels.webp"][:, 0] + 256 * rows["shN_labels.webp"][:, 1]
+    palette = np.array(meta["shN"]["codebook"])[rgba["shN_centroids.webp"][..., :3]]
+    rest = np.stack([palette[labels // 64, labels % 64 * 15 + k] for k in range(15)], axis=1)
+    columns = (
+        np.sign(logs) * np.expm1(np.abs(logs)),
+        quats,
+        np.array(meta["scales"]["codebook"])[rows["scales.webp"][:, :3]],
+        np.log(alpha / (1 - alpha)),
+        np.concatenate([book[rows["sh0.webp"][:, None, :3]], rest], axis=1),
+    )
+    return Gaussians(*(torch.from_numpy(column).float() for column in columns))
+
+
+def turned(model):
+    """Half a turn about x, by rotating colours: SH are fitted to the colours of the turned directions."""
+    half = Rotation.from_quat([1, 0, 0, 0])
+    quats = (half * Rotation.from_quat(np.roll(model.quats.numpy(), -1, axis=1))).as_quat()
+    directions = np.random.default_rng(0).normal(size=(400, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    k = model.sh.shape[1]
+    before, after = basis(half.inv().apply(directions))[:, :k], basis(directions)[:, :k]
+    mixed = np.linalg.lstsq(after, before, rcond=None)[0]
+    return replace(
+        model,
+        means=torch.from_numpy(half.apply(model.means.numpy())).float(),
+        quats=torch.from_numpy(np.roll(quats, 1, axis=1)).float(),
+        sh=torch.from_numpy(np.einsum("jk,nkc->njc", mixed, model.sh.numpy())).float(),
+    )
+
+
+def basis(d):
+    """The real harmonics of degrees 0 to 3 up to positive factors, which a half turn does not mix."""
+    x, y, z = d.T
+    return np.stack(
+        [
+            np.ones_like(x), -y, z, -x, x * y, -y * z, 3 * z * z - 1, -x * z, x * x - y * y,
+            -y * (3 * x * x - y * y), x * y * z, -y * (5 * z * z - 1), z * (5 * z * z - 3),
+            -x * (5 * z * z - 1), z * (x * x - y * y), -x * (x * x - 3 * y * y),
+        ],
+        axis=1,
+    )  # fmt: skip
+
+
+def compare(found, model, bounds):
+    order = cKDTree(found.means.numpy()).query(model.means.numpy())[1]
+    assert sorted(order) == list(range(len(model)))
+    found = found.rows(torch.from_numpy(order))
+    angles = [Rotation.from_quat(np.roll(some.quats.numpy(), -1, axis=1)) for some in (found, model)]
+    # Half a turn about an axis of its own leaves a Gaussian as it is.
+    same = [Rotation.identity(), *(Rotation.from_rotvec(np.pi * axis) for axis in np.eye(3))]
+    differ = [(angles[0].inv() * angles[1] * turn).magnitude() for turn in same]
+    assert np.min(differ, axis=0).max() <= bounds[2]
+    pairs = [
+        (found.means, model.means, bounds[0]),
+        (found.scales, model.scales, bounds[1]),
+        (found.opacities.sigmoid(), model.opacities.sigmoid(), bounds[3]),
+        (found.sh[:, 0], model.sh[:, 0], bounds[4]),
+    ]
+    if bounds[5]:
+        pairs.append((found.sh[:, 1:], model.sh[:, 1:], bounds[5]))
+    for got, expected, bound in pairs:
+        assert got.shape == expected.shape
+        np.testing.assert_allclose(got.numpy(), expected.numpy(), atol=bound, rtol=0)
+
+
+@pytest.fixture
+def model():
+    """Values that the narrowest format holds: opacities off the ends, coefficients within +-1."""
+    found = some_gaussians(300, 3)
+    found.sh[:, 1:] = found.sh[:, 1:].clamp(-0.9, 0.9)
+    found.opacities.clamp_(-4, 4)
+    found.comments = [MIP, "comment offset 1.0 2.0 3.0"]
+    return found
+
+
+@pytest.mark.parametrize("name", PACKED)
+def test_other_readers_find_the_values(tmp_path, model, name):
+    path = written(tmp_path, name, model)
+    others = {
+        "compressed-ply": [
+            lambda: by_gsply(path, gsply.plyread), lambda: by_gaussforge(path, "compressed.ply")
+        ],
+        "splat": [lambda: by_hand(path)],
+        "spz": [lambda: turned(by_gaussforge(path, "spz"))],
+        "sog": [lambda: sog_by_hand(path)],
+    }  # fmt: skip
+    for read in others[name]:
+        compare(read(), model, BOUNDS[name])
+    found = read_gaussians(path)
+    compare(found, model, BOUNDS[name])
+    stated = {"compressed-ply": model.comments, "splat": []}.get(name, [MIP])
+    assert found.comments == stated
+    plain = read_gaussians(written(tmp_path, name, replace(model, comments=[])))
+    assert plain.comments == []
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+@pytest.mark.parametrize("name", PACKED)
+def test_lower_degrees_and_single_gaussians(tmp_path, name, degree):
+    model = some_gaussians(1 if degree == 1 else 5, degree, seed=3)
+    found = read_gaussians(written(tmp_path, name, model))
+    assert len(found) == len(model) and found.degree == (0 if name == "splat" else degree)
+    np.testing.assert_allclose(found.means[:1].norm(), found.means[:1].norm())
+    with pytest.raises(ValueError, match="no Gaussian"):
+        written(tmp_path, name, some_gaussians(0, degree))
+
+
+@pytest.mark.parametrize(("name", "kind"), [("spz", "spz"), ("sog", "sog"), ("splat", "splat")])
+def test_files_of_the_other_package_are_read(tmp_path, model, name, kind):
+    path = tmp_path / f"a{FORMATS[name].suffix}"
+    if name == "spz":
+        for version in (3, 4):
+            gsply.write_spz(path, packed._gsdata(turned(model)), version=version)
+            compare(read_gaussians(path), model, (2e-4, *BOUNDS["spz"][1:]))
+    else:
+        unit = packed.collected(with_degree(model, 0) if kind == "splat" else model)
+        path.write_bytes(packed._forged(unit, kind))
+        compare(read_gaussians(path), model, BOUNDS[name])
+
+
+def test_spz_keeps_far_positions_and_small_gaussians(tmp_path):
+    model = some_gaussians(50, 0)
+    model.means *= 3000
+    found = read_gaussians(written(tmp_path, "spz", model))
+    assert (found.means - model.means).abs().max() <= float(model.means.abs().max()) / 2**22
+    model.means, model.scales = model.means / 3000, model.scales - 6
+    found = read_gaussians(written(tmp_path, "spz", model))
+    assert (found.means - model.means).abs().max() <= float(model.scales.median().exp()) / 16
+
+
+def test_what_a_format_cannot_say_is_told(model):
+    with_levels = some_gaussians(3, 1, levels=True)
+    assert not FORMATS["ply"].unstated(replace(with_levels, comments=[MIP]))
+    assert "colours that depend on the view" in FORMATS["splat"].unstated(some_gaussians(3, 1))[0]
+    for name, format_ in FORMATS.items():
+        told = " ".join(format_.unstated(replace(with_levels, comments=[MIP])))
+        assert ("antialiased" in told) == (name in ("splat", "glb")), name
+        assert ("octree levels" in told) == (name not in ("ply", "glb")), name
+
+
+def test_no_file_of_another_format_is_replaced(tmp_path):
+    for name, format_ in FORMATS.items():
+        path = tmp_path / f"{name}{format_.suffix}"
+        check_replaces(path, format_)
+        with pytest.raises(ValueError, match="choose a name that ends in"):
+            check_replaces(tmp_path / "a.txt", format_)
+        if format_.starts:
+            path.write_bytes(b"mine")
+            with pytest.raises(FileExistsError, match="choose another name"):
+                check_replaces(path, format_)
+
+
+def gz(*parts):
+    return zlib.compress(b"".join(parts), wbits=31)
+
+
+def spz_header(count=10, version=3, degree=0, bits=12, magic=0x5053474E):
+    return struct.pack("<IIIBBBB", magic, version, count, degree, bits, 0, 0)
+
+
+def zipped(change, source):
+    """A copy of an archive with changed parts: name -> bytes, or None to leave it out."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as new:
+        for entry in old.namelist():
+            part = change.get(entry, old.read(entry))
+            if part is not None:
+                new.writestr(entry, part)
+    return out.getvalue()
+
+
+def damaged_sogs(path):
+    with zipfile.ZipFile(path) as archive:
+        meta = json.loads(archive.read("meta.json"))
+        picture = archive.read("quats.webp")
+
+    def changed(**fields):
+        return zipped({"meta.json": json.dumps(meta | fields)}, path)
+
+    wide = picture[:21] + struct.pack("<I", 0x3FFF | 0x3FFF << 14) + picture[25:]
+    return {
+        "cut off": (path.read_bytes()[:-200], "is damaged"),
+        "no meta": (zipped({"meta.json": None}, path), "has no meta.json"),
+        "meta no JSON": (zipped({"meta.json": b"{"}, path), "meta.json"),
+        "no picture": (zipped({"quats.webp": None}, path), "has no quats.webp"),
+        "count too large": (changed(count=10**12), r"1,000,000,000,000 Gaussians: reading them takes"),
+        "count above the pictures'": (changed(count=meta["count"] + 5000), r"pixels for 5,\d+ Gaussians"),
+        "count no number": (changed(count="1"), "names '1' Gaussians"),
+        "short codebook": (changed(scales=meta["scales"] | {"codebook": [0.0] * 9}), "codebook of scales"),
+        "NaN in a codebook": (
+            changed(sh0=meta["sh0"] | {"codebook": [float("nan")] * 256}), "codebook of sh0"),
+        "a field is missing": (changed(means={}), "lacks a field"),
+        "a path out of the archive": (changed(quats={"files": ["../../etc/passwd"]}), "has no ../../etc"),
+        "picture too wide": (zipped({"quats.webp": wide}, path), "16384 x 16384 pixels"),
+        "picture no WebP": (zipped({"quats.webp": b"GIF89a" * 30}, path), "is no lossless WebP"),
+        "bomb": (zipped({"quats.webp": bytes(30 << 20)}, path), "inflates to 31,457,280 bytes"),
+    }  # fmt: skip
+
+
+def damaged_plys(path):
+    good = path.read_bytes()
+    return {
+        "cut off": (good[:-1], "is cut off"),
+        "no end of header": (good[:300], "does not end|ends inside the header"),
+        "count too large": (good.replace(b"vertex 300", b"vertex 99999999999"), "do not fit 99,999,999,999"),
+        "chunks missing": (good.replace(b"chunk 2", b"chunk 1"), "1 chunks of 18 numbers"),
+        "properties missing": (good.replace(b"property float max_b\n", b""), "2 chunks of 17 numbers"),
+        "SH of no degree": (good.replace(b"property uchar f_rest_44\n", b""), "44 f_rest properties"),
+        "NaN": (good.replace(good[(at := good.index(b"end_header\n") + 11) : at + 4], b"\0\0\xc0\x7f", 1),
+                "means has NaN"),
+    }  # fmt: skip
+
+
+def damaged_spzs(path):
+    good = path.read_bytes()
+    body = bytes(10 * 20)
+    return {
+        "cut off": (good[: len(good) // 2], "is cut off"),
+        "no gzip": (b"\x1f\x8b" + bytes(50), "is damaged"),
+        "other magic": (gz(spz_header(magic=1), body), "no SPZ file"),
+        "other version": (gz(spz_header(version=9), body), "no SPZ file"),
+        "degree 7": (gz(spz_header(degree=7), body), "SH degree 7"),
+        "bits 99": (gz(spz_header(bits=99), body), "fractional_bits 99"),
+        "count too large": (gz(spz_header(count=0xFFFFFFFF), body), "4,294,967,295 Gaussians"),
+        "count larger than can be": (gz(spz_header(count=100_000), body), "cannot hold 100,000 Gaussians"),
+        "fewer bytes": (gz(spz_header(count=11), body), "200|216 of 236|is cut off"),
+        "bomb": (gz(spz_header(), bytes(30 << 20)), "inflates to more than"),
+        "only a header": (b"NGSP" + bytes(4), "is cut off"),
+    }
+
+
+def damaged_splats(path):
+    good = bytearray(path.read_bytes())
+    nan = struct.pack("<f", float("nan"))
+    return {
+        "cut off": (bytes(good[:-1]), "no multiple of 32"),
+        "NaN position": (bytes(good[:32] + nan + good[36:]), "means has NaN.*number 1"),
+        "NaN scale": (bytes(good[:44] + nan + good[48:]), "Gaussian 1 has the scale"),
+        "negative scale": (bytes(good[:12] + struct.pack("<f", -1) + good[16:]), "Gaussian 0 has the scale"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "cases"),
+    [
+        ("compressed-ply", damaged_plys),
+        ("splat", damaged_splats),
+        ("spz", damaged_spzs),
+        ("sog", damaged_sogs),
+    ],
+)
+def test_damaged_files_are_refused_with_name_and_reason(tmp_path, model, name, cases):
+    path = written(tmp_path, name, model)
+    for case, (content, reason) in cases(path).items():
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=reason) as error:
+            read_gaussians(path)
+        assert str(path) in str(error.value), case
+
+
+@pytest.mark.parametrize("name", PACKED)
+def test_random_damage_gives_a_model_or_an_error(tmp_path, model, name):
+    path = written(tmp_path, name, model)
+    good, rng = path.read_bytes(), np.random.default_rng(0)
+    refused = 0
+    for _ in range(30):
+        content = bytearray(good)
+        for place in rng.integers(len(good), size=8):
+            content[place] = rng.integers(256)
+        path.write_bytes(content[: rng.integers(1, len(good) + 1)] if rng.random() < 0.3 else content)
+        try:
+            read_gaussians(path).check()
+        except ValueError as error:
+            refused += 1
+            assert str(path) in str(error)
+    assert refused > 0
+
+
+def test_other_files_are_refused(tmp_path):
+    path = tmp_path / "a.bin"
+    for content in (b"", b"glTF", b"hello"):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="is no model"):
+            read_gaussians(path)
+    path.write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
+    with pytest.raises(ValueError, match="a.bin"):
+        read_gaussians(path)
+
+
+def test_compressed_ply_has_the_layout_of_supersplat(tmp_path, model):
+    data = plyfile.PlyData.read(written(tmp_path, "compressed-ply", model))
+    assert [element.name for element in data.elements] == ["chunk", "vertex", "sh"]
+    assert [element.count for element in data.elements] == [2, 300, 300]
+    assert data.comments == ["SplatRenderMode: mip", "offset 1.0 2.0 3.0"]
