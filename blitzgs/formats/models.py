@@ -13,6 +13,7 @@ from blitzgs.formats import packed
 from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased
 from blitzgs.formats.glb import write_glb
 from blitzgs.formats.ply import read_ply, save_ply
+from blitzgs.formats.sog import write_sog
 from blitzgs.util.output import check_replaceable
 
 _HEADER = 1 << 16
@@ -65,7 +66,7 @@ FORMATS = {
     ),
     "splat": Format(".splat", ".splat", packed.write_splat, harmonics=False),
     "spz": Format("SPZ", ".spz", packed.write_spz, (b"\x1f\x8b", b"NGSP"), ("antialiasing",)),
-    "sog": Format("SOG", ".sog", packed.write_sog, (b"PK",), ("antialiasing",)),
+    "sog": Format("SOG", ".sog", write_sog, (b"PK",), ("antialiasing",)),
     "glb": Format("GLB", ".glb", write_glb, (b"glTF",), ("levels",), streams=True),
 }  # fmt: skip
 

@@ -2,14 +2,13 @@
 """Compressed formats, through the packages gsply and gaussforge.
 
 The packages trust what a file says about itself, so counts and sizes are compared with the file and with the
-free memory before they see it. Each file is written with the package whose result both read right: gaussforge
-0.6 orders the SH coefficients of compressed PLY files wrongly, and gsply 0.4 writes no SOG.
+free memory before they see it. gsply writes, and gaussforge reads all but SPZ, because gaussforge 0.6 orders
+the SH coefficients of compressed PLY files wrongly, and gsply reads files without looking at bounds.
 """
 
 from __future__ import annotations
 
 import importlib
-import io
 import json
 import re
 import struct
@@ -28,7 +27,7 @@ import torch
 
 from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource, is_antialiased, unit_quats
 from blitzgs.formats.ply import read_ply
-from blitzgs.util.output import new_file
+from blitzgs.util.output import new_file, write_file
 
 # Deflate compresses by at most this factor.
 _DEFLATE = 1040
@@ -82,32 +81,7 @@ def collected(source: GaussianSource) -> Gaussians:
     return Gaussians(**columns, comments=source.comments)
 
 
-def _write(path: Path, content: bytes) -> None:
-    with new_file(path) as partial:
-        partial.write_bytes(content)
-
-
-# --- gaussforge: bytes of float32 columns, coefficients by Gaussian, then coefficient, then channel ---
-
-
-def _forged(model: Gaussians, kind: str) -> bytes:
-    columns = {
-        "positions": model.means,
-        "scales": model.scales,
-        "rotations": model.quats,
-        "alphas": model.opacities,
-        "colors": model.sh[:, 0],
-        "sh": model.sh[:, 1:],
-    }
-    content: dict[str, Any] = {
-        name: np.ascontiguousarray(column.numpy(), dtype="<f4").tobytes() for name, column in columns.items()
-    }
-    meta = {"shDegree": model.degree, "sourceFormat": "ply", "antialiased": is_antialiased(model)}
-    content |= {"numPoints": len(model), "extras": {}, "meta": meta}
-    result = _package("gaussforge").GaussForge().write(content, kind)
-    if "error" in result:
-        raise ValueError(f"gaussforge cannot write the model as {kind}: {result['error']}")
-    return bytes(result["data"])
+# --- gaussforge ---
 
 
 def _unforged(path: Path, kind: str) -> Gaussians:
@@ -150,7 +124,7 @@ def write_compressed_ply(path: Path, source: GaussianSource) -> None:
     content: bytes = _package("gsply").compress_to_bytes(_gsdata(model))
     first, second, rest = content.split(b"\n", 2)
     lines = [line.encode() for line in model.comments]
-    _write(path, b"\n".join([first, second, *lines, rest]))
+    write_file(path, b"\n".join([first, second, *lines, rest]))
 
 
 def read_compressed_ply(path: Path) -> Gaussians:
@@ -193,7 +167,12 @@ _SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), 
 def write_splat(path: Path, source: GaussianSource) -> None:
     """Write a .splat file, which holds no SH coefficients beyond the DC."""
     model = collected(source)
-    _write(path, _forged(replace(model, sh=model.sh[:, :1]), "splat"))
+    rows = np.zeros(len(model), dtype=_SPLAT)
+    rows["mean"], rows["scale"] = model.means.numpy(), model.scales.exp().numpy()
+    shade = torch.cat([0.5 + _SH_C0 * model.sh[:, 0], model.opacities.sigmoid()[:, None]], dim=1)
+    rows["color"] = (shade.clamp(0, 1) * 255).round().numpy()
+    rows["quat"] = (model.quats * 128 + 128).round().clamp(0, 255).numpy()
+    write_file(path, rows.tobytes())
 
 
 def read_splat(path: Path) -> Gaussians:
@@ -318,21 +297,6 @@ def _half_turn(model: Gaussians) -> Gaussians:
 
 
 # --- SOG: WebP pictures of quantised columns in a ZIP archive ---
-
-
-def write_sog(path: Path, source: GaussianSource) -> None:
-    """Write an SOG file; the order of the Gaussians changes."""
-    content = io.BytesIO(_forged(collected(source), "sog"))
-    if is_antialiased(source):
-        # The package has no way to say so.
-        archive, content = zipfile.ZipFile(content), io.BytesIO()
-        with zipfile.ZipFile(content, "w") as marked:
-            for name in archive.namelist():
-                part = archive.read(name)
-                if name == "meta.json":
-                    part = json.dumps(json.loads(part) | {"antialias": True}).encode()
-                marked.writestr(zipfile.ZipInfo(name), part)
-    _write(path, content.getvalue())
 
 
 def read_sog(path: Path) -> Gaussians:

@@ -76,7 +76,14 @@ def test_polygons_of_files(tmp_path):
     ):
         path.write_text(text)
         np.testing.assert_array_equal(read_polygon(path), ring)
-    for text in ("0 0\n1 1\n", "0 0\nx y\n1 1\n", "0 0\n1 1\nnan 2\n", "{", '{"type": "Point"}', "0 0 0\n" * 4):
+    for text in (
+        "0 0\n1 1\n",
+        "0 0\nx y\n1 1\n",
+        "0 0\n1 1\nnan 2\n",
+        "{",
+        '{"type": "Point"}',
+        "0 0 0\n" * 4,
+    ):
         path.write_text(text)
         with pytest.raises(ValueError, match="region cannot be read as a polygon"):
             read_polygon(path)
