@@ -128,10 +128,7 @@ class Partition:
         """Return cell << 8 | level; Gaussians outside the grid belong to its nearest cell."""
         last = 2**BITS - 1
         index = np.floor((places["mean"] - self._origin) / self._cell).clip(0, last).astype(np.int64)
-        codes = np.zeros(len(places), np.int64)
-        for bit in range(BITS):
-            for axis in range(3):
-                codes |= ((index[:, axis] >> bit) & 1) << (3 * bit + axis)
+        codes = interleaved(index, BITS)
         if self._by_size:
             with np.errstate(divide="ignore"):
                 classes = np.floor(np.log2(self._largest / places["size"].astype(np.float64)))
@@ -234,6 +231,15 @@ class Parts:
             sh=rows[:, 12:].reshape(len(rows), -1, 3), comments=self.comments,
             levels=rows[:, 11] if self.has_levels else None,
         )  # fmt: skip
+
+
+def interleaved(index: Ints, bits: int) -> Ints:
+    """Return the Morton codes [N] of cells [N, 3]: the bits of x, y and z in turn, x lowest."""
+    codes = np.zeros(len(index), np.int64)
+    for bit in range(bits):
+        for axis in range(3):
+            codes |= ((index[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return codes
 
 
 def extents(gaussians: Gaussians) -> Array:

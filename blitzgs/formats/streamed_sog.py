@@ -3,8 +3,7 @@
 
 Format: developer.playcanvas.com, "The Streamed SOG Format". `lod-meta.json` has a binary tree over the
 region. A viewer shows one LOD of each leaf: LOD 0 has all its Gaussians, LOD n lacks the n finest octree
-levels of the model. Each LOD of a leaf is an SOG of its own (`meta.json` and WebP files), because the
-encoder, gaussforge, orders the Gaussians itself.
+levels of the model. Each LOD of a leaf is an SOG of its own (`meta.json` and WebP files), in Morton order.
 """
 
 from __future__ import annotations
@@ -17,10 +16,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from blitzgs.formats.gaussians import GaussianSource
-from blitzgs.formats.packed import write_sog
-from blitzgs.formats.partition import BITS, Counts, Partition, Parts, extents
+from blitzgs.formats.partition import BITS, Counts, Partition, Parts, extents, interleaved
+from blitzgs.formats.sog import write_sog
 from blitzgs.formats.tiles import TILE, Written, each_part, new_folder
 from blitzgs.util.output import write_file
 
@@ -46,7 +46,6 @@ def write_streamed_sog(path: Path, source: GaussianSource, most: int = TILE, pro
         processes: that encode.
 
     Raises:
-        ImportError: gaussforge is missing.
         ValueError: there is no Gaussian, or a value is not finite.
         FileExistsError: the folder has files.
         OSError: the disk is full, or `path` cannot be written; nothing is left.
@@ -120,6 +119,10 @@ def _encode(parts: Parts, folder: Path, job: tuple[int, int, int]) -> tuple[Arra
     """Write one LOD of a leaf; return the box of its Gaussians and the size of its files."""
     part, lod, count = job
     gaussians = parts.read(part, count)
+    means = gaussians.means.double().numpy()
+    sides = np.maximum(np.ptp(means, axis=0), 1e-30)
+    cells = ((means - means.min(axis=0)) / sides * 1023).astype(np.int64)
+    gaussians = gaussians.rows(torch.from_numpy(np.argsort(interleaved(cells, 10), kind="stable")))
     chunk = folder / _name(part, lod)
     chunk.mkdir()
     bundle = chunk / "bundle.sog"
