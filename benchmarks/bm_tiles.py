@@ -189,7 +189,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("tiles", type=Path, help="folder of the tileset")
     parser.add_argument("--errors", type=float, nargs="+", default=[4.0, 16.0, 64.0], help="in pixels")
     parser.add_argument("--frames", type=int, default=12)
-    parser.add_argument("--width", type=int, default=640, help="of the frames in pixels")
+    parser.add_argument("--width", type=int, default=1920, help="of the frames in pixels")
     options = parser.parse_args(arguments)
     found = measure(options.tiles, options.device, options.frames, options.width, tuple(options.errors))
     title = f"Tiles of {options.tiles.name}: {found['gaussians']:,} Gaussians, {found['bytes'] / 1e6:.1f} MB"
