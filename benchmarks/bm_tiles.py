@@ -140,7 +140,7 @@ def measure(
     folder: Path,
     device: str = "cpu",
     frames: int = 12,
-    width: int = 640,
+    width: int = 1920,
     errors: tuple[float, ...] = (4, 16, 64),
 ) -> dict[str, Any]:
     """Fly through a tileset.
