@@ -245,6 +245,9 @@ def _selection(args: argparse.Namespace) -> Selection | None:
     """Return what the flags choose; None: everything."""
     if args.crop_axes and not args.crop_polygon:
         raise ValueError("--crop-axes is for --crop-polygon")
+    for flag in ("most", "clean"):
+        if getattr(args, flag) is not None and getattr(args, flag) < 1:
+            raise ValueError(f"--{flag} must be at least 1, got {getattr(args, flag)}")
     if all(getattr(args, name) is None for name in _CHOICES):
         return None
     box = None if args.crop is None else np.array(args.crop).reshape(2, 3)
@@ -252,9 +255,6 @@ def _selection(args: argparse.Namespace) -> Selection | None:
         raise ValueError(f"--crop takes the least x y z, then the largest, got {args.crop}")
     if args.min_opacity is not None and not 0 <= args.min_opacity < 1:
         raise ValueError(f"--min-opacity must be from 0 to below 1, got {args.min_opacity}")
-    for flag in ("most", "clean"):
-        if getattr(args, flag) is not None and getattr(args, flag) < 1:
-            raise ValueError(f"--{flag} must be at least 1, got {getattr(args, flag)}")
     return Selection(
         box=box,
         polygon=None if args.crop_polygon is None else read_polygon(args.crop_polygon),

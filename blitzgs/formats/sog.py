@@ -28,8 +28,9 @@ Bytes = npt.NDArray[np.uint8]
 _BOOK = 256
 # Entries of the palette of SH coefficients: at most, and one for so many Gaussians.
 # A model of fewer Gaussians than `_EXACT` has an entry for each.
-_PALETTE, _SHARED, _EXACT = 65536, 4, 4096
-_ROUNDS, _SAMPLE = 4, 200_000
+_PALETTE, _SHARED, _EXACT = 65536, 16, 4096
+# Rounds of clustering, on so many rows for each entry.
+_ROUNDS, _SAMPLE = 3, 4
 # Values of a table of distances.
 _TABLE = 1 << 25
 
@@ -123,8 +124,8 @@ def _by_codebook(values: Tensor) -> tuple[list[float], Bytes]:
 def _palette(rows: Tensor) -> tuple[Tensor, Tensor]:
     """Return a palette [P, D] for rows [N, D], and for each row the nearest entry, int64 [N]."""
     generator = torch.Generator().manual_seed(0)
-    some = rows[torch.randperm(len(rows), generator=generator)[:_SAMPLE]]
     size = min(_PALETTE, max(_EXACT, -(-len(rows) // (64 * _SHARED)) * 64))
+    some = rows[torch.randperm(len(rows), generator=generator)[: _SAMPLE * size]]
     palette = some[:size].clone()
     for _ in range(_ROUNDS):
         nearest = _nearest(some, palette)

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sizes of a run's model in all formats, and how near the renders of the files are to the run's own.
+
+python benchmarks/bm_formats.py RUN --json formats.json
+
+PSNR is that of the held-out views rendered from the file, against those rendered from the run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.formats.gaussians import Gaussians
+from blitzgs.formats.models import FORMATS, read_gaussians
+from blitzgs.runs.evaluation import _psnr
+from blitzgs.runs.export import export
+from blitzgs.runs.folder import open_run
+from blitzgs.runs.from_file import trained_columns
+from blitzgs.runs.source import source_of
+from blitzgs.table.table import PARAMETERS
+from tests.formats.glb_reader import read_glb
+
+
+def read(path: Path) -> Gaussians:
+    if path.suffix != ".glb":
+        return read_gaussians(path)
+    content, found = read_glb(path)
+    columns = {name.rpartition(":")[2]: torch.tensor(values) for name, values in found.items()}
+    sh = [column for name, column in columns.items() if name.startswith("SH_DEGREE")]
+    return Gaussians(
+        means=columns["POSITION"],
+        quats=columns["ROTATION"][:, [3, 0, 1, 2]],
+        scales=columns["SCALE"].log(),
+        opacities=columns["OPACITY"][:, 0].logit(1e-7),
+        sh=torch.stack(sh, dim=1),
+        comments=content["asset"]["extras"]["comments"],
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    run = open_run(args.run)
+    # Views without the gate of the levels, which most formats cannot hold.
+    model = dataclasses.replace(run.model(), lod=None)
+    cameras = run.cameras()
+    views = [cameras.cameras[index] for index in cameras.test]
+    own = [model.render(view).clamp(0, 1).double() for view in views]
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, kind in FORMATS.items():
+            path = Path(folder) / f"model-{name}{kind.suffix}"
+            begin = time.perf_counter()
+            source = source_of(model)
+            export(source, model.space, kind, path)
+            seconds = time.perf_counter() - begin
+            found = read(path)
+            columns = trained_columns(found, model.space, Ranks())
+            other = dataclasses.replace(
+                model,
+                **{key: columns[key] for key in (*PARAMETERS, "level")},
+                sh_degree=min(model.sh_degree, found.degree),
+            )
+            psnr = [
+                _psnr(other.render(view).clamp(0, 1).double(), image)
+                for view, image in zip(views, own, strict=True)
+            ]
+            size = path.stat().st_size
+            rows.append(
+                {
+                    "format": name,
+                    "bytes": size,
+                    "bytes_per_gaussian": size / len(model),
+                    "psnr": sum(psnr) / len(psnr),
+                    "seconds": seconds,
+                }
+            )
+            print(rows[-1], flush=True)
+    result = {"gaussians": len(model), "sh_degree": model.sh_degree, "views": len(views), "formats": rows}
+    if args.json:
+        args.json.write_text(json.dumps(result, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
