@@ -14,6 +14,8 @@ import numpy as np
 import torch
 
 from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_model, named_path
+from blitzgs.cli.export_tiles import HELP as TILES_HELP
+from blitzgs.cli.export_tiles import add_flags, add_kinds, check_flags, export_tiles, is_tiles
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import GaussianSource, is_antialiased
@@ -65,7 +67,7 @@ contribute least are left out; the page and the output of this command say how m
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "export", run, summary, HELP)
+    parser = add_command(commands, "export", run, summary, HELP + "\n" + TILES_HELP)
     add_model(parser)
     add_device(parser)
     add_capture(parser)
@@ -73,6 +75,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     for name, found in FORMATS.items():
         kind.add_argument(f"--{name}", type=named_path, metavar="FILE", help=f"{found.title} file to write")
     kind.add_argument("--html", type=named_path, metavar="FILE", help="HTML file to write")
+    add_kinds(kind)
     parser.add_argument(
         "--max-mb",
         type=_megabytes,
@@ -129,12 +132,16 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser.add_argument(
         "--levels", type=_levels, metavar="FIRST-LAST", help="keep these octree levels, for example 0-3"
     )
+    add_flags(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Export a model; returns the exit status."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise ValueError("export writes one file from one process: run it without torchrun")
+    check_flags(args)
+    if is_tiles(args):
+        return export_tiles(args, _selection(args))
     return _export_html(args) if args.html else _export_file(args)
 
 

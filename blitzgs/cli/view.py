@@ -12,13 +12,16 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_model, named_path
+from blitzgs.cli.serve import serve_tiles
 from blitzgs.distributed.group import Ranks, resolve_device
+from blitzgs.formats.tiles import TILESET
 from blitzgs.runs import files as run_files
 from blitzgs.training.inputs import open_capture
 
 HELP = """\
-Look at a model in the browser. MODEL is the folder of a run, a checkpoint in it, or a file of
-Gaussians of any program (PLY, compressed PLY, SPZ, SOG, .splat).
+Look at a model in the browser. MODEL is the folder of a run, a checkpoint in it, a file of Gaussians of any
+program (PLY, compressed PLY, SPZ, SOG, .splat), or a folder that `blitzgs export --tiles` wrote: of this one,
+the browser loads and draws what it needs.
 The machine that holds the model renders, on its GPU or its CPU; the browser may be on another one:
 
   blitzgs view RUN                               # then open http://localhost:8080
@@ -56,6 +59,8 @@ def add_address(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show a model until Ctrl-C; returns the exit status."""
+    if (args.model / TILESET).is_file():
+        return serve_tiles(args.model, args.host, args.port)
     from blitzgs.viewer.page import require_viser
 
     require_viser()

@@ -208,11 +208,21 @@ def write_points(path: Path, columns: dict[str, Any]) -> None:
     )
 
 
-def read_ply(path: Path) -> tuple[list[str], list[tuple[str, str]], int, Array]:
-    """Read the vertices of a PLY: comments, names and numpy types, number, and packed rows (uint8)."""
-    comments, comment_ends, names, name_ends, types, type_ends, count, rows = _call("read_ply", path)
+def read_ply(
+    path: Path, first: int = 0, most: int = 2**64 - 1
+) -> tuple[list[str], list[tuple[str, str]], int, Array, int]:
+    """Read up to `most` vertices of a PLY from number `first` on.
+
+    Returns:
+        Comments, names and numpy types, number of vertices read, their packed rows (uint8), and the number
+        of vertices of the file.
+    """
+    numbers = (_array([first], "u8"), _array([most], "u8"))
+    comments, comment_ends, names, name_ends, types, type_ends, count, rows, total = _call(
+        "read_ply", path, *numbers
+    )
     properties = list(zip(_texts(names, name_ends), _texts(types, type_ends), strict=True))
-    return _texts(comments, comment_ends), properties, int(count[0]), rows
+    return _texts(comments, comment_ends), properties, int(count[0]), rows, int(total[0])
 
 
 def write_ply(

@@ -11,7 +11,7 @@ of this layout and writing it again gives the same bytes.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.formats import native
-from blitzgs.formats.gaussians import Gaussians, GaussianSource
+from blitzgs.formats.gaussians import BLOCK, Gaussians, GaussianSource
 from blitzgs.util.output import check_replaceable, new_file
 
 LEVEL = "level"
@@ -36,8 +36,35 @@ def _property_names(coefficients: int) -> list[str]:
 
 
 def _read_table(path: Path) -> tuple[list[str], npt.NDArray[np.void]]:
-    comments, properties, count, rows = native.read_ply(os.fsencode(path))
+    comments, properties, count, rows, _ = native.read_ply(os.fsencode(path))
     return comments, np.frombuffer(rows, dtype=np.dtype(properties), count=count)
+
+
+class PlySource:
+    """The Gaussians of a PLY file, a `GaussianSource` that reads a block at a time."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the header.
+
+        Raises:
+            ValueError: see `read_ply`.
+        """
+        self._path = path
+        found, self._count = self._read(0, 0)
+        self.comments, self.degree, self.has_levels = found.comments, found.degree, found.has_levels
+
+    def __len__(self) -> int:
+        return self._count
+
+    def blocks(self) -> Iterator[Gaussians]:
+        """Yield all Gaussians in order."""
+        for first in range(0, self._count, BLOCK):
+            yield self._read(first, BLOCK)[0]
+
+    def _read(self, first: int, most: int) -> tuple[Gaussians, int]:
+        comments, properties, count, rows, total = native.read_ply(os.fsencode(self._path), first, most)
+        table = np.frombuffer(rows, dtype=np.dtype(properties), count=count)
+        return _gaussians(self._path, comments, table), total
 
 
 def read_ply(path: Path | str) -> Gaussians:
@@ -47,7 +74,10 @@ def read_ply(path: Path | str) -> Gaussians:
         ValueError: the file is damaged or has no such Gaussians; names the file and the reason.
     """
     path = Path(path)
-    comments, table = _read_table(path)
+    return _gaussians(path, *_read_table(path))
+
+
+def _gaussians(path: Path, comments: list[str], table: npt.NDArray[np.void]) -> Gaussians:
     names = table.dtype.names or ()
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest not in _REST_TO_COEFFICIENTS:

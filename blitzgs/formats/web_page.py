@@ -28,7 +28,7 @@ from blitzgs.util.output import check_replaceable
 BLOCK = 256
 # Value of one step of a quantised SH coefficient. Coefficients beyond 127 steps are cut off.
 HARMONIC = 1 / 64
-_PARTS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag", "sorter.js", "viewer.js")
+_PARTS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag", "sorter.js", "viewer.js", "file.js")
 # Gaussians of which the size of all is estimated.
 _SAMPLE = 1 << 16
 
@@ -211,15 +211,26 @@ def web_page(splats: WebSplats, scene: WebScene, title: str, left_out: str = "")
         left_out: what the file lacks of the model, for the reader of the page; empty: nothing.
     """
     known = asdict(scene) | {"count": len(splats), "degree": splats.degree, "harmonic": HARMONIC}
-    fields = {
-        "title": html.escape(title),
-        "left_out": html.escape(left_out),
+    return _filled(
+        "file.js",
+        title=html.escape(title),
+        left_out=html.escape(left_out),
         # No text in a script element may look like a tag.
-        "scene": json.dumps(known, allow_nan=False).replace("<", "\\u003c"),
-        "model": base64.b64encode(packed(splats)).decode(),
-    }
+        scene=json.dumps(known, allow_nan=False).replace("<", "\\u003c"),
+        model=base64.b64encode(packed(splats)).decode(),
+    )
+
+
+def tiles_page(title: str) -> str:
+    """Return the page that shows the tileset beside it; see `blitzgs.formats.tiles`."""
+    return _filled("tiles.js", title=html.escape(title), left_out="", scene="{}", model="")
+
+
+def _filled(program: str, **fields: str) -> str:
+    """Return the page with a program that shows a model; the fields are HTML."""
     pieces = _part("page.html").split("{{")
     for index, piece in enumerate(pieces[1:], 1):
         name, _, text = piece.partition("}}")
-        pieces[index] = (fields[name] if name in fields else _part(name)) + text
+        known = fields | {"program": _part(program)}
+        pieces[index] = (known[name] if name in known else _part(name)) + text
     return "".join(pieces)

@@ -35,11 +35,13 @@ class RunSource:
         trained: the Gaussians in the trained world.
         space: maps between the trained world and the capture's world.
         comments: header lines.
+        config: configuration of the run.
     """
 
     trained: GaussianSource
     space: Space
     comments: list[str]
+    config: Config
 
     def __len__(self) -> int:
         return len(self.trained)
@@ -75,7 +77,7 @@ def source_of(model: Model) -> RunSource:
     )
     gate = None if model.lod is None else model.lod.gate
     lines = _comments(model.config, model.space, gate, model.exposures is not None)
-    return RunSource(found, model.space, lines)
+    return RunSource(found, model.space, lines, model.config)
 
 
 def open_source(folder: Path, only: str | None = None) -> RunSource:
@@ -103,7 +105,7 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
         gate = lod_gate(config, progress)
         trained = _Shards(path, manifest.shards, config, progress.step, space.extent, gate is not None)
         exposed = manifest.shared is not None and "exposures" in header_of(path / manifest.shared.file)
-        return RunSource(trained, space, _comments(config, space, gate, exposed))
+        return RunSource(trained, space, _comments(config, space, gate, exposed), config)
     if refused:
         raise CheckpointError(f"no sound checkpoint in {folder}: {'; '.join(refused)}")
     raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")

@@ -277,8 +277,9 @@ constexpr std::string_view kNumpyTypes[] = {"i1", "u1", "i2", "u2", "i4", "u4", 
 
 void read_ply(Arguments& arguments, Reply& reply) {
   const std::string path = arguments.text();
+  const std::uint64_t first = arguments.number(), most = arguments.number();
   std::ifstream in = opened(path);
-  io::PlyTable table = io::read_ply(in, path);
+  io::PlyTable table = io::read_ply(in, path, first, most);
   std::vector<std::string_view> names, types;
   for (const io::PlyProperty& property : table.properties) {
     names.push_back(property.name);
@@ -289,6 +290,7 @@ void read_ply(Arguments& arguments, Reply& reply) {
   reply.add_texts(types);
   reply.add_number(table.count);
   reply.add(std::move(table.rows));
+  reply.add_number(table.total);
 }
 
 void write_ply(Arguments& arguments, Reply&) {

@@ -239,7 +239,7 @@ std::uint64_t PlyTable::row_bytes() const {
   return bytes;
 }
 
-PlyTable read_ply(std::istream& in, const std::string& name) {
+PlyTable read_ply(std::istream& in, const std::string& name, std::uint64_t first, std::uint64_t most) {
   ByteReader reader(in, name);
   Header header = read_header(reader);
   const auto vertex = std::find_if(header.elements.begin(), header.elements.end(),
@@ -254,9 +254,15 @@ PlyTable read_ply(std::istream& in, const std::string& name) {
   const bool ascii = header.encoding == Encoding::kAscii;
   const std::uint64_t min_bytes = ascii ? 2 * vertex->properties.size() - 1 : vertex->row_bytes();
   reader.check_count(vertex->count, min_bytes, "vertices");
-  PlyTable table{std::move(header.comments), vertex->properties, vertex->count, {}};
-  table.rows.resize(vertex->count * vertex->row_bytes());
+  first = std::min(first, vertex->count);
+  PlyTable table{std::move(header.comments),
+                 vertex->properties,
+                 std::min(most, vertex->count - first),
+                 {},
+                 vertex->count};
+  table.rows.resize(table.count * vertex->row_bytes());
   if (ascii) {
+    for (std::uint64_t i = 0; i < first * table.properties.size(); ++i) read_token(reader);
     std::uint8_t* out = table.rows.data();
     for (std::uint64_t i = 0; i < table.count; ++i) {
       for (const PlyProperty& property : table.properties) {
@@ -266,9 +272,10 @@ PlyTable read_ply(std::istream& in, const std::string& name) {
     }
     return table;
   }
+  reader.skip(first * vertex->row_bytes(), "the vertices");
   reader.read_bytes(table.rows.data(), table.rows.size(), "the vertices");
   if (header.encoding == Encoding::kBig) swap_bytes(*vertex, table.rows);
-  if (vertex + 1 == header.elements.end()) reader.expect_end();
+  if (first + table.count == table.total && vertex + 1 == header.elements.end()) reader.expect_end();
   return table;
 }
 

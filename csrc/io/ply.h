@@ -7,6 +7,7 @@
 #pragma once
 #include <cstdint>
 #include <iosfwd>
+#include <limits>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -29,12 +30,15 @@ struct PlyTable {
   std::vector<PlyProperty> properties;
   std::uint64_t count = 0;
   std::vector<std::uint8_t> rows;  // count x row_bytes
+  std::uint64_t total = 0;         // rows of the file, of which `rows` may hold some
 
   std::uint64_t row_bytes() const;
 };
 
-// Throws FormatError with the file, byte offset or header line, and reason.
-PlyTable read_ply(std::istream& in, const std::string& name);
+// Reads `most` rows from row `first` on, or as many as there are. Throws FormatError with the file, byte
+// offset or header line, and reason.
+PlyTable read_ply(std::istream& in, const std::string& name, std::uint64_t first = 0,
+                  std::uint64_t most = std::numeric_limits<std::uint64_t>::max());
 // Throws std::invalid_argument if the rows do not match the properties, or if a name is not allowed in a
 // header.
 void write_ply(std::ostream& out, const PlyTable& table);

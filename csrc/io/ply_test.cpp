@@ -85,6 +85,23 @@ TEST_CASE("elements around the vertices are passed over") {
   REQUIRE(table.rows == std::vector<std::uint8_t>{7, 0, 0, 0});
 }
 
+TEST_CASE("some rows are those rows of all") {
+  const std::string header = "element vertex 4\nproperty uchar a\nproperty uchar b\nend_header\n";
+  const std::string ascii = "ply\nformat ascii 1.0\n" + header + "1 2\n3 4\n5 6\n7 8\n";
+  const std::string binary = "ply\nformat binary_big_endian 1.0\n" + header + "\1\2\3\4\5\6\7\10";
+  for (const std::string& bytes : {ascii, binary}) {
+    const auto rows = [&](std::uint64_t first, std::uint64_t most) {
+      std::istringstream in(bytes);
+      const PlyTable table = read_ply(in, "f", first, most);
+      REQUIRE((table.total == 4 && table.rows.size() == 2 * table.count));
+      return table.rows;
+    };
+    REQUIRE(rows(1, 2) == std::vector<std::uint8_t>{3, 4, 5, 6});
+    REQUIRE(rows(3, 9) == std::vector<std::uint8_t>{7, 8});
+    REQUIRE((rows(0, 0).empty() && rows(99, 1).empty()));
+  }
+}
+
 TEST_CASE("every truncation of a PLY file is refused, and wrong bytes are never worse") {
   const std::string bytes = written(some_table());
   for (std::size_t n = 0; n < bytes.size(); ++n) REQUIRE(refused(bytes.substr(0, n)));

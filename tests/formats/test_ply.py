@@ -7,7 +7,7 @@ import plyfile
 import pytest
 import torch
 
-from blitzgs.formats.ply import read_ply, read_points, write_ply
+from blitzgs.formats.ply import PlySource, read_ply, read_points, save_ply, write_ply
 
 
 def gaussians(n: int, degree: int, seed: int = 0) -> dict[str, torch.Tensor]:
@@ -224,3 +224,23 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["model.ply"]
     with pytest.raises(OSError, match="/proc"):
         write_ply("/proc/model.ply", **gaussians(1, 0))
+
+
+def test_blocks_of_a_file_are_its_rows(tmp_path, monkeypatch):
+    from blitzgs.formats import ply
+    from tests.formats.models import some_gaussians
+
+    model = some_gaussians(250, 2, levels=True)
+    save_ply(tmp_path / "m.ply", model)
+    monkeypatch.setattr(ply, "BLOCK", 100)
+    source = PlySource(tmp_path / "m.ply")
+    assert (len(source), source.degree, source.has_levels) == (250, 2, True)
+    for _ in range(2):
+        found = list(source.blocks())
+        assert [len(block) for block in found] == [100, 100, 50]
+        for name in ("means", "quats", "scales", "opacities", "sh", "levels"):
+            whole = torch.cat([getattr(block, name) for block in found])
+            torch.testing.assert_close(whole, getattr(model, name), rtol=0, atol=0)
+    (tmp_path / "m.ply").write_bytes((tmp_path / "m.ply").read_bytes()[:-10])
+    with pytest.raises(ValueError, match=r"m\.ply"):
+        PlySource(tmp_path / "m.ply")

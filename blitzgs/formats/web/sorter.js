@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // A worker that orders the Gaussians of a view front to back, by depth and then by index.
 "use strict";
-let positions, levels, lod, keys, ids, other, counts, depth;
+let positions, levels, lod, keys, ids, other, counts, depth, ranges;
 
 onmessage = (event) => {
   const ask = event.data;
@@ -13,6 +13,15 @@ onmessage = (event) => {
     ids = new Uint32Array(count);
     other = new Uint32Array(count);
     counts = new Uint32Array(65536);
+    ranges = [0, count];
+    return;
+  }
+  if (ask.page) {
+    positions.set(ask.page, ask.at);
+    return;
+  }
+  if (ask.ranges) {
+    ranges = ask.ranges;
     return;
   }
   const gated = lod !== null && gate(ask.centre);
@@ -41,12 +50,14 @@ function gate(centre) {
 function select({ forward, centre, near, far }, gated) {
   const [x, y, z] = forward, base = x * centre[0] + y * centre[1] + z * centre[2];
   let kept = 0;
-  for (let i = 0, k = 0; k < positions.length; i++, k += 3) {
-    const along = x * positions[k] + y * positions[k + 1] + z * positions[k + 2] - base;
-    if (!(along > near && along <= far)) continue;
-    if (gated && !(squared(i, centre) <= lod.squares[levels[i]])) continue;
-    depth[i] = along;
-    ids[kept++] = i;
+  for (let range = 0; range < ranges.length; range += 2) {
+    for (let i = ranges[range], k = 3 * i; i < ranges[range + 1]; i++, k += 3) {
+      const along = x * positions[k] + y * positions[k + 1] + z * positions[k + 2] - base;
+      if (!(along > near && along <= far)) continue;
+      if (gated && !(squared(i, centre) <= lod.squares[levels[i]])) continue;
+      depth[i] = along;
+      ids[kept++] = i;
+    }
   }
   return kept;
 }

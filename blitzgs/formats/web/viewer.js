@@ -1,79 +1,34 @@
 // SPDX-License-Identifier: Apache-2.0
-// Shows the model that this page contains. Lengths are in trained units; cameras look along their z axis, with
+// Draws Gaussians and moves a camera. Lengths are in the unit of the scene; cameras look along their z axis, with
 // y downwards.
 "use strict";
-(() => {
-  const WIDTH = 4096, BATCH = 256, BLOCK = 256;
-  const scene = JSON.parse(document.getElementById("scene").textContent);
+
+const WIDTH = 4096;  // of the textures, in texels
+
+// The bits of the nearest number of half precision.
+const float = new Float32Array(1), bits = new Uint32Array(float.buffer);
+function half(value) {
+  float[0] = value;
+  const sign = (bits[0] >>> 16) & 0x8000, exponent = ((bits[0] >>> 23) & 255) - 112, fraction = bits[0] & 0x7fffff;
+  if (exponent >= 31) return sign | 0x7bff;
+  if (exponent > 0) return sign | Math.min(0x7bff, ((exponent << 10) | (fraction >>> 13)) + ((fraction >>> 12) & 1));
+  return sign | Math.round(Math.abs(value) * 16777216);
+}
+
+function fail(text) {
+  const message = document.getElementById("message");
+  message.textContent = text;
+  message.hidden = false;
+  throw new Error(text);
+}
+
+// Returns a viewer of a scene (`WebScene`, with count, degree and harmonic); `look` is called with the camera before
+// each picture.
+function makeViewer(scene, look = () => {}) {
+  const BATCH = 256;
   const canvas = document.getElementById("view"), figures = document.getElementById("figures");
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
-
-  function fail(text) {
-    const message = document.getElementById("message");
-    message.textContent = text;
-    message.hidden = false;
-    throw new Error(text);
-  }
-
-  // --- The model -------------------------------------------------------------------------------------------------
-
-  async function unpacked() {
-    if (typeof DecompressionStream === "undefined") fail("This browser is too old for this page.");
-    const element = document.getElementById("model"), text = atob(element.textContent.trim());
-    element.remove();
-    const bytes = new Uint8Array(text.length);
-    for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
-    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-    return new Uint8Array(await new Response(stream).arrayBuffer());
-  }
-
-  const float = new Float32Array(1), bits = new Uint32Array(float.buffer);
-
-  // The bits of the nearest number of half precision.
-  function half(value) {
-    float[0] = value;
-    const sign = (bits[0] >>> 16) & 0x8000, exponent = ((bits[0] >>> 23) & 255) - 112, fraction = bits[0] & 0x7fffff;
-    if (exponent >= 31) return sign | 0x7bff;
-    if (exponent > 0) return sign | Math.min(0x7bff, ((exponent << 10) | (fraction >>> 13)) + ((fraction >>> 12) & 1));
-    return sign | Math.round(Math.abs(value) * 16777216);
-  }
-
-  // Returns positions, levels and the texels of all Gaussians; `write_scene` of blitzgs/formats has the layout.
-  function decode(bytes) {
-    const n = scene.count, blocks = Math.ceil(n / BLOCK), view = new DataView(bytes.buffer);
-    let at = 0;
-    const plane = () => bytes.subarray(at, (at += n));
-    const range = () => {
-      const values = new Float32Array(2 * blocks);
-      for (let i = 0; i < values.length; i++, at += 4) values[i] = view.getFloat32(at, true);
-      return values;
-    };
-    const ranges = (count) => Array.from({ length: count }, range), planes = (count) => Array.from({ length: count }, plane);
-    const boxes = ranges(3), sizes = ranges(3), tints = ranges(3);
-    const low = planes(3), high = planes(3), scales = planes(3), colours = planes(3), quats = planes(4);
-    const opacities = plane(), levels = scene.lod ? plane() : null;
-    const rest = planes(3 * scene.degree * (scene.degree + 2)), texels = Math.ceil(rest.length / 12);
-
-    const positions = new Float32Array(3 * n), geometry = new Uint32Array(8 * WIDTH * Math.ceil((2 * n) / WIDTH));
-    const shades = new Uint32Array(4 * WIDTH * Math.max(1, Math.ceil((texels * n) / WIDTH)));
-    const words = new Float32Array(geometry.buffer);
-    for (let i = 0; i < n; i++) {
-      const b = 2 * Math.floor(i / BLOCK), of = (found, codes, axis) => found[axis][b] + codes * found[axis][b + 1];
-      const g = 8 * i;
-      for (let axis = 0; axis < 3; axis++) {
-        const place = of(boxes, low[axis][i] | (high[axis][i] << 8), axis);
-        words[g + axis] = positions[3 * i + axis] = place;
-      }
-      geometry[g + 3] = quats[0][i] | (quats[1][i] << 8) | (quats[2][i] << 16) | (quats[3][i] << 24);
-      const shade = (axis) => half(of(tints, colours[axis][i], axis)), size = (axis) => half(of(sizes, scales[axis][i], axis));
-      geometry[g + 4] = shade(0) | (shade(1) << 16);
-      geometry[g + 5] = shade(2) | (half(opacities[i] / 255) << 16);
-      geometry[g + 6] = size(0) | (size(1) << 16);
-      geometry[g + 7] = size(2) | (half(levels ? levels[i] : 0) << 16);
-      for (let k = 0; k < rest.length; k += 3) shades[4 * texels * i + k / 3] = rest[k][i] | (rest[k + 1][i] << 8) | (rest[k + 2][i] << 16);
-    }
-    return { positions, levels, geometry, texels, shades };
-  }
+  if (!gl) fail("This browser shows no 3D graphics: WebGL 2 is missing or switched off.");
 
   // --- Drawing ---------------------------------------------------------------------------------------------------
 
@@ -110,7 +65,7 @@
     return made;
   }
 
-  let splats, screen, target, orderTexture;
+  let splats, screen, target, orderTexture, geometryTexture, shadesTexture, degreeTexels;
   let kept = 0, gated = false;
 
   function prepare(model) {
@@ -121,9 +76,10 @@
     splats = program("splat.vert", "splat.frag");
     screen = program("screen.vert", "screen.frag");
     const uint = gl.UNSIGNED_INT, integers = gl.RGBA_INTEGER, rows = (values, each) => values.length / each / WIDTH;
-    texture(0, gl.RGBA32UI, integers, uint, WIDTH, rows(model.geometry, 4), model.geometry);
-    texture(1, gl.RGBA32UI, integers, uint, WIDTH, rows(model.shades, 4), model.shades);
-    orderTexture = texture(2, gl.R32UI, gl.RED_INTEGER, uint, WIDTH, Math.ceil(scene.count / WIDTH), null);
+    geometryTexture = texture(0, gl.RGBA32UI, integers, uint, WIDTH, rows(model.geometry, 4), model.geometry);
+    shadesTexture = texture(1, gl.RGBA32UI, integers, uint, WIDTH, rows(model.shades, 4), model.shades);
+    orderTexture = texture(2, gl.R32UI, gl.RED_INTEGER, uint, WIDTH, Math.ceil(model.positions.length / 3 / WIDTH), null);
+    degreeTexels = model.texels;
     target = { made: null, width: 0, height: 0, buffer: gl.createFramebuffer() };
 
     const corners = new Uint16Array(6 * BATCH);
@@ -148,6 +104,19 @@
     gl.useProgram(screen.made);
     gl.uniform1i(screen.places.composited, 3);
     gl.uniform3fv(screen.places.background, scene.background);
+  }
+
+  // Replaces the Gaussians WIDTH * page to WIDTH * (page + 1) - 1.
+  function writePage(page, { positions, geometry, shades }) {
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, geometryTexture);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 2 * page, WIDTH, 2, gl.RGBA_INTEGER, gl.UNSIGNED_INT, geometry);
+    if (degreeTexels) {
+      gl.activeTexture(gl.TEXTURE1);
+      gl.bindTexture(gl.TEXTURE_2D, shadesTexture);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, degreeTexels * page, WIDTH, degreeTexels, gl.RGBA_INTEGER, gl.UNSIGNED_INT, shades);
+    }
+    sorter.postMessage({ page: positions, at: 3 * WIDTH * page }, [positions.buffer]);
   }
 
   function resize(width, height) {
@@ -195,7 +164,7 @@
     sorter = new Worker(URL.createObjectURL(new Blob([document.getElementById("sorter.js").textContent])));
     const lod = scene.lod && { ...scene.lod, squares: scene.lod.reach.map((value) => (value === null ? Infinity : value < 0 ? -1 : value * value)) };
     sorter.postMessage({ positions: model.positions, levels: model.levels, lod });
-    spare = new Uint32Array(WIDTH * Math.ceil(scene.count / WIDTH));
+    spare = new Uint32Array(WIDTH * Math.ceil(model.positions.length / 3 / WIDTH));
     sorter.onmessage = ({ data }) => {
       ({ kept, gated } = data);
       sorted = data.number;
@@ -220,6 +189,14 @@
     sorter.postMessage({ ...sortedFor, near: scene.near, far: scene.far, order: spare, number: ++asked }, [spare.buffer]);
     spare = null;
     return false;
+  }
+
+  // Shows only the Gaussians of some ranges (begin, end, begin, end, ...) from the next order on; returns its number.
+  function showRanges(ranges) {
+    sorter.postMessage({ ranges });
+    sortedFor = null;
+    wake();
+    return asked + 1;
   }
 
   // --- The camera ------------------------------------------------------------------------------------------------
@@ -335,7 +312,9 @@
       const width = Math.max(1, Math.round(canvas.clientWidth * ratio)), height = Math.max(1, Math.round(canvas.clientHeight * ratio));
       if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     }
-    const view = camera(), ready = sort(view);
+    const view = camera();
+    look(view);
+    const ready = sort(view);
     draw(view, moving ? scale : 1);
     figures.textContent = `${kept.toLocaleString("en")} of ${scene.count.toLocaleString("en")} Gaussians`
       + (gated ? " (level of detail)" : "") + (moving ? ` · ${Math.round(1000 / pace)} fps` : "");
@@ -365,9 +344,8 @@
     return upright;
   }
 
-  async function open() {
-    if (!gl) fail("This browser shows no 3D graphics: WebGL 2 is missing or switched off.");
-    const model = decode(await unpacked());
+  // Opens the view of a model: positions, texels of all Gaussians, and their levels or null.
+  async function open(model) {
     prepare(model);
     start(model);
     listen();
@@ -378,7 +356,6 @@
     document.getElementById("message").hidden = true;
   }
 
-  const ready = open();
-  ready.catch((error) => fail(`The model cannot be shown: ${error.message}`));
-  window.blitzgs = { ready, setCamera, pixels, stance: () => ({ ...stance }), scene };
-})();
+  const stanceNow = () => ({ ...stance }), shownOrder = () => sorted;
+  return { open, setCamera, pixels, writePage, showRanges, shownOrder, wake, stance: stanceNow };
+}

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measures what views of a tileset load, and how far they are from the whole model, along a flight.
+
+    blitzgs export RUN --tiles CITY
+    python benchmarks/bm_tiles.py CITY [--errors 4 16 64] [--frames 12] [--device cuda] [--json FILE]
+
+The flight comes from above towards the middle of the scene, by the same ratio of distances from frame to
+frame. For each frame and error in pixels, the tiles are chosen as the page chooses them (without a budget),
+read from the GLB files, rendered, and compared with the picture of all tiles.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from harness import make_parser, report
+from torch import Tensor
+
+from blitzgs import rasterization
+from blitzgs.viewer.world import looking
+
+# The flight begins and ends at these multiples of the distance of the page's first view.
+FARTHEST, NEAREST = 4.0, 0.05
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+
+
+@dataclass
+class Tile:
+    """A tile of the tree; rows of its Gaussians among those of all tiles."""
+
+    centre: np.ndarray
+    half: np.ndarray
+    error: float
+    children: list[Tile]
+    rows: slice
+    bytes: int
+
+
+def read_glb(path: Path) -> dict[str, np.ndarray]:
+    """Return the float32 attributes of a file of ours by their names."""
+    data = path.read_bytes()
+    size = int.from_bytes(data[12:16], "little")
+    content, found = json.loads(data[20 : 20 + size]), {}
+    for name, index in content["meshes"][0]["primitives"][0]["attributes"].items():
+        accessor = content["accessors"][index]
+        if accessor["componentType"] == 5126:
+            start = 28 + size + content["bufferViews"][accessor["bufferView"]].get("byteOffset", 0)
+            count = accessor["count"] * _WIDTHS[accessor["type"]]
+            values = np.frombuffer(data, "<f4", count, start).reshape(accessor["count"], -1)
+            found[name.removeprefix("KHR_gaussian_splatting:")] = values
+    return found
+
+
+class City:
+    """All tiles of a tileset, on a device."""
+
+    def __init__(self, folder: Path, device: torch.device) -> None:
+        """Read all files."""
+        tileset = json.loads((folder / "tileset.json").read_text())
+        self.view, self.degree = tileset["extras"]["view"], tileset["extras"]["degree"]
+        self._folder, self._parts, self._count = folder, [], 0
+        self.root = self._tile(tileset["root"])
+        names = ["POSITION", "ROTATION", "SCALE", "OPACITY"]
+        names += [f"SH_DEGREE_{d}_COEF_{k}" for d in range(self.degree + 1) for k in range(2 * d + 1)]
+        columns = [
+            torch.from_numpy(np.concatenate([part[name] for part in self._parts])).to(device)
+            for name in names
+        ]
+        self._parts.clear()
+        self.means, quats, self.scales, self.opacities = *columns[:3], columns[3][:, 0]
+        self.quats, self.sh = quats[:, [3, 0, 1, 2]].contiguous(), torch.stack(columns[4:], dim=1)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def _tile(self, node: dict[str, Any]) -> Tile:
+        box = np.array(node["boundingVolume"]["box"])
+        start, size = self._count, 0
+        if "content" in node:
+            path = self._folder / node["content"]["uri"]
+            self._parts.append(read_glb(path))
+            self._count += len(self._parts[-1]["POSITION"])
+            size = path.stat().st_size
+        rows = slice(start, self._count)
+        children = [self._tile(child) for child in node.get("children", [])]
+        return Tile(box[:3], np.diag(box[3:].reshape(3, 3)), node["geometricError"], children, rows, size)
+
+    def chosen(
+        self,
+        pose: np.ndarray,
+        K: np.ndarray,
+        size: tuple[int, int],
+        pixels: float,  # noqa: N803
+    ) -> list[Tile]:
+        """Return the tiles with contents that a view loads, as `tiles.js` chooses them."""
+        axes, centre = pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
+        (fx, _, cx), (_, fy, cy) = K[:2]
+        sides = np.stack(
+            [
+                axes[2],
+                fx * axes[0] + cx * axes[2],
+                -fx * axes[0] + (size[0] - cx) * axes[2],
+                fy * axes[1] + cy * axes[2],
+                -fy * axes[1] + (size[1] - cy) * axes[2],
+            ]
+        )
+        found, waiting = [], [self.root]
+        while waiting:
+            tile = waiting.pop()
+            if not (sides @ (tile.centre - centre) + np.abs(sides) @ tile.half > 0).all():
+                continue
+            if tile.bytes:
+                found.append(tile)
+            away = np.linalg.norm(np.maximum(0, np.abs(centre - tile.centre) - tile.half))
+            if tile.error * fy / max(float(away), self.view["near"]) > pixels:
+                waiting += tile.children
+        return found
+
+    def render(self, rows: Tensor, pose: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> Tensor:  # noqa: N803
+        """Render some of the Gaussians; float32 [H, W, 3] in [0, 1]."""
+        view, device = self.view, self.means.device
+        images, _, _ = rasterization(
+            self.means[rows], self.quats[rows], self.scales[rows], self.opacities[rows], self.sh[rows],
+            torch.from_numpy(pose).float()[None].to(device), torch.from_numpy(K).float()[None].to(device),
+            *size, near_plane=view["near"], far_plane=view["far"], eps2d=view["blur"], sh_degree=self.degree,
+            backgrounds=torch.tensor([view["background"]], dtype=torch.float32, device=device),
+            rasterize_mode="antialiased" if view["antialiased"] else "classic",
+        )  # fmt: skip
+        return images[0].clamp(0, 1)
+
+
+@torch.no_grad()
+def measure(
+    folder: Path,
+    device: str = "cpu",
+    frames: int = 12,
+    width: int = 1920,
+    errors: tuple[float, ...] = (4, 16, 64),
+) -> dict[str, Any]:
+    """Fly through a tileset.
+
+    Returns:
+        Number of Gaussians and bytes of all tiles, and for each error and frame: distance, tiles, Gaussians,
+        bytes of the view, bytes loaded since the begin of the flight, and PSNR in dB.
+    """
+    city = City(folder, torch.device(device))
+    view, size = city.view, (width, width * 9 // 16)
+    eye, target, up = (np.array(view[name]) for name in ("eye", "target", "up"))
+    focal = size[1] / 2 / math.tan(view["fov"] / 2)
+    K = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])  # noqa: N806
+    everything = torch.arange(len(city), device=city.means.device)
+    loaded: dict[float, dict[int, int]] = {error: {} for error in errors}
+    rows = []
+    for factor in np.geomspace(FARTHEST, NEAREST, frames):
+        stance = looking(target + factor * (eye - target), target, up, view["fov"])
+        pose = np.eye(4)
+        pose[:3, :3] = stance.rotation.T
+        pose[:3, 3] = -stance.rotation.T @ stance.position
+        full = city.render(everything, pose, K, size)
+        for error in errors:
+            tiles = city.chosen(pose, K, size, error)
+            loaded[error] |= {tile.rows.start: tile.bytes for tile in tiles}
+            some = torch.cat([everything[tile.rows] for tile in tiles]) if tiles else everything[:0]
+            difference = float((city.render(some, pose, K, size) - full).double().square().mean())
+            rows.append(
+                {
+                    "pixel_error": error,
+                    "distance": float(factor * np.linalg.norm(eye - target)),
+                    "tiles": len(tiles),
+                    "gaussians": len(some),
+                    "bytes": sum(tile.bytes for tile in tiles),
+                    "loaded_bytes": sum(loaded[error].values()),
+                    "psnr": -10 * math.log10(difference) if difference > 0 else None,  # None: equal
+                }
+            )
+    total = sum(file.stat().st_size for file in (folder / "tiles").iterdir())
+    return {"gaussians": len(city), "bytes": total, "width": size[0], "height": size[1], "frames": rows}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the benchmark."""
+    parser = make_parser(__doc__)
+    parser.add_argument("tiles", type=Path, help="folder of the tileset")
+    parser.add_argument("--errors", type=float, nargs="+", default=[4.0, 16.0, 64.0], help="in pixels")
+    parser.add_argument("--frames", type=int, default=12)
+    parser.add_argument("--width", type=int, default=1920, help="of the frames in pixels")
+    options = parser.parse_args(arguments)
+    found = measure(options.tiles, options.device, options.frames, options.width, tuple(options.errors))
+    title = f"Tiles of {options.tiles.name}: {found['gaussians']:,} Gaussians, {found['bytes'] / 1e6:.1f} MB"
+    report(title, found["frames"], options.json, options.device)
+
+
+if __name__ == "__main__":
+    main()
