@@ -45,7 +45,7 @@ def by_definition(x, y, masks, weight, padding):
     """The loss in float64, with torch's convolution."""
     taps = torch.exp(-((torch.arange(11.0, dtype=torch.float64) - 5) ** 2) / 4.5)
     taps = taps / taps.sum()
-    window = (taps[:, None] * taps).expand(3, 1, 11, 11)
+    window = (taps[:, None] * taps).expand(3, 1, 11, 11).to(x.device)
     x, y = x.movedim(-1, 1).double(), y.movedim(-1, 1).double()
 
     def mean(images):

@@ -67,7 +67,9 @@ def test_parameters_of_nerfstudio_and_inria_are_taken_as_they_are(device, sparse
         optimizer.catch_up()
         runs.append([image, *p.values()])
     for actual, expected in zip(*reversed(runs), strict=True):
-        assert torch.equal(actual.detach().reshape(expected.shape), expected.detach())
+        actual, expected = actual.detach().reshape(expected.shape), expected.detach()
+        # On CUDA, sums of gradients differ by rounding, and Adam takes whole steps for gradients that small.
+        assert torch.equal(actual, expected) if device == "cpu" else relative_error(actual, expected) < 0.05
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
