@@ -59,7 +59,7 @@ def names_of_calls():
 def arguments_of(function):
     """The arguments as a caller writes them; annotations may become wider."""
     plain = [p.replace(annotation=p.empty) for p in inspect.signature(function).parameters.values()]
-    return str(inspect.Signature(plain))
+    return re.sub(r" at 0x[0-9a-f]+", "", str(inspect.Signature(plain)))
 
 
 def described(name):

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
+import pytest
 
 from blitzgs.capture import colmap
+
+pycolmap = pytest.importorskip("pycolmap")
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
-import pycolmap
 import pytest
 
 from blitzgs.capture import colmap
 from blitzgs.formats import native
 from tests.capture.helpers import reconstruction, shared_data
+
+pycolmap = pytest.importorskip("pycolmap")
 
 NAMES = ["a.jpg", "sub/b c.png", "ü.jpg"]
 

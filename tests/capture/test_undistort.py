@@ -3,12 +3,13 @@ import time
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 
 from blitzgs.capture.cameras import scaled_matrix
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.undistort import rectify
+
+pycolmap = pytest.importorskip("pycolmap")
 
 DISTORTED = {
     "SIMPLE_RADIAL": [500, 320, 240, -0.12],
