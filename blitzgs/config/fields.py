@@ -79,7 +79,7 @@ class ModelConfig:
             refined in training. Views are rendered with the mean exposure (`blitzgs render --exposure`:
             with the photograph's), so held-out photographs are farther from them: `psnr_corrected` compares
             without exposure.
-        start: file of Gaussians of any program to begin with (`blitzgs train --start`), in the capture's
+        start: file of Gaussians of any program to begin with (`--start`), in the capture's
             coordinates; empty: Gaussians on the capture's points.
     """
 
