@@ -42,7 +42,8 @@ OFFLOAD_COLUMNS = {
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
     """Return the lines of a Markdown table."""
     names = list(head)
-    return [f"| {' | '.join(line)} |" for line in (names, ["---"] * len(names), *rows)]
+    first, *others = [f"| {' | '.join(line)} |" for line in (names, *rows)]
+    return [first, f"|{'---|' * len(names)}", *others]
 
 
 def ms(value: float) -> str:

@@ -39,7 +39,7 @@ def test_a_benchmark_notes_what_the_report_needs(tmp_path, monkeypatch):
     page = made(tmp_path, "photometric")
     command = "python benchmarks/bm_photometric.py --device cpu --height 20 --width 30 --repeats 1"
     assert f"`{command}`" in page and "| 1 view(s) of 30 × 20 | ms | byte floor, ms |" in page
-    assert page.count("\n| ") == 6
+    assert page.count("\n| ") == 5
 
 
 def test_the_exchange_benchmark_writes_what_the_report_reads(tmp_path):
