@@ -139,7 +139,7 @@ class TrainingState:
 
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time inside this context to `progress.stages`, unless an error leaves it.
+        """Add the time inside this context to `progress.stages`, unless it ends with an error.
 
         A run that stops within an event does it again after the resume; the training time has it once.
         """
