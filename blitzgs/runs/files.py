@@ -282,7 +282,7 @@ def open_model(
         raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
     config, progress, table = restored.config, restored.progress, restored.table
     if ranks.rank == 0:
-        _compare_with_file(config, folder / CONFIG)
+        compare_with_file(config, folder / CONFIG)
     if data is not None:
         config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
     optimiser = TableAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
@@ -298,7 +298,7 @@ def _resident_gb(path: Path) -> float:
         return 0.0
 
 
-def _compare_with_file(config: Config, path: Path) -> None:
+def compare_with_file(config: Config, path: Path) -> None:
     """Warn if a run's configuration file differs from the configuration in its checkpoint."""
     try:
         # The file has the pace of the run's beginning or, after its end, the final one.

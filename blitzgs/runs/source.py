@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ import torch
 
 from blitzgs.config.fields import Config
 from blitzgs.config.schedule import Schedule
+from blitzgs.distributed.group import Ranks
 from blitzgs.formats import gaussians
 from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource
 from blitzgs.optim.table_adam import TableAdam
@@ -20,6 +22,7 @@ from blitzgs.runs import checkpoint
 from blitzgs.runs import files as run_files
 from blitzgs.runs.checkpoint import CheckpointError, Shard
 from blitzgs.runs.folder import Model
+from blitzgs.runs.identity import check_own
 from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.shard_file import header_of, read_rows
 from blitzgs.table.table import GaussianTable
@@ -89,7 +92,7 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
 
     Raises:
         FileNotFoundError: the folder is not a run, or holds no checkpoint.
-        CheckpointError: all checkpoints are damaged.
+        CheckpointError: all checkpoints are damaged, or the newest is of another version or of another run.
     """
     run_files.check_is_run(folder)
     refused = []
@@ -101,7 +104,11 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
         except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             refused.append(f"checkpoint {path} is damaged: {error}")
             continue
+        if refused:
+            warnings.warn(f"{'; '.join(refused)}; using {name}", stacklevel=2)
+        check_own(folder, path, str(manifest.state.get("run", "")), Ranks())
         progress, space, config = run_files.parsed(manifest.state, path)
+        run_files.compare_with_file(config, folder / run_files.CONFIG)
         gate = lod_gate(config, progress)
         trained = _Shards(path, manifest.shards, config, progress.step, space.extent, gate is not None)
         exposed = manifest.shared is not None and "exposures" in header_of(path / manifest.shared.file)

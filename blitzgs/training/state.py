@@ -139,12 +139,13 @@ class TrainingState:
 
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time inside this context to `progress.stages`."""
+        """Add the time inside this context to `progress.stages`, unless it ends with an error.
+
+        A run that stops within an event does it again after the resume; the training time has it once.
+        """
         begin = self.clock()
-        try:
-            yield
-        finally:
-            self.add_stage(name, self.clock() - begin)
+        yield
+        self.add_stage(name, self.clock() - begin)
 
     def add_stage(self, name: str, seconds: float) -> None:
         """Add seconds to a kind of work in `progress.stages`."""

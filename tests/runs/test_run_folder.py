@@ -398,7 +398,7 @@ def test_export_replaces_no_file_of_another_format(trained, tmp_path, capsys):
 def test_export_refuses_a_name_that_promises_another_format(trained, tmp_path, capsys):
     path = tmp_path / "model.spz"
     assert main(["export", str(trained[1]), "--ply", str(path)]) == 1
-    assert "model.spz: the file will be a PLY" in capsys.readouterr().err
+    assert "model.spz: the file will be PLY: choose a name that ends in .ply" in capsys.readouterr().err
     assert not path.exists()
 
 

@@ -42,7 +42,8 @@ def test_a_damaged_checkpoint_is_passed_over(trained, tmp_path, capsys):
     broken = run / "checkpoints" / "checkpoint_999999"
     shutil.copytree(newest, broken)
     (broken / "manifest.json").write_text("{}")
-    assert len(open_source(run)) == before
+    with pytest.warns(UserWarning, match=f"checkpoint_999999 is damaged: .*; using {newest.name}"):
+        assert len(open_source(run)) == before
     assert main(["export", str(broken), "--ply", str(tmp_path / "a.ply")]) == 1
     assert "damaged" in capsys.readouterr().err
     assert main(["export", str(newest), "--ply", str(tmp_path / "a.ply")]) == 0
