@@ -241,13 +241,18 @@ def _packages() -> list[Line]:
     return lines
 
 
-def torch_bounds() -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the lowest torch that BlitzGS works with, and the first one that is not tested."""
-    for requirement in metadata.requires("blitzgs") or []:
-        bounds = dict(re.findall(r"(>=|<)([\d.]+)", requirement))
-        if requirement.startswith("torch") and len(bounds) == 2:
-            return _version(bounds[">="]), _version(bounds["<"])
-    raise metadata.PackageNotFoundError("torch")
+def _torch_bounds() -> dict[str, str]:
+    """Return the lowest torch that BlitzGS works with (">="), and the first that is not tested ("<").
+
+    A bound that the installed package does not state is absent.
+    """
+    try:
+        wanted = metadata.requires("blitzgs") or []
+    except metadata.PackageNotFoundError:
+        return {}
+    torch = next((text for text in wanted if re.match(r"torch\b", text)), "")
+    found = dict(re.findall(r"(>=|<)\s*([\d.]+)", torch))
+    return {sign: found[sign] for sign in (">=", "<") if sign in found}
 
 
 def _version(text: str) -> tuple[int, ...]:
@@ -255,11 +260,9 @@ def _version(text: str) -> tuple[int, ...]:
 
 
 def _torch(timeout: float) -> Line:
-    try:
-        low, high = torch_bounds()
-    except metadata.PackageNotFoundError:
-        low, high = (0,), (10**6,)
-    install = f"pip install 'torch>={'.'.join(map(str, low))},<{'.'.join(map(str, high))}'"
+    bounds = _torch_bounds()
+    limits = ",".join(f"{sign}{version}" for sign, version in bounds.items())
+    install = f"pip install 'torch{limits}'" if bounds else "pip install torch"
     try:
         found = probe("torch", timeout=timeout)
     except ProbeError as error:
@@ -269,9 +272,9 @@ def _torch(timeout: float) -> Line:
     cuda = f"CUDA {found['cuda']}" if found["cuda"] else "for CPUs only"
     nccl = f", NCCL {found['nccl']}" if found["nccl"] else ""
     text = f"{found['version']}, {cuda}{nccl}, {found['threads']} threads"
-    if version < low:
+    if version < _version(bounds.get(">=", "0")):
         return Line("torch", "failed", f"{text}: too old", install, values=found)
-    if version >= high:
+    if "<" in bounds and version >= _version(bounds["<"]):
         return Line("torch", "warning", f"{text}: newer than what is tested", install, values=found)
     return Line("torch", "ok", text, values=found)
 

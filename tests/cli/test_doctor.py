@@ -17,6 +17,8 @@ from blitzgs._built import LIBRARY_DIR
 from blitzgs.cli import doctor, main
 
 ROOT = Path(__file__).resolve().parents[2]
+# The requirement of the sources: an editable installation may be older than they are.
+REQUIREMENTS = re.findall(r'"(torch>=2\.11,<2\.14)"', (ROOT / "pyproject.toml").read_text())
 GOOD = {"image_error": 1e-6, "gradient_error": 1e-5, "seconds": 0.1}
 
 
@@ -60,6 +62,10 @@ def test_a_torch_that_does_not_load_is_named(code, state, text, tmp_path):
     fake.write_text(code)
     # The folder of the package comes first in the path of a probe, so the fake lies before a copy of it.
     (fake.parent / "blitzgs").symlink_to(ROOT / "blitzgs")
+    facts = ["Metadata-Version: 2.1", "Name: blitzgs", "Version: 1"]
+    facts += [f"Requires-Dist: {requirement}" for requirement in REQUIREMENTS]
+    (fake.parent / "blitzgs-1.dist-info").mkdir()
+    (fake.parent / "blitzgs-1.dist-info" / "METADATA").write_text("\n".join(facts))
     command = "import sys; from blitzgs.cli import doctor; doctor._PACKAGE = doctor.Path(sys.path[1]) / 'b'; "
     command += "from blitzgs.cli import main; sys.exit(main(['doctor', '--json', '--timeout', '3']))"
     environment = os.environ | {"PYTHONPATH": str(fake.parent)}
@@ -101,14 +107,27 @@ def torch_of(version, **more):
     "version, state", [("2.10.1", "failed"), ("2.11.0+cu130", "ok"), ("2.13.0", "ok"), ("2.14.0", "warning")]
 )
 def test_the_bounds_of_torch(version, state, monkeypatch):
+    monkeypatch.setattr(doctor.metadata, "requires", lambda _: REQUIREMENTS)
     monkeypatch.setattr(doctor, "probe", lambda *_, **__: torch_of(version))
     assert doctor._torch(1).state == state
 
 
-def test_the_bounds_are_those_of_the_package():
-    text = (ROOT / "pyproject.toml").read_text()
-    low, high = re.search(r'"torch>=(\d+\.\d+),<(\d+\.\d+)"', text).groups()
-    assert doctor.torch_bounds() == (doctor._version(low), doctor._version(high)) == ((2, 11), (2, 14))
+@pytest.mark.parametrize(
+    "requirements, remedy",
+    [
+        (["numpy", "torch<2.14,>=2.11"], "pip install 'torch>=2.11,<2.14'"),
+        (["torchvision>=9", "torch>=2.11"], "pip install 'torch>=2.11'"),
+        (["numpy"], "pip install torch"),
+        (None, "pip install torch"),
+    ],
+)
+def test_the_remedy_names_the_bounds_that_are_known(requirements, remedy, monkeypatch):
+    def fails(*_, **__):
+        raise doctor.ProbeError("No module named 'torch'")
+
+    monkeypatch.setattr(doctor.metadata, "requires", lambda _: requirements)
+    monkeypatch.setattr(doctor, "probe", fails)
+    assert doctor._torch(1).remedy == remedy
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,7 @@ def test_torchrun_entry(trained, tmp_path):
         (["train", "--data", "d", "--out", "x", "--device", "cuda:x"], 1, "cuda or cuda:N, got 'cuda:x'"),
         (["train", "--data", "d", "--out", ""], 2, "argument --out: the path is empty"),
         (["train", "--data", "", "--out", "x"], 2, "argument --data: the path is empty"),
-        (["eval", ""], 2, "argument RUN: the path is empty"),
+        (["eval", ""], 2, "argument MODEL: the path is empty"),
         (["gate", "fit", "run", "--out", ""], 2, "argument --out: the path is empty"),
         (["synth", "."], 1, "the folder must be given by its name, got '.'"),
         (["synth", "city", "--processes=-2"], 1, "processes must be at least 1, got -2"),
