@@ -15,8 +15,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import websocket
+import pytest
 
+websocket = pytest.importorskip("websocket")
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 

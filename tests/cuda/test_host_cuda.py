@@ -18,6 +18,7 @@ def test_the_current_stream_is_torchs_and_its_object_is_made_once():
 def test_an_event_on_the_current_stream_waits_for_its_work():
     event, side = torch.cuda.Event(), torch.cuda.Stream()
     values = torch.zeros(1 << 20, device="cuda")
+    values += 0  # loads the kernel, which may take longer than the sleep
     torch.cuda.synchronize()
     with torch.cuda.stream(side):
         torch.cuda._sleep(1_000_000_000)  # longer than a busy host needs for the next lines

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 
 from blitzgs.capture.capture import load_capture
@@ -19,6 +18,8 @@ from blitzgs.sfm.pycolmap_stage import features
 from blitzgs.sfm.reconstruct import Settings
 from blitzgs.sfm.report import examine
 from tests.sfm.scene import FOCAL, aligned, with_gps, write_photographs
+
+pycolmap = pytest.importorskip("pycolmap")
 
 
 def poses_of(capture, placed):
