@@ -20,9 +20,8 @@ from typing import Any
 
 import torch
 from bm_render import OPTIONS, CallRender
-from harness import make_parser, write_json
+from harness import Clock, make_parser, write_json
 from scenes import BenchmarkScene, aerial, garden_like
-from timing import Clock
 
 from blitzgs.config.fields import LossConfig, OptimiserConfig, ScheduleConfig
 from blitzgs.config.schedule import Schedule

@@ -2,21 +2,18 @@
 """The city's benchmark: its arms, phases, deadline, and what the report makes of its JSON."""
 
 import json
-import sys
 from pathlib import Path
 
+import bm_city
+import city_report
+import city_run
 import pytest
+import report
 
 from blitzgs.config.files import load_config
 from tests.training.tiny import write_tiny_capture
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-import bm_city  # noqa: E402
-import city_report  # noqa: E402
-import city_run  # noqa: E402
-import report  # noqa: E402
 
 # 26 steps of 4 images.
 TINY = ["--gpus", "0", "--held-out", "2", "--scale", "0.004", "--log.every=8", "--data.threads=1"]

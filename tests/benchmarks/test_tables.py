@@ -3,30 +3,20 @@
 
 import csv
 import json
-import sys
 from pathlib import Path
 
+import bm_popping
 import pytest
+import tables
 import yaml
+from quality_plan import runs_of
+
+from tests.training.tiny import OVERRIDES
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-import bm_popping  # noqa: E402
-import tables  # noqa: E402
-from quality_plan import runs_of  # noqa: E402
-
-from tests.training.tiny import OVERRIDES, write_tiny_capture  # noqa: E402
 
 PLANS = yaml.safe_load(tables.PAPER.read_text())
 FLAGS = " ".join(f"--{text}" for text in OVERRIDES)
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("tables") / "capture"
-    write_tiny_capture(folder)
-    return folder
 
 
 def finished(recipe, seed, psnr, capture="town", **more):
