@@ -18,8 +18,7 @@ from blitzgs.capture.image_files import (
     read_whole,
 )
 from blitzgs.capture.images import ImageStore
-from tests.capture.helpers import smooth_image, write_capture, write_image
-from tests.capture.image_bytes import tiff
+from tests.capture.helpers import smooth_image, tiff, write_capture, write_image
 
 NAMES = [f"{i}.png" for i in range(9)]
 BOX = b"\0\0\0\x20ftyp%s\0\0\0\0mif1" + bytes(20)

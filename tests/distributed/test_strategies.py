@@ -13,8 +13,7 @@ from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.distributed.test_training import sorted_table
 from tests.helpers import needs_cuda
-from tests.training.tiny import tiny_config, tiny_scene
-from tests.training.tiny_runs import events_of, steps_of
+from tests.training.tiny import events_of, steps_of, tiny_config, tiny_scene
 
 # 30 steps of 2 images, with a checkpoint after 10, and density events after 28, 36, 44 and 52 images.
 SETTINGS = (

@@ -19,8 +19,16 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import EIGHT, RankError, on_each_device, run_ranks
-from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene, write_tiny_capture
-from tests.training.tiny_runs import events_of, read_log, steps_of
+from tests.training.tiny import (
+    OVERRIDES,
+    as_flags,
+    events_of,
+    read_log,
+    steps_of,
+    tiny_config,
+    tiny_scene,
+    write_tiny_capture,
+)
 
 ROOT = Path(__file__).parents[2]
 # 10 + 20 steps of 2 images; density events (after 28, 36, 44 and 52 images) fall into the 20 steps.

@@ -7,8 +7,7 @@ from blitzgs.formats import gaussians as blocks
 from blitzgs.formats import glb
 from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.glb import write_glb
-from tests.formats.glb_reader import read_glb
-from tests.formats.models import some_gaussians
+from tests.formats.helpers import read_glb, some_gaussians
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

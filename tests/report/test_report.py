@@ -19,8 +19,7 @@ from blitzgs.report.page import MAX_BYTES
 from blitzgs.report.report import report
 from blitzgs.runs.folder import open_run
 from blitzgs.runs.previews import PARTS, Previews, preview_file
-from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
-from tests.training.tiny_runs import at_step, events_of, train
+from tests.training.tiny import OVERRIDES, as_flags, at_step, events_of, train, write_tiny_capture
 
 try:
     from tests.browser import Browser, chromium, wait_for

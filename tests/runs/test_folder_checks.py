@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a run is checked before training begins."""
+"""The folder of a run is checked before training begins, and another run's checkpoints are refused."""
 
+import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +12,7 @@ import pytest
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.folder_checks import FolderError, check_room, check_writable, locked
+from blitzgs.runs.identity import known_id
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import RankError, run_ranks
 from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene, write_tiny_capture
@@ -97,3 +100,47 @@ def test_one_run_at_a_time(tmp_path, monkeypatch, capsys):
     assert main(command) == 0  # a lock does not outlive its process
     with locked(out, Ranks()):
         pass
+
+
+@pytest.fixture(scope="module")
+def other(trained, tmp_path_factory):
+    """Another run of the same capture."""
+    folder = tmp_path_factory.mktemp("other") / "run"
+    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.4", "log.pictures=0")
+    assert main(["train", "--data", str(trained[0]), "--out", str(folder), *flags]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("known_by", ["cameras", "log"])
+@pytest.mark.parametrize("command", ["eval", "render", "export", "resume", "extend"])
+def test_a_checkpoint_of_another_run_is_refused(trained, other, tmp_path, capsys, command, known_by):
+    run = tmp_path / "run"
+    shutil.copytree(trained[1], run)
+    if known_by == "log":  # as in runs of earlier versions
+        cameras = json.loads((run / "cameras.json").read_text())
+        del cameras["run"]
+        (run / "cameras.json").write_text(json.dumps(cameras))
+    arguments = {
+        "eval": ["eval", str(run)],
+        "render": ["render", str(run), "--out", str(tmp_path / "out")],
+        "export": ["export", str(run), "--ply", str(tmp_path / "out.ply")],
+        "resume": ["train", "--out", str(run), "--resume"],
+        "extend": ["train", "--out", str(run), "--extend=1.5"],
+    }[command]
+    assert main(arguments) == 0  # its own checkpoint
+    shutil.rmtree(run / "checkpoints")
+    shutil.copytree(other / "checkpoints", run / "checkpoints")
+    shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    capsys.readouterr()
+    assert main(arguments) == 1
+    shown = " ".join(capsys.readouterr().err.split())
+    assert f"was written by another run ({known_id(other)}) than the one in {run} ({known_id(run)})" in shown
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{", '{"run": 5}', '{"run": ""}', "\udcff"])
+def test_a_damaged_file_names_no_run(tmp_path, content):
+    for name in ("cameras.json", "log.jsonl"):
+        (tmp_path / name).write_text(content, errors="surrogateescape")
+    assert known_id(tmp_path) == ""
+    assert known_id(tmp_path / "nothing") == ""

@@ -15,8 +15,16 @@ from blitzgs.training.trainer import Trainer
 from blitzgs.view.visible import VisibleFinder
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import DEVICES
-from tests.training.tiny import HEIGHT, WIDTH, Camera, photographed, random_gaussians, tiny_config
-from tests.training.tiny_runs import steps_of, stop_at
+from tests.training.tiny import (
+    HEIGHT,
+    WIDTH,
+    Camera,
+    photographed,
+    random_gaussians,
+    steps_of,
+    stop_at,
+    tiny_config,
+)
 
 COUNT, VIEWS = 8000, 12
 RESIDENT = "memory.resident_gb=0.0078"

@@ -13,8 +13,15 @@ from blitzgs.runs.guard import NonFiniteError
 from blitzgs.training.hints import small_batch_hint
 from blitzgs.training.trainer import Trainer
 from tests.helpers import DEVICES, needs_cuda
-from tests.training.tiny import tiny_config, tiny_scene
-from tests.training.tiny_runs import assert_same_table, events_of, steps_of, stop_at, train
+from tests.training.tiny import (
+    assert_same_table,
+    events_of,
+    steps_of,
+    stop_at,
+    tiny_config,
+    tiny_scene,
+    train,
+)
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,30 @@
-"""A reader of GLB files that shares nothing with the writer: it follows the glTF 2.0 specification."""
+# SPDX-License-Identifier: Apache-2.0
+"""Models of random Gaussians, and a reader of GLB files that follows the glTF 2.0 specification alone."""
 
 import json
 import struct
 
 import numpy as np
+import torch
+
+from blitzgs.formats.gaussians import Gaussians
+
+
+def some_gaussians(count, degree, seed=0, levels=False):
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    return Gaussians(
+        means=3 * normal(count, 3),
+        quats=normal(count, 4),
+        scales=normal(count, 3) * 0.7 - 3,
+        opacities=2 * normal(count),
+        sh=0.2 * normal(count, (degree + 1) ** 2, 3),
+        levels=torch.randint(0, 4, (count,), generator=generator).float() if levels else None,
+    )
+
 
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
