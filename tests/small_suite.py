@@ -21,7 +21,7 @@ OPS, BLOCKS = "tests/ops/test_", "tests/table/test_blocks.py::test_"
 TESTS = [
     *(INTERSECT + test for test in (
         "lists_match_the_cpu[False-8]", "lists_match_the_cpu[True-16]", "more_tiles_than_16_bits_hold",
-        "tile_ranges_cut_the_whole", "capacity_beyond_the_count", "a_long_run_of_equal_depths", "no_splats",
+        "tile_ranges_cut_the_whole", "no_splats", "depths_of_every_kind[5000-1-True-one number]",
         "depths_of_every_kind[60000-3-True-18 decades]",
         "depths_of_every_kind[5000-1-True-four neighbouring numbers]",
     )),
@@ -60,6 +60,7 @@ TESTS = [
     *(OPS + test for test in (
         "lazy_adam.py::test_float32_drift_of_any_second_moment[40-30-cuda]",
         "lazy_adam.py::test_float32_drift_of_any_second_moment[700-400-cuda]",
+        "intersect.py::test_capacity[cuda]",
         "photometric.py::test_float32_matches_the_definition[shape0-True-cuda]",
         "photometric.py::test_float32_matches_the_definition[shape4-False-cuda]",
         "photometric.py::test_a_partition_of_the_tiles_adds_up_to_the_whole[16-cuda]",

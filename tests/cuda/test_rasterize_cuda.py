@@ -130,17 +130,6 @@ def test_packed_gradients_have_four_channels_at_most(scene):
         ops.rasterize_bwd(*arguments, False, True, table)
 
 
-def test_deterministic_gradients_repeat(scene):
-    job = Job(scene, 3)
-    saved = job.forward("cuda")
-    g = torch.Generator().manual_seed(7)
-    v = torch.randn(saved[0].shape, generator=g), torch.randn(saved[1].shape, generator=g)
-    first = job.backward("cuda", torch.float32, saved, *v, True, True)
-    for _ in range(3):
-        again = job.backward("cuda", torch.float32, saved, *v, True, True)
-        assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
-
-
 def test_tile_ranges_are_the_image_bit_for_bit(scene):
     whole = Job(scene, 3).forward("cuda")
     tiles = len(whole[3])
