@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small scenes, and error measures that fail for NaN and wrong shapes (tests/test_helpers.py tests them)."""
+"""Small scenes, and error measures that fail for NaN and wrong shapes (test_reference.py tests them)."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from blitzgs.capture.world import (
     geodetic,
     read_frame,
 )
-from tests.capture import project_files as files
+from tests.capture import helpers as files
 
 TURN = Rotation.from_euler("xyz", [10, -70, 130], degrees=True).as_matrix()
 PLACE = np.array([412_345.0, 5_654_321.0, 120.0])

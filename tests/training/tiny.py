@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from blitzgs.capture.images import ImageMemory
 from blitzgs.capture.lengths import Sight
@@ -23,7 +24,8 @@ from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import RenderOptions, Views
-from blitzgs.table.table import GaussianTable
+from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, lazy_adam_step_
+from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.training.trainer import Trainer
 
 WIDTH, HEIGHT, COUNT = 48, 32, 400
@@ -270,3 +272,33 @@ def assert_same_table(a: GaussianTable, b: GaussianTable) -> None:
     assert len(a) == len(b)
     for name in a:
         assert torch.equal(a[name], b[name]), name
+
+
+def _state(table: GaussianTable) -> AdamState:
+    groups = table.parameters, table.exp_avgs, table.exp_avg_sqs
+    return AdamState(*groups, table["last_step"], table["moment_step"])
+
+
+def schedule_of(rates: Tensor) -> AdamSchedule:
+    """Return the schedule with these learning rates, [S + 1, 6]."""
+    return AdamSchedule(rates, 0.9, 0.999, 1e-15)
+
+
+def caught_up(table: GaussianTable, schedule: AdamSchedule, step: int) -> GaussianTable:
+    """Return a copy of a table with no pending steps up to `step`."""
+    copy = GaussianTable({name: table[name].clone() for name in table})
+    lazy_adam_catch_up_(_state(copy), schedule, step)
+    return copy
+
+
+def step_some(
+    table: GaussianTable, ids: Tensor, schedule: AdamSchedule, step: int, generator: torch.Generator
+) -> Tensor:
+    """Take a step with random gradients of about half of the rows `ids`; return these rows, int32 [U]."""
+    stepped = ids[torch.rand(len(ids), generator=generator).to(ids.device) < 0.5]
+    grads = [
+        torch.randn((len(stepped), *table[name].shape[1:]), generator=generator).to(ids.device)
+        for name in PARAMETERS
+    ]
+    lazy_adam_step_(_state(table), schedule, step, grads, stepped)
+    return stepped
