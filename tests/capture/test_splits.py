@@ -105,13 +105,15 @@ def split_of(root, **options):
 LISTS = [list(c) for c in itertools.product([None, [0, 1]], [None, [2], []], [None, [3], [2]])]
 
 
-@pytest.mark.parametrize("written", ["{}", "./{}"])
 @pytest.mark.parametrize(("train", "val", "test"), LISTS)
-def test_lists_are_followed_exactly(tmp_path, train, val, test, written):
+def test_lists_are_followed_exactly(tmp_path, train, val, test):
     write_images(tmp_path)
     given = {"train_filenames": train, "val_filenames": val, "test_filenames": test}
+    # A name may begin with "./", as programs write it.
     lists = {
-        key: [written.format(FRAMES[i]) for i in part] for key, part in given.items() if part is not None
+        key: [("./" if i % 2 else "") + FRAMES[i] for i in part]
+        for key, part in given.items()
+        if part is not None
     }
     write(tmp_path, **lists)
     # The formula: held out is what val or test name; trained on is what train names, or without it the rest.

@@ -313,14 +313,19 @@ FIELDS = [
 ]
 
 
+@pytest.fixture(scope="module")
+def explained():
+    return describe_all()
+
+
 @pytest.mark.parametrize("name", [*FIELDS, "seed"])
-def test_every_field_is_explained(name):
+def test_every_field_is_explained(name, explained):
     head, _, meaning = describe(name).partition("\n")
     assert head.startswith(f"--{name}=") and len(meaning.split()) >= 2
     assert name not in RANGES or str(RANGES[name]) in head
     # The flag that is shown sets the default.
     assert load_config(None, [head.split("   (")[0]]) == Config()
-    assert head in describe_all()
+    assert head in explained
 
 
 @pytest.mark.parametrize("kind", [Config, *SECTIONS.values()], ids=lambda kind: kind.__name__)
