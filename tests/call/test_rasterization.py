@@ -200,7 +200,7 @@ def render(name, matrices, device="cpu", count=5, depth=3.0, views=0, scenes=1, 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", CALLS)
-def test_a_renderer_refuses_them(name, device):
+def test_a_renderer_refuses_intrinsics_of_no_pinhole(name, device):
     good = np.array(GOOD)
     render(name, [good], device, **CALLS[name])
     for entry in ENTRIES:
@@ -209,7 +209,7 @@ def test_a_renderer_refuses_them(name, device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_values_that_are_not_finite_and_rounding_are_no_error(device):
+def test_intrinsics_that_are_not_finite_or_rounded_are_no_error(device):
     rounded = np.array(GOOD)
     rounded[0, 1], rounded[2, 2] = 1e-6, 1 + 1e-7
     assert torch.equal(
@@ -221,7 +221,7 @@ def test_values_that_are_not_finite_and_rounding_are_no_error(device):
 
 
 @pytest.mark.parametrize(("row", "column", "value"), ENTRIES)
-def test_a_camera_refuses_them(row, column, value):
+def test_a_camera_refuses_intrinsics_of_no_pinhole(row, column, value):
     pose = np.eye(4)
     assert checked_camera("a", 32, 24, GOOD, pose).width == 32
     with pytest.raises(ValueError, match=r"K must be \[\[fx, 0, cx\]"):

@@ -161,7 +161,7 @@ def test_help_explains_fields(arguments, texts, capsys):
         (["completion", ""], ["bash", "zsh", "fish"]),
     ],
 )
-def test_bash(words, completed, tmp_path):
+def test_bash_completes(words, completed, tmp_path):
     (tmp_path / "script").write_text(script("bash"))
     program = (
         'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _blitzgs; echo "${COMPREPLY[@]}"'
@@ -171,7 +171,7 @@ def test_bash(words, completed, tmp_path):
     assert done.stdout.split() == completed and not done.stderr
 
 
-def test_fish(tmp_path):
+def test_fish_completes(tmp_path):
     lines = script("fish").splitlines()
     assert any("-a train -d" in line for line in lines)
     assert any("seen_subcommand_from render' -l split -x -a 'test train all'" in line for line in lines)
@@ -181,7 +181,7 @@ def test_fish(tmp_path):
         subprocess.run(["fish", "-n", str(tmp_path / "script")], check=True)
 
 
-def test_zsh_runs_the_script_of_bash(tmp_path):
+def test_zsh_completes_by_the_script_of_bash(tmp_path):
     assert script("zsh").startswith("autoload -U +X bashcompinit") and script("bash") in script("zsh")
     if shutil.which("zsh"):
         (tmp_path / "script").write_text(script("zsh"))

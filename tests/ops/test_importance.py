@@ -216,7 +216,7 @@ def items(kind, n_segments, seed=0):
 @pytest.mark.parametrize("n_segments", [1, 3, 11])
 @pytest.mark.parametrize("kind", ["many sizes", "ties", "all alike", "tiny", "zeros"])
 @pytest.mark.parametrize("share", [(0, 1), (1, 2), (99, 100), (123_456_789, 1_000_000_000), (1, 1)])
-def test_equals_sorting(device, n_segments, kind, share):
+def test_mass_cuts_equal_sorting(device, n_segments, kind, share):
     weights, segments, owners, ids = items(kind, n_segments)
     expected = by_sorting(weights.tolist(), segments.tolist(), ids[owners].tolist(), share)
     cut = MassCut.begin(*(t.to(device) for t in (weights, segments, owners, ids)), n_segments)
@@ -323,7 +323,7 @@ def expected(table, rows, is_split):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [1, 1000])
-def test_matches_the_formulas(device, count):
+def test_spawn_features_match_the_formulas(device, count):
     table, rows, is_split = candidates(count, device)
     features = spawn_features(table, rows, is_split, TIME, EXTENT, LEVELS)
     assert features.dtype == torch.float32

@@ -34,14 +34,14 @@ def cloud(kind, n=3000):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("k", [1, 3, 6, 32])
 @pytest.mark.parametrize("kind", ["uniform", "clusters and outliers", "plane", "duplicates"])
-def test_matches_a_kd_tree(device, k, kind):
+def test_knn_distances_match_a_kd_tree(device, k, kind):
     points = torch.from_numpy(cloud(kind)).float()
     expected = cKDTree(points.double().numpy()).query(points.double().numpy(), k + 1)[0][:, 1:]
     got = knn_distances(points.to(device), k).cpu().double()
     torch.testing.assert_close(got, torch.from_numpy(expected), rtol=1e-6, atol=1e-30)
 
 
-def test_float64_is_exact():
+def test_knn_distances_in_float64_are_exact():
     points = cloud("clusters and outliers", 500)
     expected = cKDTree(points).query(points, 4)[0][:, 1:]
     torch.testing.assert_close(
@@ -62,7 +62,7 @@ def test_rows_that_are_not_finite_are_left_out(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_small_clouds(device):
+def test_knn_distances_of_small_clouds(device):
     points = torch.tensor([[0.0, 0, 0], [3, 4, 0], [0, 0, 1]], device=device)
     assert knn_distances(points, 4)[0].tolist() == [1.0, 5.0, math.inf, math.inf]
     assert knn_distances(points[:1], 2).tolist() == [[math.inf, math.inf]]
@@ -167,7 +167,7 @@ def test_float64_matches_the_formula_closely():
     torch.testing.assert_close(rows["means"], wanted, rtol=0, atol=1e-6)
 
 
-def test_the_order_of_the_rows_does_not_matter():
+def test_position_noise_does_not_depend_on_the_order_of_the_rows():
     rows = gaussians()
     order = torch.randperm(300, generator=torch.Generator().manual_seed(0))
     shuffled = {name: column[order].contiguous() for name, column in rows.items()}
@@ -179,7 +179,7 @@ def test_the_order_of_the_rows_does_not_matter():
     assert torch.equal(rows["means"][order], shuffled["means"])
 
 
-def test_wrong_shapes_are_named():
+def test_wrong_shapes_of_position_noise_are_named():
     rows = gaussians(10)
     rows["scales"] = rows["scales"][:9]
     with pytest.raises(RuntimeError, match="position_noise_: scales"):
@@ -212,7 +212,7 @@ def test_draws_depend_on_the_key_alone():
     assert not torch.equal(hash_keys(keys, 3, 4), hash_keys(keys, 4, 3))
 
 
-def test_distributions():
+def test_draws_have_their_distributions():
     keys = torch.arange(200_000)
     flat, bell = uniform(keys, 1), normal(keys, 1)
     assert flat.min() > 0 and flat.max() < 1

@@ -224,7 +224,7 @@ def test_sums_follow_the_splats_back(n, device):
     assert torch.equal(torch.cat(got, 1).cpu(), expected)
 
 
-def test_doubles_and_strided_columns():
+def test_doubles_and_strided_columns_are_scattered():
     wide = torch.randn(4, 9, dtype=torch.float64)
     data = [wide[:, 2:5], wide[:, 0], wide[:1].expand(4, 9)]
     masks = torch.tensor([1, 0, 3, 2])
@@ -280,7 +280,7 @@ def test_each_value_of_each_column_is_looked_at(backend, value):
     assert find_non_finite(columns, [opacities]) and find_non_finite(columns, [opacities[8:]])
 
 
-def test_columns_need_not_be_contiguous():
+def test_columns_that_are_searched_need_not_be_contiguous():
     column = torch.ones(4, 6).T
     column[5, 3] = torch.nan
     assert find_non_finite([column], []) and not find_non_finite([column[:5]], [])

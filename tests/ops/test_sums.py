@@ -46,7 +46,7 @@ def tensors(nodes, roots):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [0, 1, 700])
-def test_sums_equal_a_walk_down_each_tree(device, count):
+def test_tree_sums_equal_a_walk_down_each_tree(device, count):
     nodes, roots = forest()
     features = torch.rand(count, FEATURES, generator=torch.Generator().manual_seed(1))
     features[::3, 1] = math.nan
@@ -116,7 +116,7 @@ def add(sums, device, rule="density", columns=COLUMNS, seed=0):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("rule", DIVISIONS)
-def test_equals_dense_sums(device, rule):
+def test_view_sums_equal_dense_sums(device, rule):
     sums = empty(device)
     for seed in (0, 1):
         add(sums, device, rule, seed=seed)
@@ -179,7 +179,7 @@ def state(n=50, dtype=torch.float32, device="cpu"):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("with_phi", [False, True])
-def test_matches_the_definition(device, with_phi):
+def test_density_stats_match_the_definition(device, with_phi):
     visible, offsets, gradients, conics, phi, covariance = rows(device=device)
     sums, counts, radii = state(device=device)
     for _ in range(2):
@@ -260,7 +260,7 @@ def test_density_stats_opcheck(device):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n_parts", [0, 1, 3000])
-def test_each_target_gets_this_ranks_share(device, n_parts):
+def test_each_target_of_a_report_gets_this_ranks_share(device, n_parts):
     g = torch.Generator().manual_seed(1)
     parts = torch.rand(3, n_parts, 2, generator=g, dtype=torch.float64).to(device)
     work = torch.randint(0, 1000, (777,), generator=g, dtype=torch.int32).to(device)

@@ -136,19 +136,19 @@ def test_a_fall_is_reported_once():
     assert curve.fall == FALL + 1 and len(curve.warnings()) == 1
 
 
-def test_single_batches_are_no_fall():
+def test_single_batches_are_no_fall_of_the_curve():
     curve, said = followed(([25.0] * (WINDOW - 1) + [15.0]) * 4)
     assert not said and not curve.warnings()
 
 
-def test_a_reset_begins_anew():
+def test_a_reset_begins_the_curve_anew():
     curve, _ = followed([25.0] * WINDOW)
     curve.restart()
     curve, said = followed([15.0] * (2 * WINDOW), curve)
     assert not said and curve.fall == 0
 
 
-def test_survives_a_resume():
+def test_a_curve_survives_a_resume():
     curve, _ = followed([25.0] * 20)
     again = Curve.of(curve.saved())
     assert again == curve and followed([19.0] * 30, again)[1]

@@ -21,13 +21,10 @@ from blitzgs.view.look import Look
 from blitzgs.viewer.studio import open_model
 from blitzgs.viewer.tileset import open_city, to_globe
 from blitzgs.viewer.world import looking
-from tests.browser import Browser, chromium, wait_for
+from tests.browser import Browser, needs_chromium, wait_for
 from tests.formats.helpers import read_glb
 from tests.formats.test_tiles import SCENE, city, nodes
 
-needs_chromium = pytest.mark.skipif(
-    chromium() is None, reason="Chromium is missing: install it (Debian: apt-get install chromium)"
-)
 WIDTH, HEIGHT = 320, 240
 K = np.array([[280.0, 0, 160], [0, 280, 120], [0, 0, 1]])
 UP = np.array([0.0, 0, 1])
@@ -55,13 +52,6 @@ def shown(tmp_path_factory):
         server.shutdown()
 
 
-def go(browser, url):
-    browser.call("Page.navigate", url=url)
-    wait_for(lambda: browser.evaluate("location.href") == url, 30, "the page is open")
-    wait_for(lambda: browser.evaluate("typeof blitzgs !== 'undefined'"), 30, "the program runs")
-    browser.evaluate("blitzgs.ready")
-
-
 def settle(browser, view):
     call = f"blitzgs.settle({json.dumps(view.tolist())}, {json.dumps(K.tolist())}, {WIDTH}, {HEIGHT})"
     return browser.evaluate(call)
@@ -75,7 +65,7 @@ def pixels(browser):
 @needs_chromium
 def test_nearer_views_load_more_tiles_and_farther_ones_show_fewer(shown):
     _, browser, url = shown
-    go(browser, url)
+    browser.go(url)
     far = settle(browser, pose((20, -300, 150)))
     near = settle(browser, pose((20, 4, 5)))
     assert 0 < far["shown"] < near["shown"] and far["gaussians"] < near["gaussians"]
@@ -92,7 +82,7 @@ def test_nearer_views_load_more_tiles_and_farther_ones_show_fewer(shown):
 @needs_chromium
 def test_with_all_tiles_the_picture_is_that_of_our_renderer(shown):
     folder, browser, url = shown
-    go(browser, url + "?error=1e-9")
+    browser.go(url + "?error=1e-9")
     opened = open_model(folder / "city.ply", Ranks())
     view = pose((20, -6, 9))
     state = settle(browser, view)
@@ -108,7 +98,7 @@ def test_with_all_tiles_the_picture_is_that_of_our_renderer(shown):
 @needs_chromium
 def test_a_budget_is_kept_and_missing_tiles_are_said(shown):
     folder, browser, url = shown
-    go(browser, url + "?budget=28000&error=0.01")
+    browser.go(url + "?budget=28000&error=0.01")
     first = settle(browser, pose((8, 8, 4), (2, 2, 1)))
     assert first["shown"] == first["wanted"] == 7  # pages of 4,096 Gaussians
     other = settle(browser, pose((32, 22, 4), (38, 28, 1)))
