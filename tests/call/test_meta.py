@@ -311,12 +311,6 @@ def test_reading_all_of_meta_reads_no_parameter(monkeypatch):
         len(meta["non_finite"])
 
 
-def test_finite_input_is_not_warned_of(recwarn):
-    _, _, meta = rasterize_scene(random_scene(n=30))
-    assert meta["non_finite"] == {}
-    assert not [w for w in recwarn if "blitzgs" in str(w.message)]
-
-
 PLAIN = {"image": 1, "ids": [2, 3], "mask": None}
 READERS = {
     "dict": dict,
