@@ -20,8 +20,6 @@ from blitzgs.formats.ply import read_ply
 from tests.helpers import DEVICES, orbit_camera
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
 SCENE = (
     torch.tensor([[-0.5, 0, 3], [0.4, 0.1, 4], [0, -0.3, 5]]),
     torch.tensor([[1, 0, 0, 0], [0.9, 0.1, 0.3, 0.2], [1, 0, 0, 0.5]]),
@@ -75,7 +73,6 @@ def test_gradients_are_computed_from_cpp(build, tmp_path):
     assert (found - means.grad).abs().max() < 1e-5 * means.grad.abs().max()
 
 
-MINIMAL = Path(__file__).resolve().parents[2] / "examples" / "minimal_trainer.py"
 WIDTH, HEIGHT, VIEWS = 64, 48, 12
 
 
@@ -112,15 +109,21 @@ def write_capture(root):
     write_model(root / "sparse" / "0", model)
 
 
+def example(name):
+    """Import an example."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 @pytest.mark.parametrize("device", DEVICES)
 def test_minimal_trainer_it_learns_a_capture(device, tmp_path, capsys):
     write_capture(tmp_path)
-    spec = importlib.util.spec_from_file_location("minimal_trainer", MINIMAL)
-    trainer = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(trainer)
     out = tmp_path / "model.ply"
     torch.manual_seed(0)
-    model = trainer.main(["--data", str(tmp_path), "--out", str(out), "--steps", "700", "--device", device])
+    arguments = ["--data", str(tmp_path), "--out", str(out), "--steps", "700", "--device", device]
+    model = example("minimal_trainer").main(arguments)
     printed = capsys.readouterr().out
     assert float(printed.split(" dB")[0].split()[-1]) > 18
     written = read_ply(out)
@@ -129,29 +132,12 @@ def test_minimal_trainer_it_learns_a_capture(device, tmp_path, capsys):
     assert written.sh.shape[1:] == (16, 3)
 
 
-def test_it_is_short_and_needs_no_trainer():
-    text = MINIMAL.read_text()
-    assert len(text.splitlines()) <= 150
-    assert "blitzgs.training" not in text and "blitzgs.frame.frame" not in text
-
-
-RESEARCH = Path(__file__).resolve().parents[2] / "examples" / "research_trainer.py"
-
-
-@pytest.fixture(scope="module")
-def example():
-    spec = importlib.util.spec_from_file_location("research_trainer", RESEARCH)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("strategy", ["mcmc", "default"])
-def test_research_trainer_it_learns_a_capture(example, strategy, tmp_path, capsys):
+def test_research_trainer_it_learns_a_capture(strategy, tmp_path, capsys):
     write_capture(tmp_path)
     torch.manual_seed(0)
     out = tmp_path / "model.ply"
-    trainer = example.main(
+    trainer = example("research_trainer").main(
         ["--data", str(tmp_path), "--out", str(out), "--steps", "210", "--strategy", strategy, "--most", "31",
          "--device", "cpu"]
     )  # fmt: skip
@@ -163,8 +149,9 @@ def test_research_trainer_it_learns_a_capture(example, strategy, tmp_path, capsy
     assert trainer.motions.abs().max() > 0 and trainer.looks.abs().max() > 0.01
 
 
-def test_the_pose_hook_is_a_rigid_motion(example):
-    trainer = example.Trainer.__new__(example.Trainer)
+def test_the_pose_hook_is_a_rigid_motion():
+    kind = example("research_trainer").Trainer
+    trainer = kind.__new__(kind)
     trainer.motions, trainer.extent = torch.tensor([[0, 0, 0.3, 0.1, 0.2, -0.1]]), 2.0
     pose = torch.eye(4)
     pose[:3, 3] = torch.tensor([1.0, 2, 3])
@@ -175,5 +162,8 @@ def test_the_pose_hook_is_a_rigid_motion(example):
     assert moved[3].tolist() == [0, 0, 0, 1]
 
 
-def test_it_is_short():
-    assert len(RESEARCH.read_text().splitlines()) <= 150
+@pytest.mark.parametrize("name", ["minimal_trainer", "research_trainer"])
+def test_an_example_is_short_and_needs_no_trainer(name):
+    text = (ROOT / "examples" / f"{name}.py").read_text()
+    assert len(text.splitlines()) <= 150
+    assert "blitzgs.training" not in text and "blitzgs.frame.frame" not in text
