@@ -6,15 +6,10 @@ import torch
 
 from blitzgs.ops.rasterize import RasterizeSaved
 from tests.cuda.scenes import Scene, ops, relative_error
+from tests.ops.splats import kept_by
 
 # Where rounding decides whether a splat takes part, the images differ by up to about alpha = 1/255.
 CUT_SHARE = 2e-3
-
-
-def kept_by(outputs):
-    """What the backward pass takes of the outputs of the forward pass."""
-    _, transmittances, last_ids, _, packed_splats, tile_order, _ = outputs
-    return [transmittances, last_ids, packed_splats, tile_order]
 
 
 class Job:

@@ -10,7 +10,7 @@ import torch
 from blitzgs.ops.intersect import intersect, tile_counts
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.ops.splat_gradients import GradientBuffer, gradient_columns, packed_table
-from tests.ops.splats import Splats, dense_composite, near_a_cut, random_splats
+from tests.ops.splats import Splats, dense_composite, kept_by, near_a_cut, random_splats
 
 WIDTH, HEIGHT = 53, 37  # neither is a multiple of a tile
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,12 +36,6 @@ def forward(splats, n_cameras=1, tile_size=16, backgrounds=None, tile_begin=0, t
         tile_begin,
         tile_end,
     )
-
-
-def kept_by(outputs):
-    """What the backward pass takes of the outputs of the forward pass."""
-    _, transmittances, last_ids, _, packed_splats, tile_order, _ = outputs
-    return [transmittances, last_ids, packed_splats, tile_order]
 
 
 def backward(

@@ -184,6 +184,7 @@ def write_tiny_capture(folder: Path) -> None:
     import cv2
 
     from blitzgs.capture.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints, write_model
+    from blitzgs.viewer.frustums import quaternion
 
     capture, images = tiny_scene()
     (folder / "images").mkdir(parents=True)
@@ -211,20 +212,6 @@ def write_tiny_capture(folder: Path) -> None:
         ),
     )
     write_model(folder / "sparse" / "0", model)
-
-
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of a rotation matrix: the dominant eigenvector of Bar-Itzhack's symmetric matrix."""
-    m = rotation
-    matrix = np.array(
-        [
-            [m[0, 0] + m[1, 1] + m[2, 2], 0, 0, 0],
-            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], 0, 0],
-            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    return np.linalg.eigh(matrix, UPLO="L")[1][:, -1]
 
 
 def train(
