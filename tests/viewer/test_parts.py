@@ -33,6 +33,7 @@ class Camera:
 
 
 def camera_at(position, target, up=(0.0, 0.0, 1.0)):
+    """The matrix from the world to a camera that looks at a target."""
     stance = looking(np.array(position, float), np.array(target, float), np.array(up), 1.0)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = stance.rotation.T, -stance.rotation.T @ stance.position
@@ -251,11 +252,8 @@ SPACE = Space((500.0, -200.0, 30.0), 4.0, 1.5)
 BOX = np.array([[-1.0, -1.0, -0.2], [1.0, 1.0, 0.2]])
 
 
-def pose(position, target, up=(0.0, 0.0, 1.0)):
-    stance = looking(np.array(position, float), np.array(target, float), np.array(up, float), 1.0)
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = stance.rotation, stance.position
-    return found
+def pose(position, target):
+    return np.linalg.inv(camera_at(position, target))
 
 
 def aerial():
@@ -263,7 +261,7 @@ def aerial():
     cameras = []
     for x in np.linspace(-8, 8, 9):
         for y in (-2.0, 2.0):
-            world_to_camera = np.linalg.inv(pose((x, y, 6), (x + 1, y, 0)))
+            world_to_camera = camera_at((x, y, 6), (x + 1, y, 0))
             K = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
             cameras.append(
                 SimpleNamespace(name="a", width=64, height=48, K=K, world_to_camera=world_to_camera)

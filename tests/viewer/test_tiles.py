@@ -20,22 +20,17 @@ from blitzgs.view.draw import Drawer
 from blitzgs.view.look import Look
 from blitzgs.viewer.studio import open_model
 from blitzgs.viewer.tileset import open_city, to_globe
-from blitzgs.viewer.world import looking
 from tests.browser import Browser, needs_chromium, wait_for
 from tests.formats.helpers import read_glb
 from tests.formats.test_tiles import SCENE, city, nodes
+from tests.viewer.test_parts import camera_at
 
 WIDTH, HEIGHT = 320, 240
 K = np.array([[280.0, 0, 160], [0, 280, 120], [0, 0, 1]])
-UP = np.array([0.0, 0, 1])
 
 
 def pose(eye, target=(20, 15, 0)):
-    stance = looking(np.array(eye, float), np.array(target, float), UP, 1.0)
-    matrix = np.eye(4)
-    matrix[:3, :3] = stance.rotation.T
-    matrix[:3, 3] = -stance.rotation.T @ stance.position
-    return matrix
+    return camera_at(eye, target)
 
 
 @pytest.fixture(scope="module")
