@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -176,8 +177,31 @@ def read_whole(path: Path) -> bytes:
     if data[:2] == b"\xff\xd8":
         native.check_jpeg(data, os.fsencode(path))
     elif data[:8] == _PNG_START:
-        native.check_png(data, os.fsencode(path))
+        check_png(data, str(path))
     return data
+
+
+def check_png(data: bytes, name: str) -> None:
+    """Refuse a PNG without all of its chunks, or with a wrong checksum of one that a picture needs.
+
+    Raises:
+        FormatError: names the file, the byte offset and the reason.
+    """
+    at, kinds = len(_PNG_START), set()
+    while b"IEND" not in kinds:
+        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
+        if len(data) < max(end, at + 12):
+            raise native.FormatError(f"{name}: at byte {at}: truncated PNG: it ends before its last chunk")
+        kind = data[at + 4 : at + 8]
+        # The names of chunks that a picture needs begin with a capital letter. Others may be damaged.
+        is_needed = not kind[0] & 0x20 or kind == b"tRNS"
+        checksum = int.from_bytes(data[end - 4 : end], "big")
+        if is_needed and zlib.crc32(memoryview(data)[at + 4 : end - 4]) != checksum:
+            raise native.FormatError(f"{name}: at byte {at}: damaged PNG: the checksum of a chunk is wrong")
+        kinds.add(kind)
+        at = end
+    if b"IDAT" not in kinds:
+        raise native.FormatError(f"{name}: damaged PNG: it has no image data")
 
 
 def decode_rgb(data: bytes, name: str, background: tuple[float, float, float] | None = None) -> UInt8:
