@@ -11,8 +11,15 @@ import numpy as np
 from blitzgs.capture.cameras import Float64, camera_centres
 from blitzgs.capture.capture import Capture, load_capture
 from blitzgs.capture.control_points import Placed, align, place, read_control_points
-from blitzgs.capture.gps import gps_positions
-from blitzgs.capture.world import GEOCENTRIC, WorldFrame, converted, fit_similarity, frame_in, pyproj_module
+from blitzgs.capture.world import (
+    GEOCENTRIC,
+    WorldFrame,
+    converted,
+    fit_similarity,
+    frame_in,
+    gps_positions,
+    pyproj_module,
+)
 from blitzgs.cli.arguments import Commands, add_capture, add_command, add_run, named_path
 from blitzgs.config.files import load_config
 from blitzgs.runs import files as run_files

@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.table import Table
 
 from blitzgs.cli.arguments import Commands, add_command, add_device, named_path
-from blitzgs.cli.final_report import kept_warnings, write_final_report
 from blitzgs.cli.live import add_live_page, check_live_page, live_page, say_where_to_look
+from blitzgs.cli.report import kept_warnings, write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
 from blitzgs.config.describe import describe, describe_all, describe_page
 from blitzgs.config.fields import Config, Transport
@@ -33,7 +33,7 @@ from blitzgs.training.extension import LEAST_IMAGES
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import check_worlds, understood
-from blitzgs.util.laps import Laps
+from blitzgs.util.progress import Laps
 from blitzgs.util.terminal import printable
 
 HELP = """\

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import blitzgs
-from blitzgs.capture.capture import Capture, MissingImagesError, load_capture
+from blitzgs.capture.capture import Capture, MissingImagesError, capture_fingerprint, load_capture
 from blitzgs.capture.check_files import damaged
-from blitzgs.capture.fingerprint import capture_fingerprint
 from blitzgs.capture.images import ImageStore, decoded_shapes
 from blitzgs.capture.shared_images import SharedImages, size_of
 from blitzgs.config.fields import Config

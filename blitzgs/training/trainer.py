@@ -42,8 +42,8 @@ from blitzgs.training.setup import set_up
 from blitzgs.training.state import never
 from blitzgs.training.step_report import StepRecord, log_step, measure_step
 from blitzgs.training.watching import Watching
-from blitzgs.util.laps import Laps
 from blitzgs.util.output import write_file
+from blitzgs.util.progress import Laps
 from blitzgs.view.views import render_options
 
 

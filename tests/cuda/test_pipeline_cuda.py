@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from blitzgs.frame import frame as pipeline
-from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.transport import LocalTransport
+from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops.projection_types import Sizes, WeightedViews
 from blitzgs.ops.splat_gradients import gradient_columns
 from blitzgs.table.blocks import BlockIndex, morton_order

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.run import MAX_ATTEMPTS, run
+from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops.projection_types import Sizes
 
 

@@ -12,8 +12,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.pixels import collect_images
-from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
+from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges, collect_images
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batch import Batch
 from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term

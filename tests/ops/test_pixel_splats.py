@@ -8,8 +8,7 @@ from blitzgs.ops.pixel_splats import pixel_splats
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
 from blitzgs.ops.rasterize import rasterize
-from blitzgs.reference.compositing import composited_weights
-from blitzgs.reference.contributors import median_splats, strongest_splats
+from blitzgs.reference.compositing import composited_weights, median_splats, strongest_splats
 from tests.helpers import BACKENDS, DEVICES
 from tests.ops.test_importance import crowded, lists_of
 

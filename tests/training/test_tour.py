@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 
-from blitzgs.training.tour import tour_of
+from blitzgs.training.sampler import tour_of
 from tests.training.tiny import Camera
 
 K = np.array([[60.0, 0.0, 32.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]])

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
+from blitzgs.capture.image_files import reduced, reduced_mask
 from blitzgs.capture.images import ImageMemory
 from blitzgs.capture.lengths import Sight
-from blitzgs.capture.reduced import reduced, reduced_mask
 from blitzgs.config.fields import Config
 from blitzgs.config.files import load_config
 from blitzgs.frame import frame as pipeline

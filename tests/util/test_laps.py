@@ -4,7 +4,7 @@ import time
 import psutil
 import pytest
 
-from blitzgs.util.laps import Laps
+from blitzgs.util.progress import Laps
 
 
 def test_parts_add_up_from_the_start_of_the_process(monkeypatch):
