@@ -307,6 +307,27 @@ def quats_to_rotations(quats: Float64) -> Float64:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def rotation_to_quat(rotation: Float64) -> Float64:
+    """Return (w, x, y, z), w >= 0, of a rotation matrix [3, 3], through its largest component."""
+    r = rotation
+    squares = np.array(
+        [
+            1 + r[0, 0] + r[1, 1] + r[2, 2],
+            1 + r[0, 0] - r[1, 1] - r[2, 2],
+            1 - r[0, 0] + r[1, 1] - r[2, 2],
+            1 - r[0, 0] - r[1, 1] + r[2, 2],
+        ]
+    )
+    largest = int(squares.argmax())
+    a, b, c = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    d, e, f = r[1, 0] + r[0, 1], r[0, 2] + r[2, 0], r[2, 1] + r[1, 2]
+    rows = np.array(
+        [[squares[0], a, b, c], [a, squares[1], d, e], [b, d, squares[2], f], [c, e, f, squares[3]]]
+    )
+    quat: Float64 = rows[largest] / np.linalg.norm(rows[largest])
+    return quat if quat[0] >= 0 else -quat
+
+
 def world_to_camera(images: ColmapImages) -> Float64:
     """Return the poses as matrices [N, 4, 4]."""
     poses = np.tile(np.eye(4), (len(images.ids), 1, 1))

@@ -196,13 +196,8 @@ def check_replaces_ply(path: Path) -> None:
         FileNotFoundError: there is no such folder.
         OSError: `path` is no regular file.
     """
-    check_replaceable(path)
-    if path.exists():
-        with open(path, "rb") as file:
-            start = file.read(3)
-        if start not in (b"", b"ply"):
-            raise FileExistsError(f"{path} exists and is not a PLY file: choose another name")
-    elif not path.parent.is_dir():
+    check_replaceable(path, (b"ply",), " and is not a PLY file")
+    if not path.parent.is_dir():
         raise FileNotFoundError(f"{path.parent} is not a folder: make it first, or choose another one")
 
 

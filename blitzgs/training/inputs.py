@@ -14,10 +14,10 @@ from typing import Any
 
 import blitzgs
 from blitzgs.capture.capture import Capture, MissingImagesError, capture_fingerprint, load_capture
-from blitzgs.capture.check_files import damaged
+from blitzgs.capture.check_files import FindDamage, damaged
 from blitzgs.capture.images import ImageStore, decoded_shapes
 from blitzgs.capture.shared_images import SharedImages, size_of
-from blitzgs.config.fields import Config
+from blitzgs.config.fields import Config, DataConfig
 from blitzgs.config.files import ConfigError, to_dict
 from blitzgs.distributed.group import Ranks
 from blitzgs.view.views import Space
@@ -52,20 +52,7 @@ def open_capture(
     if not data.path:
         raise ConfigError("data.path: no capture given; use --data DIR")
     try:
-        capture = load_capture(
-            data.path,
-            images=data.images,
-            downscale=data.downscale,
-            split=data.split,
-            masks=data.masks,
-            undistort=data.undistort,
-            exif=data.exif,
-            allow_missing=data.allow_missing,
-            inside_only=data.inside_only,
-            sparse=data.sparse,
-            stray_cameras=data.stray_cameras,
-            find_damage=partial(_damaged_of_share, ranks),
-        )
+        capture = load_configured(data, partial(_damaged_of_share, ranks))
     except MissingImagesError as error:
         raise MissingImagesError(f"{error} ({remedy})") from error
     budget = min(data.cache_bytes, _host_memory() // 2)
@@ -76,6 +63,24 @@ def open_capture(
     background = config.model.background
     return capture, ImageStore(
         capture, left // ranks.local_world_size, threads, background=background, shared=shared
+    )
+
+
+def load_configured(data: DataConfig, find_damage: FindDamage = damaged) -> Capture:
+    """Call `load_capture` with the fields of a configuration."""
+    return load_capture(
+        data.path,
+        images=data.images,
+        downscale=data.downscale,
+        split=data.split,
+        masks=data.masks,
+        undistort=data.undistort,
+        exif=data.exif,
+        allow_missing=data.allow_missing,
+        inside_only=data.inside_only,
+        sparse=data.sparse,
+        stray_cameras=data.stray_cameras,
+        find_damage=find_damage,
     )
 
 

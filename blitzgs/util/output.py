@@ -79,11 +79,18 @@ def write_file(path: Path, content: bytes | str, sync: bool = True) -> None:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def check_replaceable(path: Path) -> None:
-    """Check that `path` does not exist or is a regular file.
+def check_replaceable(path: Path, ours: tuple[bytes, ...] = (), otherwise: str = "") -> None:
+    """Check that `path` does not exist, or is a regular file that may be replaced.
+
+    Args:
+        path: the file.
+        ours: if there are any, a file that is not empty must have one of these in its first 2000 bytes, or
+            at its start if they have 8 bytes or fewer.
+        otherwise: what else it is, as it follows in the error after "FILE exists".
 
     Raises:
         OSError: it is a link, a device, a folder or something else that must not be replaced.
+        FileExistsError: the file has none of `ours`.
     """
     try:
         mode = path.lstat().st_mode
@@ -93,6 +100,11 @@ def check_replaceable(path: Path) -> None:
         kinds = {stat.S_IFLNK: "a symbolic link", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe"}
         kind = kinds.get(stat.S_IFMT(mode), "a device or socket")
         raise OSError(f"{path} is {kind}, which is not overwritten: remove it or choose another name")
+    if ours:
+        with open(path, "rb") as file:
+            start = file.read(2000)
+        if start and not any(start.startswith(mark) if len(mark) <= 8 else mark in start for mark in ours):
+            raise FileExistsError(f"{path} exists{otherwise}: choose another name")
 
 
 class OutputFolder:
