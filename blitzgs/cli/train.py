@@ -27,15 +27,15 @@ from blitzgs.config.recipes import default_recipe, recipe_path
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.folder_checks import locked
+from blitzgs.training.budget import LEAST_IMAGES
 from blitzgs.training.estimate import estimate
-from blitzgs.training.extension import LEAST_IMAGES
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import check_worlds, understood
 from blitzgs.util.progress import Laps
 from blitzgs.util.terminal import printable
 
-# See `blitzgs.training.extension.extended`.
+# See `blitzgs.training.budget.extended`.
 _EXTENSION = number(
     float,
     lambda value: 1 < value < LEAST_IMAGES or (value.is_integer() and value >= LEAST_IMAGES),

@@ -17,8 +17,8 @@ from typing import Any
 
 import yaml
 
-from blitzgs.config.errors import ConfigError as ConfigError
 from blitzgs.config.fields import Config
+from blitzgs.config.fields import ConfigError as ConfigError
 from blitzgs.config.ranges import problems
 from blitzgs.config.recipes import base_file
 from blitzgs.util.output import write_file

@@ -38,9 +38,9 @@ from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
+from blitzgs.training.budget import extended
 from blitzgs.training.curve import Curve
 from blitzgs.training.exposure import Exposures
-from blitzgs.training.extension import extended
 from blitzgs.training.inputs import check_alike, check_capture, check_resolution
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras

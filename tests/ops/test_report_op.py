@@ -2,7 +2,7 @@
 import pytest
 import torch
 
-from blitzgs.ops.report import report_
+from blitzgs.ops.photometric import report_
 from tests.helpers import DEVICES, sum_parts
 
 

@@ -4,7 +4,7 @@
 import pytest
 import torch
 
-from blitzgs.ops.view_sums import DIVISIONS, ViewSums, view_sums_
+from blitzgs.ops.importance import DIVISIONS, ViewSums, view_sums_
 from tests.helpers import DEVICES
 
 N, VIEWS, WORDS = 300, 7, 2

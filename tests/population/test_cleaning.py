@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from blitzgs.ops.cull_mask import WORD_BITS
+from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.population.cleaning import floaters, views_counting
 
 

@@ -10,7 +10,7 @@ from blitzgs.config.files import ConfigError, load_config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
-from blitzgs.training.extension import extended
+from blitzgs.training.budget import extended
 from blitzgs.training.trainer import Trainer
 from tests.training.tiny import tiny_config, tiny_scene
 from tests.training.tiny_runs import stop_at, train

@@ -5,7 +5,7 @@ import pytest
 
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.undistort import rectify
-from blitzgs.training.hints import large_images_hint, undistortion_note
+from blitzgs.training.understood import large_images_hint, undistortion_note
 
 
 def capture_of(*cameras):

@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 
-from blitzgs.cli.serve import tiles_server
+from blitzgs.cli.view import tiles_server
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import save_ply
 from blitzgs.formats.tiles import write_tiles
