@@ -10,7 +10,6 @@ import socket
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import blitzgs
 from blitzgs.capture.capture import Capture, MissingImagesError, capture_fingerprint, load_capture
@@ -18,7 +17,7 @@ from blitzgs.capture.check_files import FindDamage, damaged
 from blitzgs.capture.images import ImageStore, decoded_shapes
 from blitzgs.capture.shared_images import SharedImages, size_of
 from blitzgs.config.fields import Config, DataConfig
-from blitzgs.config.files import ConfigError, to_dict
+from blitzgs.config.files import ConfigError, flat, to_dict
 from blitzgs.distributed.group import Ranks
 from blitzgs.view.views import Space
 
@@ -197,7 +196,7 @@ def check_alike(config: Config, capture: Capture, ranks: Ranks, resume: bool) ->
         return
     fields = {
         f"configuration field {name}": value
-        for name, value in _flatten(to_dict(config))
+        for name, value in flat(to_dict(config)).items()
         if name not in HOST_FIELDS
     }
     ranks.compare_across_ranks(
@@ -214,10 +213,3 @@ def code_fingerprint() -> str:
         digest.update(str(path.relative_to(root)).encode())
         digest.update(path.read_bytes())
     return f"{blitzgs.__version__}+{digest.hexdigest()[:12]}"
-
-
-def _flatten(fields: dict[str, Any], where: str = "") -> list[tuple[str, object]]:
-    flat: list[tuple[str, object]] = []
-    for name, value in fields.items():
-        flat += _flatten(value, f"{where}{name}.") if isinstance(value, dict) else [(where + name, value)]
-    return flat
