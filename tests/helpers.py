@@ -13,7 +13,7 @@ from torch import Tensor
 import blitzgs
 from benchmarks.gradients import parameter_gradients as parameter_gradients
 from benchmarks.gradients import sum_of_ranks as sum_of_ranks
-from blitzgs.ops.report import report_
+from blitzgs.ops.photometric import report_
 from blitzgs.reference import ReferenceImage, render
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "viewmats")

@@ -130,12 +130,17 @@ def kernels_in_source() -> dict[Kernel, str]:
     for path in sorted((ROOT / "csrc").rglob("*.cu*")):
         for name, parameters in _KERNEL.findall(path.read_text()):
             found[name, _pieces(parameters)] = str(path.relative_to(ROOT))
-    return found
+    # One kernel does the rows of several structs, each of which counts.
+    file = found.pop(("row_kernel", 1))
+    rows = re.findall(r"for_each_row\(const (\w+).*&, CudaStream\);", (ROOT / file).read_text())
+    return found | dict.fromkeys(((name, 1) for name in rows), file)
 
 
 def kernel_of(signature: str) -> Kernel | None:
     """The kernel of a name as the profiler prints it; None: not of this library."""
     text = signature.replace("(anonymous namespace)", "anonymous").removeprefix("void ")
+    if rows := re.search(r"::row_kernel<blitzgs::(\w+)", text):
+        return rows[1], 1
     if not text.startswith("blitzgs::"):
         return None
     depth, names = 0, [""]

@@ -33,8 +33,15 @@ from blitzgs.capture.bounded_cache import BoundedCache as BoundedCache
 from blitzgs.capture.cameras import Camera, same_shape
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.check_files import FileCheck, mask_error
-from blitzgs.capture.image_files import UInt8, apply_orientation, decode_mask, decode_rgb, read_whole
-from blitzgs.capture.reduced import reduced, reduced_mask
+from blitzgs.capture.image_files import (
+    UInt8,
+    apply_orientation,
+    decode_mask,
+    decode_rgb,
+    read_whole,
+    reduced,
+    reduced_mask,
+)
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.capture.undistort import Rectification
 from blitzgs.formats import native

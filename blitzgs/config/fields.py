@@ -400,3 +400,7 @@ class Config:
     ranks: RanksConfig = field(default_factory=RanksConfig)
     log: LogConfig = field(default_factory=LogConfig)
     seed: int = 0
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names the field, the value and the remedy."""

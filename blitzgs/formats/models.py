@@ -79,12 +79,7 @@ def check_replaces(path: Path, kind: Format) -> None:
         FileExistsError: the file is not empty and no file of the format.
         OSError: it is no regular file.
     """
-    check_replaceable(path)
-    if path.exists() and kind.starts:
-        with open(path, "rb") as file:
-            start = file.read(4)
-        if start and not start.startswith(kind.starts):
-            raise FileExistsError(f"{path} exists and is not a {kind.title} file: choose another name")
+    check_replaceable(path, kind.starts, f" and is not a {kind.title} file")
     if path.suffix.lower() != kind.suffix:
         raise ValueError(f"{path}: the file will be {kind.title}: choose a name that ends in {kind.suffix}")
 

@@ -128,12 +128,8 @@ def check_replaces_page(path: Path) -> None:
         FileExistsError: there is a file that is not empty and no page of ours.
         OSError: `path` is no regular file.
     """
-    check_replaceable(path)
-    if path.exists():
-        with open(path, "rb") as file:
-            start = file.read(2000)
-        if start and b'<meta name="generator" content="BlitzGS">' not in start:
-            raise FileExistsError(f"{path} exists, and blitzgs did not write it: choose another name")
+    mark = b'<meta name="generator" content="BlitzGS">'
+    check_replaceable(path, (mark,), ", and blitzgs did not write it")
 
 
 def packed(splats: WebSplats) -> bytes:

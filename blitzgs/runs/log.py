@@ -287,6 +287,16 @@ class _Failures:
                     )
 
 
+def records(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the records of a log, oldest first, without lines that a crash or a full disk left incomplete."""
+    if not path.exists():
+        return
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        with contextlib.suppress(ValueError, RecursionError):
+            if isinstance(record := json.loads(line), dict):
+                yield record
+
+
 def _drop_repeated(path: Path, run_id: str, done: int, total: int) -> None:
     """Drop the records of run `run_id` after `done` images: the resumed run will write them again."""
     if not run_id or not path.exists():

@@ -2,6 +2,7 @@
 #include "population/density_stats.h"
 
 #include "common/op.h"
+#include "common/rows.h"
 #include "population/find_non_finite.h"
 #include "population/knn.h"
 #include "population/spawn_features.h"
@@ -39,20 +40,20 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
   DeviceScope scope(grad_sum);
   dispatch_floating(grad_sum, [&](auto zero) {
     using T = decltype(zero);
-    const DensityStatsArgs<T> args{mutable_data<T>(grad_sum),
-                                   mutable_data<std::int32_t>(grad_count),
-                                   mutable_data<T>(max_radii),
-                                   data<std::int32_t>(visible_ids),
-                                   data<std::int32_t>(splat_offsets),
-                                   data<T>(v_means2d),
-                                   v_means2d.stride(0),
-                                   data<T>(conics),
-                                   data_or_null<T>(phi),
-                                   visible,
-                                   static_cast<T>(width) / 2,
-                                   static_cast<T>(height) / 2,
-                                   static_cast<T>(weight)};
-    backend::density_stats(args, scope.workspace, scope.stream);
+    const DensityStats<T> args{mutable_data<T>(grad_sum),
+                               mutable_data<std::int32_t>(grad_count),
+                               mutable_data<T>(max_radii),
+                               data<std::int32_t>(visible_ids),
+                               data<std::int32_t>(splat_offsets),
+                               data<T>(v_means2d),
+                               v_means2d.stride(0),
+                               data<T>(conics),
+                               data_or_null<T>(phi),
+                               visible,
+                               static_cast<T>(width) / 2,
+                               static_cast<T>(height) / 2,
+                               static_cast<T>(weight)};
+    backend::for_each_row(args, scope.stream);
   });
 }
 
@@ -179,22 +180,22 @@ Tensor spawn_features(const std::vector<Tensor>& columns, const Tensor& rows_in,
                is_split = checked(kSpawnOp, "is_split", is_split_in, ScalarType::Bool, {rows.size(0)});
   Tensor features = make_empty(grad_sum, {rows.size(0), kSpawnFeatures});
   DeviceScope scope(grad_sum);
-  const SpawnFeaturesArgs args{data<float>(grad_sum),
-                               data<std::int32_t>(grad_count),
-                               data<float>(opacities),
-                               data<float>(scales),
-                               data<std::int32_t>(birth),
-                               data<std::uint8_t>(level),
-                               data<float>(moments),
-                               3 * moments.size(1),
-                               data<std::int64_t>(rows),
-                               data<bool>(is_split),
-                               rows.size(0),
-                               time,
-                               extent,
-                               static_cast<int>(level_count),
-                               mutable_data<float>(features)};
-  backend::spawn_features(args, scope.stream);
+  const SpawnFeatures args{data<float>(grad_sum),
+                           data<std::int32_t>(grad_count),
+                           data<float>(opacities),
+                           data<float>(scales),
+                           data<std::int32_t>(birth),
+                           data<std::uint8_t>(level),
+                           data<float>(moments),
+                           3 * moments.size(1),
+                           data<std::int64_t>(rows),
+                           data<bool>(is_split),
+                           rows.size(0),
+                           time,
+                           extent,
+                           static_cast<int>(level_count),
+                           mutable_data<float>(features)};
+  backend::for_each_row(args, scope.stream);
   return features;
 }
 
@@ -228,8 +229,8 @@ Tensor voxel_keys(const Tensor& points, const std::vector<double>& origin, doubl
   const VoxelGrid grid{{origin[0], origin[1], origin[2]}, voxel_size};
   dispatch_floating(rows, [&](auto zero) {
     using T = decltype(zero);
-    backend::voxel_keys(data<T>(rows), rows.size(0), grid, mutable_data<std::int64_t>(keys), scope.workspace,
-                        scope.stream);
+    backend::for_each_row(VoxelKeys<T>{data<T>(rows), grid, mutable_data<std::int64_t>(keys), rows.size(0)},
+                          scope.stream);
   });
   return keys;
 }

@@ -10,8 +10,7 @@ import torch.utils.checkpoint
 
 import blitzgs
 from blitzgs.reference import render
-from blitzgs.reference.compositing import composited_weights
-from blitzgs.reference.contributors import median_splats
+from blitzgs.reference.compositing import composited_weights, median_splats
 from blitzgs.reference.gaussians import normals, sh_colors, sh_values
 from tests.helpers import (
     BACKENDS,

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from blitzgs.capture.image_files import decode_rgb, read_header, read_whole
+from blitzgs.capture.image_files import check_png, decode_rgb, read_header, read_whole
 from blitzgs.capture.transforms import read_transforms
 from blitzgs.formats import native
 from blitzgs.formats.ply import read_ply, read_point_cloud
@@ -70,7 +70,7 @@ def read_parts(path: str) -> None:
     if path.endswith(".tif"):
         native.tiff_as_stored(data, name)
     if path.endswith(".png"):
-        native.check_png(data, name)
+        check_png(data, path)
 
 
 READERS = {

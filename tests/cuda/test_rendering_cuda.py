@@ -8,8 +8,8 @@ import torch
 
 import blitzgs
 from blitzgs.frame import frame as pipeline
-from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.transport import LocalTransport
+from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops import project_gradient, splat_gradients
 from blitzgs.ops.projection_types import Sizes, WeightedViews
 from blitzgs.ops.splat_gradients import gradient_columns

@@ -12,12 +12,11 @@ import torch
 from blitzgs.config.fields import LossConfig
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
-from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.pixels import collect_images
 from blitzgs.frame.run import MAX_ATTEMPTS, run
-from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
+from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges, collect_images
+from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops.projection_types import Sizes
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batch import Batch

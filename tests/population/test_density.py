@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.counter_random import hash_keys, normal
-from blitzgs.ops.cull_mask import WORD_BITS
 from blitzgs.population import growth
 from blitzgs.population.cleaning import floaters, views_counting
 from blitzgs.population.density import (

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from blitzgs.cli import main
-from blitzgs.cli.final_report import kept_warnings
+from blitzgs.cli.report import kept_warnings
 from blitzgs.report.compare import compare, differences, labels
 from blitzgs.report.gather import MAX_POINTS
 from blitzgs.report.page import MAX_BYTES

@@ -20,8 +20,7 @@ from blitzgs.config.ranges import problems
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
-from blitzgs.training.budget import Budget
-from blitzgs.training.extension import extended
+from blitzgs.training.budget import Budget, extended
 from blitzgs.training.replay import replay
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks

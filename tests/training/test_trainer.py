@@ -10,8 +10,8 @@ from blitzgs.config.files import ConfigError
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.guard import NonFiniteError
-from blitzgs.training.hints import small_batch_hint
 from blitzgs.training.trainer import Trainer
+from blitzgs.training.understood import small_batch_hint
 from tests.helpers import DEVICES, needs_cuda
 from tests.training.tiny import (
     assert_same_table,

@@ -24,8 +24,12 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.training import inputs
 from blitzgs.training.estimate import _grown, estimate
-from blitzgs.training.hints import large_images_hint, undistortion_note
-from blitzgs.training.understood import HopelessCaptureError, check_worlds
+from blitzgs.training.understood import (
+    HopelessCaptureError,
+    check_worlds,
+    large_images_hint,
+    undistortion_note,
+)
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, as_flags, tiny_config, write_tiny_capture
 
 FLAGS = as_flags("config=defaults", *OVERRIDES, "schedule.iterations=10")

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from blitzgs.capture.image_files import reduced, reduced_mask
 from blitzgs.capture.images import ImageMemory
 from blitzgs.capture.lengths import Sight
-from blitzgs.capture.reduced import reduced, reduced_mask
 from blitzgs.config.fields import Config
 from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks
@@ -184,7 +184,7 @@ def write_tiny_capture(folder: Path) -> None:
     import cv2
 
     from blitzgs.capture.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints, write_model
-    from blitzgs.viewer.frustums import quaternion
+    from blitzgs.capture.colmap import rotation_to_quat
 
     capture, images = tiny_scene()
     (folder / "images").mkdir(parents=True)
@@ -198,7 +198,7 @@ def write_tiny_capture(folder: Path) -> None:
         ColmapImages(
             ids=np.arange(1, 9, dtype=np.uint32),
             camera_ids=np.ones(8, dtype=np.uint32),
-            quats=np.stack([quaternion(pose[:3, :3]) for pose in poses]),
+            quats=np.stack([rotation_to_quat(pose[:3, :3]) for pose in poses]),
             translations=poses[:, :3, 3],
             names=[camera.name for camera in capture.cameras],
             point2d_offsets=np.zeros(9, dtype=np.uint64),

@@ -13,9 +13,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from blitzgs.util.charts import line_chart
-from blitzgs.util.laps import Laps
 from blitzgs.util.output import OutputFolder, new_file, write_file
-from blitzgs.util.progress import image_progress
+from blitzgs.util.progress import Laps, image_progress
 from blitzgs.util.terminal import printable
 
 PARTS = st.sampled_from(

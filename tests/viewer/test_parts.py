@@ -11,13 +11,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from blitzgs.capture.colmap import rotation_to_quat
 from blitzgs.view.look import Picture
 from blitzgs.view.views import Space
 from blitzgs.viewer import compare, paths
 from blitzgs.viewer.curves import Curves
 from blitzgs.viewer.door import Door, is_loopback
 from blitzgs.viewer.film import read_film
-from blitzgs.viewer.frustums import MAX_FRUSTUMS, quaternion, shown_cameras
+from blitzgs.viewer.frustums import MAX_FRUSTUMS, shown_cameras
 from blitzgs.viewer.overlay import round_length
 from blitzgs.viewer.pace import Pace
 from blitzgs.viewer.shade import shaded
@@ -58,7 +59,7 @@ def test_coordinates_go_there_and_back():
 
 def test_quaternions_turn_as_their_rotations():
     for pose in (camera_at((1, 2, 3), (0, 0, 0)), np.diag([1.0, -1.0, -1.0, 1.0]), np.eye(4)):
-        w, x, y, z = quaternion(pose[:3, :3])
+        w, x, y, z = rotation_to_quat(pose[:3, :3])
         forward = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
         np.testing.assert_allclose(forward, pose[:3, 2], atol=1e-9)
 

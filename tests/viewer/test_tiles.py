@@ -10,7 +10,7 @@ import pytest
 
 from blitzgs.capture.world import WorldFrame, enu_frame
 from blitzgs.cli import main
-from blitzgs.cli.serve import tiles_server
+from blitzgs.cli.view import tiles_server
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import save_ply
 from blitzgs.formats.tiles import write_tiles

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "population/find_non_finite.h"
-
 #include <atomic>
 
 #include "common/parallel.h"
+#include "population/find_non_finite.h"
+#include "population/tree_sums.h"
 
 namespace blitzgs::cpu {
 
@@ -25,5 +25,13 @@ void check_columns(const CheckedColumns<T>& checked, CudaStream) {
 
 template void check_columns<float>(const CheckedColumns<float>&, CudaStream);
 template void check_columns<double>(const CheckedColumns<double>&, CudaStream);
+
+void tree_sums(const TreeSumsArgs& args, CudaStream) {
+  parallel_for(0, args.n_rows, 256, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t row = begin; row < end; ++row) {
+      args.sums[row] = tree_sum_of(args, args.features + row * args.n_features);
+    }
+  });
+}
 
 }  // namespace blitzgs::cpu

@@ -1,12 +1,94 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "exchange/tile_costs.h"
-
+#include <cstdlib>
 #include <vector>
 
 #include "common/catch.h"
 #include "common/test_workspace.h"
+#include "exchange/scatter.h"
+#include "exchange/tile_costs.h"
 
 using namespace blitzgs;
+
+namespace {
+
+struct NoWorkspace final : Workspace {
+  void* allocate_bytes(std::size_t) override { std::abort(); }
+};
+
+SplatGroups make_groups(const std::vector<std::int64_t>& sizes) {
+  SplatGroups groups{};
+  for (const std::int64_t size : sizes) {
+    const int m = groups.count++;
+    groups.size[m] = size;
+    groups.start[m] = m ? groups.start[m - 1] + groups.size[m - 1] : 0;
+  }
+  return groups;
+}
+
+}  // namespace
+
+TEST_CASE("scattered splats arrive in order, and their sums return", "[scatter]") {
+  const int n = 9000, n_ranks = 3;  // more than one chunk
+  std::vector<std::int32_t> a(2 * n), b(n);
+  std::vector<std::int64_t> masks(n), sizes(n_ranks);
+  for (int i = 0; i < n; ++i) {
+    a[2 * i] = i, a[2 * i + 1] = -i, b[i] = 7 * i;
+    masks[i] = (i % 2 ? 1 : 0) | (i % 5 ? 0 : 4);  // rank 1 gets nothing, some splats go nowhere
+    for (int m = 0; m < n_ranks; ++m) sizes[m] += (masks[i] >> m) & 1;
+  }
+  const SplatGroups groups = make_groups(sizes);
+  const std::int64_t total = groups.start[2] + groups.size[2];
+  std::vector<std::int32_t> packed(3 * total);
+  std::vector<SplatPlace> places(place_runs(n) * n_ranks);
+  ScatterTargets targets{};
+  for (int m = 0; m < n_ranks; ++m) {
+    targets.words[m][0] = packed.data() + 3 * groups.start[m];
+    targets.words[m][1] = targets.words[m][0] + 2 * groups.size[m];
+  }
+  NoWorkspace workspace;
+  cpu::scatter({{{a.data(), b.data()}, {0, 2, 3}, 2}, masks.data(), n}, groups, targets, places.data(),
+               workspace, nullptr);
+
+  std::vector<std::int32_t> a2(2 * total), b2(total);
+  cpu::gather(packed.data(), groups, {{a2.data(), b2.data()}, {0, 2, 3}, 2}, workspace, nullptr);
+  std::size_t at = 0;
+  for (int m = 0; m < n_ranks; ++m) {
+    for (int i = 0; i < n; ++i) {
+      if (((masks[i] >> m) & 1) == 0) continue;
+      REQUIRE((a2[2 * at] == i && a2[2 * at + 1] == -i && b2[at] == 7 * i));
+      ++at;
+    }
+  }
+  REQUIRE(at == b2.size());
+
+  std::vector<double> values(3 * total), x(n, -1.0), y(2 * n, -1.0);
+  for (std::int64_t i = 0; i < total; ++i) {
+    const double weight = i < groups.start[2] ? 1.0 : 10.0;
+    values[3 * i] = weight * b2[i];
+    values[3 * i + 1] = weight;
+    values[3 * i + 2] = 2 * weight;
+  }
+  cpu::sum<double>({values.data(), 3, n, places.data(), groups}, {{x.data(), y.data()}, {0, 1, 3}, 2},
+                   workspace, nullptr);
+  for (int i = 0; i < n; ++i) {
+    const double weight = (masks[i] & 1 ? 1.0 : 0.0) + (masks[i] & 4 ? 10.0 : 0.0);
+    REQUIRE(x[i] == weight * b[i]);
+    REQUIRE((y[2 * i] == weight && y[2 * i + 1] == 2 * weight));
+  }
+}
+
+TEST_CASE("splats beyond a group's size are dropped", "[scatter]") {
+  const std::int32_t column[4] = {1, 2, 3, 4};
+  const std::int64_t masks[4] = {1, 1, 1, 1};
+  std::int32_t packed[4] = {-1, -1, -1, -1};
+  SplatPlace place;
+  ScatterTargets targets{};
+  targets.words[0][0] = packed;
+  NoWorkspace workspace;
+  cpu::scatter({{{column}, {0, 1}, 1}, masks, 4}, make_groups({2}), targets, &place, workspace, nullptr);
+  REQUIRE((packed[0] == 1 && packed[1] == 2 && packed[2] == -1));
+  REQUIRE((place.first == 0 && place.bits == 15));
+}
 
 namespace {
 
