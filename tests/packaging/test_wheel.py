@@ -9,7 +9,6 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import urllib.request
 from pathlib import Path
@@ -114,10 +113,10 @@ def test_the_viewer_sends_pictures(environment):
         options = {"url": url, "version": version, "warm_up": 1, "seconds": 10} | orbit
         client = str(ROOT / "benchmarks" / "view_client.py")
         assert json.loads(run(environment, "python", client, json.dumps(options)))["pictures"] > 0
-        page.send_signal(signal.SIGINT)
-        assert page.wait(60) == 0
+        assert page.poll() is None
     finally:
-        page.kill()
+        page.terminate()
+        page.wait(60)
 
 
 def test_the_sources_install(tmp_path):
