@@ -26,7 +26,7 @@ from blitzgs.cli.export_tiles import add_flags, add_kinds, check_flags, export_t
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import GaussianSource, is_antialiased
-from blitzgs.formats.models import FORMATS, Format, check_replaces, offset_of, read_gaussians
+from blitzgs.formats.models import FORMATS, Format, check_replaces, offset_of, open_gaussians
 from blitzgs.formats.selection import Selected, Selection, read_polygon
 from blitzgs.formats.web_page import check_replaces_page
 from blitzgs.runs.clean import cleaned
@@ -186,10 +186,9 @@ def _export_file(args: argparse.Namespace) -> int:
         for flag in ("classic", "clean", "coordinates"):
             if getattr(args, flag):
                 raise ValueError(f"--{flag} needs the folder of a run, and {args.model} is a file")
-        found = read_gaussians(args.model)
-        source: GaussianSource = found
+        source = open_gaussians(args.model)
         if selection is not None:
-            source = Selected(found, selection, offset_of(found.comments))
+            source = Selected(source, selection, offset_of(source.comments))
         kind.write(path, source)
         written = Exported(None, None, 0.0)
     else:

@@ -57,9 +57,18 @@ class PlySource:
         return self._count
 
     def blocks(self) -> Iterator[Gaussians]:
-        """Yield all Gaussians in order."""
+        """Yield all Gaussians in order.
+
+        Raises:
+            ValueError: a value cannot be shown; names the file.
+        """
         for first in range(0, self._count, BLOCK):
-            yield self._read(first, BLOCK)[0]
+            block, _ = self._read(first, BLOCK)
+            try:
+                block.check()
+            except ValueError as error:
+                raise ValueError(f"{self._path}, from Gaussian {first:,} on: {error}") from error
+            yield block
 
     def _read(self, first: int, most: int) -> tuple[Gaussians, int]:
         comments, properties, count, rows, total = native.read_ply(os.fsencode(self._path), first, most)

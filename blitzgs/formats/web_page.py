@@ -189,7 +189,7 @@ def estimated_bytes(splats: WebSplats) -> int:
 
 @cache
 def _part(name: str) -> str:
-    return resources.files("blitzgs.formats").joinpath("web", name).read_text(encoding="utf-8")
+    return resources.files("blitzgs.formats").joinpath(f"web/{name}").read_text(encoding="utf-8")
 
 
 def frame_bytes() -> int:

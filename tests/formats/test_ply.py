@@ -247,7 +247,13 @@ def test_blocks_of_a_file_are_its_rows(tmp_path, monkeypatch):
         for name in ("means", "quats", "scales", "opacities", "sh", "levels"):
             whole = torch.cat([getattr(block, name) for block in found])
             torch.testing.assert_close(whole, getattr(model, name), rtol=0, atol=0)
-    (tmp_path / "m.ply").write_bytes((tmp_path / "m.ply").read_bytes()[:-10])
+    content = bytearray((tmp_path / "m.ply").read_bytes())
+    width = 4 * (17 + 24 + 1)
+    content[-100 * width : 4 - 100 * width] = np.float32("nan").tobytes()
+    (tmp_path / "m.ply").write_bytes(content)
+    with pytest.raises(ValueError, match=r"m\.ply, from Gaussian 100 on: means .* first is number 50"):
+        list(source.blocks())
+    (tmp_path / "m.ply").write_bytes(content[:-10])
     with pytest.raises(ValueError, match=r"m\.ply"):
         PlySource(tmp_path / "m.ply")
 

@@ -65,6 +65,18 @@ def test_the_bar_moves_now_and_then_and_to_its_end(tmp_path, monkeypatch, capsys
     assert positions == [0, 40]
 
 
+def test_the_remaining_time_follows_a_change_of_speed(tmp_path, monkeypatch, capsys):
+    now = 0.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    log = RunLog(tmp_path, 4000, 0, tensorboard=False)
+    for t in range(10, 2010, 10):
+        now += 1.0 if t <= 1000 else 4.0
+        log.scalars(t, {"loss": 0.5})
+    log.close()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[99].endswith("ETA 0:05:00") and lines[-1].endswith("ETA 0:13:20")
+
+
 def test_elsewhere_long_work_prints_a_line_now_and_then(tmp_path, monkeypatch, capsys):
     work_on(tmp_path, monkeypatch, terminal=False)
     assert "views measured" not in capsys.readouterr().out

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from blitzgs.capture.capture import load_capture
+from blitzgs.capture.world import frame_beside, geodetic
 from blitzgs.cli import main
 from blitzgs.cli import sfm as command
 from blitzgs.config.files import load_config
@@ -162,6 +163,12 @@ def test_interrupted_work_goes_on_and_is_placed_by_gps(tmp_path, monkeypatch):
     for image in model.images.values():
         expected = metres[int(image.name[5])] - metres[0]
         assert image.projection_center() == pytest.approx(expected, abs=1.0)
+    frame = frame_beside(tmp_path)
+    latitude, longitude, height = geodetic(frame.to_world(metres[1] - metres[0]))
+    assert (latitude, longitude) == pytest.approx(
+        (47 + metres[1][1] / 111_177, 8 + metres[1][0] / 76_057), abs=1e-7
+    )
+    assert height == pytest.approx(metres[1][2] + 400, abs=0.01)
     assert not (tmp_path / "images").is_symlink()
 
 
