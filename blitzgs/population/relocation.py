@@ -191,11 +191,11 @@ def _keep_moments(table: GaussianTable, sources: Tensor, copies: Tensor, before:
     share = 1.0 / copies.double()
     dimmed = table["opacities"][sources].double().sigmoid() / before.double().sigmoid()
     for names, power in ((EXP_AVGS, 1), (EXP_AVG_SQS, 2)):
+        of_opacities, of_others = (dimmed**power).float(), (share**power).float()
         for name, parameter in zip(names, PARAMETERS, strict=True):
-            factor = ((dimmed if parameter == "opacities" else share) ** power).float()
-            column = table[name]
-            rows = take_rows(column, sources)
-            put_rows_(column, sources, rows.mul_(factor.view(-1, *[1] * (column.dim() - 1))))
+            factor = of_opacities if parameter == "opacities" else of_others
+            rows = take_rows(table[name], sources)
+            put_rows_(table[name], sources, rows.mul_(factor.view(-1, *[1] * (rows.dim() - 1))))
 
 
 def _copies(table: GaussianTable, rows: Tensor, counts: Tensor, time: int, step: int) -> dict[str, Tensor]:
