@@ -202,7 +202,8 @@ def _copies(table: GaussianTable, rows: Tensor, counts: Tensor, time: int, step:
     """Return new rows that copy each of `rows` as often as `counts` has it."""
     first = counts.cumsum(0) - counts
     # Use slots after those of clones and splits, which may have the same parents in the same event.
-    slots = torch.arange(len(rows), device=rows.device) - first.repeat_interleave(counts)
+    slots = torch.arange(len(rows), device=rows.device)
+    slots -= first.repeat_interleave(counts, output_size=len(rows))
     slots += CHILDREN_OF_A_SPLIT + 1
     new = {name: take_rows(table[name], rows) for name in (*PARAMETERS, "level")}
     new |= table.inherited(rows)

@@ -52,12 +52,13 @@ def place(count: int, gone: Tensor, beside: Tensor, means: Tensor) -> Placement:
     is_left[first] = False
     new, is_left = new[:-1], is_left[:-1]
 
-    # Rows that are left and new Gaussians that are left, in Morton order, come together one by one.
+    # Rows that are left and new Gaussians that are left come together one by one; those that are appended are
+    # in Morton order.
     rank_left = is_left.cumsum(0)
     left = gone.new_empty(leaving + 1)
     left[(rank_left - 1).where(is_left, leaving)] = gone
     n_left = rank_left[-1:].sum()
-    along = morton_order(means)
+    along = morton_order(means) if joining > leaving else numbers_new
     is_placed = new[along] >= 0
     rank = (~is_placed).cumsum(0) - 1
     others = left[rank.clamp(0, leaving)].where(rank < n_left, count + rank - n_left)

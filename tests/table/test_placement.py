@@ -55,6 +55,14 @@ def test_every_row_is_taken_once_and_pairs_are_those_of_a_stack(device, count, l
         assert appended == along and len(others) == joining - len(pairs)
 
 
+def test_spread_is_the_sum_of_mean_widths_up_to_a_limit():
+    bounds = torch.zeros(3, 8)
+    bounds[0, 3:6] = torch.tensor([1.0, 2.0, 4.0])
+    bounds[1, :3], bounds[1, 3:6] = -50.0, 50.0
+    bounds[2, :3], bounds[2, 3:6] = 3e38, -3e38  # no row is finite
+    assert spread(bounds, 10.0) == 3.5 + 10.0
+
+
 def relocated(table, generator, share, growth):
     """Replace a share of the rows by copies of others, and let the table grow."""
     n = len(table)
