@@ -6,11 +6,11 @@
 
 The table is the `aerial` scene of `scenes.py`, dealt round-robin to the ranks, each row some steps behind.
 Before every event, `--dead` of the Gaussians become transparent; an event replaces them, and the table grows
-by 5 % in each of the first `--events` and not in as many after them. Times are medians, in ms by the host's
-clock with the device idle before and after, of the slowest rank. "event" is an event as in a training. The
-parts are measured in further events, in which the host waits after each part; a part includes those that it
-calls. With one rank, steps of `--views` views are measured before the events, after them, and once the table
-is sorted again.
+by 5 % in each of the first `--events` and not in as many after them. Times are medians and means, in ms by
+the host's clock with the device idle before and after, of the slowest rank. "event" is an event as in a
+training. The parts are measured in further events, in which the host waits after each part; a part includes
+those that it calls. With one rank, steps of `--views` views are measured before the events, after them, and
+once the table is sorted again.
 """
 
 from __future__ import annotations
@@ -130,15 +130,7 @@ def make_state(scene: BenchmarkScene, table: GaussianTable, ranks: Ranks) -> Tra
     optimiser = TableAdam(OptimiserConfig(*[RATE] * 7), schedule, 1.0, ranks.device)
     owners = TileOwners(ranks)
     capture = SimpleNamespace(cameras=[], train=[], points=[])
-    progress = Progress(
-        step=STEP,
-        sh_degree=3,
-        level_count=1,
-        peak_gaussians=0,
-        seconds=0.0,
-        milestones={},
-        reference_distance=1.0,
-    )
+    progress = Progress(step=STEP, sh_degree=3, level_count=1, peak_gaussians=0, seconds=0.0)
     return TrainingState(
         config=config,
         capture=cast(Any, capture),
@@ -227,7 +219,7 @@ def slowest(ranks: Ranks, values: dict[str, float]) -> dict[str, float]:
 
 
 def measure(millions: float, ranks: Ranks, args: argparse.Namespace) -> dict[str, Any]:
-    """Measure the events of one size; the parts come last, as measuring them cannot be undone."""
+    """Measure the events of one size, as a whole."""
     if ranks.device.type == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
@@ -253,6 +245,7 @@ def measure(millions: float, ranks: Ranks, args: argparse.Namespace) -> dict[str
     state.sort()
     result["step sorted again"] = events.step_ms()
     times = {name: 1e3 * statistics.median(seconds) for name, seconds in measured.seconds.items()}
+    times |= {f"mean {name}": 1e3 * statistics.mean(seconds) for name, seconds in measured.seconds.items()}
     result |= slowest(ranks, times)
     result["each event"] = [round(1e3 * s, 2) for seconds in measured.seconds.values() for s in seconds]
     if ranks.device.type == "cuda":
@@ -261,7 +254,10 @@ def measure(millions: float, ranks: Ranks, args: argparse.Namespace) -> dict[str
 
 
 def measure_parts(millions: float, ranks: Ranks, args: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return the median time of each part of an event that grows the table, and of one that does not."""
+    """Return the median time of each part of an event that grows the table, and of one that does not.
+
+    From then on all events are slower, because the host waits after each part.
+    """
     scene = aerial(int(millions * 1e6), str(ranks.device), views=args.views)
     state = make_state(scene, make_table(scene, ranks), ranks)
     events = Events(state, scene, args.dead)
