@@ -9,7 +9,6 @@ from torch import Tensor
 import blitzgs._library  # noqa: F401  (registers the ops)
 
 
-@torch.no_grad()
 def take_rows(column: Tensor, rows: Tensor, out: Tensor | None = None) -> Tensor:
     """Return the rows `rows` of a column, as `column.index_select(0, rows)` does.
 
@@ -33,7 +32,6 @@ def take_rows(column: Tensor, rows: Tensor, out: Tensor | None = None) -> Tensor
     return out
 
 
-@torch.no_grad()
 def put_rows_(column: Tensor, rows: Tensor, fresh: Tensor | None = None) -> None:
     """Overwrite rows of a column, in place.
 

@@ -233,6 +233,8 @@ class GaussianTable:
             old = self[name]
             return torch.cat((old, old.new_empty((max(0, count - len(old)), *old.shape[1:]))))
         old = self.columns[name]
+        if len(old) == count:
+            return old
         memory = self._memory.get(name, old)
         if len(memory) < count:
             room = int(GROWTH * count)
@@ -358,8 +360,8 @@ class GaussianTable:
             put_rows_(column, placement.new, new.get(name))
             if name in LAYOUTS:
                 self._store(name, column[: placement.total])
-            else:
-                self._memory[name] = self._memory.get(name, column)
+            elif placement.total != len(self.columns[name]):
+                self._memory.setdefault(name, column)
                 self.columns[name] = column[: placement.total]
 
     def exchange(self, destination_ranks: Tensor, ranks: RowExchange) -> None:
