@@ -76,6 +76,8 @@ class Progress:
         gate: digest of the spawn gate's files; empty without a gate, and in old checkpoints.
         stages: seconds of each kind of work besides the optimiser steps; see `TrainingState.stage`.
         events_left: (time, order, kind) of the events of the last step that a signal kept from running.
+        sorted_spread: spread of the blocks of all ranks when density events last sorted the rows, as
+            `blitzgs.training.events.densify` measures it; 0: they have not.
     """
 
     step: int
@@ -94,6 +96,7 @@ class Progress:
     gate: str = ""
     stages: dict[str, float] = dataclasses.field(default_factory=dict)
     events_left: list[tuple[Any, ...]] = dataclasses.field(default_factory=list)
+    sorted_spread: int = 0
 
 
 @dataclass

@@ -183,8 +183,14 @@ def write_tiny_capture(folder: Path) -> None:
 
     import cv2
 
-    from blitzgs.capture.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints, write_model
-    from blitzgs.capture.colmap import rotation_to_quat
+    from blitzgs.capture.colmap import (
+        ColmapCamera,
+        ColmapImages,
+        ColmapModel,
+        ColmapPoints,
+        rotation_to_quat,
+        write_model,
+    )
 
     capture, images = tiny_scene()
     (folder / "images").mkdir(parents=True)
