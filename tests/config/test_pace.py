@@ -65,7 +65,7 @@ def test_a_change_of_pace_does_not_change_past_events():
             position_decay=2_500,
             evaluate_every=333,
         )
-        optimiser = OptimiserConfig()
+        optimiser = OptimiserConfig(final=0.1)
         schedule, happened, phases, step = Schedule(config), [], [], 0
         rates = schedule.learning_rates(optimiser, 2.0)
         while step < schedule.steps:

@@ -6,6 +6,7 @@ import json
 import pytest
 import torch
 
+from blitzgs.config.fields import OptimiserConfig
 from blitzgs.config.files import ConfigError, load_config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
@@ -36,6 +37,8 @@ def test_the_new_length(overrides, by, images):
     assert after.iterations == images
     # Nothing before the old end changes.
     assert after.events(0, before.iterations) == before.events(0, before.iterations)
+    old, new = (schedule.learning_rates(OptimiserConfig(final=0.1), 1.0) for schedule in (before, after))
+    assert torch.equal(new[: len(old)], old)
 
 
 def test_a_run_that_is_not_finished_is_not_extended():
