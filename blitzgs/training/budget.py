@@ -147,7 +147,7 @@ def extended(config: Config, step: int, by: float) -> Config:
     """Return the configuration of a finished run with a longer schedule.
 
     The times of all events stay, so the new part of the run has no density events and no importance passes.
-    The position rate stays at its final value.
+    Learning rates stay at their final values.
 
     Args:
         config: the run's own configuration.

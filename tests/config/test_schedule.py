@@ -145,8 +145,9 @@ def test_size_pruning_starts_after_its_time():
 
 
 def test_learning_rates():
-    config = OptimiserConfig()
-    schedule = Schedule(ScheduleConfig(iterations=1_000, batch_size=4, position_decay=500))
+    config = OptimiserConfig(final=0.1)
+    times = ScheduleConfig(iterations=1_000, batch_size=4, densify_until=100, position_decay=500)
+    schedule = Schedule(times)
     table = schedule.learning_rates(config, extent=2.0).double()
     assert table.shape == (251, 6)
     assert not table[0].any()
@@ -155,7 +156,9 @@ def test_learning_rates():
         position = 2.0 * math.exp(
             (1 - fraction) * math.log(config.position) + fraction * math.log(config.position_final)
         )
-        others = [config.rotation, config.scale, config.opacity, config.sh_dc, config.sh_rest]
+        share = 0.1 ** min(max((step - 1) * 4 - 100, 0) / 400, 1.0)
+        colors = [config.sh_dc * share, config.sh_rest * share]
+        others = [config.rotation * share, config.scale * share, config.opacity, *colors]
         expected = torch.tensor([position, *others]).double()
         torch.testing.assert_close(table[step], 2.0 * expected, rtol=1e-6, atol=0.0)
 
@@ -227,7 +230,7 @@ def test_a_change_of_pace_does_not_change_past_events():
             position_decay=2_500,
             evaluate_every=333,
         )
-        optimiser = OptimiserConfig()
+        optimiser = OptimiserConfig(final=0.1)
         schedule, happened, phases, step = Schedule(config), [], [], 0
         rates = schedule.learning_rates(optimiser, 2.0)
         while step < schedule.steps:

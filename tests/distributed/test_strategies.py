@@ -40,7 +40,7 @@ RELOCATION = (
     "loss.opacity=0.01",
     "population.max_gaussians=450",
 )
-# The second importance pass at the end of density control keeps half.
+# The second importance pass at the end of density control keeps half. Then rates fall.
 PRUNED = (
     "population.importance=true",
     "population.score=weight",
@@ -49,6 +49,8 @@ PRUNED = (
     "schedule.t1=0",
     "schedule.densify_until=54",
     "schedule.t2=54",
+    "schedule.position_decay=60",
+    "optimiser.final=0.1",
 )
 OPTIONS = {
     "relocation": RELOCATION,

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from blitzgs.cli import main
-from blitzgs.config.fields import Config, ScheduleConfig
+from blitzgs.config.fields import Config, OptimiserConfig, ScheduleConfig
 from blitzgs.config.files import ConfigError, load_config
 from blitzgs.config.ranges import problems
 from blitzgs.config.schedule import Schedule
@@ -273,6 +273,8 @@ def test_the_new_length(overrides, by, images):
     assert after.iterations == images
     # Nothing before the old end changes.
     assert after.events(0, before.iterations) == before.events(0, before.iterations)
+    old, new = (schedule.learning_rates(OptimiserConfig(final=0.1), 1.0) for schedule in (before, after))
+    assert torch.equal(new[: len(old)], old)
 
 
 def test_a_run_that_is_not_finished_is_not_extended():
