@@ -90,6 +90,20 @@ def test_image_and_gradients_match_the_definition(channels, dtype, image_error, 
         assert (a - b).abs().max() <= gradient_error * b.abs().max()
 
 
+def test_gradcheck():
+    """Of the colours and, alone, of the opacity of an image."""
+    splats = random_splats(8, 9, 8, channels=2, dtype=torch.float64, smallest=2, opacity=(0.1, 0.9), seed=4)
+    tile_lists = lists(splats, width=9, height=8)
+    backgrounds = torch.rand(1, 2, dtype=torch.float64)
+    leaves = [t.requires_grad_() for t in (*splats.values(), backgrounds)]
+
+    def image(*values):
+        return rasterize(*values[:4], *tile_lists, n_cameras=1, width=9, height=8, backgrounds=values[4])
+
+    # Steps small enough that no pixel crosses the cut at 1/255.
+    assert torch.autograd.gradcheck(image, leaves, eps=1e-7, atol=1e-5, rtol=1e-4)
+
+
 def test_absolute_gradients_sum_each_pixels_gradient():
     splats = random_splats(30, WIDTH, HEIGHT, dtype=torch.float64, smallest=4)
     v_renders = torch.zeros(1, HEIGHT, WIDTH, 3, dtype=torch.float64)
