@@ -146,6 +146,7 @@ def main(arguments: list[str] | None = None) -> None:
     row |= served(opened, (width, height), options.seconds, options.full)
     if on_gpu:
         row["mb_above_model"] = (torch.cuda.max_memory_reserved(ranks.device) - held) / 1e6
+        row["mb_of_that_in_use"] = (torch.cuda.max_memory_allocated(ranks.device) - held) / 1e6
     report("The viewer", [row], options.json, options.device)
 
 

@@ -2,7 +2,7 @@
 """The wheel in dist/ works in fresh environments without a compiler; `make test-wheel` runs this.
 
 Each environment downloads a torch, which takes gigabytes. Interpreters that are not there are skipped:
-PYTHONS="/path/python3.10 /path/python3.13" names others than those in PATH.
+PYTHONS="/path/python3.10 /path/python3.13" names others than those in PATH and of pyenv.
 """
 
 import json
@@ -37,12 +37,18 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
 def fresh(folder, python, torch, *packages):
     """Make an environment with a torch and other packages."""
-    if shutil.which(python) is None:
+    versions, name = Path.home() / ".pyenv" / "versions", Path(python).name
+    found = [python, *map(str, versions.glob(f"{name.removeprefix('python')}.*/bin/{name}"))]
+    # Those of pyenv in PATH may do nothing but say that another version is selected.
+    found = [
+        p for p in found if shutil.which(p) and not subprocess.call([p, "-c", ""], stderr=subprocess.DEVNULL)
+    ]
+    if not found:
         pytest.skip(f"{python} is not here")
     uv = shutil.which("uv")
     if uv is None:
         pytest.skip("needs uv, whose environments share their files: pip install uv")
-    subprocess.run([uv, "venv", "-q", "--seed", "--python", shutil.which(python), folder], check=True)
+    subprocess.run([uv, "venv", "-q", "--seed", "--python", shutil.which(found[0]), folder], check=True)
     install = [uv, "pip", "install", "-q", "--python", folder / "bin" / "python", f"torch=={torch}"]
     subprocess.run([*install, *packages], check=True)
     return folder
