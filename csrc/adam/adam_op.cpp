@@ -20,11 +20,12 @@ void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<T
                         double eps, const std::optional<Tensor>& ids, const std::optional<Tensor>& count) {
   constexpr const char* kOp = "lazy_adam_catch_up_";
   AdamTensors state(kOp, state_in, tables, {step, explicit_steps, beta1, beta2, eps});
-  const std::optional<Tensor> list = checked(kOp, "ids", ids, ScalarType::Int, {-1});
+  const std::optional<Tensor> list = state.checked_rows(ids);
   const std::int64_t n = max_listed(kOp, count, list ? list->size(0) : state.rows());
   DeviceScope scope(state.like());
   dispatch_floating(state.like(), [&](auto zero) {
-    auto args = state.arguments<decltype(zero)>(data_or_null<std::int32_t>(list), n);
+    auto args = state.arguments<decltype(zero)>(list);
+    args.n = n;
     args.count = data_or_null<std::int32_t>(count);
     if (n > 0) backend::lazy_adam(args, scope.workspace, scope.stream);
   });

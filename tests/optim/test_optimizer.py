@@ -8,7 +8,7 @@ import pickle
 import pytest
 import torch
 
-from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, GrowingSchedule, lazy_adam_step_
+from blitzgs.ops.lazy_adam import AdamSchedule, GrowingSchedule
 from blitzgs.optim import LazyAdam
 from tests.helpers import BACKENDS, DEVICES, relative_error
 from tests.optim.adam_pair import BOUND, LR, AdamPair
@@ -368,10 +368,10 @@ def test_a_growing_schedule_has_the_sums_of_one_known_in_advance(device):
     known = AdamSchedule(rates, 0.9, 0.999, 1e-8, dtype=dtype)
     growing = GrowingSchedule((0.9, 0.999), 1e-8, dtype, torch.device(device), 0)
     param = torch.zeros(1, 4, dtype=dtype, device=device)
-    steps = (torch.zeros(1, dtype=torch.int32, device=device) for _ in range(2))
-    state = AdamState.alone(param, param.clone(), param.clone(), *steps)
+    steps = [torch.zeros(1, dtype=torch.int32, device=device) for _ in range(2)]
+    state = [param, param.clone(), param.clone(), *steps]
     for step in range(1, 400):
-        lazy_adam_step_(state, growing, step, [param.clone()], None, rates=rates[step, 4:].tolist())
+        growing.step_(state, param.clone(), None, tuple(rates[step, 4:].tolist()))
     assert growing.explicit_steps < 399
     ours, expected = (s.tables[0][:400, :24].view(400, 4, 6)[:, :, 4:] for s in (growing, known))
     assert torch.equal(growing.tables[1][1:400, 4:], rates[1:, 4:])
