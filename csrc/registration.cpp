@@ -209,8 +209,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor v_renders)");
 
   // The optimiser: dense Adam over a list of rows, with the arguments of project_bwd_step_; and the
-  // statistics of density control. ids: int32 or int64. current: the parameters of the listed rows (None: all)
-  // are at the step before. rates: of a single parameter, they enter the tables, see `RatesArgs`.
+  // statistics of density control. ids: int32 or int64. current: the parameters of the listed rows (None:
+  // all) are at the step before. rates: of a single parameter, they enter the tables, see `RatesArgs`.
   m.def(
       "lazy_adam_step_(Tensor(a!)[] state, Tensor(b!)[] tables, int step, int explicit_steps, float beta1, "
       "float beta2, float eps, Tensor[] grads, Tensor? ids, bool current=False, float[] rates=[]) -> ()");
