@@ -147,22 +147,30 @@ class GrowingSchedule(AdamTables):
         return self.last - self.begin >= self.LENGTH
 
     def step_(
-        self, state: list[Tensor], gradient: Tensor, rows: Tensor | None, rates: tuple[float, float]
+        self,
+        state: list[Tensor],
+        taken: Tensor,
+        gradient: Tensor,
+        rows: Tensor | None,
+        rates: tuple[float, float],
     ) -> None:
         """Take the next step, as `lazy_adam_step_` does.
 
         Args:
             state: of N rows.
+            taken: the number of steps taken, float32 [] on the CPU.
             gradient: that of the rows, [U, ...].
-            rows: int32 or int64 [U], each once; None: all.
+            rows: int32 [U] or int64 [1, U], each once; None: all.
             rates: the learning rates of this step, for the first three values of a row and for the rest.
         """
         constants = self.constants(self.row + 1)
         with below_autograd():
             torch.ops.blitzgs.lazy_adam_step_(
-                state, self.tables, *constants, [gradient], rows, self.current == self.last, rates
+                state, self.tables, *constants, [gradient], rows, self.current == self.last, rates, taken
             )
         self.last += 1
+        if rows is None:
+            self.current = self.last
 
     def catch_up_(self, state: list[Tensor], rows: Tensor | None = None, count: Tensor | None = None) -> None:
         """Apply the missed steps up to the last one, as `lazy_adam_catch_up_` does with these arguments."""

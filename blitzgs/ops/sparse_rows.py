@@ -107,10 +107,11 @@ def of_shape(table: Tensor, shape: Sequence[int]) -> Tensor:
 
 
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows int64 [U], each once, and the values [U, ...] of a sparse tensor.
+    """Return the rows int64 [1, U], each once, and the values [U, ...] of a sparse tensor.
 
     Args:
         table: a tensor whose only sparse dimension is the first.
     """
-    table = table.coalesce()
-    return raw_indices(table)[0], raw_values(table)
+    if not table.is_coalesced():
+        table = table.coalesce()
+    return raw_indices(table), raw_values(table)

@@ -163,8 +163,7 @@ class LazyAdam(torch.optim.Optimizer):
         state, schedule = self._tables_of(group, index, param)
         rate, rest = group["lr"], group["lr_rest"]
         rates = (float(rate), float(rate if rest is None else rest))
-        _move(schedule.step_, param, state, gradient, rows, rates)
-        state["step"].fill_(schedule.last)
+        _move(schedule.step_, param, state, state["step"], gradient, rows, rates)
         # A backward pass that has saved the parameter must fail, as it does after a step of torch's Adam.
         torch.autograd.graph.increment_version(param)
 

@@ -63,11 +63,13 @@ struct AdamTensors {
   const Tensor& like() const { return params[0]; }
   std::int64_t rows() const { return like().size(0); }
 
-  // Checks a list of rows, int32 or int64 [n]; none: all rows.
+  // Checks a list of rows, int32 [n] or int64 [n] or [1, n] (as sparse tensors have them); none: all rows.
   std::optional<Tensor> checked_rows(const std::optional<Tensor>& ids) const {
-    return checked(op, "ids", ids,
-                   ids && ids->scalar_type() == ScalarType::Long ? ids->scalar_type() : ScalarType::Int,
-                   {-1});
+    if (!ids || ids->scalar_type() != ScalarType::Long || ids->dim() != 2)
+      return checked(op, "ids", ids,
+                     ids && ids->scalar_type() == ScalarType::Long ? ScalarType::Long : ScalarType::Int,
+                     {-1});
+    return checked(op, "ids", *ids, ScalarType::Long, {1, -1});
   }
 
   // The kernel's arguments for the rows of a list (`checked_rows`). Gradients are null; the caller sets them.
@@ -83,7 +85,7 @@ struct AdamTensors {
     } else {
       args.ids = data_or_null<std::int32_t>(ids);
     }
-    args.n = ids ? ids->size(0) : rows();
+    args.n = ids ? ids->numel() : rows();
     args.last_step = mutable_data<std::int32_t>(last_step);
     args.moment_step = mutable_data<std::int32_t>(moment_step);
     args.table = data<double>(table);
@@ -114,7 +116,7 @@ struct AdamTensors {
                     ": rates must be empty or two numbers, for one parameter and tables without final_rules");
     check_takes_step();
     const std::optional<Tensor> list = checked_rows(ids);
-    const std::int64_t n = list ? list->size(0) : rows();
+    const std::int64_t n = list ? list->numel() : rows();
     std::vector<Tensor> held;
     for (int c = 0; c < count(); ++c) {
       const Tensor& grad = held.emplace_back(as_contiguous(grads[c]));
