@@ -271,7 +271,7 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
     const auto block_rows = static_cast<int>(kListThreads / width);
     const Prepared prepared = catches_up ? prepare_rules(behind, workspace, stream) : Prepared{};
     launch_early(
-        "lazy_adam, one parameter", alone_kernel,
+        "lazy_adam of one parameter", alone_kernel,
         {filled_blocks(std::max<std::int64_t>(args.n, 1), block_rows, kListBlocks), kListThreads, stream},
         args, prepared, block_rows);
     return;
