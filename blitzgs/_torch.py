@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 from torch.utils import _pytree as pytree
 
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -77,6 +78,29 @@ def register_mapping(kind: type, copy: Callable[[dict[str, Any]], Any]) -> None:
         lambda values: (list(values.values()), list(values)),
         lambda values, keys: copy(dict(zip(keys, values, strict=True))),
     )
+
+
+def quick_step(step: _F) -> _F:
+    """Return the method `step` of an optimiser as torch wraps it: with step hooks, and a range for profilers.
+
+    Where there are neither, it is called without torch's wrapper, which takes 5 us of the host's time.
+    """
+    wrapped = torch.optim.Optimizer.profile_hook_step(step)
+
+    @functools.wraps(step)
+    def call(self: Any, *args: Any, **kwargs: Any) -> Any:
+        if (
+            torch.autograd.profiler._is_profiler_enabled
+            or self._optimizer_step_pre_hooks
+            or self._optimizer_step_post_hooks
+            or _global_optimizer_pre_hooks
+            or _global_optimizer_post_hooks
+        ):
+            return wrapped(self, *args, **kwargs)
+        return step(self, *args, **kwargs)
+
+    call.hooked = True  # type: ignore[attr-defined]  # torch wraps each step without this mark
+    return call  # type: ignore[return-value]
 
 
 def mark_coalesced(table: Tensor) -> None:

@@ -209,11 +209,13 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor v_renders)");
 
   // The optimiser: dense Adam over a list of rows, with the arguments of project_bwd_step_; and the
-  // statistics of density control. current: the parameters of the listed rows (None: all)
-  // are at the step before. rates: enter the tables first, see `RatesArgs`.
+  // statistics of density control. ids: int32 [U] or int64 [U] or [1, U]. current: the parameters of the
+  // listed rows (None: all) are at the step before. rates: of a single parameter, they enter the tables
+  // (`RatesArgs`), and taken, float32 [] on the CPU, counts the step.
   m.def(
       "lazy_adam_step_(Tensor(a!)[] state, Tensor(b!)[] tables, int step, int explicit_steps, float beta1, "
-      "float beta2, float eps, Tensor[] grads, Tensor? ids, bool current=False, float[] rates=[]) -> ()");
+      "float beta2, float eps, Tensor[] grads, Tensor? ids, bool current=False, float[] rates=[], "
+      "Tensor(c!)? taken=None) -> ()");
   m.def(
       "lazy_adam_catch_up_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
       "float beta2, float eps, Tensor? ids, Tensor? count=None) -> ()");

@@ -154,8 +154,9 @@ class HostSum:
         end = self._ranks.world_size * self._sums
         # The costs follow the sums of the last rank. Copy both; the totals then replace that rank's sums.
         total = numbers[end - self._sums :].copy()
-        of_ranks = numbers[:end].reshape(self._ranks.world_size, self._sums)
-        np.add.reduce(of_ranks, 0, out=total[: self._sums])
+        if self._ranks.world_size > 1:
+            of_ranks = numbers[:end].reshape(self._ranks.world_size, self._sums)
+            np.add.reduce(of_ranks, 0, out=total[: self._sums])
         return torch.from_numpy(total)
 
 

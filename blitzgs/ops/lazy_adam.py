@@ -39,14 +39,6 @@ class AdamState(NamedTuple):
     last_step: Tensor
     moment_step: Tensor
 
-    @classmethod
-    def alone(cls, param: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, *steps: Tensor) -> AdamState:
-        """Return the state of a single parameter [N, ...], of any width.
-
-        Its learning rates are those of SH: one for the first three values of a row, one for the rest.
-        """
-        return cls([param], [exp_avg], [exp_avg_sq], *steps)
-
     @property
     def tensors(self) -> list[Tensor]:
         """The group `state` of the ops (`AdamTensors` of csrc/adam/lazy_adam_op.h)."""
@@ -130,10 +122,11 @@ class AdamSchedule(AdamTables):
 
 
 class GrowingSchedule(AdamTables):
-    """The tables of one parameter whose learning rates become known step by step.
+    """The tables of one parameter [N, ...], of any width, whose learning rates become known step by step.
 
-    `lazy_adam_step_` enters the learning rates of each step. The tables have a fixed length. Their rows, and
-    the optimiser's columns of steps, count from `begin`.
+    Its methods take the parameter's state: the parameter, its first and second moments, `last_step` and
+    `moment_step` (see `AdamState`). The tables have a fixed length. Their rows, and the columns of steps,
+    count from `begin`.
 
     Attributes:
         begin: number of steps taken before the tables begin, with which all rows must be up to date.
@@ -164,7 +157,40 @@ class GrowingSchedule(AdamTables):
 
     def is_full(self) -> bool:
         """Tell whether no further step fits."""
-        return self.row >= self.LENGTH
+        return self.last - self.begin >= self.LENGTH
+
+    def step_(
+        self,
+        state: list[Tensor],
+        taken: Tensor,
+        gradient: Tensor,
+        rows: Tensor | None,
+        rates: tuple[float, float],
+    ) -> None:
+        """Take the next step, as `lazy_adam_step_` does.
+
+        Args:
+            state: of N rows.
+            taken: the number of steps taken, float32 [] on the CPU.
+            gradient: that of the rows, [U, ...].
+            rows: int32 [U] or int64 [1, U], each once; None: all.
+            rates: the learning rates of this step, for the first three values of a row and for the rest.
+        """
+        constants = self.constants(self.row + 1)
+        with below_autograd():
+            torch.ops.blitzgs.lazy_adam_step_(
+                state, self.tables, *constants, [gradient], rows, self.current == self.last, rates, taken
+            )
+        self.last += 1
+        if rows is None:
+            self.current = self.last
+
+    def catch_up_(self, state: list[Tensor], rows: Tensor | None = None, count: Tensor | None = None) -> None:
+        """Apply the missed steps up to the last one, as `lazy_adam_catch_up_` does with these arguments."""
+        with below_autograd():
+            torch.ops.blitzgs.lazy_adam_catch_up_(state, self.tables, *self.constants(self.row), rows, count)
+        if rows is None:
+            self.current = self.last
 
 
 def lazy_adam_step_(
@@ -173,8 +199,6 @@ def lazy_adam_step_(
     step: int,
     grads: Sequence[Tensor],
     ids: Tensor | None,
-    current: bool = False,
-    rates: Sequence[float] = (),
 ) -> None:
     """Take Adam step ``step`` for the rows `ids`, in place, after the zero-gradient steps they skipped.
 
@@ -187,17 +211,14 @@ def lazy_adam_step_(
         schedule: of S steps, for the dtype of the parameters.
         step: 1 <= step <= S.
         grads: gradients of the listed rows, shaped like the parameters with U rows.
-        ids: int32 [U], the rows, each once; None: all.
-        current: the parameters of these rows are at ``step`` - 1, so that none has to catch up.
-        rates: for a `GrowingSchedule`, the learning rates of ``step`` to enter into its tables: of the first
-            three values of a row, and of the rest.
+        ids: int32 or int64 [U], the rows, each once; None: all.
 
     Raises:
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
     with below_autograd():
         torch.ops.blitzgs.lazy_adam_step_(
-            state.tensors, schedule.tables, *schedule.constants(step), list(grads), ids, current, list(rates)
+            state.tensors, schedule.tables, *schedule.constants(step), list(grads), ids
         )
 
 
@@ -218,7 +239,7 @@ def lazy_adam_catch_up_(
         state: of N rows.
         schedule: of S steps, for the dtype of the parameters.
         step: 0 <= step <= S; 0: nothing to do.
-        ids: int32 [A], the rows, each once; None: all.
+        ids: int32 or int64 [A], the rows, each once; None: all.
         count: int32 [1], only the first `count` of `ids` are rows; the host does not wait for it. None: all.
 
     Raises:

@@ -131,7 +131,8 @@ def _first_gradients(
         # Autograd would copy a gradient that is not contiguous, and its indices with it. Torch adds to an
         # empty sparse gradient in place, so parts share no memory.
         found[4:] = [
-            part.clone(memory_format=torch.contiguous_format) for part in gradients[4].split(ctx.parts, 1)
+            part.clone(memory_format=torch.contiguous_format)
+            for part in gradients[4].split_with_sizes(ctx.parts, 1)
         ]
     if not dense:
         found = [gradient if wanted else None for gradient, wanted in zip(found, needed, strict=True)]

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.weak import WeakTensorKeyDictionary
 
 from blitzgs._torch import mark_coalesced, raw_indices, raw_values
 from blitzgs.ops.derivatives import linear_map
@@ -63,11 +63,13 @@ class KeptMarks:
     """
 
     def __init__(self) -> None:
-        self._parameters = WeakTensorKeyDictionary()
+        self._parameters: dict[int, weakref.ref[Tensor]] = {}
 
     def of(self, param: Tensor) -> None:
         """Keep the marks of the gradients that `param`, a leaf, will receive."""
-        if param in self._parameters or not (param.is_leaf and param.requires_grad):
+        key = id(param)
+        known = self._parameters.get(key)
+        if (known is not None and known() is param) or not (param.is_leaf and param.requires_grad):
             return
         arriving = [-1]
 
@@ -83,7 +85,7 @@ class KeptMarks:
 
         param.register_hook(look)
         param.register_post_accumulate_grad_hook(mark)
-        self._parameters[param] = True
+        self._parameters[key] = weakref.ref(param, lambda _: self._parameters.pop(key, None))
 
 
 def of_shape(table: Tensor, shape: Sequence[int]) -> Tensor:
@@ -105,10 +107,11 @@ def of_shape(table: Tensor, shape: Sequence[int]) -> Tensor:
 
 
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows int64 [U], each once, and the values [U, ...] of a sparse tensor.
+    """Return the rows int64 [1, U], each once, and the values [U, ...] of a sparse tensor.
 
     Args:
         table: a tensor whose only sparse dimension is the first.
     """
-    table = table.coalesce()
-    return raw_indices(table)[0], raw_values(table)
+    if not table.is_coalesced():
+        table = table.coalesce()
+    return raw_indices(table), raw_values(table)

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from blitzgs.ops.lazy_adam import AdamState, GrowingSchedule, lazy_adam_catch_up_, lazy_adam_step_
+from blitzgs._torch import quick_step
+from blitzgs.ops.lazy_adam import GrowingSchedule
 from blitzgs.ops.sparse_rows import KeptMarks, distinct_rows
 from blitzgs.optim.lazy_adam_checks import (
     MOMENTS,
@@ -126,6 +127,7 @@ class LazyAdam(torch.optim.Optimizer):
             del self.param_groups[-1]
             raise
 
+    @quick_step
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """Take a step for the rows that have a gradient, which first catch up with the step before.
 
@@ -142,15 +144,13 @@ class LazyAdam(torch.optim.Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        for place in self._places():
-            if place[2].grad is not None:
-                self._step_alone(*place)
+        for group, index, param in self._places():
+            if (gradient := param.grad) is not None:
+                self._step_alone(group, index, param, gradient)
         return loss
 
-    def _step_alone(self, group: dict[str, Any], index: int, param: Tensor) -> None:
+    def _step_alone(self, group: dict[str, Any], index: int, param: Tensor, gradient: Tensor) -> None:
         """Take the step of one parameter."""
-        gradient = param.grad
-        assert gradient is not None
         rows = None
         if gradient.is_sparse:
             if gradient.sparse_dim() != 1:
@@ -159,18 +159,20 @@ class LazyAdam(torch.optim.Optimizer):
                     f"{gradient.sparse_dim()} of them"
                 )
             self._marks.of(param)
-            listed, gradient = distinct_rows(gradient)
-            rows = listed.int()
+            rows, gradient = distinct_rows(gradient)
         state, schedule = self._tables_of(group, index, param)
         rate, rest = group["lr"], group["lr_rest"]
         rates = (float(rate), float(rate if rest is None else rest))
-        is_current = schedule.current == schedule.last
-        schedule.last += 1
-        state["step"] += 1
-        if param.numel() > 0:
-            lazy_adam_step_(_alone(param, state), schedule, schedule.row, [gradient], rows, is_current, rates)
+        _move(schedule.step_, param, state, state["step"], gradient, rows, rates)
         # A backward pass that has saved the parameter must fail, as it does after a step of torch's Adam.
         torch.autograd.graph.increment_version(param)
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Remove the gradients, or set them to zero; see `torch.optim.Optimizer.zero_grad`."""
+        if not set_to_none:
+            return super().zero_grad(False)
+        for _, _, param in self._places():
+            param.grad = None
 
     def catch_up(
         self,
@@ -203,15 +205,13 @@ class LazyAdam(torch.optim.Optimizer):
             params = [params]
         chosen = None if params is None else set(map(id, params))
         for group, index, param in self._places():
-            if _STEPS[0] not in self.state.get(param, ()) or (chosen is not None and id(param) not in chosen):
+            if (chosen is not None and id(param) not in chosen) or _STEPS[0] not in self.state.get(param, ()):
                 continue
             state, schedule = self._tables_of(group, index, param)
             if moments:
                 _settle(param, state, schedule)
-            elif schedule.current < schedule.last and param.numel() > 0:
-                lazy_adam_catch_up_(_alone(param, state), schedule, schedule.row, rows, count)
-                if rows is None:
-                    schedule.current = schedule.last
+            elif schedule.current < schedule.last:
+                _move(schedule.catch_up_, param, state, rows, count)
 
     def bring_up_to_date(self) -> None:
         """Deprecated name of `catch_up(moments=True)`."""
@@ -329,7 +329,6 @@ class LazyAdam(torch.optim.Optimizer):
         self, group: dict[str, Any], index: int, param: Tensor
     ) -> tuple[dict[str, Any], GrowingSchedule]:
         """Return the state of a parameter and its schedule; make or correct them where needed."""
-        check_param(param)
         state: dict[str, Any] = self.state[param]
         if not state:
             state["step"] = torch.tensor(0.0, dtype=torch.float32, device="cpu")
@@ -338,14 +337,14 @@ class LazyAdam(torch.optim.Optimizer):
             # gsplat's strategies append float zeros. The value is right for rows whose moments are zero.
             if name in state and state[name].dtype != torch.int32:
                 state[name] = state[name].int()
-        check_rows(param, state)
-        step, betas = int(state["step"]), (float(group["betas"][0]), float(group["betas"][1]))
+        step, betas = int(state["step"]), tuple(group["betas"])
         schedule: GrowingSchedule | None = group[_SCHEDULES].get(index)
         if schedule is not None and (schedule.last != step or schedule.betas != betas or schedule.is_full()):
             if _STEPS[0] in state:
                 _settle(param, state, schedule)
             schedule = None
         if schedule is None:
+            check_param(param)
             schedule = GrowingSchedule(betas, group["eps"], param.dtype, param.device, step)
             group[_SCHEDULES][index] = schedule
         schedule.eps = group["eps"]
@@ -355,16 +354,23 @@ class LazyAdam(torch.optim.Optimizer):
         return state, schedule
 
 
-def _alone(param: Tensor, state: Mapping[str, Any]) -> AdamState:
-    return AdamState.alone(param, *(state[name] for name in (*MOMENTS, *_STEPS)))
+def _move(move: Callable[..., None], param: Tensor, state: Mapping[str, Any], *arguments: Any) -> None:
+    """Call a method of a schedule; say what is wrong with the parameter if it is refused."""
+    try:
+        move(
+            [param, state["exp_avg"], state["exp_avg_sq"], state["last_step"], state["moment_step"]],
+            *arguments,
+        )
+    except RuntimeError:
+        check_param(param)
+        check_rows(param, state)
+        raise
 
 
 @torch.no_grad()
 def _settle(param: Tensor, state: dict[str, Any], schedule: GrowingSchedule) -> None:
     """Bring all rows and their moments up to date, and leave the state of `torch.optim.Adam`."""
-    if param.numel() > 0:
-        lazy_adam_catch_up_(_alone(param, state), schedule, schedule.row)
-    schedule.current = schedule.last
+    _move(schedule.catch_up_, param, state)
     behind = (schedule.row - state["moment_step"]).double()
     for name, beta in zip(MOMENTS, schedule.betas, strict=True):
         state[name] *= (beta**behind).to(param.dtype).view(-1, *(1,) * (param.dim() - 1))

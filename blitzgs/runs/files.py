@@ -53,7 +53,7 @@ FREE_FIELDS = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass
 class Progress:
     """The progress of a run; saved with every checkpoint.
 

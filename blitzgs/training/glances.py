@@ -42,8 +42,13 @@ class Glances:
             return
         # Rank 0 decides, because the clocks of the ranks differ.
         count = state.ranks.broadcast_object(self._affordable() if state.ranks.rank == 0 else 0)
-        if count == 0:
-            return
+        if count > 0:
+            with state.stage("glances"):
+                self._measure(count)
+
+    def _measure(self, count: int) -> None:
+        """Measure the first views, as many as `count`."""
+        state = self._state
         started, views = state.clock(), sorted(self._order[:count])
         try:
             metrics = measure(state, views, None, lpips=None)

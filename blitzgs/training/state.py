@@ -125,8 +125,8 @@ class TrainingState:
 
     def stepped(self, step: int, sh_degree: int) -> None:
         """Note that optimiser step `step` (from 1) was taken at a spherical-harmonics degree."""
-        seconds = self.clock() - self._started
-        self.progress = replace(self.progress, step=step, sh_degree=sh_degree, seconds=seconds)
+        progress = self.progress
+        progress.step, progress.sh_degree, progress.seconds = step, sh_degree, self.clock() - self._started
 
     @contextlib.contextmanager
     def paused_clock(self) -> Iterator[None]:

@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import time
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
@@ -152,22 +150,25 @@ class Trainer:
                     return None
                 # The budget may change the number of steps.
                 while (step := state.progress.step + 1) <= state.schedule.steps:
-                    with self._saving_without_room("a step", is_saved=step == done + 1):
+                    try:
                         self.step(step)
+                    except PoolError as error:
+                        self._save_without_room(error, "a step", is_saved=step == done + 1)
                     if step == done + 1:
                         self._laps.lap("first step")
                         state.log.event(step * size, "setup", self._laps.seconds, self._laps.text())
                     events = state.schedule.events((step - 1) * size, step * size)
                     if events:
                         self._write_record()
-                    with self._saving_without_room("an event"):
-                        all_ran = handle_all(state, events)
-                    if not all_ran:
-                        self._stop(_stopped_by(agreement.now(step).signal))
-                        return None
+                        try:
+                            all_ran = handle_all(state, events)
+                        except PoolError as error:
+                            self._save_without_room(error, "an event")
+                        if not all_ran:
+                            self._stop(_stopped_by(agreement.now(step).signal))
+                            return None
                     budget.after(step)
-                    with state.stage("glances"):
-                        glances.after((step - 1) * size, step * size)
+                    glances.after((step - 1) * size, step * size)
                     if step == state.schedule.steps:
                         break
                     decision = agreement.after(step, self.loader.lost is not None)
@@ -196,24 +197,21 @@ class Trainer:
             state.stops = never
             self.close()
 
-    @contextlib.contextmanager
-    def _saving_without_room(self, what: str, is_saved: bool = False) -> Iterator[None]:
-        """Save the model before an error says that the Gaussians of a step or event do not fit into the pool.
+    def _save_without_room(self, error: PoolError, what: str, is_saved: bool = False) -> NoReturn:
+        """Save the model and raise the error that the Gaussians of a step or event do not fit into the pool.
 
         Args:
+            error: says so.
             what: what needs the Gaussians, as text.
             is_saved: whether the newest checkpoint already has all steps.
         """
         state = self.state
-        try:
-            yield
-        except PoolError as error:
-            if is_saved or state.ranks.world_size > 1:
-                raise  # with several ranks, the others are in the middle of the step or event
-            self._stop(f"saved after {state.images_seen:,} images, before {what} that lacks room")
-            raise PoolError(
-                f"{error}. The model so far is saved: continue with --resume and a larger memory.resident_gb"
-            ) from error
+        if is_saved or state.ranks.world_size > 1:
+            raise error  # with several ranks, the others are in the middle of the step or event
+        self._stop(f"saved after {state.images_seen:,} images, before {what} that lacks room")
+        raise PoolError(
+            f"{error}. The model so far is saved: continue with --resume and a larger memory.resident_gb"
+        ) from error
 
     def _check_photographs(self) -> None:
         """Raise an error on all ranks if one of them continued without a photograph (`BatchLoader.lost`)."""

@@ -11,9 +11,15 @@ namespace {
 void lazy_adam_step(const std::vector<Tensor>& state, const std::vector<Tensor>& tables, std::int64_t step,
                     std::int64_t explicit_steps, double beta1, double beta2, double eps,
                     const std::vector<Tensor>& grads, const std::optional<Tensor>& ids, bool current,
-                    const std::vector<double>& rates) {
-  AdamTensors adam("lazy_adam_step_", state, tables, {step, explicit_steps, beta1, beta2, eps});
+                    const std::vector<double>& rates, std::optional<Tensor> taken) {
+  constexpr const char* kOp = "lazy_adam_step_";
+  AdamTensors adam(kOp, state, tables, {step, explicit_steps, beta1, beta2, eps});
+  if (taken) {
+    check_in_place(kOp, "taken", *taken, ScalarType::Float, {});
+    STD_TORCH_CHECK(taken->is_cpu(), "blitzgs::", kOp, ": taken must be on the CPU");
+  }
   adam.step_rows(grads, ids, current, rates);
+  if (taken) ++*mutable_data<float>(*taken);
 }
 
 void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<Tensor>& tables,
@@ -21,11 +27,12 @@ void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<T
                         double eps, const std::optional<Tensor>& ids, const std::optional<Tensor>& count) {
   constexpr const char* kOp = "lazy_adam_catch_up_";
   AdamTensors state(kOp, state_in, tables, {step, explicit_steps, beta1, beta2, eps});
-  const std::optional<Tensor> list = checked(kOp, "ids", ids, ScalarType::Int, {-1});
-  const std::int64_t n = max_listed(kOp, count, list ? list->size(0) : state.rows());
+  const std::optional<Tensor> list = state.checked_rows(ids);
+  const std::int64_t n = max_listed(kOp, count, list ? list->numel() : state.rows());
   DeviceScope scope(state.like());
   dispatch_floating(state.like(), [&](auto zero) {
-    auto args = state.arguments<decltype(zero)>(data_or_null<std::int32_t>(list), n);
+    auto args = state.arguments<decltype(zero)>(list);
+    args.n = n;
     args.count = data_or_null<std::int32_t>(count);
     if (n > 0) backend::lazy_adam(args, scope.workspace, scope.stream);
   });

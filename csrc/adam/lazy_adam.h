@@ -83,10 +83,25 @@ struct PendingSteps {
   T explicit_up_to;  // elements with sqrt(v) <= this take the steps one by one; negative: none
 };
 
+// Tables of a schedule of a single parameter, which is in the SH column, whose learning rates become known
+// step by step. The term of a step goes to the tails of the explicit_steps rows before it; earlier rows need
+// none, because moments of that age have decayed below rounding.
+struct RatesArgs {
+  double* table;
+  float* lr_table;
+  std::int32_t step, explicit_steps;  // step 0: no learning rates to enter
+  double ratio, root;                 // q_0 and sqrt(beta2)
+  float rates[2];                     // learning rates of SH DC and SH rest
+
+  BLITZGS_HD std::int32_t reach() const { return step < explicit_steps ? step : explicit_steps; }
+  BLITZGS_HD double ratio_of(int order) const { return ratio * std::pow(root, order); }
+};
+
 template <class T>
 struct AdamArgs {
   AdamColumn<T> columns[kAdamColumns];
-  const std::int32_t* ids;  // [n], the rows, each once; null: all n rows
+  const std::int32_t* ids;       // [n], the rows, each once; null: those of long_ids
+  const std::int64_t* long_ids;  // [n]; null: all n rows
   std::int64_t n;
   // CUDA, catching up: the number of valid ids in device memory; null: all n
   const std::int32_t* count;
@@ -97,12 +112,14 @@ struct AdamArgs {
   std::int32_t step;
   std::int32_t explicit_steps;
   double beta1, beta2, eps;
-  bool current;  // the parameters of the listed rows stand at target(), so that none has to catch up
+  bool current;     // the parameters of the listed rows stand at target(), so that none has to catch up
+  RatesArgs rates;  // of `step`; they enter the tables
 
   // Tests the SH column, because the other columns may be empty.
   BLITZGS_HD bool with_gradient() const { return columns[kAdamColumns - 1].grad != nullptr; }
   // The step to which the listed rows catch up: `step`, or the step before it if a gradient step follows.
   BLITZGS_HD std::int32_t target() const { return with_gradient() ? step - 1 : step; }
+  BLITZGS_HD std::int64_t row(std::int64_t i) const { return ids ? ids[i] : long_ids ? long_ids[i] : i; }
   BLITZGS_HD const double* table_row(std::int32_t t) const {
     return table + static_cast<std::int64_t>(t) * kAdamTable;
   }
@@ -255,9 +272,10 @@ BLITZGS_HD AdamStep<T> adam_step_scalars(const AdamArgs<T>& args) {
   s.one_minus_beta2 = static_cast<T>(1.0 - args.beta2);
   s.inverse_root2 = static_cast<T>(row[kCorrection2]);
   s.eps = static_cast<T>(args.eps);
+  const float* rates = args.lr_table + static_cast<std::int64_t>(args.step) * kAdamGroups;
   for (int g = 0; g < kAdamGroups; ++g) {
-    s.rate[g] = static_cast<T>(args.lr_table[static_cast<std::int64_t>(args.step) * kAdamGroups + g] *
-                               row[kCorrection1]);
+    const float rate = args.rates.step == 0 ? rates[g] : args.rates.rates[g == kAdamGroups - 1];
+    s.rate[g] = static_cast<T>(rate * row[kCorrection1]);
   }
   return s;
 }
@@ -275,20 +293,6 @@ BLITZGS_HD int adam_group(int column, std::int64_t element) {
   return column == 4 && element >= 3 ? 5 : column;
 }
 
-// Tables of a schedule whose learning rates become known step by step. The term of a step goes to the tails
-// of the explicit_steps rows before it; earlier rows need none, because moments of that age have decayed
-// below rounding.
-struct RatesArgs {
-  double* table;
-  float* lr_table;
-  std::int32_t step, explicit_steps;
-  double ratio, root;  // q_0 and sqrt(beta2)
-  float rate, rest;    // learning rates of the groups before SH rest, and of SH rest
-
-  BLITZGS_HD std::int32_t reach() const { return step < explicit_steps ? step : explicit_steps; }
-  BLITZGS_HD double ratio_of(int order) const { return ratio * std::pow(root, order); }
-};
-
 // Adds the term of a step to the tails of an order in the row `back` before it; power = ratio_of(order)^back.
 // The row before the step also notes the step's learning rates.
 BLITZGS_HD void enter_rate(const RatesArgs& args, std::int32_t back, int order, double power) {
@@ -300,18 +304,17 @@ BLITZGS_HD void enter_rate(const RatesArgs& args, std::int32_t back, int order, 
                         : order == 2 ? a
                                      : a * a) *
                        power;
-  double* tails =
-      args.table + static_cast<std::int64_t>(args.step - back) * kAdamTable + kTails + order * kAdamGroups;
-  float* rates = args.lr_table + static_cast<std::int64_t>(args.step) * kAdamGroups;
-  for (int group = 0; group < kAdamGroups; ++group) {
-    const float rate = group == kAdamGroups - 1 ? args.rest : args.rate;
-    tails[group] += rate * share;
-    if (back == 1 && order == 0) rates[group] = rate;
+  constexpr int kDc = kAdamGroups - 2;
+  double* tails = args.table + static_cast<std::int64_t>(args.step - back) * kAdamTable + kTails +
+                  order * kAdamGroups + kDc;
+  float* rates = args.lr_table + static_cast<std::int64_t>(args.step) * kAdamGroups + kDc;
+  for (int part = 0; part < 2; ++part) {
+    tails[part] += args.rates[part] * share;
+    if (back == 1 && order == 0) rates[part] = args.rates[part];
   }
 }
 
 namespace BLITZGS_BACKEND {
-void enter_rates(const RatesArgs& args, CudaStream);
 // With gradients: the listed rows catch up to step - 1 and take the step `step`; their parameters and moments
 // are then at `step`. Without gradients (column.grad null): the parameters of the listed rows catch up to
 // `step`.

@@ -67,8 +67,8 @@ void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream) {
   parallel_for(0, args.n, 512, [&](std::int64_t begin, std::int64_t end) {
     PendingStepsCache<T> pending;
     for (std::int64_t i = begin; i < end; ++i) {
-      const std::int64_t row = args.ids ? args.ids[i] : i;
-      if (args.ids) prefetch_row(args, args.ids[std::min(i + kPrefetchDistance, end - 1)]);
+      const std::int64_t row = args.row(i);
+      prefetch_row(args, args.row(std::min(i + kPrefetchDistance, end - 1)));
       const AdamRow<T> state = adam_row(args, row);
       if (!with_gradient && state.from >= target) continue;
       const PendingSteps<T>* steps = state.moves ? &pending.get(args, state.from, target) : nullptr;
@@ -77,13 +77,12 @@ void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream) {
       if (with_gradient) args.moment_step[row] = args.step;
     }
   });
-}
-
-void enter_rates(const RatesArgs& args, CudaStream) {
   for (int order = 0; order < kAdamOrders; ++order) {
-    const double ratio = args.ratio_of(order);
+    const double ratio = args.rates.ratio_of(order);
     double power = 1;
-    for (std::int32_t back = 1; back <= args.reach(); ++back) enter_rate(args, back, order, power *= ratio);
+    for (std::int32_t back = 1; back <= args.rates.reach(); ++back) {
+      enter_rate(args.rates, back, order, power *= ratio);
+    }
   }
 }
 

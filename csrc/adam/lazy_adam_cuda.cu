@@ -34,12 +34,6 @@ __global__ void __launch_bounds__(kListThreads)
   if (from < n) rules[from] = final_pending_steps(args, static_cast<std::int32_t>(from));
 }
 
-__global__ void __launch_bounds__(kListThreads) enter_rates_kernel(const __grid_constant__ RatesArgs args) {
-  const int item = static_cast<int>(blockIdx.x * kListThreads + threadIdx.x);
-  const int back = item / kAdamOrders + 1, order = item % kAdamOrders;
-  if (back <= args.reach()) enter_rate(args, back, order, std::pow(args.ratio_of(order), back));
-}
-
 // Calls update<Column, Width>(local row, pack) for the packs that this thread handles in every Rows rows.
 // ShPacks: the packs in an SH row; 0: sh_packs is their number.
 template <int ShWidth, int ShPacks, int Rows, class F>
@@ -132,71 +126,66 @@ __global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ 
   const int count = static_cast<int>(args.n - first < Rows ? args.n - first : Rows);
   const auto take_step = [&]<int Column, int Width>(int local, int pack) {
     if (local >= count) return;
-    const std::int64_t row = args.ids ? args.ids[first + local] : first + local;
+    const std::int64_t row = args.row(first + local);
     step_pack<Column, Width>(args, step, row, first + local, pack);
   };
   for_each_pack<ShWidth, ShPacks, Rows>(static_cast<int>(args.columns[4].width) / ShWidth, take_step);
   __syncthreads();
   if (threadIdx.x >= count) return;
-  const std::int64_t i = first + threadIdx.x, row = args.ids ? args.ids[i] : i;
+  const std::int64_t i = first + threadIdx.x, row = args.row(i);
   args.last_step[row] = args.step;
   args.moment_step[row] = args.step;
 }
 
-// A parameter that is stepped alone is in the last column and may have any width. A thread handles one
-// element at a time, so that neighbouring lanes access neighbouring addresses.
-__device__ std::int64_t first_element() { return blockIdx.x * std::int64_t{kListThreads} + threadIdx.x; }
-__device__ std::int64_t element_stride() { return gridDim.x * std::int64_t{kListThreads}; }
-
-// catch_up_kernel for a parameter that is stepped alone.
+// catch_up_kernel and step_kernel for a parameter that is stepped alone, which is in the last column and may
+// have any width: the rows catch up if rules are prepared, and then take the step if there is a
+// gradient, whose learning rates enter the tables. A block handles whole rows, so no other block reads or
+// writes their last_step and moment_step; neighbouring lanes access neighbouring addresses.
 __global__ void __launch_bounds__(kListThreads)
-    catch_up_alone_kernel(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
-                          const PendingRow* pending_rows) {
-  wait_for_earlier_kernels();
-  if (!*prepared.any_pending) return;
-  const AdamColumn<float>& column = args.columns[kAlone];
-  const std::int64_t elements = listed(args) * column.width;
-  for (std::int64_t e = first_element(); e < elements; e += element_stride()) {
-    const PendingRow row = pending_rows[e / column.width];
-    if (row.id < 0) continue;
-    const std::int64_t j = e % column.width, at = row.id * column.width + j;
-    const AdamRule<float>& rule = prepared.of(row.from).rules[adam_group(kAlone, j)];
-    column.param[at] -=
-        adam_ruled_drift(rule, column.exp_avg[at] * row.here.first,
-                         adam_root(column.exp_avg_sq[at] * row.here.second), static_cast<float>(args.eps));
-  }
-}
-
-// step_kernel for a parameter that is stepped alone; mark_steps_kernel writes last_step and moment_step.
-__global__ void __launch_bounds__(kListThreads)
-    step_alone_kernel(const __grid_constant__ AdamArgs<float> args) {
+    alone_kernel(const __grid_constant__ AdamArgs<float> args, const Prepared prepared, int block_rows) {
   __shared__ AdamStep<float> step;
   wait_for_earlier_kernels();
-  if (threadIdx.x == 0) step = adam_step_scalars(args);
-  __syncthreads();
   const AdamColumn<float>& column = args.columns[kAlone];
-  for (std::int64_t e = first_element(); e < args.n * column.width; e += element_stride()) {
-    const std::int64_t i = e / column.width, j = e % column.width, row = args.ids ? args.ids[i] : i;
-    const Decay decay = make_decay(args, args.target() - args.moment_step[row]);
-    const std::int64_t at = row * column.width + j;
-    float p = column.param[at], m = column.exp_avg[at] * decay.first,
-          v = column.exp_avg_sq[at] * decay.second;
-    adam_update(step, adam_group(kAlone, j), column.grad[e], p, m, v);
-    column.param[at] = p;
-    column.exp_avg[at] = m;
-    column.exp_avg_sq[at] = v;
+  const bool takes_step = args.with_gradient();
+  if (takes_step && threadIdx.x == 0) step = adam_step_scalars(args);
+  __syncthreads();
+  const std::int64_t n = listed(args), stride = gridDim.x * std::int64_t{block_rows};
+  for (std::int64_t first = blockIdx.x * std::int64_t{block_rows}; first < n; first += stride) {
+    const auto count = static_cast<unsigned>(n - first < block_rows ? n - first : block_rows),
+               width = static_cast<unsigned>(column.width);
+    for (unsigned e = threadIdx.x; e < count * width; e += kListThreads) {
+      const unsigned j = e % width;
+      const std::int64_t row = args.row(first + e / width), at = row * column.width + j;
+      const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
+      const bool moves = prepared.decays && adam_moves(args, from, stand);
+      if (!moves && !takes_step) continue;
+      const int group = adam_group(kAlone, static_cast<int>(j));
+      float p = column.param[at], m = column.exp_avg[at], v = column.exp_avg_sq[at];
+      if (moves) {
+        const Decay here = prepared.decays[from - stand];
+        p -= adam_drift(args, prepared.of(from), group, m * here.first, v * here.second);
+      }
+      if (takes_step) {
+        const Decay decay = make_decay(args, args.target() - stand);
+        m *= decay.first;
+        v *= decay.second;
+        adam_update(step, group, column.grad[first * column.width + e], p, m, v);
+        column.exp_avg[at] = m;
+        column.exp_avg_sq[at] = v;
+      }
+      column.param[at] = p;
+    }
+    __syncthreads();
+    for (unsigned i = threadIdx.x; i < count; i += kListThreads) {
+      const std::int64_t row = args.row(first + i);
+      if (args.last_step[row] < args.step) args.last_step[row] = args.step;
+      if (takes_step) args.moment_step[row] = args.step;
+    }
   }
-}
-
-// Sets last_step and moment_step of the listed rows, one thread per row. This is a launch of its own after
-// step_alone_kernel, because several blocks may step a row, and all of them read its moment_step.
-__global__ void __launch_bounds__(kListThreads)
-    mark_steps_kernel(const __grid_constant__ AdamArgs<float> args) {
-  wait_for_earlier_kernels();
-  for (std::int64_t i = first_element(); i < args.n; i += element_stride()) {
-    const std::int64_t row = args.ids ? args.ids[i] : i;
-    args.last_step[row] = args.step;
-    args.moment_step[row] = args.step;
+  for (int item = static_cast<int>(blockIdx.x * kListThreads + threadIdx.x);
+       item < args.rates.reach() * kAdamOrders; item += static_cast<int>(gridDim.x) * kListThreads) {
+    const int back = item / kAdamOrders + 1, order = item % kAdamOrders;
+    enter_rate(args.rates, back, order, std::pow(args.rates.ratio_of(order), back));
   }
 }
 
@@ -219,13 +208,8 @@ unsigned filled_blocks(std::int64_t items, int items_per_block, int blocks_per_m
                   static_cast<unsigned>(blocks_per_multiprocessor * multiprocessors()));
 }
 
-LaunchShape alone_size(const AdamArgs<float>& args, CudaStream stream) {
-  return {filled_blocks(args.n * args.columns[kAlone].width, kListThreads, kListBlocks), kListThreads,
-          stream};
-}
-
-void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stream) {
-  if (args.step == 0) return;
+// Computes the rules by which rows catch up to args.step, which is not 0.
+Prepared prepare_rules(const AdamArgs<float>& args, Workspace& workspace, CudaStream stream) {
   // Rows whose moments are explicit_steps or more before last_step do not move (adam_moves), so longer decays
   // are not needed.
   const std::int32_t first = args.final_rules ? std::max(0, args.step - args.explicit_steps + 1) : 0,
@@ -236,20 +220,20 @@ void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stre
                           args.final_rules,
                           first,
                           n_decays};
-  auto* pending_rows = workspace.allocate<PendingRow>(args.n);
   launch_early("lazy_adam catch-up", prepare,
                {blocks_for(std::max(args.step - first, n_decays), kPrepareThreads / kPrepareLanes),
                 kPrepareThreads, stream},
                args, prepared);
+  return prepared;
+}
+
+void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stream) {
+  const Prepared prepared = prepare_rules(args, workspace, stream);
+  auto* pending_rows = workspace.allocate<PendingRow>(args.n);
   // The grid is limited because n may be far more than the number of valid ids.
   launch_early("lazy_adam catch-up", list_pending_rows,
                {filled_blocks(args.n, kListThreads, kListBlocks), kListThreads, stream}, args, prepared,
                pending_rows);
-  if (is_alone(args)) {
-    launch_early("lazy_adam catch-up", catch_up_alone_kernel, alone_size(args, stream), args, prepared,
-                 pending_rows);
-    return;
-  }
   const auto kernel = select(args, catch_up_kernel<4, 12, kRows>, catch_up_kernel<1, kFewPacks, kMoreRows>,
                              catch_up_kernel<1, 0, kRows>);
   launch_early("lazy_adam catch-up", kernel,
@@ -277,27 +261,27 @@ void check_alignment(const AdamArgs<float>& args) {
 template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream) {
   static_assert(std::is_same_v<T, float>);
-  if (args.n == 0) return;
   check_alignment(args);
   AdamArgs<float> behind = args;
   behind.step = args.target();
   for (AdamColumn<float>& column : behind.columns) column.grad = nullptr;
-  if (!args.current) catch_up(behind, workspace, stream);
-  if (!args.with_gradient()) return;
+  const bool catches_up = !args.current && behind.step > 0 && args.n > 0;
   if (is_alone(args)) {
-    launch_early("lazy_adam step", step_alone_kernel, alone_size(args, stream), args);
-    launch_early("lazy_adam step", mark_steps_kernel,
-                 {filled_blocks(args.n, kListThreads, kListBlocks), kListThreads, stream}, args);
+    const std::int64_t width = std::clamp<std::int64_t>(args.columns[kAlone].width, 1, kListThreads);
+    const auto block_rows = static_cast<int>(kListThreads / width);
+    const Prepared prepared = catches_up ? prepare_rules(behind, workspace, stream) : Prepared{};
+    launch_early(
+        "lazy_adam of one parameter", alone_kernel,
+        {filled_blocks(std::max<std::int64_t>(args.n, 1), block_rows, kListBlocks), kListThreads, stream},
+        args, prepared, block_rows);
     return;
   }
+  if (args.n == 0) return;
+  if (catches_up) catch_up(behind, workspace, stream);
+  if (!args.with_gradient()) return;
   const auto kernel =
       select(args, step_kernel<4, 12, kRows>, step_kernel<1, kFewPacks, kMoreRows>, step_kernel<1, 0, kRows>);
   launch_early("lazy_adam step", kernel, {blocks_for(args.n, rows_per_block(args)), kThreads, stream}, args);
-}
-
-void enter_rates(const RatesArgs& args, CudaStream stream) {
-  enter_rates_kernel<<<blocks_for(args.reach() * kAdamOrders, kListThreads), kListThreads, 0, stream>>>(args);
-  check_launch("lazy_adam, learning rates");
 }
 
 template <class T>

@@ -63,17 +63,29 @@ struct AdamTensors {
   const Tensor& like() const { return params[0]; }
   std::int64_t rows() const { return like().size(0); }
 
-  // The kernel's arguments for the n rows `ids`, or for all rows if ids is null. Gradients are null; the
-  // caller sets them.
+  // Checks a list of rows, int32 [n] or int64 [n] or [1, n] (as sparse tensors have them); none: all rows.
+  std::optional<Tensor> checked_rows(const std::optional<Tensor>& ids) const {
+    if (!ids || ids->scalar_type() != ScalarType::Long || ids->dim() != 2)
+      return checked(op, "ids", ids,
+                     ids && ids->scalar_type() == ScalarType::Long ? ScalarType::Long : ScalarType::Int,
+                     {-1});
+    return checked(op, "ids", *ids, ScalarType::Long, {1, -1});
+  }
+
+  // The kernel's arguments for the rows of a list (`checked_rows`). Gradients are null; the caller sets them.
   template <class T>
-  AdamArgs<T> arguments(const std::int32_t* ids, std::int64_t n) {
+  AdamArgs<T> arguments(const std::optional<Tensor>& ids) {
     AdamArgs<T> args{};
     for (int c = 0; c < count(); ++c) {
       args.columns[first() + c] = {mutable_data<T>(params[c]), mutable_data<T>(exp_avgs[c]),
                                    mutable_data<T>(exp_avg_sqs[c]), nullptr, width(c)};
     }
-    args.ids = ids;
-    args.n = n;
+    if (ids && ids->scalar_type() == ScalarType::Long) {
+      args.long_ids = data<std::int64_t>(*ids);
+    } else {
+      args.ids = data_or_null<std::int32_t>(ids);
+    }
+    args.n = ids ? ids->numel() : rows();
     args.last_step = mutable_data<std::int32_t>(last_step);
     args.moment_step = mutable_data<std::int32_t>(moment_step);
     args.table = data<double>(table);
@@ -92,19 +104,19 @@ struct AdamTensors {
     return args;
   }
 
-  // Takes the step for the rows `ids`, int32 [A], or for all rows, from a gradient [A, ...] for each column.
-  // current: the parameters of the rows stand at step - 1. rates: empty, or the learning rates of the step,
-  // of the first three values of SH and of all others, which enter the tables (`RatesArgs`).
+  // Takes the step for the rows `ids`, int32 or int64 [A], or for all rows, from a gradient [A, ...] for each
+  // column. current: the parameters of the rows stand at step - 1. rates: empty, or the learning rates of the
+  // step, of the first three values of SH and of all others, which enter the tables (`RatesArgs`).
   void step_rows(const std::vector<Tensor>& grads, const std::optional<Tensor>& ids, bool current,
                  const std::vector<double>& rates) {
     STD_TORCH_CHECK(std::ssize(grads) == count(), "blitzgs::", op, ": grads must hold ",
                     alone ? "one" : "means, quats, scales, opacities, sh", "; got ", grads.size(),
                     " tensors");
-    STD_TORCH_CHECK(rates.empty() || (rates.size() == 2 && !final_rules), "blitzgs::", op,
-                    ": rates must be empty or two numbers, for tables without final_rules");
+    STD_TORCH_CHECK(rates.empty() || (rates.size() == 2 && alone && !final_rules), "blitzgs::", op,
+                    ": rates must be empty or two numbers, for one parameter and tables without final_rules");
     check_takes_step();
-    const std::optional<Tensor> list = checked(op, "ids", ids, ScalarType::Int, {-1});
-    const std::int64_t n = list ? list->size(0) : rows();
+    const std::optional<Tensor> list = checked_rows(ids);
+    const std::int64_t n = list ? list->numel() : rows();
     std::vector<Tensor> held;
     for (int c = 0; c < count(); ++c) {
       const Tensor& grad = held.emplace_back(as_contiguous(grads[c]));
@@ -116,17 +128,19 @@ struct AdamTensors {
     DeviceScope scope(like());
     dispatch_floating(like(), [&](auto zero) {
       using T = decltype(zero);
-      AdamArgs<T> args = arguments<T>(data_or_null<std::int32_t>(list), n);
+      AdamArgs<T> args = arguments<T>(list);
       for (int c = 0; c < count(); ++c) args.columns[first() + c].grad = data<T>(held[c]);
       args.current = current;
       if (!rates.empty()) {
-        backend::enter_rates(
-            {mutable_data<double>(table), mutable_data<float>(lr_table), args.step, args.explicit_steps,
-             constants.beta1 / std::sqrt(constants.beta2), std::sqrt(constants.beta2),
-             static_cast<float>(rates[0]), static_cast<float>(rates[1])},
-            scope.stream);
+        args.rates = {mutable_data<double>(table),
+                      mutable_data<float>(lr_table),
+                      args.step,
+                      args.explicit_steps,
+                      constants.beta1 / std::sqrt(constants.beta2),
+                      std::sqrt(constants.beta2),
+                      {static_cast<float>(rates[0]), static_cast<float>(rates[1])}};
       }
-      if (n > 0) backend::lazy_adam(args, scope.workspace, scope.stream);
+      if (n > 0 || !rates.empty()) backend::lazy_adam(args, scope.workspace, scope.stream);
     });
   }
 

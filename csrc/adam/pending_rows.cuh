@@ -91,7 +91,7 @@ static __global__ void __launch_bounds__(kListThreads)
     PendingRow mine{-1, 0, {}};
     bool explicitly = false;
     if (i < n) {
-      const std::int32_t row = args.ids ? args.ids[i] : static_cast<std::int32_t>(i);
+      const std::int32_t row = static_cast<std::int32_t>(args.row(i));
       const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
       if (adam_moves(args, from, stand)) {
         mine = {row, from, prepared.decays[from - stand]};

@@ -329,8 +329,7 @@ void project_bwd_step(const TensorList& state_in, const TensorList& tables, std:
   dispatch_floating(p.means, [&](auto zero) {
     using T = decltype(zero);
     backend::project_bwd_step(p.inputs<T>(), b.pointers(), v.source<T>(), b.regularisers<T>(),
-                              state.arguments<T>(data<std::int32_t>(b.visible_ids), b.visible()),
-                              scope.workspace, scope.stream);
+                              state.arguments<T>(b.visible_ids), scope.workspace, scope.stream);
   });
 }
 

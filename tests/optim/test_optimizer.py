@@ -8,7 +8,7 @@ import pickle
 import pytest
 import torch
 
-from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, GrowingSchedule, lazy_adam_step_
+from blitzgs.ops.lazy_adam import AdamSchedule, GrowingSchedule
 from blitzgs.optim import LazyAdam
 from tests.helpers import BACKENDS, DEVICES, relative_error
 from tests.optim.adam_pair import BOUND, LR, AdamPair
@@ -333,6 +333,21 @@ def test_a_closure_computes_the_loss():
     assert optimizer.step(closure).item() < first == 12.0
 
 
+def test_step_hooks_and_profilers_see_each_step():
+    param, seen = torch.nn.Parameter(torch.ones(4, 3)), []
+    optimizer = LazyAdam([param])
+    before = optimizer.register_step_pre_hook(lambda *_: seen.append("before"))
+    after = optimizer.register_step_post_hook(lambda *_: seen.append("after"))
+    param.grad = torch.ones_like(param)
+    optimizer.step()
+    before.remove()
+    after.remove()
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+        optimizer.step()
+    assert seen == ["before", "after"] and int(optimizer.state[param]["step"]) == 2
+    assert "Optimizer.step#LazyAdam.step" in {event.name for event in profile.events()}
+
+
 def test_the_old_name_of_catching_up():
     pair = Pair(("cpu", torch.float64))
     pair.step()
@@ -368,10 +383,10 @@ def test_a_growing_schedule_has_the_sums_of_one_known_in_advance(device):
     known = AdamSchedule(rates, 0.9, 0.999, 1e-8, dtype=dtype)
     growing = GrowingSchedule((0.9, 0.999), 1e-8, dtype, torch.device(device), 0)
     param = torch.zeros(1, 4, dtype=dtype, device=device)
-    steps = (torch.zeros(1, dtype=torch.int32, device=device) for _ in range(2))
-    state = AdamState.alone(param, param.clone(), param.clone(), *steps)
+    steps = [torch.zeros(1, dtype=torch.int32, device=device) for _ in range(2)]
+    state = [param, param.clone(), param.clone(), *steps]
     for step in range(1, 400):
-        lazy_adam_step_(state, growing, step, [param.clone()], None, rates=rates[step, 4:].tolist())
+        growing.step_(state, torch.tensor(0.0), param.clone(), None, tuple(rates[step, 4:].tolist()))
     assert growing.explicit_steps < 399
     ours, expected = (s.tables[0][:400, :24].view(400, 4, 6)[:, :, 4:] for s in (growing, known))
     assert torch.equal(growing.tables[1][1:400, 4:], rates[1:, 4:])
