@@ -24,7 +24,7 @@ NONE = "–"
 
 def title_of(run: Json) -> str:
     """Return the name of a run in the tables."""
-    title = TITLES[run["recipe"]]
+    title = TITLES.get(run["recipe"], run["recipe"])
     if run.get("batch_size", 4) != 4:
         title += f", {run['batch_size']} views a step"
     if run["ranks"] > 1:
@@ -166,6 +166,21 @@ def popping_rows(file: Json) -> Rows:
     ]
 
 
+def curve_rows(file: Json) -> Rows:
+    """Tabulate what views can leave out, by rule."""
+    return [
+        {
+            "left out by": line["rule"],
+            "splats": f"{line['left out']:.0%}",
+            "below": f"{line['threshold']:.2f}",
+            "of the light": f"{line['light']:.2%}",
+            "PSNR against all": f"{line['PSNR against all']:.1f}",
+        }
+        for lines in (run["curve"] for run in file["results"] if "curve" in run)
+        for line in lines
+    ]
+
+
 def rank_rows(file: Json) -> Rows:
     """Tabulate runs of one arm on several ranks, against the one on one rank."""
 
@@ -175,7 +190,7 @@ def rank_rows(file: Json) -> Rows:
     rows = []
     for run, one in compared(file):
         row = {
-            "view level": TITLES[run["recipe"]],
+            "view level": TITLES.get(run["recipe"], run["recipe"]),
             "views a step": str(run["batch_size"]),
             "ranks": str(run["ranks"]),
             "PSNR": text(run.get("psnr"), ".2f"),
@@ -221,6 +236,7 @@ TABLES: dict[str, Callable[[Json], Rows]] = {
     "city_costs": cost_rows,
     "city_phases": phase_rows,
     "city_popping": popping_rows,
+    "city_curve": curve_rows,
     "city_ranks": rank_rows,
     "city_memory": memory_rows,
 }

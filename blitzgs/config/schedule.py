@@ -142,6 +142,11 @@ class Schedule:
         """
         return not self.gathers_statistics(begin)
 
+    def has_new_levels(self, begin: int) -> bool:
+        """Tell whether levels follow footprints again before the step at [begin, begin + B)."""
+        time, before = self.pace.time(begin), self.pace.time(max(0, begin - self.batch_size))
+        return time // self._config.densify_every > before // self._config.densify_every
+
     def has_spawn_gate(self, time: int) -> bool:
         """Tell whether the spawn gate judges the candidates of a density event at `time`."""
         return time >= self._scaled(self._config.gate_from)
