@@ -154,7 +154,7 @@ def curve_of(
     for index in range(len(chosen)):
         view = poses.pick([index])
         found = survey(table, view, options)
-        rows, light = found.splats.visible_ids.long(), found.weights.double() * 2.0**-32
+        rows, light = found.splats.gaussian_ids.long(), found.weights.double() * 2.0**-32
         distance = (table["means"][rows].double() - centres_of(view.viewmats)[0]).norm(dim=1)
         keys = {
             "octree level": reach[rows] / distance,

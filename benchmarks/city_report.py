@@ -51,6 +51,13 @@ def mean_share(run: Json, name: str) -> float | None:
     return sum(phase[name] * (phase["to"] - phase["from"]) for phase in parts) / images if images else None
 
 
+def rate_after_growth(run: Json) -> float | None:
+    """Return the images per second of the phases in which the model no longer grows."""
+    parts = [phase for phase in run["phases"] if "growth" not in phase["on"]]
+    seconds = sum(phase["seconds"] for phase in parts)
+    return sum(phase["to"] - phase["from"] for phase in parts) / seconds if seconds else None
+
+
 def trained(file: Json, ranks: int | None = None) -> list[Json]:
     """Return the runs whose training is over; with `ranks`, those of so many ranks."""
     return [run for run in file["results"] if "phases" in run and ranks in (None, run["ranks"])]
@@ -94,6 +101,7 @@ def arm_rows(file: Json) -> Rows:
             "images": f"{run['images']:,}",
             "seconds": f"{run['seconds']:.1f}",
             "images/s": f"{run['images_per_second']:,.0f}",
+            "after growth": text(rate_after_growth(run), ",.0f"),
             "active": text(mean_share(run, "active"), ".1%"),
             "visible": text(mean_share(run, "visible"), ".1%"),
             "M Gaussians": f"{run['population']['initial'] / 1e6:.2f} → {run['gaussians'] / 1e6:.2f}",
