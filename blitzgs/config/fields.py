@@ -257,6 +257,8 @@ class PopulationConfig:
             the pass keeps all Gaussians and only computes phi and the cull matrix.
         pass2_views: with fewer training views the second pass keeps all Gaussians, because scores add up what
             the views show, and say little about places that few of them see.
+        view_mass: the Gaussians that count in a view are the fewest that make up this share of all
+            contributions to it.
         phi: from the first pass on, density control multiplies the gradients that it sums with phi: among the
             views that see a Gaussian, the share of those in which it counts.
         gate: model file of a spawn gate (`blitzgs gate fit`), or "default" for the one that comes with
@@ -292,6 +294,7 @@ class PopulationConfig:
     pass2_mass: float = 0.99
     pass2_keep: float = 1.0
     pass2_views: int = 0
+    view_mass: float = 0.99
     phi: bool = True
     gate: str | None = None
     gate_rate: float = 0.6
