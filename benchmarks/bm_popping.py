@@ -123,6 +123,7 @@ def popping_of(
 
 
 # Shares of the splats that a rule leaves out.
+RULES = ("octree level", "footprint", "contribution")
 SHARES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
 
 
@@ -156,15 +157,12 @@ def curve_of(
         found = survey(table, view, options)
         rows, light = found.splats.gaussian_ids.long(), found.weights.double() * 2.0**-32
         distance = (table["means"][rows].double() - centres_of(view.viewmats)[0]).norm(dim=1)
-        keys = {
-            "octree level": reach[rows] / distance,
-            "footprint": size[rows] * float(view.Ks[0, 0, 0]) / distance,
-            "contribution": light,
-        }
+        footprint = size[rows] * float(view.Ks[0, 0, 0]) / distance
+        keys = dict(zip(RULES, (reach[rows] / distance, footprint, light), strict=True))
         image = pipeline.forward(table, view, options).renders[0].clamp(0, 1)
         seen.append((view, rows, light, keys, image))
     lines = []
-    for rule in seen[0][3]:
+    for rule in RULES:
         ordered = torch.cat([keys[rule] for *_, keys, _ in seen]).sort().values
         for share in SHARES:
             threshold = float(ordered[int(share * len(ordered))])

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The measure of popping: levels that are cut off pop, levels that fade pop less, a single level does not."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -50,6 +51,21 @@ def test_smooth_levels_pop_less(trained, tmp_path, device, capsys):
     clip = cv2.VideoCapture(str(tmp_path / "shown" / "popping.mp4"))
     assert clip.get(cv2.CAP_PROP_FRAME_COUNT) == 200
     assert clip.get(cv2.CAP_PROP_FRAME_WIDTH) == 3 * 48
+
+
+def test_the_curve_has_more_loss_for_more_splats_and_least_for_what_contributes_least(trained, tmp_path):
+    path = tmp_path / "curve.json"
+    bm_popping.main([str(trained), "--curve", "--device", "cpu", "--json", str(path)])
+    lines = json.loads(path.read_text())["rows"]
+    rules = {rule: [line for line in lines if line["rule"] == rule] for rule in bm_popping.RULES}
+    for some in rules.values():
+        shares, light, psnr = (
+            [line[key] for line in some] for key in ("left out", "light", "PSNR against all")
+        )
+        assert shares == pytest.approx(bm_popping.SHARES, abs=0.05)
+        assert light == sorted(light) and psnr == sorted(psnr, reverse=True)
+    for rule in bm_popping.RULES[:-1]:
+        assert all(a["light"] < b["light"] for a, b in zip(rules["contribution"], rules[rule], strict=True))
 
 
 def test_a_model_of_one_level_does_not_pop(trained, monkeypatch):
