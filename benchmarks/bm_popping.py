@@ -166,6 +166,8 @@ def curve_of(
         ordered = torch.cat([keys[rule] for *_, keys, _ in seen]).sort().values
         for share in SHARES:
             threshold = float(ordered[int(share * len(ordered))])
+            if math.isinf(threshold):  # views keep level 0 at any distance
+                break
             error = kept = lit = 0.0
             for view, rows, light, keys, image in seen:
                 stays = keys[rule] >= threshold

@@ -180,7 +180,7 @@ def curve_rows(file: Json) -> Rows:
         {
             "left out by": line["rule"],
             "splats": f"{line['left out']:.0%}",
-            "below": f"{line['threshold']:.2f}",
+            "below": f"{line['threshold']:.3g}",
             "of the light": f"{line['light']:.2%}",
             "PSNR against all": f"{line['PSNR against all']:.1f}",
         }
