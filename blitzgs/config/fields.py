@@ -141,6 +141,7 @@ class ScheduleConfig:
             gate.
         t1, t2: times of the first and the second importance pass, if `population.importance` is set; 0: no
             pass. A pass happens after the density event of the same time.
+        mask_share: share of the time from the last importance pass to the end in which `view.cull` holds.
         sh_every: the spherical-harmonics degree grows by one at every multiple of this.
         position_decay: length of the exponential decay of the position learning rate.
         checkpoint_every: a checkpoint is written at every multiple of this, in addition to those by
@@ -164,6 +165,7 @@ class ScheduleConfig:
     gate_from: int = 11_250
     t1: int = 7_500
     t2: int = 16_000
+    mask_share: float = 0.5
     sh_every: int = 1_000
     position_decay: int = 30_000
     checkpoint_every: int = 0
@@ -318,7 +320,7 @@ class ViewConfig:
         smooth: opacities fade out over half a level around the distance at which `lod` would cut them off.
             All views then have the gate, and `most_kept` is ignored. Needs `lod`.
         cull: from the first importance pass on, a training view leaves out the Gaussians that did not count
-            in it at the last pass. This ends halfway between the last pass and the end of the run. Needs
+            in it at the last pass, for `schedule.mask_share` of the rest of the run. Needs
             `population.importance`.
     """
 

@@ -71,6 +71,7 @@ RANGES: Mapping[str, Range] = {
     "schedule.gate_from": _TIME,
     "schedule.t1": _EVERY_OR_NEVER,
     "schedule.t2": _EVERY_OR_NEVER,
+    "schedule.mask_share": Range(0, 1, low_open=True, high_open=True),
     "schedule.sh_every": _EVERY,
     "schedule.position_decay": _EVERY,
     "schedule.checkpoint_every": _EVERY_OR_NEVER,

@@ -103,11 +103,11 @@ class Schedule:
         return sorted(found)
 
     def _clear_cull(self) -> tuple[EventKind, float, float, float]:
-        """Return when the cull mask is dropped: halfway between the last importance pass and the end."""
+        """Return when the cull mask is dropped, between the last importance pass and the end."""
         config = self._config
         # A pass that is set to a time after the end does not happen.
         last = max(time for time in (0, config.t1, config.t2) if time < config.iterations)
-        time = math.floor((last + config.iterations) / 2)
+        time = math.floor(last + config.mask_share * (config.iterations - last))
         return "clear_cull", time, time + 1, min(last, 1)
 
     def _series(self, first: float, until: float, every: float, begin: int, end: int) -> list[int]:
@@ -144,8 +144,10 @@ class Schedule:
 
     def has_new_levels(self, begin: int) -> bool:
         """Tell whether levels follow footprints again before the step at [begin, begin + B)."""
+        # Scales and opacities change slowly after the growth, and all rows have to catch up.
+        every = 10 * self._config.densify_every
         time, before = self.pace.time(begin), self.pace.time(max(0, begin - self.batch_size))
-        return time // self._config.densify_every > before // self._config.densify_every
+        return time // every > before // every
 
     def has_spawn_gate(self, time: int) -> bool:
         """Tell whether the spawn gate judges the candidates of a density event at `time`."""

@@ -173,7 +173,12 @@ def test_levels_that_follow_footprints_leave_out_what_is_small_in_the_view(tmp_p
         return lod_gate(state.config, dataclasses.replace(state.progress, finest_level=31, gated_views=""))
 
     monkeypatch.setattr(view_level, "follow_footprints", watched)
-    flags = ("view.footprint=0.5", "population.importance=false", "view.cull=false")
+    flags = (
+        "view.footprint=0.5",
+        "population.importance=false",
+        "view.cull=false",
+        "schedule.densify_every=2",
+    )
     whole, summary = train(tmp_path / "whole", *flags)
     assert followed == [(60, True), (80, True)] and summary is not None
     progress = whole.state.progress
@@ -330,6 +335,7 @@ def test_the_mask_is_cleared_halfway_after_the_last_pass():
     assert cleared(t1=16_000, t2=100_000) == [53_000]  # the run ends before the second pass
     assert cleared(t1=0, t2=0) == []
     assert cleared(t1=16_000, t2=34_000, scale=0.5) == [31_000]
+    assert cleared(t1=16_000, t2=34_000, mask_share=0.75) == [76_000]
 
 
 def test_a_mask_needs_the_passes():
