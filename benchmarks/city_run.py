@@ -92,7 +92,7 @@ def phases_of(config: Config, records: Sequence[Record], images: int, seconds: f
     """
     schedule, view = config.schedule, config.view
     begins = schedule.t1 or schedule.t2
-    cleared = schedule.t2 + schedule.mask_share * (schedule.iterations - schedule.t2)
+    cleared = (schedule.t2 + schedule.iterations) / 2
     marks = sorted({0, begins, schedule.densify_until, schedule.t2, cleared, schedule.iterations})
     steps = [record for record in records if "loss" in record]
     clock = [(0.0, 0.0)] + [(record["t"], record["t"] / record["images_per_second"]) for record in steps]

@@ -141,7 +141,6 @@ class ScheduleConfig:
             gate.
         t1, t2: times of the first and the second importance pass, if `population.importance` is set; 0: no
             pass. A pass happens after the density event of the same time.
-        mask_share: share of the time from the last importance pass to the end in which `view.cull` holds.
         sh_every: the spherical-harmonics degree grows by one at every multiple of this.
         position_decay: length of the exponential decay of the position learning rate.
         checkpoint_every: a checkpoint is written at every multiple of this, in addition to those by
@@ -165,7 +164,6 @@ class ScheduleConfig:
     gate_from: int = 11_250
     t1: int = 7_500
     t2: int = 16_000
-    mask_share: float = 0.5
     sh_every: int = 1_000
     position_decay: int = 30_000
     checkpoint_every: int = 0
@@ -259,8 +257,6 @@ class PopulationConfig:
             the pass keeps all Gaussians and only computes phi and the cull matrix.
         pass2_views: with fewer training views the second pass keeps all Gaussians, because scores add up what
             the views show, and say little about places that few of them see.
-        view_mass: the Gaussians that count in a view are the fewest that make up this share of all
-            contributions to it.
         phi: from the first pass on, density control multiplies the gradients that it sums with phi: among the
             views that see a Gaussian, the share of those in which it counts.
         gate: model file of a spawn gate (`blitzgs gate fit`), or "default" for the one that comes with
@@ -296,7 +292,6 @@ class PopulationConfig:
     pass2_mass: float = 0.99
     pass2_keep: float = 1.0
     pass2_views: int = 0
-    view_mass: float = 0.99
     phi: bool = True
     gate: str | None = None
     gate_rate: float = 0.6
@@ -320,7 +315,7 @@ class ViewConfig:
         smooth: opacities fade out over half a level around the distance at which `lod` would cut them off.
             All views then have the gate, and `most_kept` is ignored. Needs `lod`.
         cull: from the first importance pass on, a training view leaves out the Gaussians that did not count
-            in it at the last pass, for `schedule.mask_share` of the rest of the run. Needs
+            in it at the last pass. This ends halfway between the last pass and the end of the run. Needs
             `population.importance`.
     """
 

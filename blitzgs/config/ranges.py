@@ -71,7 +71,6 @@ RANGES: Mapping[str, Range] = {
     "schedule.gate_from": _TIME,
     "schedule.t1": _EVERY_OR_NEVER,
     "schedule.t2": _EVERY_OR_NEVER,
-    "schedule.mask_share": Range(0, 1, low_open=True, high_open=True),
     "schedule.sh_every": _EVERY,
     "schedule.position_decay": _EVERY,
     "schedule.checkpoint_every": _EVERY_OR_NEVER,
@@ -105,7 +104,6 @@ RANGES: Mapping[str, Range] = {
     "population.pass1_keep": _SHARE,
     "population.pass2_mass": _SHARE,
     "population.pass2_keep": _SHARE,
-    "population.view_mass": _SHARE,
     "population.pass2_views": Range(0, 1e6),
     "view.footprint": Range(0, 1000),
     "view.most_kept": Range(0, 1),
@@ -155,8 +153,6 @@ def problems(config: Config) -> Iterator[str]:
         )
     if population.strategy == "relocation" and population.gate is not None:
         yield "population.gate: withholds candidates of population.strategy=density; relocation has none"
-    if population.view_mass != round(population.view_mass, 9):
-        yield f"population.view_mass: give at most 9 decimal places, got {population.view_mass}"
     if config.view.smooth and not config.view.lod:
         yield "view.smooth: needs view.lod=true, whose cuts it smooths"
     if config.view.cull and not population.importance:

@@ -103,11 +103,11 @@ class Schedule:
         return sorted(found)
 
     def _clear_cull(self) -> tuple[EventKind, float, float, float]:
-        """Return when the cull mask is dropped, between the last importance pass and the end."""
+        """Return when the cull mask is dropped: halfway between the last importance pass and the end."""
         config = self._config
         # A pass that is set to a time after the end does not happen.
         last = max(time for time in (0, config.t1, config.t2) if time < config.iterations)
-        time = math.floor(last + config.mask_share * (config.iterations - last))
+        time = math.floor((last + config.iterations) / 2)
         return "clear_cull", time, time + 1, min(last, 1)
 
     def _series(self, first: float, until: float, every: float, begin: int, end: int) -> list[int]:

@@ -3,7 +3,7 @@
 
 For view v and Gaussian i, w is the sum of alpha T over the pixels at which the renderer composites i, a
 is their number, c_rad tells whether the box around its alpha >= 1/255 overlaps the image, and c_vis
-whether it is in the smallest set, by descending w (ties by id), that holds a share VIEW_MASS of the total.
+whether it is in the smallest set, by descending w (ties by id), that holds 99 % of the view's total.
 Then:
 
     score_i = sum over v with a > 0 of w / (a + SCORE_EPS)^p, p = 1 for "density", 1/2 "root", 0 "weight"
@@ -111,7 +111,6 @@ def sweep(
     rule: ScoreRule = "density",
     lod: SceneGate | None = None,
     stops: Callable[[], bool] | None = None,
-    mass: float = VIEW_MASS,
 ) -> Importance:
     """Score the Gaussians by their contributions to V views. Collective: every rank calls it.
 
@@ -127,13 +126,12 @@ def sweep(
             None: no gate.
         stops: whether to give up, asked before each batch but the first; the same answer on every rank. None:
             never.
-        mass: the share of a view's total that counts.
 
     Raises:
         SweepStoppedError: `stops` said so; the table is as it was.
     """
     table = table_of(scene)
-    sums = _Sums(len(table), n_views, table.device, rule, mass)
+    sums = _Sums(len(table), n_views, table.device, rule)
     owners = owners or TileOwners(ranks)
     transport, finder = open_transport(ranks), VisibleFinder(scene, lod)
     with _NextSurvey(table.device, ranks.world_size == 1 and scene is table) as beside:
@@ -210,8 +208,8 @@ def _side_stream(device: torch.device) -> torch.cuda.Stream:
 class _Sums:
     """The sums over the views surveyed so far, for N Gaussians."""
 
-    def __init__(self, count: int, n_views: int, device: torch.device, rule: ScoreRule, mass: float) -> None:
-        self._rule, self._mass = rule, mass
+    def __init__(self, count: int, n_views: int, device: torch.device, rule: ScoreRule) -> None:
+        self._rule = rule
         # Terms are integers in a unit for which the sum over all views fits into 62 bits.
         self._unit = 2.0 ** -min(48, 62 - n_views.bit_length() - _TERM_BITS[rule])
         self._sums = ViewSums(
@@ -225,7 +223,7 @@ class _Sums:
         """Add the splats of a batch of views."""
         splats, ids = found.splats, surveyed.table["id"]
         counts = integer_mass_prefix(
-            found.weights, splats.camera_ids, splats.gaussian_ids, ids, self._mass, ranks, len(columns)
+            found.weights, splats.camera_ids, splats.gaussian_ids, ids, VIEW_MASS, ranks, len(columns)
         )
         home = self._sums.score.device  # where the whole table is
         lists = (

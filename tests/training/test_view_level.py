@@ -335,7 +335,6 @@ def test_the_mask_is_cleared_halfway_after_the_last_pass():
     assert cleared(t1=16_000, t2=100_000) == [53_000]  # the run ends before the second pass
     assert cleared(t1=0, t2=0) == []
     assert cleared(t1=16_000, t2=34_000, scale=0.5) == [31_000]
-    assert cleared(t1=16_000, t2=34_000, mask_share=0.75) == [76_000]
 
 
 def test_a_mask_needs_the_passes():

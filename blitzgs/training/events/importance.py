@@ -51,7 +51,6 @@ def run(state: TrainingState, event: Event) -> None:
             cast(ScoreRule, state.config.population.score),
             scene_gate(state.config, state.progress, state.table, state.ranks),
             state.stops,
-            state.config.population.view_mass,
         )
     found.store(state.table, state.config.view.cull)
     before = state.population()
