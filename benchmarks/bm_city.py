@@ -6,7 +6,8 @@ r"""Trains a synthetic city with and without the view level: quality, speed by p
         --gpus 2 --ranks 1 2 --popping --json benchmarks/results/city.json
 
 The arms are `configs/city.yaml` with the LOD gate and the cull mask (full), without the one (no_lod), the
-other (no_mask), or both (all_off). Every run is a process on one GPU; each GPU has one at a time. The
+other (no_mask), or both (all_off), and those of --arm NAME="--section.field=value ...". Every run is a
+process on one GPU; each GPU has one at a time. The
 numbers of ranks above 1 follow when these are over: the first of --arms, under torchrun, with the machine to
 itself. With several --batch-sizes, the first of --arms is trained with each on every number of ranks.
 
@@ -37,7 +38,7 @@ from bm_quality import Pool, positive
 from city_report import TABLES
 from city_run import RESERVE, CityRun
 from harness import ROOT, command_line, make_parser, markdown_table, write_json
-from quality_plan import runs_of
+from quality_plan import parse_named, runs_of
 
 CONFIG = ROOT / "configs" / "city.yaml"
 ON = "--population.importance=true"
@@ -79,9 +80,12 @@ def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
     held_out(args.city, args.held_out, split)
     capture = {"city": f"'{args.city}' --data.split={json.dumps(str(split.resolve()))}"}
     common = " ".join([f"--schedule.scale={args.scale}", "--log.every=200", *overrides])
-    recipes = {arm: f"'{CONFIG}' {ARMS[arm]} {common}" for arm in args.arms}
+    arms = {arm: ARMS[arm] for arm in args.arms} | dict(map(parse_named, args.arm))
+    if not arms:
+        raise ValueError("nothing to train: --arms and --arm name no arm")
+    recipes = {arm: f"'{CONFIG}' {flags} {common}" for arm, flags in arms.items()}
     first, device, sizes = (
-        args.arms[0],
+        next(iter(arms)),
         "cuda" if args.gpus else "cpu",
         list(dict.fromkeys(args.batch_sizes)) or [None],
     )
@@ -89,7 +93,7 @@ def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
     for ranks, size in itertools.product(dict.fromkeys(args.ranks), sizes):
         is_first = ranks == 1 and size == sizes[0]
         batch = "" if size is None else f" --schedule.batch_size={size}"
-        chosen = {arm: recipes[arm] + batch for arm in (args.arms if is_first else [first])}
+        chosen = {arm: recipes[arm] + batch for arm in (arms if is_first else [first])}
         for spec in runs_of(capture, chosen, [0], [], None, device, ranks):
             frames = args.popping if is_first and spec.recipe == first else 0
             runs.append(
@@ -129,9 +133,9 @@ def collect(args: Any) -> str:
     Raises:
         OSError: the folder has no results.
     """
-    order = list(ARMS)
+    order = {arm: place for place, arm in enumerate(ARMS)}
     runs = quality_report.read_runs(args.out / quality_report.RUNS)
-    runs.sort(key=lambda run: (run["ranks"], order.index(run["recipe"]), run.get("batch_size", 0)))
+    runs.sort(key=lambda run: (run["ranks"], order.get(run["recipe"], len(ARMS)), run.get("batch_size", 0)))
     saved = args.out / "city.json"
     file = {"city": json.loads(saved.read_text()), "results": runs}
     if not runs:
@@ -182,7 +186,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = make_parser(__doc__, device=None)
     parser.add_argument("city", type=Path, help="folder that blitzgs synth has made")
     parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS), help="(all)")
+    parser.add_argument("--arms", nargs="*", choices=ARMS, default=list(ARMS), help="(all)")
+    parser.add_argument(
+        "--arm", action="append", default=[], metavar="NAME=FLAGS", help="another arm: flags of city.yaml"
+    )
     gpus = torch.cuda.device_count()
     parser.add_argument("--gpus", type=int, default=gpus, help="to use; 0: the CPU (%(default)s)")
     parser.add_argument("--ranks", type=positive, nargs="+", default=[1], help="(%(default)s)")
@@ -191,7 +198,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument(
         "--popping", type=int, nargs="?", const=240, default=0, metavar="FRAMES",
-        help="measure popping on the first arm's model (240 frames)",
+        help="measure popping, and what views can leave out, on the first arm's model (240 frames)",
     )  # fmt: skip
     parser.add_argument("--seconds-per-run", type=float, default=100.0, help="(%(default)s)")
     parser.add_argument("--held-out", type=positive, default=64, help="views to measure (%(default)s)")

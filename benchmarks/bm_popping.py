@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures how much levels pop along a descending flight: with the LOD gate's cuts, and smoothed.
+"""Measures what the LOD gate changes: popping along a descending flight, and what a view can leave out.
 
     python benchmarks/bm_popping.py RUN [--frames 240] [--out FOLDER] [--device cuda] [--json FILE]
+    python benchmarks/bm_popping.py RUN --curve [--device cuda] [--json FILE]
 
 The flight goes down the viewing axis of one of the run's cameras towards what it looks at, by the same ratio
 of distances from frame to frame, so that levels come at an even pace. Each frame is rendered with all
@@ -14,6 +15,12 @@ only the levels have changed. Both are reported as the mean and the largest over
 also the value that one pixel in 1,000 exceeds in the worst frame. More frames make smaller steps.
 
 Into the folder go a chart of the popping (popping.svg) and the clip (popping.mp4: full, gated, smooth).
+
+With --curve, views of the run's cameras are rendered with all Gaussians, and again without those that a rule
+puts below a threshold, which is the same for all views: by octree level and distance (as the gate of a run
+without view.footprint does), by footprint (as with view.footprint), and by the contribution to the very view,
+which no rule of distances can beat. For each share of the splats that is left out, the table has the
+threshold, the share of the light (sum of alpha T) and the PSNR against the picture with all.
 """
 
 from __future__ import annotations
@@ -33,13 +40,16 @@ from blitzgs.capture.pictures import to_uint8
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.survey import survey
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import load_cameras
 from blitzgs.runs.files import TrainedModel
+from blitzgs.runs.lod import level_fork
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.charts import line_chart
 from blitzgs.view.gate import LodGate, SceneGate, centres_of
+from blitzgs.view.levels import footprint_sizes
 from blitzgs.view.views import CameraLike, ViewSet, render_options
 
 MODES = ("full", "gated", "smooth")
@@ -112,6 +122,80 @@ def popping_of(
     return found
 
 
+# Shares of the splats that a rule leaves out.
+RULES = ("octree level", "footprint", "contribution")
+SHARES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
+
+
+@torch.no_grad()
+def curve_of(
+    model: TrainedModel, cameras: Any, device: torch.device, views: int = 16
+) -> list[dict[str, Any]]:
+    """Measure what views lose without the splats that a rule puts last, for each rule and share of `SHARES`.
+
+    Args:
+        model: the model; its table is on `device`.
+        cameras: the cameras of its capture, of which every n-th is a view.
+        device: renders the views.
+        views: number of views.
+
+    Returns:
+        For each rule and share "rule", "left out" (share of the splats), "threshold" (of the levels: the
+        factor by which the gate's distances shrink; of the footprints: pixels; of the contributions: sum of
+        alpha T in pixels), "light" (share of the sum of alpha T that goes) and "PSNR against all".
+    """
+    chosen = [cameras[i * len(cameras) // views] for i in range(min(views, len(cameras)))]
+    table, poses = model.table, ViewSet(chosen, model.space, device)
+    options = render_options(model.config, model.space, model.progress.sh_degree)
+    count = model.progress.level_count
+    gate = LodGate(model.progress.reference_distance, level_fork(model.config), count, count - 1)
+    reach = torch.tensor(gate.reach(), dtype=torch.float64, device=device)[table["level"].long()]
+    size = footprint_sizes(table["scales"], table["opacities"]).exp()
+    seen = []
+    for index in range(len(chosen)):
+        view = poses.pick([index])
+        found = survey(table, view, options)
+        rows, light = found.splats.gaussian_ids.long(), found.weights.double() * 2.0**-32
+        distance = (table["means"][rows].double() - centres_of(view.viewmats)[0]).norm(dim=1)
+        footprint = size[rows] * float(view.Ks[0, 0, 0]) / distance
+        keys = dict(zip(RULES, (reach[rows] / distance, footprint, light), strict=True))
+        image = pipeline.forward(table, view, options).renders[0].clamp(0, 1)
+        seen.append((view, rows, light, keys, image))
+    lines = []
+    for rule in RULES:
+        ordered = torch.cat([keys[rule] for *_, keys, _ in seen]).sort().values
+        for share in SHARES:
+            threshold = float(ordered[int(share * len(ordered))])
+            if math.isinf(threshold):  # views keep level 0 at any distance
+                break
+            error = kept = lit = 0.0
+            for view, rows, light, keys, image in seen:
+                stays = keys[rule] >= threshold
+                active = _rows(rows[stays])
+                without = pipeline.forward(table, view, options, active).renders[0].clamp(0, 1)
+                error += float((without - image).square().mean()) / len(seen)
+                kept += float(stays.sum())
+                lit += float(light[stays].sum() / light.sum()) / len(seen)
+            lines.append(
+                {
+                    "rule": rule,
+                    "left out": 1.0 - kept / len(ordered),
+                    "threshold": threshold,
+                    "light": 1.0 - lit,
+                    "PSNR against all": -10.0 * math.log10(error) if error > 0 else math.inf,
+                }
+            )
+    return lines
+
+
+def _rows(rows: Tensor) -> ActiveRows:
+    """Return the active set of one view that sees these rows, int64 [U]."""
+    ids = rows.sort().values.int()
+    return ActiveRows(
+        ids, torch.ones_like(ids), torch.tensor([len(ids)], dtype=torch.int32, device=ids.device)
+    )
+
+
 class _Flight:
     """Renders one frame after the other in one way, and records the changes."""
 
@@ -181,7 +265,7 @@ def _gate(model: TrainedModel, smooth: bool, ranks: Ranks) -> SceneGate:
     progress, config = model.progress, model.config
     count = progress.level_count
     finest = count - 1 if progress.finest_level is None else progress.finest_level
-    gate = LodGate(progress.reference_distance, config.lod.fork, count, finest, smooth)
+    gate = LodGate(progress.reference_distance, level_fork(config), count, finest, smooth)
     return SceneGate(gate, math.inf if smooth else config.view.most_kept, model.table, ranks)
 
 
@@ -252,7 +336,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, default=240)
     parser.add_argument("--width", type=int, default=640, help="of the frames in pixels")
     parser.add_argument("--camera", help="name of the view whose axis is flown along")
+    parser.add_argument("--curve", action="store_true", help="measure what views can leave out, not popping")
     options = parser.parse_args(arguments)
+    if options.curve:
+        ranks = Ranks(device=torch.device(options.device))
+        model = run_files.open_model(options.run, ranks)
+        lines = curve_of(model, load_cameras(options.run).cameras, ranks.device)
+        title = f"What views of {options.run.name} can leave out"
+        return report(title, lines, options.json, options.device)
     out = options.out or options.run / "popping"
     found = popping(options.run, out, options.device, options.frames, options.width, options.camera)
     rows = [

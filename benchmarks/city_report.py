@@ -24,7 +24,7 @@ NONE = "–"
 
 def title_of(run: Json) -> str:
     """Return the name of a run in the tables."""
-    title = TITLES[run["recipe"]]
+    title = TITLES.get(run["recipe"], run["recipe"])
     if run.get("batch_size", 4) != 4:
         title += f", {run['batch_size']} views a step"
     if run["ranks"] > 1:
@@ -49,6 +49,13 @@ def mean_share(run: Json, name: str) -> float | None:
     parts = [phase for phase in run["phases"] if phase[name] is not None]
     images = sum(phase["to"] - phase["from"] for phase in parts)
     return sum(phase[name] * (phase["to"] - phase["from"]) for phase in parts) / images if images else None
+
+
+def rate_after_growth(run: Json) -> float | None:
+    """Return the images per second of the phases in which the model no longer grows."""
+    parts = [phase for phase in run["phases"] if "growth" not in phase["on"]]
+    seconds = sum(phase["seconds"] for phase in parts)
+    return sum(phase["to"] - phase["from"] for phase in parts) / seconds if seconds else None
 
 
 def trained(file: Json, ranks: int | None = None) -> list[Json]:
@@ -94,6 +101,7 @@ def arm_rows(file: Json) -> Rows:
             "images": f"{run['images']:,}",
             "seconds": f"{run['seconds']:.1f}",
             "images/s": f"{run['images_per_second']:,.0f}",
+            "after growth": text(rate_after_growth(run), ",.0f"),
             "active": text(mean_share(run, "active"), ".1%"),
             "visible": text(mean_share(run, "visible"), ".1%"),
             "M Gaussians": f"{run['population']['initial'] / 1e6:.2f} → {run['gaussians'] / 1e6:.2f}",
@@ -166,6 +174,21 @@ def popping_rows(file: Json) -> Rows:
     ]
 
 
+def curve_rows(file: Json) -> Rows:
+    """Tabulate what views can leave out, by rule."""
+    return [
+        {
+            "left out by": line["rule"],
+            "splats": f"{line['left out']:.0%}",
+            "below": f"{line['threshold']:.3g}",
+            "of the light": f"{line['light']:.2%}",
+            "PSNR against all": f"{line['PSNR against all']:.1f}",
+        }
+        for lines in (run["curve"] for run in file["results"] if "curve" in run)
+        for line in lines
+    ]
+
+
 def rank_rows(file: Json) -> Rows:
     """Tabulate runs of one arm on several ranks, against the one on one rank."""
 
@@ -175,7 +198,7 @@ def rank_rows(file: Json) -> Rows:
     rows = []
     for run, one in compared(file):
         row = {
-            "view level": TITLES[run["recipe"]],
+            "view level": TITLES.get(run["recipe"], run["recipe"]),
             "views a step": str(run["batch_size"]),
             "ranks": str(run["ranks"]),
             "PSNR": text(run.get("psnr"), ".2f"),
@@ -221,6 +244,7 @@ TABLES: dict[str, Callable[[Json], Rows]] = {
     "city_costs": cost_rows,
     "city_phases": phase_rows,
     "city_popping": popping_rows,
+    "city_curve": curve_rows,
     "city_ranks": rank_rows,
     "city_memory": memory_rows,
 }

@@ -55,7 +55,7 @@ Georeferenced models are written around their own origin, because the files' num
 coordinates. The offset is in FILE.offset.json and, where there is one, in the header.
 
 A PLY file of a model trained with view.lod has all its Gaussians, and most viewers show them all. The last
-property, `level`, is their octree level. The line
+property, `level`, is their level. The line
 `comment lod reference_distance D fork F levels K finest L` tells a viewer what a view keeps: level l up to
 the distance D * F^(1/2 - l), no level above L, and level 0 at any distance.
 

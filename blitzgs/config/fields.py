@@ -310,8 +310,10 @@ class ViewConfig:
     """Which Gaussians a view leaves out before projection.
 
     Attributes:
-        lod: from `schedule.densify_until` on, views leave out Gaussians whose octree level is too fine for
-            their distance. The trained model is evaluated and rendered in the same way.
+        lod: from `schedule.densify_until` on, views leave out Gaussians that are too small for their
+            distance. The trained model is evaluated and rendered in the same way.
+        footprint: the smallest footprint that `lod` keeps: opacity times size in pixels of a training view.
+            0: a Gaussian is as small as the octree voxel that it descends from, as in the paper.
         most_kept: views that would keep at least this share of all Gaussians are rendered with all of them.
         smooth: opacities fade out over half a level around the distance at which `lod` would cut them off.
             All views then have the gate, and `most_kept` is ignored. Needs `lod`.
@@ -321,6 +323,7 @@ class ViewConfig:
     """
 
     lod: bool = False
+    footprint: float = 0.0
     most_kept: float = 0.8
     smooth: bool = False
     cull: bool = False

@@ -106,6 +106,7 @@ RANGES: Mapping[str, Range] = {
     "population.pass2_mass": _SHARE,
     "population.pass2_keep": _SHARE,
     "population.pass2_views": Range(0, 1e6),
+    "view.footprint": Range(0, 1000),
     "view.most_kept": Range(0, 1),
     "memory.resident_gb": Range(0, 1e6),
     "ranks.timeout_seconds": Range(1, 1e6),

@@ -142,6 +142,13 @@ class Schedule:
         """
         return not self.gathers_statistics(begin)
 
+    def has_new_levels(self, begin: int) -> bool:
+        """Tell whether levels follow footprints again before the step at [begin, begin + B)."""
+        # Scales and opacities change slowly after the growth, and all rows have to catch up.
+        every = 10 * self._config.densify_every
+        time, before = self.pace.time(begin), self.pace.time(max(0, begin - self.batch_size))
+        return time // every > before // every
+
     def has_spawn_gate(self, time: int) -> bool:
         """Tell whether the spawn gate judges the candidates of a density event at `time`."""
         return time >= self._scaled(self._config.gate_from)

@@ -115,7 +115,10 @@ class Partition:
         else:
             distance, fork, levels = float(lod[1]), float(lod[2]), int(lod[3])
             angle = _PIXELS * 2 * math.tan(_FOV / 2) / _HEIGHT
-            errors = [angle * distance * fork ** (-0.5 - level) for level in range(levels)]
+            # Finer levels than those of an octree are taken together, or viewers would switch all the time.
+            self._merged = max(1, round(math.log(2) / math.log(fork)))
+            last = range(0, levels + self._merged - 1, self._merged)
+            errors = [angle * distance * fork ** (-0.5 - level) for level in last]
         # The coarsest level is shown at any distance at which the scene is larger than that.
         self._errors, self._whole_error = errors, max(side, 2 * errors[0])
 
@@ -134,7 +137,8 @@ class Partition:
                 classes = np.floor(np.log2(self._largest / places["size"].astype(np.float64)))
             levels = classes.clip(0, _SIZE_CLASSES - 1).astype(np.int64)
         else:
-            levels = places["level"].astype(np.int64).clip(0, len(self._errors) - 1)
+            levels = -(-places["level"].astype(np.int64) // self._merged)
+            levels = levels.clip(0, len(self._errors) - 1)
         return codes << 8 | levels
 
     def count(self) -> Counts:

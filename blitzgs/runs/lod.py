@@ -10,6 +10,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs.files import Progress
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import LodGate, SceneGate
+from blitzgs.view.levels import FOOTPRINT_STEPS
 
 # Gaussians move after the training views were chosen, and held-out views see a little more or less.
 _SLACK = 0.9
@@ -28,11 +29,16 @@ def lod_gate(config: Config, progress: Progress) -> LodGate | None:
         return None
     return LodGate(
         progress.reference_distance,
-        config.lod.fork,
+        level_fork(config),
         progress.level_count,
         progress.finest_level,
         config.view.smooth,
     )
+
+
+def level_fork(config: Config) -> float:
+    """Return the ratio of the distances of neighbouring levels of the LOD gate."""
+    return config.lod.fork ** (1 / FOOTPRINT_STEPS) if config.view.footprint > 0 else config.lod.fork
 
 
 def scene_gate(config: Config, progress: Progress, table: GaussianTable, ranks: Ranks) -> SceneGate | None:

@@ -10,25 +10,44 @@ import warnings
 from blitzgs.capture.capture import Capture, train_views_fingerprint
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.files import Progress
-from blitzgs.runs.lod import lod_gate, scene_gate
+from blitzgs.runs.lod import level_fork, lod_gate, scene_gate
 from blitzgs.table.layouts import CULL
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.state import TrainingState
 from blitzgs.view.gate import ViewGate, lod_bits
+from blitzgs.view.levels import FOOTPRINT_LEVELS, footprint_levels, footprint_sizes
 
 
 def follow_schedule(state: TrainingState, begin: int) -> None:
     """Open the LOD gate, if the step at [begin, begin + B) is the first that has it.
 
+    With `view.footprint`, levels follow opacities and scales as often as density control came before.
+
     Collective: every rank calls this before every step.
     """
-    progress = state.progress
-    if not (state.config.view.lod and state.schedule.has_lod_gate(begin)):
+    view = state.config.view
+    if not (view.lod and state.schedule.has_lod_gate(begin)):
         return
-    finest = progress.level_count - 1
-    if finest != progress.finest_level or not progress.gated_views:
-        state.progress = dataclasses.replace(progress, finest_level=finest)
+    opens = state.progress.finest_level is None
+    if view.footprint > 0 and (opens or state.schedule.has_new_levels(begin)):
+        follow_footprints(state)
+    if opens or not state.progress.gated_views:
+        state.progress = dataclasses.replace(state.progress, finest_level=state.progress.level_count - 1)
         choose_views(state)
+
+
+def follow_footprints(state: TrainingState) -> None:
+    """Give each Gaussian the level that follows from its footprint. Collective."""
+    state.catch_up()
+    config, table = state.config, state.table
+    # In no training view is a Gaussian larger than at the largest focal length.
+    focal = max(float(state.capture.cameras[index].K[0, 0]) for index in state.capture.train)
+    sizes = footprint_sizes(table["scales"], table["opacities"])
+    table["level"] = footprint_levels(
+        sizes, focal / config.view.footprint, state.progress.reference_distance, level_fork(config)
+    )
+    state.progress = dataclasses.replace(state.progress, level_count=FOOTPRINT_LEVELS)
+    state.stepper.reindex()
 
 
 def choose_views(state: TrainingState) -> None:

@@ -16,6 +16,8 @@ BASE_RESOLUTION = 0.001
 # Voxel keys have 21 bits per axis. With this many levels, the finest grid of `measure_levels` uses all of
 # them.
 MAX_LEVELS = 22
+# Levels of footprints: four to an octave of the octree, and as many as the ops take.
+FOOTPRINT_LEVELS, FOOTPRINT_STEPS = 32, 4
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,39 @@ def farthest(level: int, reference_distance: float, fork: float) -> float:
         fork: f.
     """
     return math.inf if level == 0 else reference_distance * fork ** (0.5 - level)
+
+
+def footprint_sizes(scales: Tensor, opacities: Tensor) -> Tensor:
+    """Return the logarithms of o sqrt(a b) of Gaussians, float64 [N], in the unit of the scales.
+
+    a and b are the largest two scales of a Gaussian and o is its opacity. This size times the focal length
+    over the distance is its footprint in pixels. In a picture that sees the broad side of the Gaussian and
+    nothing in front, pi times the square of the footprint is the sum of alpha^2, to which the squared error
+    is proportional that leaving the Gaussian out makes.
+
+    Args:
+        scales: logarithms, [N, 3].
+        opacities: logits, [N].
+    """
+    broad = scales.double().sum(1) - scales.double().amin(1)
+    return 0.5 * broad + torch.nn.functional.logsigmoid(opacities.double())
+
+
+def footprint_levels(sizes: Tensor, reach: float, reference_distance: float, fork: float) -> Tensor:
+    """Return the levels that follow what Gaussians are, uint8 [N].
+
+    The level is the finest whose `farthest` distance is at least that at which the footprint becomes too
+    small. So a view that leaves out levels by distance leaves out only Gaussians of smaller footprints.
+
+    Args:
+        sizes: `footprint_sizes`, [N].
+        reach: distance at which the footprint of a size of 1 becomes too small: the focal length in pixels
+            over the smallest footprint.
+        reference_distance: d_0 of the levels.
+        fork: ratio of neighbouring levels, of which there are `FOOTPRINT_LEVELS`.
+    """
+    level = ((math.log(reference_distance / reach) - sizes) / math.log(fork) + 0.5).floor()
+    return level.clamp(0, FOOTPRINT_LEVELS - 1).to(torch.uint8)
 
 
 def measure_levels(

@@ -1,5 +1,6 @@
 """3D Tiles of a model: the tree against what its files hold by an independent reader of GLB."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -116,6 +117,25 @@ def test_errors_fall_and_volumes_hold_what_is_inside(written):
             assert (found[0] >= inner[0]).all() and (found[1] <= inner[1]).all()
             # At 3.33 standard deviations, not more.
             assert (inner[1] - inner[0] <= 1.12 * (found[1] - found[0])).all()
+
+
+def test_levels_finer_than_those_of_an_octree_are_taken_together(written, tmp_path):
+    model, path, done, tileset = written
+    fine = dataclasses.replace(
+        model,
+        comments=["comment lod reference_distance 40.0 fork 1.189207115002721 levels 14 finest 13"],
+        # Levels of 1 to 4, 5 to 8 and 9 to 12 are one each.
+        levels=(4 * model.levels - torch.arange(len(model)) % 4).clamp(min=0),
+    )
+    again = write_tiles(tmp_path / "city", fine, upright((0.0, -1.0, 0.0)), SCENE, "the city", most=300)
+    assert again.tiles == done.tiles
+    other = json.loads((tmp_path / "city" / "tileset.json").read_text())
+    pairs = list(zip(nodes(tileset["root"]), nodes(other["root"]), strict=True))
+    errors = np.array([[old["geometricError"], new["geometricError"]] for (old, _), (new, _) in pairs])
+    before, after = errors[errors[:, 0] > 0].T
+    ratios = np.unique((after / before).round(6))
+    # Levels reach by half a step farther than their number says: half an octave, or an eighth.
+    assert set(ratios) <= {1.0, round(2**0.375, 6)} and len(ratios) > 0
 
 
 def test_every_gaussian_is_in_one_tile_with_its_values(written):

@@ -18,9 +18,10 @@ from blitzgs.frame import frame as pipeline
 from blitzgs.population.importance import is_culled
 from blitzgs.runs import files as run_files
 from blitzgs.runs.evaluation import image_metrics
-from blitzgs.runs.lod import scene_gate
+from blitzgs.runs.lod import lod_gate, scene_gate
 from blitzgs.table.layouts import CULL
 from blitzgs.table.table import GaussianTable
+from blitzgs.training import view_level
 from blitzgs.training.events import evaluate
 from blitzgs.training.step import Stepper
 from blitzgs.training.trainer import Trainer
@@ -159,6 +160,43 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch, last):
     second, _ = train(tmp_path, resume=True)
     assert_same_table(second.state.table, whole.state.table)
     assert second.state.progress.gated_views == whole.state.progress.gated_views
+
+
+def test_levels_that_follow_footprints_leave_out_what_is_small_in_the_view(tmp_path, monkeypatch):
+    followed, follow = [], view_level.follow_footprints
+
+    def watched(state):
+        before = state.table["level"].clone()
+        follow(state)
+        gate, table = scene_gate_of(state), state.table
+        distances = torch.cdist(table["means"].double(), state.views.centres(state.capture.train))
+        _, middle, largest = table["scales"].double().exp().sort(1).values.unbind(1)
+        size = table["opacities"].double().sigmoid() * (middle * largest).sqrt()
+        footprints = size[:, None] * float(state.capture.cameras[0].K[0, 0]) / distances
+        reach = torch.tensor(gate.reach(), dtype=torch.float64)[table["level"].long()]
+        left_out = distances > reach[:, None]
+        assert footprints[left_out].max() < 0.5 and left_out[footprints < 0.5 / 2**0.25].all()
+        followed.append((state.images_seen, not torch.equal(table["level"], before)))
+
+    def scene_gate_of(state):
+        return lod_gate(state.config, dataclasses.replace(state.progress, finest_level=31, gated_views=""))
+
+    monkeypatch.setattr(view_level, "follow_footprints", watched)
+    flags = (
+        "view.footprint=0.5",
+        "population.importance=false",
+        "view.cull=false",
+        "schedule.densify_every=2",
+    )
+    whole, summary = train(tmp_path / "whole", *flags)
+    assert followed == [(60, True), (80, True)] and summary is not None
+    progress = whole.state.progress
+    assert "1" in progress.gated_views and blitzgs.open_run(tmp_path / "whole").model().lod is not None
+    stop_at(monkeypatch, 75)
+    assert train(tmp_path / "stopped", *flags)[1] is None
+    monkeypatch.undo()
+    resumed, _ = train(tmp_path / "stopped", *flags, resume=True)
+    assert_same_table(resumed.state.table, whole.state.table)
 
 
 def _train_on(ranks, folder):

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs.view.levels import Levels, measure_levels
+from blitzgs.view.gate import LodGate
+from blitzgs.view.levels import FOOTPRINT_LEVELS, Levels, footprint_levels, footprint_sizes, measure_levels
 
 
 def cloud(count=5000, seed=0):
@@ -54,3 +55,20 @@ def test_degenerate_input_is_refused():
         measure_levels(points[:0], centres, 2.0, 0.001)
     with pytest.raises(ValueError, match="spread out, .* measures 0, .* Check the points of the capture"):
         measure_levels(points[:1].repeat(5, 1), centres, 2.0, 0.001)
+
+
+def test_levels_of_footprints_leave_out_only_what_is_too_small_and_most_of_that():
+    generator = torch.Generator().manual_seed(3)
+    scales = torch.rand(4000, 3, generator=generator, dtype=torch.float64) * 6 - 7
+    opacities = torch.randn(4000, generator=generator, dtype=torch.float64) * 3
+    focal, pixels, distance, fork = 900.0, 0.5, 300.0, 2**0.25
+    levels = footprint_levels(footprint_sizes(scales, opacities), focal / pixels, distance, fork)
+    reach = torch.tensor(LodGate(distance, fork, FOOTPRINT_LEVELS, FOOTPRINT_LEVELS - 1).reach())
+    reach = reach.double()[levels.long()]
+    _, middle, largest = scales.exp().sort(1).values.unbind(1)
+    size = opacities.sigmoid() * (middle * largest).sqrt()
+    kept_to = size * focal / pixels  # the footprint is `pixels` there
+    assert (reach >= kept_to * (1 - 1e-9)).all()
+    inside = (levels > 0) & (levels < FOOTPRINT_LEVELS - 1)
+    assert inside.double().mean() > 0.5 and (reach < kept_to * fork * (1 + 1e-9))[inside].all()
+    assert reach[levels == 0].isinf().all()
