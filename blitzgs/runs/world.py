@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from blitzgs.capture.cameras import Float64
+from blitzgs.call.covariances import quaternions
 from blitzgs.capture.world import GEO, WorldFrame, read_frame
 from blitzgs.ops.harmonics import spherical_harmonics
 from blitzgs.runs.folder import Model
@@ -53,7 +53,7 @@ def in_world(model: Model, frame: WorldFrame) -> Model:
     return replace(
         model,
         means=(model.means.double() @ rotation.T).float(),
-        quats=_product(_quaternion(frame.rotation), model.quats.double()).float(),
+        quats=_product(quaternions(rotation[None])[0], model.quats.double()).float(),
         sh=rotated_harmonics(model.sh, rotation),
         space=moved,
     )
@@ -76,20 +76,6 @@ def rotated_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
         matrix = torch.linalg.lstsq(after[:, own], before[:, own]).solution.float()
         out[:, own] = torch.einsum("ij,njc->nic", matrix, sh[:, own])
     return out
-
-
-def _quaternion(rotation: Float64) -> Tensor:
-    """Return w, x, y, z of a rotation: the largest eigenvector of 4 q q^T - 1."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    matrix = np.array(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, b + d, c + g],
-            [c - g, b + d, e - a - i, f + h],
-            [d - b, c + g, f + h, i - a - e],
-        ]
-    )
-    return torch.from_numpy(np.linalg.eigh(matrix)[1][:, -1].copy())
 
 
 def _product(left: Tensor, right: Tensor) -> Tensor:
