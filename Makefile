@@ -67,7 +67,9 @@ demo: venv build
 	  $(if $(wildcard $(DEMO)/run/checkpoints/*),--resume) \
 	  || { echo "A new run from the start: make demo DEMO=runs/another"; exit 1; }
 	$(RUN) blitzgs export $(DEMO)/run --ply $(DEMO)/city.ply
+	$(RUN) blitzgs export $(DEMO)/run --html $(DEMO)/city.html
 	@echo
+	@echo "The model, for a browser:          $(DEMO)/city.html"
 	@echo "Pictures (render | photograph | error): $(DEMO)/run/evaluation"
 	@echo "Report, for a browser:             $(DEMO)/run/report.html"
 	@echo "The model, for any 3DGS viewer:    $(DEMO)/city.ply"

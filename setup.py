@@ -3,6 +3,7 @@
 
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -36,6 +37,17 @@ def torch_folder() -> Path:
     )
 
 
+def is_stale(build: Path) -> bool:
+    """Tell whether CMake would refuse its cache: the folder has moved, or a compiler is gone."""
+    cache = build / "CMakeCache.txt"
+    entries = dict(re.findall(r"^(\w+):\w+=(/.*)$", cache.read_text(), re.M)) if cache.is_file() else {}
+    places = {"CMAKE_HOME_DIRECTORY": str(ROOT), "CMAKE_CACHEFILE_DIR": str(build)}
+    compilers = (entries.get(f"CMAKE_{language}_COMPILER", "/") for language in ("CXX", "CUDA"))
+    return any(entries.get(name, place) != place for name, place in places.items()) or not all(
+        map(os.path.exists, compilers)
+    )
+
+
 class CMakeBuild(build_ext):
     def run(self) -> None:
         package = ROOT if self.inplace else Path(self.build_lib).resolve()
@@ -49,8 +61,19 @@ class CMakeBuild(build_ext):
         for name in ("BLITZGS_CUDA", "BLITZGS_CUDA_ARCHS", "BLITZGS_GLIBC"):
             if name in os.environ:
                 arguments.append(f"-D{name}={os.environ[name]}")
-        subprocess.check_call(["cmake", "-S", str(ROOT), "-B", str(build), "-G", "Ninja", *arguments])
-        subprocess.check_call(["cmake", "--build", str(build)])
+        # The ninja of an earlier environment, which pip deletes after each build, may be gone.
+        if ninja := shutil.which("ninja"):
+            arguments.append(f"-DCMAKE_MAKE_PROGRAM={ninja}")
+        if is_stale(build):
+            arguments.append("--fresh")
+        try:
+            subprocess.check_call(["cmake", "-S", str(ROOT), "-B", str(build), "-G", "Ninja", *arguments])
+            subprocess.check_call(["cmake", "--build", str(build)])
+        except subprocess.CalledProcessError as error:
+            raise SystemExit(
+                f"The kernels were not built: CMake ended with status {error.returncode}, as it says above.\n"
+                f"If the compiler, CUDA or torch has changed since the last build, remove {build} first."
+            ) from None
 
     def get_outputs(self) -> list[str]:
         return []

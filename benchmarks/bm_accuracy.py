@@ -31,9 +31,8 @@ from pathlib import Path
 import torch
 from exact_windows import EPS2D, FAR, NEAR, ExactWindows
 from gradients import parameter_gradients
-from harness import make_parser, write_json
+from harness import make_parser, median_ms, write_json
 from scenes import BenchmarkScene, aerial
-from timing import median_ms
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks

@@ -29,7 +29,7 @@ from blitzgs.runs.folder import open_run
 from blitzgs.runs.from_file import trained_columns
 from blitzgs.runs.source import source_of
 from blitzgs.table.table import PARAMETERS
-from tests.formats.glb_reader import read_glb
+from tests.formats.helpers import read_glb
 
 
 def read(path: Path) -> Gaussians:

@@ -38,9 +38,8 @@ from blitzgs.table.pool import Pool, PoolError
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batch import Batch
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
-from blitzgs.training.sampler import BatchSampler
+from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.step import Stepper
-from blitzgs.training.tour import tour_of
 from blitzgs.view.views import Space, ViewSet
 
 LINES, VIEWS_A_LINE = 12, 20

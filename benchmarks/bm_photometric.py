@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from harness import make_parser, write_json
-from timing import copy_bandwidth, median_ms
+from harness import copy_bandwidth, make_parser, median_ms, write_json
 from torch import Tensor
 
 from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_sums

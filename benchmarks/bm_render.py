@@ -20,9 +20,8 @@ from functools import partial
 from typing import Any
 
 import torch
-from harness import make_parser, write_json
+from harness import Clock, make_parser, write_json
 from scenes import BenchmarkScene, aerial, garden_like
-from timing import Clock
 from torch import Tensor
 
 from blitzgs import rasterization

@@ -20,9 +20,8 @@ from typing import Any
 
 import torch
 from bm_render import OPTIONS, CallRender
-from harness import make_parser, write_json
+from harness import Clock, make_parser, write_json
 from scenes import BenchmarkScene, aerial, garden_like
-from timing import Clock
 
 from blitzgs.config.fields import LossConfig, OptimiserConfig, ScheduleConfig
 from blitzgs.config.schedule import Schedule
@@ -57,9 +56,9 @@ def make_scene(name: str, views: int, order: str) -> BenchmarkScene:
 
 def random_photographs(scene: BenchmarkScene) -> Batch:
     """Return a batch of random photographs of the scene's views."""
-    count = len(scene.viewmats)
-    targets = torch.randint(0, 256, (count, scene.height, scene.width, 3), dtype=torch.uint8, device="cuda")
-    samples = torch.full((count,), float(targets[0].numel()), device="cuda")
+    count, device = len(scene.viewmats), scene.means.device
+    targets = torch.randint(0, 256, (count, scene.height, scene.width, 3), dtype=torch.uint8, device=device)
+    samples = torch.full((count,), float(targets[0].numel()), device=device)
     views = Views(scene.viewmats, scene.Ks, scene.width, scene.height)
     return Batch(list(range(count)), views, targets, None, samples, None)
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reporting that benchmarks share: a Markdown table on stdout, and JSON with command, commit and machine."""
+"""What benchmarks share: medians by device events, and reports.
+
+A report is a Markdown table on stdout, and JSON with command, commit and machine.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,11 @@ import json
 import os
 import platform
 import shlex
+import statistics
 import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -147,3 +152,66 @@ def report(
     print(markdown_table(rows) + "\n")
     if path is not None:
         write_json(path, device, title=title, rows=list(rows))
+
+
+def median_ms(
+    function: Callable[..., Any], inputs: Sequence[tuple[Any, ...]], repeats: int = 30, warm_up: int = 5
+) -> float:
+    """Return the median milliseconds of ``function(*inputs[i])``, rotating among the input sets.
+
+    The sets together must be larger than the last-level cache; otherwise the cache is measured.
+    """
+    cuda = any(torch.is_tensor(x) and x.is_cuda for x in _flatten(inputs))
+    for i in range(warm_up):
+        function(*inputs[i % len(inputs)])
+    times = []
+    for i in range(repeats):
+        arguments = inputs[i % len(inputs)]
+        if cuda:
+            start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+            # Keeps the device busy while the work is queued, so that there are no gaps between launches.
+            torch.cuda._sleep(200_000)
+            start.record()
+            function(*arguments)
+            end.record()
+            end.synchronize()
+            times.append(start.elapsed_time(end))
+        else:
+            begin = time.perf_counter()
+            function(*arguments)
+            times.append(1e3 * (time.perf_counter() - begin))
+    return statistics.median(times)
+
+
+class Clock:
+    """Time between marks on the device."""
+
+    def __init__(self) -> None:
+        self.marks: list[tuple[str, torch.cuda.Event]] = []
+        self.mark("")
+
+    def mark(self, stage: str) -> None:
+        """End a stage."""
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        self.marks.append((stage, event))
+
+    def stages(self) -> list[tuple[str, float]]:
+        """Return name and time of each stage, in order."""
+        torch.cuda.synchronize()
+        return [(name, begin.elapsed_time(end))
+                for (_, begin), (name, end) in zip(self.marks, self.marks[1:], strict=False)]  # fmt: skip
+
+
+def _flatten(value: Any) -> list[Any]:
+    if isinstance(value, list | tuple):
+        return [leaf for item in value for leaf in _flatten(item)]
+    return [value]
+
+
+def copy_bandwidth(device: torch.device | str, megabytes: int = 2048) -> float:
+    """Return the GB/s (read plus written) of a device-to-device copy."""
+    source = torch.empty(megabytes << 20, dtype=torch.uint8, device=device)
+    target = torch.empty_like(source)
+    milliseconds = median_ms(lambda a, b: b.copy_(a), [(source, target)], repeats=10)
+    return 2 * source.numel() / milliseconds / 1e6

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from blitzgs.capture.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints
+from blitzgs.capture.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints, rotation_to_quat
 from blitzgs_synth.arrays import Doubles, Ints
 from blitzgs_synth.flight import View
 from blitzgs_synth.tracks import Cloud
@@ -31,7 +31,7 @@ def colmap_model(views: list[View], cloud: Cloud) -> ColmapModel:
     images = ColmapImages(
         ids=image_ids,
         camera_ids=np.ones(len(views), np.uint32),
-        quats=np.stack([_quaternion(v.rotation) for v in views]),
+        quats=np.stack([rotation_to_quat(v.rotation) for v in views]),
         translations=np.stack([v.translation for v in views]),
         names=[v.name for v in views],
         point2d_offsets=np.concatenate([[0], np.cumsum(totals)]).astype(np.uint64),
@@ -66,24 +66,3 @@ def _mean_errors(views: list[View], cloud: Cloud, starts: Ints, lengths: Ints) -
         errors[rows] = np.linalg.norm(projected - cloud.pixels[rows], axis=1)
     mean: Doubles = np.bincount(cloud.points, errors, len(cloud.positions)) / np.maximum(lengths, 1)
     return mean
-
-
-def _quaternion(rotation: Doubles) -> Doubles:
-    """Return (w, x, y, z), w >= 0, of a rotation matrix, through its largest component."""
-    r = rotation
-    squares = np.array(
-        [
-            1 + r[0, 0] + r[1, 1] + r[2, 2],
-            1 + r[0, 0] - r[1, 1] - r[2, 2],
-            1 - r[0, 0] + r[1, 1] - r[2, 2],
-            1 - r[0, 0] - r[1, 1] + r[2, 2],
-        ]
-    )
-    largest = int(squares.argmax())
-    a, b, c = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    d, e, f = r[1, 0] + r[0, 1], r[0, 2] + r[2, 0], r[2, 1] + r[1, 2]
-    rows = np.array(
-        [[squares[0], a, b, c], [a, squares[1], d, e], [b, d, squares[2], f], [c, e, f, squares[3]]]
-    )
-    quat: Doubles = rows[largest] / np.linalg.norm(rows[largest])
-    return quat if quat[0] >= 0 else -quat

@@ -243,8 +243,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def("sectors_of_rows(Tensor rows) -> Tensor");
   m.def("rows_of_sectors(Tensor sectors, int n) -> Tensor");
 
-  // Rows of a table, old and new, in another order.
-  m.def("take_rows(Tensor column, Tensor rows, Tensor? fresh) -> Tensor");
+  // Rows of a column in another order; and rows of a column overwritten by others, or by zeros.
+  m.def("take_rows_(Tensor(a!) out, Tensor column, Tensor rows) -> ()");
+  m.def("put_rows_(Tensor(a!) column, Tensor rows, Tensor? fresh) -> ()");
   // The first rows of columns, in the same memory without autograd's knowledge.
   m.def("first_rows(Tensor[] columns, int[] lengths) -> Tensor[]");
 
@@ -256,6 +257,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "swap_blocks_(Tensor(a!)[] pool, Tensor(b!)[] table, int n_written, Tensor slots, Tensor leaving, "
       "Tensor coming) -> ()");
+
+  // Keys that sample without replacement, and counts of keys by a digit of their bits.
+  m.def("sampling_keys(Tensor weights, Tensor ids, int seed, int event) -> Tensor");
+  m.def("key_histogram(Tensor keys, Tensor prefix, int shift, int width) -> Tensor");
 
   // A number that is 0 if all values of the columns are finite and none of `nonzero` is 0.
   m.def("find_non_finite(Tensor[] columns, Tensor[] nonzero) -> Tensor");

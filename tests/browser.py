@@ -17,13 +17,23 @@ import cv2
 import numpy as np
 import pytest
 
-websocket = pytest.importorskip("websocket")
+try:
+    import websocket
+except ImportError:  # websocket-client, of the extra test
+    websocket = None
+
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
 def chromium() -> str | None:
     """Return the path of an installed Chromium; None: there is none."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+needs_chromium = pytest.mark.skipif(
+    chromium() is None or websocket is None,
+    reason="Chromium or websocket-client is missing: install them (Debian: apt-get install chromium)",
+)
 
 
 class Browser:
@@ -67,6 +77,13 @@ class Browser:
                 assert "error" not in message, message
                 return message.get("result", {})
             self.messages.append(message)
+
+    def go(self, url: str):
+        """Open another page, and wait until its program is ready."""
+        self.call("Page.navigate", url=url)
+        wait_for(lambda: self.evaluate("location.href") == url, 30, "the page is open")
+        wait_for(lambda: self.evaluate("typeof blitzgs !== 'undefined'"), 30, "its program runs")
+        self.evaluate("blitzgs.ready")
 
     def errors(self) -> list[str]:
         """Return the page's exceptions and error messages so far."""

@@ -3,6 +3,7 @@ import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: it says how OpenMP threads wait
 
+import cv2  # noqa: F401 - before pycolmap, whose own libpng and zlib it would call
 import pytest
 import torch
 

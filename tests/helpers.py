@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small scenes, and error measures that fail for NaN and wrong shapes (tests/test_helpers.py tests them)."""
+"""Small scenes, and error measures that fail for NaN and wrong shapes (test_reference.py tests them)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 import blitzgs
 from benchmarks.gradients import parameter_gradients as parameter_gradients
 from benchmarks.gradients import sum_of_ranks as sum_of_ranks
-from blitzgs.ops.report import report_
+from blitzgs.ops.photometric import report_
 from blitzgs.reference import ReferenceImage, render
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "viewmats")

@@ -2,18 +2,23 @@
 """README and docs name only files, links, modules, configuration fields and commands that exist."""
 
 import importlib
+import importlib.util
 import re
 import shlex
+import shutil
+import subprocess
 from functools import cache
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 import torch
+import yaml
 
 import blitzgs
 from blitzgs import cli
 from blitzgs.config.fields import Config
-from blitzgs.config.files import load_config, to_dict
+from blitzgs.config.files import to_dict
 from tests.training.tiny import OVERRIDES, write_tiny_capture
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -21,7 +26,6 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 # A decision names what existed when it was taken.
 PRESENT = [name for name in NAMES if not name.startswith("docs/decisions/")]
-CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
 FENCED = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 FOLDERS = ("benchmarks", "blitzgs", "cmake", "configs", "csrc", "docs", "examples", "tests")
 # The folder benchmarks/results exists only if something was measured.
@@ -125,11 +129,6 @@ def test_configuration_fields_exist(name):
         match = re.match(r"(?:--)?(?!\w+\.jsonl)(\w+\.\w+)(=|$)", code)
         if match and match[1].split(".")[0] in sections:
             assert match[1] in fields(), f"{name} names the field {match[1]}, which does not exist"
-
-
-@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.name)
-def test_configurations_parse(path):
-    load_config(path, [])
 
 
 def commands(page):
@@ -270,3 +269,57 @@ def test_the_example_of_the_single_ops_renders_the_image_of_the_one_call():
     assert renders.amax() > 0.1
     torch.testing.assert_close(names["renders"], renders)
     torch.testing.assert_close(names["alphas"][..., None], alphas)
+
+
+@pytest.fixture(scope="module")
+def hooks():
+    pytest.importorskip("mkdocs", reason="needs pip install 'blitzgs[docs]'")
+    pytest.importorskip("latex2mathml", reason="needs pip install 'blitzgs[docs]'")
+    spec = importlib.util.spec_from_file_location("hooks", ROOT / "docs" / "site" / "hooks.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_links_of_the_repository_become_links_of_the_site(hooks):
+    text = "[a](docs/guide/view.md#x) [b](csrc/math/vec.h) [c](https://a.b/c.md)\n```md\n[d](docs/image.md)\n```\n"
+    turned = "[a](guide/view.md#x) [b](source/csrc/math/vec.h.md) [c](https://a.b/c.md)\n```md\n[d](docs/image.md)\n```\n"
+    assert hooks.with_links(text, "README.md") == turned
+    assert (
+        hooks.with_links("[a](../../README.md#try-it)", "docs/guide/README.md") == "[a](../index.md#try-it)"
+    )
+    assert hooks.with_links("[a](docs/paper.md)", "CONTRIBUTING.md") == "[a](../paper.md)"
+
+
+def test_equations_become_mathml(hooks):
+    page = r'<td><span class="arithmatex">\(a&lt;\hat{C}\)</span></td>'
+    math = ElementTree.fromstring(hooks.on_page_content(page))[0]
+    assert math.tag.endswith("math") and "".join(math.itertext()) == "a<C^"
+    assert [part.tag.rpartition("}")[2] for part in math.iter()].count("mover") == 1
+
+
+def test_the_api_has_every_public_name(hooks):
+    names = hooks.public_names()
+    assert {"blitzgs.rasterization", "blitzgs.optim.LazyAdam", "blitzgs.formats.ply.write_ply"} <= set(names)
+    assert "api/ops.md" in hooks.api_pages() and "blitzgs.ops.project\n" in hooks.api_pages()["api/ops.md"]
+
+
+def test_every_page_is_in_the_navigation():
+    nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
+    named = set(re.findall(r"[\w/.-]+\.md", str(nav)))
+    pages = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
+    assert pages <= named, pages - named
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+def test_a_second_demo_continues_the_first(tmp_path):
+    def train_command():
+        command = ["make", "-n", "demo", f"DEMO={tmp_path}", f"VENV={tmp_path / 'venv'}"]
+        lines = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        return next(
+            line for line in lines.replace("\\\n", " ").split("\n") if f"--out {tmp_path}/run" in line
+        )
+
+    assert "--resume" not in train_command()
+    (tmp_path / "run" / "checkpoints" / "checkpoint_000001").mkdir(parents=True)
+    assert "--resume" in train_command()

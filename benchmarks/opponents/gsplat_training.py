@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from opponents import relocation
 
 from blitzgs import rasterization
 from blitzgs.capture.capture import Capture
@@ -32,7 +33,6 @@ from blitzgs.ops.photometric import photometric_loss
 from blitzgs.population.initialisation import SH_C0
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.views import Space, ViewSet
-from opponents import relocation
 
 STRATEGIES = ("default", "default-reset", "mcmc")
 

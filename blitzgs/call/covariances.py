@@ -40,7 +40,7 @@ def decompose(covars: Tensor) -> Decomposed:
         matrices = torch.where(finite[:, None, None], matrices, torch.eye(3, device=covars.device).double())
         axes, variances = _principal_axes(matrices)
         scales = variances.clamp(min=0).sqrt().masked_fill_(~finite[:, None], torch.nan)
-        return Decomposed(upper, quaternions(axes).to(covars.dtype), scales.to(covars.dtype))
+        return Decomposed(upper, _quaternions(axes).to(covars.dtype), scales.to(covars.dtype))
 
 
 def _principal_axes(matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -76,7 +76,7 @@ def _principal_axes(matrices: Tensor) -> tuple[Tensor, Tensor]:
     return axes, (axes * (matrices @ axes)).sum(dim=1) * size[:, :, 0]
 
 
-def quaternions(rotations: Tensor) -> Tensor:
+def _quaternions(rotations: Tensor) -> Tensor:
     """Return (w, x, y, z) [N, 4] of rotations [N, 3, 3], over the largest of the four (Shepperd 1978)."""
     r = rotations
     xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]

@@ -7,6 +7,8 @@ pinhole image of the wanted size, re-centres the world in float64 and splits the
 
 from __future__ import annotations
 
+import hashlib
+import os
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -378,3 +380,20 @@ def _orientation(view: SourceView, header: ImageHeader, exif: str) -> int:
     swaps = header.orientation >= 5 and view.lens.width != view.lens.height
     turned = (view.lens.width > view.lens.height) != (header.width > header.height)
     return header.orientation if swaps and turned else 1
+
+
+def capture_fingerprint(capture: Capture) -> str:
+    """Return a digest of the cameras, the points and the split."""
+    digest = hashlib.sha256()
+    for camera in capture.cameras:
+        digest.update(os.fsencode(f"{camera.name} {camera.width} {camera.height}"))
+        digest.update(camera.K.tobytes() + camera.world_to_camera.tobytes())
+    digest.update(capture.points.tobytes() + capture.colors.tobytes())
+    digest.update(repr((capture.train, capture.test)).encode())
+    return digest.hexdigest()[:12]
+
+
+def train_views_fingerprint(capture: Capture) -> str:
+    """Return a digest of the names of the training views, in their order."""
+    names = [capture.cameras[index].name for index in capture.train]
+    return hashlib.sha256(repr(names).encode()).hexdigest()[:12]

@@ -8,8 +8,9 @@ Poses map world to camera: x_camera = R(q) x_world + t with q = (w, x, y, z); pi
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, fields
+import struct
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -198,16 +199,100 @@ def write_model(folder: Path | str, model: ColmapModel, *, text: bool = False) -
             stand in the file.
     """
     folder = Path(folder)
+    _check(model, text)
     folder.mkdir(parents=True, exist_ok=True)
-    suffix = ".txt" if text else ".bin"
-    rows = [(c.id, c.model, c.width, c.height, [float(p) for p in c.params]) for c in model.cameras]
-    native.write_cameras(os.fsencode(folder / f"cameras{suffix}"), rows)
-    native.write_images(os.fsencode(folder / f"images{suffix}"), _columns(model.images))
-    native.write_points(os.fsencode(folder / f"points3D{suffix}"), _columns(model.points))
+    files = _texts_of(model) if text else _bytes_of(model)
+    for name, content in zip(FILES, files, strict=True):
+        (folder / (name + (".txt" if text else ".bin"))).write_bytes(content)
 
 
-def _columns(table: ColmapImages | ColmapPoints) -> dict[str, Any]:
-    return {f.name: getattr(table, f.name) for f in fields(table)}
+def _check(model: ColmapModel, text: bool) -> None:
+    """Refuse a model that its files could not hold."""
+    for camera in model.cameras:
+        if len(camera.params) != len(camera_models()[camera.model]):
+            raise ValueError(f"camera {camera.id}: {len(camera.params)} parameters do not fit {camera.model}")
+    images, points = model.images, model.points
+    n, m = len(images.ids), len(points.ids)
+    for what, found, wanted in (
+        ("images: quats [N, 4]", images.quats.shape, (n, 4)),
+        ("images: translations [N, 3]", images.translations.shape, (n, 3)),
+        ("images: camera_ids [N]", images.camera_ids.shape, (n,)),
+        ("images: names [N]", (len(images.names),), (n,)),
+        ("images: points2d [O, 2]", images.points2d.shape, (int(images.point2d_offsets[-1]), 2)),
+        ("images: point3d_ids [O]", images.point3d_ids.shape, (int(images.point2d_offsets[-1]),)),
+        ("points: positions [M, 3]", points.positions.shape, (m, 3)),
+        ("points: colors [M, 3]", points.colors.shape, (m, 3)),
+        ("points: errors [M]", points.errors.shape, (m,)),
+        ("points: track_image_ids", points.track_image_ids.shape, (int(points.track_offsets[-1]),)),
+        ("points: track_point2d_ids", points.track_point2d_ids.shape, (int(points.track_offsets[-1]),)),
+    ):
+        if found != wanted:
+            raise ValueError(f"{what} must have the shape {wanted}, got {found}")
+    for name in images.names:
+        if not name or "\0" in name or "\n" in name:
+            raise ValueError(f"images: the name {name!r} is empty or has a NUL or line break in it")
+        if text and name != name.strip(" \t\r\v\f"):
+            raise ValueError(
+                f"images: the name '{name}' begins or ends with a blank, which readers of text strip; rename "
+                "the image or write the model as .bin"
+            )
+
+
+def _bytes_of(model: ColmapModel) -> Iterator[bytes]:
+    """Yield the binary files of a model."""
+    ids = {name: number for number, name, _ in native.camera_models()}
+    cameras = (
+        struct.pack(f"<IiQQ{len(c.params)}d", c.id, ids[c.model], c.width, c.height, *c.params)
+        for c in model.cameras
+    )
+    yield struct.pack("<Q", len(model.cameras)) + b"".join(cameras)
+    images, points = model.images, model.points
+    poses = zip(images.ids, images.quats, images.translations, images.camera_ids, images.names, strict=True)
+    heads = [struct.pack("<I7dI", i, *q, *t, c) + os.fsencode(name) + b"\0" for i, q, t, c, name in poses]
+    observations = np.empty(len(images.points2d), [("xy", "<f8", 2), ("id", "<i8")])
+    observations["xy"], observations["id"] = images.points2d, images.point3d_ids
+    yield _joined(heads, images.point2d_offsets, observations)
+    table = np.empty(len(points.ids), [("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")])
+    table["id"], table["xyz"], table["rgb"] = points.ids, points.positions, points.colors
+    table["error"] = points.errors
+    tracks = np.empty(len(points.track_image_ids), [("image", "<u4"), ("point2d", "<u4")])
+    tracks["image"], tracks["point2d"] = points.track_image_ids, points.track_point2d_ids
+    yield _joined([row.tobytes() for row in table], points.track_offsets, tracks)
+
+
+def _joined(heads: list[bytes], offsets: npt.NDArray[np.uint64], rows: npt.NDArray[np.void]) -> bytes:
+    """Return the number of records, and for each its head, the number of its rows, and these."""
+    parts, data, size = [struct.pack("<Q", len(heads))], rows.tobytes(), rows.itemsize
+    ends = offsets.tolist()
+    for head, begin, end in zip(heads, ends, ends[1:], strict=False):
+        parts += [head, struct.pack("<Q", end - begin), data[begin * size : end * size]]
+    return b"".join(parts)
+
+
+def _texts_of(model: ColmapModel) -> Iterator[bytes]:
+    """Yield the text files of a model; numbers are the shortest that are read back as the same bits."""
+
+    def line(*values: Any) -> str:
+        return " ".join(map(str, values)) + "\n"
+
+    images, points = model.images, model.points
+    yield "".join(line(c.id, c.model, c.width, c.height, *c.params) for c in model.cameras).encode()
+    observed = np.column_stack([images.points2d.astype(object), images.point3d_ids.astype(object)])
+    poses = zip(images.ids, images.quats, images.translations, images.camera_ids, images.names, strict=True)
+    ends = images.point2d_offsets.tolist()
+    lines = [
+        line(i, *q, *t, c, name) + line(*observed[begin:end].ravel())
+        for (i, q, t, c, name), begin, end in zip(poses, ends, ends[1:], strict=False)
+    ]
+    yield os.fsencode("".join(lines))
+    tracks = np.column_stack([points.track_image_ids, points.track_point2d_ids])
+    rows = zip(points.ids, points.positions, points.colors, points.errors, strict=True)
+    ends = points.track_offsets.tolist()
+    lines = [
+        line(i, *xyz, *rgb, error, *tracks[begin:end].ravel())
+        for (i, xyz, rgb, error), begin, end in zip(rows, ends, ends[1:], strict=False)
+    ]
+    yield "".join(lines).encode()
 
 
 def quats_to_rotations(quats: Float64) -> Float64:
@@ -220,6 +305,27 @@ def quats_to_rotations(quats: Float64) -> Float64:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotation_to_quat(rotation: Float64) -> Float64:
+    """Return (w, x, y, z), w >= 0, of a rotation matrix [3, 3], through its largest component."""
+    r = rotation
+    squares = np.array(
+        [
+            1 + r[0, 0] + r[1, 1] + r[2, 2],
+            1 + r[0, 0] - r[1, 1] - r[2, 2],
+            1 - r[0, 0] + r[1, 1] - r[2, 2],
+            1 - r[0, 0] - r[1, 1] + r[2, 2],
+        ]
+    )
+    largest = int(squares.argmax())
+    a, b, c = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    d, e, f = r[1, 0] + r[0, 1], r[0, 2] + r[2, 0], r[2, 1] + r[1, 2]
+    rows = np.array(
+        [[squares[0], a, b, c], [a, squares[1], d, e], [b, d, squares[2], f], [c, e, f, squares[3]]]
+    )
+    quat: Float64 = rows[largest] / np.linalg.norm(rows[largest])
+    return quat if quat[0] >= 0 else -quat
 
 
 def world_to_camera(images: ColmapImages) -> Float64:

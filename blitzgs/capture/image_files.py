@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -176,8 +177,31 @@ def read_whole(path: Path) -> bytes:
     if data[:2] == b"\xff\xd8":
         native.check_jpeg(data, os.fsencode(path))
     elif data[:8] == _PNG_START:
-        native.check_png(data, os.fsencode(path))
+        check_png(data, str(path))
     return data
+
+
+def check_png(data: bytes, name: str) -> None:
+    """Refuse a PNG without all of its chunks, or with a wrong checksum of one that a picture needs.
+
+    Raises:
+        FormatError: names the file, the byte offset and the reason.
+    """
+    at, kinds = len(_PNG_START), set()
+    while b"IEND" not in kinds:
+        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
+        if len(data) < max(end, at + 12):
+            raise native.FormatError(f"{name}: at byte {at}: truncated PNG: it ends before its last chunk")
+        kind = data[at + 4 : at + 8]
+        # The names of chunks that a picture needs begin with a capital letter. Others may be damaged.
+        is_needed = not kind[0] & 0x20 or kind == b"tRNS"
+        checksum = int.from_bytes(data[end - 4 : end], "big")
+        if is_needed and zlib.crc32(memoryview(data)[at + 4 : end - 4]) != checksum:
+            raise native.FormatError(f"{name}: at byte {at}: damaged PNG: the checksum of a chunk is wrong")
+        kinds.add(kind)
+        at = end
+    if b"IDAT" not in kinds:
+        raise native.FormatError(f"{name}: damaged PNG: it has no image data")
 
 
 def decode_rgb(data: bytes, name: str, background: tuple[float, float, float] | None = None) -> UInt8:
@@ -307,3 +331,33 @@ def apply_orientation(pixels: UInt8, orientation: int) -> UInt8:
     for turn in _TURNS.get(orientation, ()):
         pixels = np.asarray(cv2.rotate(pixels, turn))
     return pixels
+
+
+def reduced(pixels: UInt8, mask: UInt8 | None, factor: int) -> UInt8:
+    """Return the mean colours of squares of `factor` x `factor` pixels, rounded.
+
+    The rest of a width or height that does not divide is cut off on the right and below, so that the pinhole
+    of the result has the same intrinsics divided by `factor`.
+
+    Args:
+        pixels: [H, W, 3], or [H, W].
+        mask: [H, W], 0 = excluded; None: all pixels count. A mean is that of the pixels that count, or 0
+            where none does.
+        factor: at most 16.
+    """
+    width, height = pixels.shape[1] // factor, pixels.shape[0] // factor
+    pixels = pixels[: height * factor, : width * factor]
+    if mask is None:
+        return np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    # In float32, these sums are exact.
+    counted = (mask[: height * factor, : width * factor] != 0).astype(np.float32)
+    share = cv2.resize(counted, (width, height), interpolation=cv2.INTER_AREA)
+    sums = cv2.resize(pixels * counted[..., None], (width, height), interpolation=cv2.INTER_AREA)
+    return np.rint(sums / np.maximum(share, factor**-2)[..., None]).astype(np.uint8)
+
+
+def reduced_mask(mask: UInt8, factor: int) -> UInt8:
+    """Return which squares of `factor` x `factor` pixels count, 0 or 1: at least half of their pixels do."""
+    height, width = mask.shape[0] // factor, mask.shape[1] // factor
+    squares = (mask[: height * factor, : width * factor] != 0).reshape(height, factor, width, factor)
+    return (2 * squares.sum((1, 3)) >= factor**2).astype(np.uint8)

@@ -21,7 +21,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeAlias, Unpack
+from typing import Protocol, TypeAlias
 
 import cv2
 import numpy as np
@@ -33,8 +33,15 @@ from blitzgs.capture.bounded_cache import BoundedCache as BoundedCache
 from blitzgs.capture.cameras import Camera, same_shape
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.check_files import FileCheck, mask_error
-from blitzgs.capture.image_files import UInt8, apply_orientation, decode_mask, decode_rgb, read_whole
-from blitzgs.capture.reduced import reduced, reduced_mask
+from blitzgs.capture.image_files import (
+    UInt8,
+    apply_orientation,
+    decode_mask,
+    decode_rgb,
+    read_whole,
+    reduced,
+    reduced_mask,
+)
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.capture.undistort import Rectification
 from blitzgs.formats import native
@@ -179,7 +186,7 @@ class ImageStore:
             ValueError: the file is damaged or its size changed; names it.
             OSError: the file cannot be read.
         """
-        return torch.from_numpy(self._result("image", index, factor))
+        return torch.from_numpy(self._result(("image", index, factor)))
 
     def mask(self, index: int, factor: int = 1) -> Tensor | None:
         """Return which pixels count, uint8 0 or 1 [height, width]; None: all. Shared: do not write to it.
@@ -189,7 +196,7 @@ class ImageStore:
         """
         if not has_mask(self.capture.cameras[index]):
             return None
-        return torch.from_numpy(self._result("mask", index, factor))
+        return torch.from_numpy(self._result(("mask", index, factor)))
 
     def prefetch(self, indices: Iterable[int], masks: Iterable[int] = (), factor: int = 1) -> None:
         """Start to decode what is needed next, in order, as much as the memory for decoded images holds.
@@ -247,7 +254,7 @@ class ImageStore:
         budget = self.compressed.budget
         return budget // 4 + budget - self.compressed.bytes
 
-    def _result(self, *key: Unpack[_Key]) -> UInt8:
+    def _result(self, key: _Key) -> UInt8:
         if self._check is not None and self._check.damage is not None:
             raise ValueError(self._check.damage)
         found = self._submit(key)

@@ -9,14 +9,22 @@ import dataclasses
 import numpy as np
 
 from blitzgs.capture.cameras import Float64, camera_centres
-from blitzgs.capture.capture import Capture, load_capture
+from blitzgs.capture.capture import Capture
 from blitzgs.capture.control_points import Placed, align, place, read_control_points
-from blitzgs.capture.gps import gps_positions
-from blitzgs.capture.world import GEOCENTRIC, WorldFrame, converted, fit_similarity, frame_in, pyproj_module
+from blitzgs.capture.world import (
+    GEOCENTRIC,
+    WorldFrame,
+    converted,
+    fit_similarity,
+    frame_in,
+    gps_positions,
+    pyproj_module,
+)
 from blitzgs.cli.arguments import Commands, add_capture, add_command, add_run, named_path
 from blitzgs.config.files import load_config
 from blitzgs.runs import files as run_files
 from blitzgs.runs.world import load_frame, save_frame
+from blitzgs.training.inputs import load_configured
 from blitzgs.util.terminal import printable
 
 HELP = """\
@@ -66,18 +74,7 @@ def _capture(args: argparse.Namespace) -> Capture:
     data = load_config(args.folder / run_files.CONFIG).data
     if args.data is not None:
         data = dataclasses.replace(data, path=str(args.data))
-    return load_capture(
-        data.path,
-        images=data.images,
-        split=data.split,
-        masks=False,
-        undistort=data.undistort,
-        exif=data.exif,
-        allow_missing=data.allow_missing,
-        sparse=data.sparse,
-        stray_cameras=data.stray_cameras,
-        inside_only=data.inside_only,
-    )
+    return load_configured(dataclasses.replace(data, masks=False, downscale=1))
 
 
 def _by_points(args: argparse.Namespace, capture: Capture) -> WorldFrame:

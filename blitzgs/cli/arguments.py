@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from blitzgs.config.ranges import RANGES
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from blitzgs.capture.capture import Capture
     from blitzgs.runs.cameras import RunCameras
 
+Number = TypeVar("Number", int, float)
 Commands = argparse._SubParsersAction  # argparse has no public name for it
 
 
@@ -74,24 +75,28 @@ def add_capture(parser: argparse.ArgumentParser) -> None:
 
 def add_pool(parser: argparse.ArgumentParser) -> None:
     """Add the flag --resident-gb: views may need a larger pool on fewer ranks than the run was trained on."""
+    field = "memory.resident_gb"
     parser.add_argument(
         "--resident-gb",
-        type=_gigabytes,
+        type=number(float, lambda value: value in RANGES[field], str(RANGES[field])),
         metavar="GB",
         help="gigabytes of each device that hold Gaussians; those that do not fit stay in host memory; 0: "
         "all are on the device (default: memory.resident_gb of the run)",
     )
 
 
-def _gigabytes(text: str) -> float:
-    allowed = RANGES["memory.resident_gb"]
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan  # which is not in any range
-    if value not in allowed:
-        raise argparse.ArgumentTypeError(f"must be {allowed}, got {text}")
-    return value
+def number(
+    kind: Callable[[str], Number], fits: Callable[[Number], bool], described: str
+) -> Callable[[str], Number]:
+    """Return a type of argparse: numbers that fit; `described` follows "must be" in the error."""
+
+    def parsed(text: str) -> Number:
+        with suppress(ValueError):
+            if fits(value := kind(text)):
+                return value
+        raise argparse.ArgumentTypeError(f"must be {described}, got {text}")
+
+    return parsed
 
 
 def add_split(parser: argparse.ArgumentParser, verb: str) -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import re
 import sys
@@ -13,13 +12,21 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_model, named_path
+from blitzgs.cli.arguments import (
+    Commands,
+    add_capture,
+    add_command,
+    add_device,
+    add_model,
+    named_path,
+    number,
+)
 from blitzgs.cli.export_tiles import HELP as TILES_HELP
 from blitzgs.cli.export_tiles import add_flags, add_kinds, check_flags, export_tiles, is_tiles
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import GaussianSource, is_antialiased
-from blitzgs.formats.models import FORMATS, Format, check_replaces, offset_of, read_gaussians
+from blitzgs.formats.models import FORMATS, Format, check_replaces, offset_of, open_gaussians
 from blitzgs.formats.selection import Selected, Selection, read_polygon
 from blitzgs.formats.web_page import check_replaces_page
 from blitzgs.runs.clean import cleaned
@@ -78,7 +85,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     add_kinds(kind)
     parser.add_argument(
         "--max-mb",
-        type=_megabytes,
+        type=number(float, lambda mb: 0 < mb <= LARGEST_MB, f"a number of megabytes up to {LARGEST_MB}"),
         metavar="MB",
         help=f"with --html: largest size of the file in megabytes (default: {MAX_MB})",
     )
@@ -179,10 +186,9 @@ def _export_file(args: argparse.Namespace) -> int:
         for flag in ("classic", "clean", "coordinates"):
             if getattr(args, flag):
                 raise ValueError(f"--{flag} needs the folder of a run, and {args.model} is a file")
-        found = read_gaussians(args.model)
-        source: GaussianSource = found
+        source = open_gaussians(args.model)
         if selection is not None:
-            source = Selected(found, selection, offset_of(found.comments))
+            source = Selected(source, selection, offset_of(source.comments))
         kind.write(path, source)
         written = Exported(None, None, 0.0)
     else:
@@ -281,16 +287,6 @@ def _levels(text: str) -> tuple[int, int]:
     if match is None or int(match[1]) > int(match[2] or match[1]):
         raise argparse.ArgumentTypeError(f"must be two levels such as 0-3, or one, got {text}")
     return int(match[1]), int(match[2] or match[1])
-
-
-def _megabytes(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value <= LARGEST_MB:
-        raise argparse.ArgumentTypeError(f"must be a number of megabytes up to {LARGEST_MB}, got {text}")
-    return value
 
 
 def _explain(exported: Exported, antialiased: bool, kind: Format, args: argparse.Namespace) -> None:

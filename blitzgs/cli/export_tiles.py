@@ -8,7 +8,7 @@ import os
 import time
 from typing import TYPE_CHECKING
 
-from blitzgs.cli.arguments import named_path
+from blitzgs.cli.arguments import named_path, number
 from blitzgs.formats.selection import Selected, Selection
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ A city that no browser holds at once is written as a folder that viewers load pi
 Memory does not grow with the model; the disk needs twice the size of the model. See docs/guide/tiles.md.
 """
 _FLAGS = ("tile_gaussians", "processes")
+_POSITIVE = number(int, lambda value: value >= 1, "a whole number from 1 on")
 
 
 def add_kinds(kind: _MutuallyExclusiveGroup) -> None:
@@ -42,13 +43,13 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of both."""
     parser.add_argument(
         "--tile-gaussians",
-        type=_positive,
+        type=_POSITIVE,
         metavar="N",
         help="with --tiles and --streamed-sog: Gaussians of a tile (default: 32768)",
     )
     parser.add_argument(
         "--processes",
-        type=_positive,
+        type=_POSITIVE,
         metavar="N",
         help="with --tiles and --streamed-sog: processes that write tiles (default: as many as CPU cores)",
     )
@@ -97,13 +98,3 @@ def export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
     if args.tiles:
         print(f"look at it: blitzgs view {path}")
     return 0
-
-
-def _positive(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be a whole number from 1 on, got {text}")
-    return value

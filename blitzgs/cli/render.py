@@ -7,7 +7,6 @@ import argparse
 import io
 import itertools
 import json
-import math
 import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -28,6 +27,7 @@ from blitzgs.cli.arguments import (
     add_pool,
     add_split,
     named_path,
+    number,
 )
 from blitzgs.cli.rendered import Rendered, open_rendered
 from blitzgs.distributed.group import Ranks
@@ -44,6 +44,8 @@ from blitzgs.viewer.film import Film, read_film
 
 # What may be written beside the colours.
 MEASURED: tuple[Mode, ...] = ("depth", "alpha")
+
+_POSITIVE = number(float, lambda value: 0 < value < 1e6, "a positive number")
 
 HELP = """\
 Render views of a model to pictures, or a camera path to a film:
@@ -86,10 +88,10 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         "--size", type=_size, metavar="WxH", help="with --path: pixels (default: the file's, else 1920x1080)"
     )
     parser.add_argument(
-        "--fps", type=_positive, help="with --path: frames a second (default: the file's, else 30)"
+        "--fps", type=_POSITIVE, help="with --path: frames a second (default: the file's, else 30)"
     )
     parser.add_argument(
-        "--seconds", type=_positive, help="with --path: duration (default: the file's, else 10)"
+        "--seconds", type=_POSITIVE, help="with --path: duration (default: the file's, else 10)"
     )
     parser.add_argument(
         "--dataparser",
@@ -257,16 +259,6 @@ def _npy(values: npt.NDArray[np.float32]) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, values)
     return buffer.getvalue()
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"must be a positive number, got {text}")
-    return value
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -28,7 +28,7 @@ Masks in masks/ (black: not used) keep features away from what moves. COLMAP doe
 install 'blitzgs[sfm]') or the program colmap, on a GPU if it is built for one.
 
 Photographs of one camera (by EXIF, else by size and folder) share its lens. With GPS in 9 of 10 photographs,
-each is matched with its 50 nearest and the model is in metres east, north and up (sfm/georeference.json);
+each is matched with its 50 nearest and the model is in metres east, north and up (CAPTURE/geo.json);
 altitudes that are missing, equal or contradictory are left out. Without GPS all pairs are matched, or, of
 more than 300 photographs, neighbours by name. More than 500 photographs are placed by the global mapper.
 

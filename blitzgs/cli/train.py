@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import math
 import os
 import shlex
 import sys
@@ -17,9 +16,9 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from blitzgs.cli.arguments import Commands, add_command, add_device, named_path
-from blitzgs.cli.final_report import kept_warnings, write_final_report
+from blitzgs.cli.arguments import Commands, add_command, add_device, named_path, number
 from blitzgs.cli.live import add_live_page, check_live_page, live_page, say_where_to_look
+from blitzgs.cli.report import kept_warnings, write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
 from blitzgs.config.describe import describe, describe_all, describe_page
 from blitzgs.config.fields import Config, Transport
@@ -28,13 +27,20 @@ from blitzgs.config.recipes import default_recipe, recipe_path
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.folder_checks import locked
+from blitzgs.training.budget import LEAST_IMAGES
 from blitzgs.training.estimate import estimate
-from blitzgs.training.extension import LEAST_IMAGES
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import check_worlds, understood
-from blitzgs.util.laps import Laps
+from blitzgs.util.progress import Laps
 from blitzgs.util.terminal import printable
+
+# See `blitzgs.training.budget.extended`.
+_EXTENSION = number(
+    float,
+    lambda value: 1 < value < LEAST_IMAGES or (value.is_integer() and value >= LEAST_IMAGES),
+    f"a number of images from {LEAST_IMAGES} on, or a factor above 1",
+)
 
 HELP = """\
 Train a model of a capture, which is a folder DIR with photographs and their cameras: a COLMAP model
@@ -104,7 +110,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     )
     parser.add_argument(
         "--extend",
-        type=_extension,
+        type=_EXTENSION,
         metavar="IMAGES|FACTOR",
         help="train the finished run in RUN longer: by a number of images (100 or more), or to a multiple of "
         "its length (--extend=1.5)",
@@ -156,19 +162,6 @@ class _Help(argparse.Action):
         else:
             parser.print_help()
         parser.exit()
-
-
-def _extension(text: str) -> float:
-    """Return what --extend says; see `blitzgs.training.extension.extended`."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (1 < value < math.inf and (value < LEAST_IMAGES or value.is_integer())):
-        raise argparse.ArgumentTypeError(
-            f"must be a number of images from {LEAST_IMAGES} on, or a factor above 1, got {text}"
-        )
-    return value
 
 
 def run(args: argparse.Namespace) -> int:

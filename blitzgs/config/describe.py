@@ -17,8 +17,7 @@ from typing import Any
 
 import yaml
 
-from blitzgs.config.errors import ConfigError
-from blitzgs.config.fields import Config
+from blitzgs.config.fields import Config, ConfigError
 from blitzgs.config.ranges import RANGES
 
 _WIDTH = 100

@@ -178,6 +178,8 @@ class OptimiserConfig:
         position, position_final: learning rates of the means, relative to extent, at the start and after
             `schedule.position_decay`.
         sh_dc, sh_rest, opacity, scale, rotation: learning rates.
+        final: share of the rates of colour, scale and rotation that is left in the end; they fall from
+            `schedule.densify_until` until `schedule.position_decay`. 1: they are constant.
         position_noise: strength of the random steps of almost transparent Gaussians, relative to the position
             rate (3DGS-MCMC's noise, with lengths relative to extent); 0: none.
     """
@@ -189,6 +191,7 @@ class OptimiserConfig:
     opacity: float = 2.5e-2
     scale: float = 5e-3
     rotation: float = 1e-3
+    final: float = 1.0
     position_noise: float = 0.0
 
 
@@ -400,3 +403,7 @@ class Config:
     ranks: RanksConfig = field(default_factory=RanksConfig)
     log: LogConfig = field(default_factory=LogConfig)
     seed: int = 0
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names the field, the value and the remedy."""

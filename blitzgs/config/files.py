@@ -11,14 +11,14 @@ import json
 import math
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from blitzgs.config.errors import ConfigError as ConfigError
 from blitzgs.config.fields import Config
+from blitzgs.config.fields import ConfigError as ConfigError
 from blitzgs.config.ranges import problems
 from blitzgs.config.recipes import base_file
 from blitzgs.util.output import write_file
@@ -30,7 +30,7 @@ class Ignored:
 
 # Fields of earlier versions, each with the value that stands for what BlitzGS does now. Files and checkpoints
 # that have this value are still read.
-REMOVED: typing.Mapping[str, Any] = {
+REMOVED: Mapping[str, Any] = {
     "model.far": 1e6,
     "model.eps2d": 0.3,
     "model.initial_opacity": 0.1,
@@ -97,6 +97,15 @@ def to_dict(config: Config) -> dict[str, Any]:
     """Return the configuration as nested dictionaries of JSON-able values."""
     result: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
     return result
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the values of nested dictionaries by names such as "section.field"."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        nested = isinstance(value, Mapping)
+        found |= flat(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
+    return found
 
 
 def save_config(config: Config, path: Path) -> None:

@@ -82,6 +82,7 @@ RANGES: Mapping[str, Range] = {
     "optimiser.opacity": _RATE,
     "optimiser.scale": _RATE,
     "optimiser.rotation": _RATE,
+    "optimiser.final": Range(1e-9, 1),
     "optimiser.position_noise": Range(0, 1e12),
     "loss.ssim": Range(0, 1),
     "loss.opacity": Range(0, 1e6),

@@ -6,7 +6,7 @@ from __future__ import annotations
 import difflib
 from pathlib import Path
 
-from blitzgs.config.errors import ConfigError
+from blitzgs.config.fields import ConfigError
 
 # The name that stands for the default of every field, without a file.
 DEFAULTS = "defaults"

@@ -154,7 +154,9 @@ class Schedule:
         """Tabulate the learning rates of the whole run.
 
         The position rate falls exponentially from `position` to `position_final` over `position_decay`
-        images, both times `extent`; with `position` 0 it stays 0. Every rate is multiplied by sqrt(B).
+        images, both times `extent`; with `position` 0 it stays 0. The opacity rate is constant. The other
+        rates fall exponentially from `densify_until` to `position_decay`, where `final` of them is left.
+        Every rate is multiplied by sqrt(B).
 
         Args:
             config: the rates for B = 1.
@@ -165,11 +167,13 @@ class Schedule:
         """
         begin = torch.arange(self.steps, dtype=torch.float64) * self.batch_size
         times = self.pace.times(begin)
-        progress = (times / self._config.position_decay).clamp(max=1.0)
+        densify_until, end = self._config.densify_until, self._config.position_decay
+        progress = (times / end).clamp(max=1.0)
         fall = config.position_final / config.position if config.position > 0 else 0.0
         position = config.position * fall**progress * extent
-        constants = (config.rotation, config.scale, config.opacity, config.sh_dc, config.sh_rest)
+        share = config.final ** ((times - densify_until) / max(end - densify_until, 1)).clamp(0.0, 1.0)
         table = torch.zeros(self.steps + 1, len(RATES), dtype=torch.float64)
-        table[1:, 0] = position
-        table[1:, 1:] = torch.tensor(constants, dtype=torch.float64)
+        falling = (config.rotation, config.scale, 0.0, config.sh_dc, config.sh_rest)
+        table[1:, 1:] = share[:, None] * torch.tensor(falling, dtype=torch.float64)
+        table[1:, 0], table[1:, RATES.index("opacities")] = position, config.opacity
         return (table * math.sqrt(self.batch_size)).float()

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.host import PinnedNumbers, current_stream
-from blitzgs.ops.report import report_
+from blitzgs.ops.photometric import report_
 
 
 class _Side:

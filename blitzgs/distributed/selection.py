@@ -14,13 +14,12 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.mass_cut import CHOICE_STEP, STEPS, TIES_STEP, MassCut
+from blitzgs.ops.sampling import KEY_BITS, key_histogram, key_of_bits
 
 # Digits of a threshold search, most significant first. The first digit of a score is its exponent and three
 # bits of its mantissa, so all scores of a bin share one exponent and their mantissas can be summed exactly.
-# Keys are of one set of rows, so their histograms may be large; fewer rounds need fewer waits.
-_KEY_DIGITS = (16, 16)
+_KEY_DIGITS = (11, 11, 10)
 _SCORE_DIGITS = (11, 10, 10)
 _ID_DIGITS = (13, 13, 13, 12, 12)
 _MANTISSA_BITS = 23
@@ -33,24 +32,6 @@ def decimal_share(share: float) -> Fraction:
     the floor of its exact product with 100 would be 98.
     """
     return Fraction(repr(float(share)))
-
-
-def sampling_keys(weights: Tensor, ids: Tensor, seed: int, event: int) -> Tensor:
-    """Draw keys; the k smallest are a sample without replacement, with probability proportional to weight.
-
-    key = -log(u) / weight with u uniform in (0, 1) from (seed, event, id) alone (exponential races,
-    Efraimidis and Spirakis 2006).
-
-    Args:
-        weights: float32 [N], >= 0; zero gives an infinite key, never chosen while a positive one remains.
-        ids: int64 [N], persistent.
-        seed: of the run.
-        event: number that differs between draws.
-
-    Returns:
-        float32 [N].
-    """
-    return (-uniform(seed, event, ids).log() / weights.double()).float()
 
 
 def smallest(keys: Tensor, ids: Tensor, k: int, ranks: Ranks) -> Tensor:
@@ -74,12 +55,23 @@ def smallest(keys: Tensor, ids: Tensor, k: int, ranks: Ranks) -> Tensor:
     n_invalid, total = ranks.all_reduce(invalid).tolist()
     if n_invalid:
         raise ValueError(f"smallest: {n_invalid} of {total} keys are NaN")
-    if k >= total:
-        return torch.ones_like(keys, dtype=torch.bool)
-    segments = torch.zeros_like(ids)
-    digits = _ordered_bits(keys)
-    threshold, left = _kth(digits, _KEY_DIGITS, torch.full((1,), k, device=keys.device), segments, ranks)
-    return _with_ties(digits, ids, threshold, left, segments, ranks)
+    if k == 0 or k >= total:
+        return torch.full_like(keys, k > 0, dtype=torch.bool)
+    left = torch.full((1,), k, device=keys.device)
+    prefix, shift = torch.zeros_like(left), KEY_BITS
+    for width in _KEY_DIGITS:
+        shift -= width
+        counts = ranks.all_reduce(key_histogram(keys, prefix, shift, width))
+        digit, left = _descend(counts[None], left)
+        prefix = (prefix << width) | digit
+    limit = key_of_bits(prefix)
+    tied = keys == limit
+    # Usually all tied rows are selected.
+    if bool(counts[digit] > left):
+        rows = tied.nonzero().squeeze(1)
+        last, _ = _kth(ids[rows], _ID_DIGITS, left, torch.zeros_like(rows), ranks)
+        tied[rows] = ids[rows] <= last
+    return tied.logical_or_(keys < limit)
 
 
 def mass_prefix(
@@ -182,12 +174,6 @@ def integer_mass_prefix(
     return cut.chosen
 
 
-def _ordered_bits(keys: Tensor) -> Tensor:
-    """Map float32 to int64 in [0, 2^32) with the same order; -0 equals 0."""
-    bits = (keys + 0.0).view(torch.int32)
-    return (bits ^ ((bits >> 31) & 0x7FFFFFFF)).to(torch.int64) + (1 << 31)
-
-
 def _kth(
     keys: Tensor,
     digits: tuple[int, ...],
@@ -211,11 +197,16 @@ def _kth(
     for width in digits:
         shift -= width
         counts = _histogram(keys, prefix, shift, width, segments, None, ranks)
-        ends = counts.cumsum(1)
-        chosen = (ends < left[:, None]).sum(1).clamp(max=counts.shape[1] - 1)
-        left = left - (ends - counts).gather(1, chosen[:, None]).squeeze(1)
-        prefix = (prefix << width) | chosen
+        digit, left = _descend(counts, left)
+        prefix = (prefix << width) | digit
     return torch.where(k > 0, prefix, -1), torch.where(k > 0, left, 0)
+
+
+def _descend(counts: Tensor, left: Tensor) -> tuple[Tensor, Tensor]:
+    """Find the digit [S] at which counts [S, digits] reach `left` [S], and how many are left before it."""
+    ends = counts.cumsum(1)
+    digit = (ends < left[:, None]).sum(1).clamp(max=counts.shape[1] - 1)
+    return digit, left - (ends - counts).gather(1, digit[:, None]).squeeze(1)
 
 
 def _mass_threshold(

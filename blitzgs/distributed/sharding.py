@@ -36,7 +36,7 @@ def global_positions(sizes: Sequence[int], rank: int) -> Tensor:
 def shard_sizes(rows: int, ranks: Ranks) -> list[int]:
     """Return the present number of rows on each rank. Collective."""
     counts = ranks.all_gather(torch.tensor([rows], dtype=torch.int64, device=ranks.device))
-    return [int(count.item()) for count in counts]
+    return [int(count) for count in torch.cat(counts).tolist()]
 
 
 def imbalance(sizes: Sequence[int]) -> float:

@@ -64,7 +64,7 @@ def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float]
         FileExistsError: there is a file of another format.
         OSError: the file cannot be written, or `path` is no regular file; an existing file is unchanged.
     """
-    check_replaces_glb(path)
+    check_replaceable(path, (b"glTF",), " and is not a GLB file")
     count, columns = len(source), _columns(len(source), source.degree, source.has_levels)
     size = glb_bytes(count, source.degree, source.has_levels)
     if count == 0:
@@ -100,16 +100,6 @@ def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float]
         file.write(struct.pack("<4sIIII", b"glTF", 2, body + size, room, 0x4E4F534A))
         file.write(text)
         file.write(struct.pack("<II", size, 0x004E4942))
-
-
-def check_replaces_glb(path: Path) -> None:
-    """Check that writing a GLB file replaces no file of another format; see `check_replaceable`."""
-    check_replaceable(path)
-    if path.exists():
-        with open(path, "rb") as file:
-            start = file.read(4)
-        if start not in (b"", b"glTF"):
-            raise FileExistsError(f"{path} exists and is not a GLB file: choose another name")
 
 
 def _columns(count: int, degree: int, has_levels: bool) -> list[_Column]:

@@ -12,7 +12,7 @@ import torch
 from blitzgs.formats import packed
 from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased
 from blitzgs.formats.glb import write_glb
-from blitzgs.formats.ply import read_ply, save_ply
+from blitzgs.formats.ply import PlySource, read_ply, save_ply
 from blitzgs.formats.sog import write_sog
 from blitzgs.util.output import check_replaceable
 
@@ -79,14 +79,21 @@ def check_replaces(path: Path, kind: Format) -> None:
         FileExistsError: the file is not empty and no file of the format.
         OSError: it is no regular file.
     """
-    check_replaceable(path)
-    if path.exists() and kind.starts:
-        with open(path, "rb") as file:
-            start = file.read(4)
-        if start and not start.startswith(kind.starts):
-            raise FileExistsError(f"{path} exists and is not a {kind.title} file: choose another name")
+    check_replaceable(path, kind.starts, f" and is not a {kind.title} file")
     if path.suffix.lower() != kind.suffix:
         raise ValueError(f"{path}: the file will be {kind.title}: choose a name that ends in {kind.suffix}")
+
+
+def open_gaussians(path: Path) -> GaussianSource:
+    """Open a model that any program wrote; one in INRIA's layout is read block by block, others at once.
+
+    Raises:
+        ValueError, ImportError: see `read_gaussians`.
+    """
+    with open(path, "rb") as file:
+        header = file.read(_HEADER).partition(b"end_header")[0]
+    is_inria = header.startswith(b"ply") and b" packed_position" not in header
+    return PlySource(path) if is_inria else read_gaussians(path)
 
 
 def read_gaussians(path: Path | str) -> Gaussians:

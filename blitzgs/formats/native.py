@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled readers and writers of files (csrc/io), loaded when they are first needed.
+"""The compiled readers of files (csrc/io), loaded when they are first needed.
 
 They run without the GIL. Arrays that they return own the memory that was filled; arguments are not copied if
 they have the wanted type.
@@ -10,7 +10,6 @@ from __future__ import annotations
 import ctypes
 import os
 import weakref
-from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import Any
 
@@ -27,13 +26,9 @@ class FormatError(ValueError):
     """A file is damaged; the message has the file, the place and the reason."""
 
 
-class WriteError(OSError):
-    """A file cannot be written."""
-
-
 # In the order of blitzgs_io_type and blitzgs_io_status_code of csrc/io/io_api.h.
 _TYPES = tuple(np.dtype(name) for name in ("u1", "u4", "i8", "u8", "f8"))
-_ERRORS = (None, FormatError, WriteError, ValueError, MemoryError, RuntimeError)
+_ERRORS = (None, FormatError, ValueError, MemoryError, RuntimeError)
 
 
 class _Column(ctypes.Structure):
@@ -52,7 +47,7 @@ def _library() -> ctypes.CDLL:
         library = ctypes.CDLL(str(path))
     except OSError as error:
         raise ImportError(
-            f"the readers and writers of files are not built ({error}): run `pip install .`, or `make build` "
+            f"the readers of files are not built ({error}): run `pip install .`, or `make build` "
             "in a checkout"
         ) from error
     library.blitzgs_io_call.restype = ctypes.c_void_p
@@ -110,11 +105,6 @@ def _texts(characters: Array, ends: Array) -> list[str]:
     return [os.fsdecode(data[begin:end]) for begin, end in zip(begins, begins[1:], strict=False)]
 
 
-def _columns_of(texts: Iterable[str]) -> tuple[bytes, Array]:
-    data = [os.fsencode(text) for text in texts]
-    return b"".join(data), np.cumsum([len(text) for text in data], dtype="u8")
-
-
 def camera_models() -> list[tuple[int, str, str]]:
     """Return the id, name and parameters (separated by commas) of every camera model of COLMAP."""
     ids, names, name_ends, params, param_ends = _call("camera_models")
@@ -162,52 +152,6 @@ def read_points(path: Path, with_tracks: bool) -> dict[str, Array]:
     }
 
 
-def write_cameras(path: Path, rows: Sequence[tuple[int, str, int, int, Sequence[float]]]) -> None:
-    """Write cameras.bin or .txt; the inverse of `read_cameras`."""
-    ids, models, widths, heights, params = zip(*rows, strict=True) if rows else ((),) * 5
-    _call(
-        "write_cameras",
-        path,
-        _array(ids, "u4"),
-        *_columns_of(models),
-        _array(widths, "u8"),
-        _array(heights, "u8"),
-        _array([value for values in params for value in values], "f8"),
-        np.cumsum([len(values) for values in params], dtype="u8"),
-    )
-
-
-def write_images(path: Path, columns: dict[str, Any]) -> None:
-    """Write images.bin or .txt; the inverse of `read_images`."""
-    _call(
-        "write_images",
-        path,
-        _array(columns["ids"], "u4"),
-        _array(columns["quats"], "f8"),
-        _array(columns["translations"], "f8"),
-        _array(columns["camera_ids"], "u4"),
-        *_columns_of(columns["names"]),
-        _array(columns["point2d_offsets"], "u8"),
-        _array(columns["points2d"], "f8"),
-        _array(columns["point3d_ids"], "i8"),
-    )
-
-
-def write_points(path: Path, columns: dict[str, Any]) -> None:
-    """Write points3D.bin or .txt; the inverse of `read_points`."""
-    _call(
-        "write_points",
-        path,
-        _array(columns["ids"], "i8"),
-        _array(columns["positions"], "f8"),
-        _array(columns["colors"], "u1"),
-        _array(columns["errors"], "f8"),
-        _array(columns["track_offsets"], "u8"),
-        _array(columns["track_image_ids"], "u4"),
-        _array(columns["track_point2d_ids"], "u4"),
-    )
-
-
 def read_ply(
     path: Path, first: int = 0, most: int = 2**64 - 1
 ) -> tuple[list[str], list[tuple[str, str]], int, Array, int]:
@@ -225,23 +169,9 @@ def read_ply(
     return _texts(comments, comment_ends), properties, int(count[0]), rows, int(total[0])
 
 
-def write_ply(
-    path: Path, comments: Sequence[str], properties: Sequence[tuple[str, str]], count: int, rows: Array
-) -> None:
-    """Write the vertices of a PLY; the inverse of `read_ply`."""
-    names, types = zip(*properties, strict=True) if properties else ((), ())
-    texts = (*_columns_of(comments), *_columns_of(names), *_columns_of(types))
-    _call("write_ply", path, *texts, _array([count], "u8"), _array(rows, "u1"))
-
-
 def check_jpeg(data: bytes, name: Path) -> None:
     """Refuse a JPEG that is damaged (csrc/io/jpeg.h); `name` names it in the message."""
     _call("check_jpeg", data, name)
-
-
-def check_png(data: bytes, name: Path) -> None:
-    """Refuse a PNG that is damaged (csrc/io/image_header.h)."""
-    _call("check_png", data, name)
 
 
 def read_image_header(data: bytes, name: Path) -> dict[str, Any]:

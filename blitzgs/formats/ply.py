@@ -57,9 +57,18 @@ class PlySource:
         return self._count
 
     def blocks(self) -> Iterator[Gaussians]:
-        """Yield all Gaussians in order."""
+        """Yield all Gaussians in order.
+
+        Raises:
+            ValueError: a value cannot be shown; names the file.
+        """
         for first in range(0, self._count, BLOCK):
-            yield self._read(first, BLOCK)[0]
+            block, _ = self._read(first, BLOCK)
+            try:
+                block.check()
+            except ValueError as error:
+                raise ValueError(f"{self._path}, from Gaussian {first:,} on: {error}") from error
+            yield block
 
     def _read(self, first: int, most: int) -> tuple[Gaussians, int]:
         comments, properties, count, rows, total = native.read_ply(os.fsencode(self._path), first, most)
@@ -153,14 +162,15 @@ def save_ply(path: Path, source: GaussianSource, offset: npt.NDArray[np.float64]
     """Write Gaussians block by block; see `write_ply`."""
     check_replaces_ply(path)
     names = _property_names((source.degree + 1) ** 2) + [LEVEL] * source.has_levels
-    properties = [(name, "f4") for name in names]
+    for line in source.comments:
+        if not line.startswith(("comment", "obj_info")) or "\n" in line:
+            raise ValueError(f"ply: '{line}' is not one comment or obj_info line")
+    header = ["ply", "format binary_little_endian 1.0", *source.comments, f"element vertex {len(source)}"]
+    header += [*(f"property float {name}" for name in names), "end_header\n"]
     with new_file(path) as partial:
         try:
-            # The header of an empty file, with the number that it is to have.
-            native.write_ply(os.fsencode(partial), source.comments, properties, 0, np.empty(0, np.uint8))
-            header = partial.read_bytes()
             with open(partial, "wb") as file:
-                file.write(header.replace(b"\nelement vertex 0\n", b"\nelement vertex %d\n" % len(source)))
+                file.write(os.fsencode("\n".join(header)))
                 for block in source.blocks():
                     block.check()
                     file.write(_rows(block, len(names), offset).data)
@@ -195,13 +205,8 @@ def check_replaces_ply(path: Path) -> None:
         FileNotFoundError: there is no such folder.
         OSError: `path` is no regular file.
     """
-    check_replaceable(path)
-    if path.exists():
-        with open(path, "rb") as file:
-            start = file.read(3)
-        if start not in (b"", b"ply"):
-            raise FileExistsError(f"{path} exists and is not a PLY file: choose another name")
-    elif not path.parent.is_dir():
+    check_replaceable(path, (b"ply",), " and is not a PLY file")
+    if not path.parent.is_dir():
         raise FileNotFoundError(f"{path.parent} is not a folder: make it first, or choose another one")
 
 

@@ -128,12 +128,8 @@ def check_replaces_page(path: Path) -> None:
         FileExistsError: there is a file that is not empty and no page of ours.
         OSError: `path` is no regular file.
     """
-    check_replaceable(path)
-    if path.exists():
-        with open(path, "rb") as file:
-            start = file.read(2000)
-        if start and b'<meta name="generator" content="BlitzGS">' not in start:
-            raise FileExistsError(f"{path} exists, and blitzgs did not write it: choose another name")
+    mark = b'<meta name="generator" content="BlitzGS">'
+    check_replaceable(path, (mark,), ", and blitzgs did not write it")
 
 
 def packed(splats: WebSplats) -> bytes:
@@ -193,7 +189,7 @@ def estimated_bytes(splats: WebSplats) -> int:
 
 @cache
 def _part(name: str) -> str:
-    return resources.files("blitzgs.formats").joinpath("web", name).read_text(encoding="utf-8")
+    return resources.files("blitzgs.formats").joinpath(f"web/{name}").read_text(encoding="utf-8")
 
 
 def frame_bytes() -> int:

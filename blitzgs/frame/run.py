@@ -56,6 +56,7 @@ def run(
             transport.capacity.learn(needed)
         if result is not None:
             return result, consumed
+        del exchange, consumed  # before the next attempt takes as much memory again
     raise RuntimeError(
         f"{MAX_ATTEMPTS} attempts have each needed more than the one before had asked for: the last had "
         f"{sizes} and needs {tuple(needed)}. The inputs must not change during a call"

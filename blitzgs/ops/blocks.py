@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the rows that the views of a step may see, block by block, from conservative bounds of each block."""
+"""Finds the rows that the views of a step may see, block by block, from conservative bounds of each block.
+
+Also converts the cull mask between the layout by row, which moves with rows, and that of the kernels.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs._library import below_autograd
 
 BLOCK_ROWS = 256
@@ -47,7 +51,7 @@ class GateRules(NamedTuple):
         reach: one distance for each of 1 to 32 levels, in the unit of the means: up to it the level is kept.
             Distances must not increase towards finer levels; a negative one removes the level everywhere.
         lod_views: bit v is set when view v has an LOD gate.
-        cull: int32 [ceil(N / 256), columns, 8], of `blitzgs.ops.cull_mask`; None: there is none.
+        cull: int32 [ceil(N / 256), columns, 8], of `blitzgs.ops.blocks`; None: there is none.
         columns: of `cull`, one for each view; negative: the view has no mask. Empty: no view has one.
     """
 
@@ -232,3 +236,45 @@ def _(bounds: Tensor, *_args: object, capacity_blocks: int | None = None) -> tup
 @torch.library.register_fake("blitzgs::gate_views_")
 def _(*_args: object) -> None:
     return None
+
+
+# Bits of a word of a mask. In the layout by row, each bit is of one column.
+WORD_BITS = 32
+SECTOR_WORDS = BLOCK_ROWS // WORD_BITS
+
+
+@torch.no_grad()
+def sectors_of_rows(rows: Tensor) -> Tensor:
+    """Convert a mask from the layout by row to the layout by block and column (a column is a view).
+
+    Args:
+        rows: int32 [N, words]; bit v % 32 of word v / 32 is that of column v.
+
+    Returns:
+        int32 [ceil(N / 256), 32 words, 8]: for each block of 256 rows and column the 32 bytes of the rows'
+        bits; bit r % 32 of word r / 32 is that of the block's row r. Rows beyond N have zeros.
+
+    Raises:
+        RuntimeError: a wrong shape or dtype.
+    """
+    return torch.ops.blitzgs.sectors_of_rows(rows)
+
+
+@torch.no_grad()
+def rows_of_sectors(sectors: Tensor, n: int) -> Tensor:
+    """Convert a mask of N rows back to the layout by row, int32 [N, words]; the inverse of `sectors_of_rows`.
+
+    Raises:
+        RuntimeError: a wrong shape or dtype.
+    """
+    return torch.ops.blitzgs.rows_of_sectors(sectors, n)
+
+
+@torch.library.register_fake("blitzgs::sectors_of_rows")
+def _(rows: Tensor) -> Tensor:
+    return rows.new_empty(-(-rows.shape[0] // BLOCK_ROWS), WORD_BITS * rows.shape[1], SECTOR_WORDS)
+
+
+@torch.library.register_fake("blitzgs::rows_of_sectors")
+def _(sectors: Tensor, n: int) -> Tensor:
+    return sectors.new_empty(n, sectors.shape[1] // WORD_BITS)

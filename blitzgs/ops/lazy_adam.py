@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -108,12 +109,24 @@ class AdamSchedule(AdamTables):
             ValueError: decay rates outside their range.
         """
         self.betas, self.eps = (beta1, beta2), eps
-        self.lr_table, self.table = lr_table, _make_table(lr_table, beta1, beta2)
         self.explicit_steps = explicit_steps(beta1, beta2, dtype)
+        self._take(_make_table(lr_table, beta1, beta2), lr_table, dtype)
+
+    def _take(self, table: Tensor, lr_table: Tensor, dtype: torch.dtype) -> None:
+        self.table, self.lr_table, self._dtype = table, lr_table, dtype
         rules = torch.ops.blitzgs.lazy_adam_final_rules(
-            self.table, lr_table.new_empty(0, dtype=dtype), self.explicit_steps, eps
+            table, lr_table.new_empty(0, dtype=dtype), self.explicit_steps, self.eps
         )
-        self.tables = [self.table, lr_table, rules]
+        self.tables = [table, lr_table, rules]
+
+    def of_group(self, group: int) -> AdamSchedule:
+        """Return the schedule for a parameter alone (`AdamState.alone`) with the rates of one group."""
+        alone = copy.copy(self)
+        table, rates = self.table.clone(), self.lr_table[:, group, None].repeat(1, GROUPS)
+        tails = table[:, _TAILS].view(-1, ORDERS, GROUPS)
+        tails.copy_(tails[:, :, group, None].clone().expand_as(tails))
+        alone._take(table, rates, self._dtype)
+        return alone
 
 
 class GrowingSchedule(AdamTables):

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Computes L1 and SSIM of rendered views in one kernel, differentiable in the renders."""
+"""Computes L1 and SSIM of rendered views in one kernel, differentiable in the renders; reports their sums."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -107,8 +108,8 @@ def photometric_fwd_bwd(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the sums of `photometric_sums` and the gradient of their weighted total, without autograd.
 
-    The sums are returned as K partial sums; `blitzgs.ops.report` adds them up later, off the critical path of
-    a step. The gradient equals that of `photometric_sums`, but it is defined only at the owned pixels.
+    The sums are returned as K partial sums; `report_` adds them up later, off the critical path of a step.
+    The gradient equals that of `photometric_sums`, but it is defined only at the owned pixels.
 
     For the loss of `photometric_loss`, summed over views: ``l1_weights = 1 - w``, ``ssim_weights = -w`` and
     ``samples = pixel_counts(renders, masks)``.
@@ -205,3 +206,29 @@ def _backward(ctx: Any, v_l1_sums: Tensor, v_ssim_sums: Tensor) -> tuple[Tensor 
 
 
 torch.library.register_autograd("blitzgs::photometric_fwd", _backward, setup_context=_save_inputs)
+
+
+def report_(
+    parts: Tensor | None,
+    tile_work: Tensor | None,
+    tiles: tuple[int, int],
+    rank: int,
+    n_ranks: int,
+    targets: Sequence[Tensor],
+) -> None:
+    """Write this rank's part of the report into all targets.
+
+    A target has the loss sums of the M ranks, [M, 2, B], and then the work of the T tiles.
+
+    Args:
+        parts: float64 [B, K, 2], of `blitzgs.ops.photometric.photometric_fwd_bwd`; None: no views.
+        tile_work: int32 [T], of `rasterize_fwd`; None: no tiles.
+        tiles: this rank's [first, one past last).
+        rank: this rank.
+        n_ranks: M.
+        targets: float32 [2 M B + T] each, on this device or in peer-accessible memory of other devices.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes.
+    """
+    torch.ops.blitzgs.report_(parts, tile_work, *tiles, rank, n_ranks, targets)

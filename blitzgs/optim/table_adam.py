@@ -10,11 +10,12 @@ from torch import Tensor
 from blitzgs.config.fields import OptimiserConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.frame.frame import Frame
+from blitzgs.ops.copy_rows import put_rows_, take_rows
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_
 from blitzgs.ops.project_step import project_bwd_step_
 from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.ops.splat_gradients import SplatGradients
-from blitzgs.table.table import GaussianTable
+from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 
 # Adam's constants for one view a step.
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
@@ -30,6 +31,7 @@ class TableAdam:
 
     Attributes:
         lr_table: float32 [S + 1, 6], the learning rates of every step; see `Schedule.learning_rates`.
+        schedule: the tables of the lazy optimiser.
         pending_table: table that bounds the movement by pending steps (`AdamSchedule.table`).
     """
 
@@ -49,8 +51,9 @@ class TableAdam:
         rates = schedule.learning_rates(self._config, self._extent)
         self._position_rates = rates[:, 0].tolist()
         self.lr_table: Tensor = rates.to(self._device)  # type: ignore[call-overload]
-        self._schedule = AdamSchedule(self.lr_table, *self._betas, self._eps)
-        self.pending_table = self._schedule.table
+        self.schedule = AdamSchedule(self.lr_table, *self._betas, self._eps)
+        self.pending_table = self.schedule.table
+        self._alone: dict[str, AdamSchedule] = {}
 
     def position_rate(self, step: int) -> float:
         """Return the learning rate of the means in step `step` (from 1), in their unit."""
@@ -64,7 +67,17 @@ class TableAdam:
 
         ``count``, int32 [1]: only the first `count` of `ids` are rows.
         """
-        lazy_adam_catch_up_(_state_of(table), self._schedule, step, ids, count)
+        lazy_adam_catch_up_(_state_of(table), self.schedule, step, ids, count)
+
+    def pending(self, table: GaussianTable, step: int) -> Pending:
+        """Return the pending steps of a table after step number `step`, which may be in host memory."""
+        return Pending(self, table, step)
+
+    def schedule_of(self, name: str) -> AdamSchedule:
+        """Return the schedule of one column of `PARAMETERS` alone, which is not "sh"."""
+        if name not in self._alone:
+            self._alone[name] = self.schedule.of_group(PARAMETERS.index(name))
+        return self._alone[name]
 
     def step(
         self,
@@ -92,7 +105,7 @@ class TableAdam:
         """
         project_bwd_step_(
             _state_of(table),
-            self._schedule,
+            self.schedule,
             step,
             WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg),
             frame.projected,
@@ -101,6 +114,39 @@ class TableAdam:
             table["level"] if frame.options.fade else None,
             means2d_sums,
         )
+
+
+class Pending:
+    """The pending steps of a table's rows, for code that changes few of them between two steps."""
+
+    def __init__(self, optimiser: TableAdam, table: GaussianTable, step: int) -> None:
+        self._optimiser, self._table, self._step = optimiser, table, step
+        self._device = optimiser.lr_table.device
+
+    def current(self, name: str) -> Tensor:
+        """Return what a column of `PARAMETERS` (not "sh") is with all pending steps; no row catches up."""
+        table, device = self._table, self._device
+        values, last_step = (table[column].to(device, copy=True) for column in (name, "last_step"))
+        moments = (table[f"{moment}.{name}"].to(device) for moment in ("exp_avg", "exp_avg_sq"))
+        state = AdamState.alone(values, *moments, last_step, table["moment_step"].to(device))
+        lazy_adam_catch_up_(state, self._optimiser.schedule_of(name), self._step)
+        return values.to(table.device)
+
+    def catch_up(self, rows: Tensor) -> None:
+        """Apply the pending steps of some rows (int64 [M], each once)."""
+        table = self._table
+        if table.device == self._device:
+            self._optimiser.catch_up(table, rows.int(), self._step)
+            return
+        names = (*PARAMETERS, *EXP_AVGS, *EXP_AVG_SQS, "last_step", "moment_step")
+        part = {name: take_rows(table[name], rows).to(self._device) for name in names}
+        params, exp_avgs, exp_avg_sqs = (
+            [part[name] for name in group] for group in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)
+        )
+        state = AdamState(params, exp_avgs, exp_avg_sqs, part["last_step"], part["moment_step"])
+        lazy_adam_catch_up_(state, self._optimiser.schedule, self._step)
+        for name in (*PARAMETERS, "last_step"):
+            put_rows_(table[name], rows, part[name].to(table.device))
 
 
 def _state_of(table: GaussianTable) -> AdamState:

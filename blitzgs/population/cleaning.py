@@ -8,7 +8,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from blitzgs.ops.cull_mask import WORD_BITS
+from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.voxel_keys import voxel_keys
 

@@ -13,9 +13,10 @@ from torch.nn.functional import softplus
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
 from blitzgs.ops.counter_random import hash_keys, normal
+from blitzgs.optim.table_adam import Pending
 from blitzgs.spawn.candidates import Candidates, Veto, spawn_features
 from blitzgs.spawn.lineage import Births, Cause, Lineage
-from blitzgs.table.blocks import morton_order
+from blitzgs.table.placement import place
 from blitzgs.table.table import PARAMETERS, GaussianTable, opacity_logit
 
 SPLIT_SHRINK = 1.6
@@ -85,8 +86,9 @@ def densify(
     extent: float = 1.0,
     veto: Veto | None = None,
     lineage: Lineage | None = None,
+    pending: Pending | None = None,
 ) -> DensityReport:
-    """Run one density event on a table without pending steps, and reset the statistics that it used.
+    """Run one density event, and reset the statistics that it used.
 
     A candidate is a Gaussian with at least `min_observations` gradients whose mean, `grad_sum / grad_count`,
     reaches the threshold. A small candidate gets a copy. A large one is replaced by two children that are
@@ -98,7 +100,7 @@ def densify(
     Pruning applies to old and new rows; a new row has no screen radius yet.
 
     Args:
-        table: changed in place; left in `morton_order`.
+        table: changed in place; the rows are those of `placement.place`.
         rules: thresholds.
         time: time of the event, in images.
         step: the latest optimiser step; new rows are current up to it.
@@ -108,10 +110,13 @@ def densify(
         extent: extent of the scene, in the unit of the means; only used for the candidates' features.
         veto: returns which candidates are withheld; None: none are.
         lineage: logs births and deaths, or None.
+        pending: the table's pending steps, of which the candidates take theirs; None: there are none.
     """
     gradient = table["grad_sum"] / table["grad_count"].clamp(min=1)
     candidates = (gradient >= rules.grad_threshold) & (table["grad_count"] >= rules.min_observations)
     wanted, vetoed = candidates.sum(), 0
+    if pending is not None:
+        pending.catch_up(candidates.nonzero().squeeze(1))
     largest = math.log(rules.clone_scale) if rules.clone_scale > 0 else -math.inf
     small = table["scales"].amax(dim=1) <= largest
     if veto is not None:
@@ -126,23 +131,26 @@ def densify(
     splits = (candidates & ~small).nonzero().squeeze(1)
     new = _children(table, clones, splits, time, seed, level_count)
     new["last_step"] = torch.full_like(new["birth"], step)
-    causes = death_causes(table.columns, table["max_radii"], rules)
+    causes = death_causes(table, rules, None, pending)
     causes[splits] = Cause.SPLIT
-    causes = torch.cat((causes, death_causes(new, None, rules)))
-    rows = (causes == 0).nonzero().squeeze(1)
+    gone = causes.nonzero().squeeze(1)
+    causes = torch.cat((causes, causes_of(new["level"], new["scales"], None, new["opacities"], rules)))
+    born = (causes[len(table) :] == 0).nonzero().squeeze(1)
     if lineage is not None:
-        died = len(causes) - len(rows)
+        died = len(causes) - (len(table) - len(gone)) - len(born)
         _log(lineage, table, new, (clones, splits), causes, died, time, step, extent, level_count)
     grown = len(clones) + len(splits)
     report = DensityReport(
         cloned=len(clones),
         split=len(splits),
-        pruned=len(table) + grown - len(rows),
+        pruned=grown + len(gone) - len(born),
         held_back=int(wanted) - grown - vetoed,
         vetoed=vetoed,
     )
-    means = torch.cat((table["means"], new["means"])).index_select(0, rows)
-    table.renew(rows[morton_order(means)], new)
+    parents = torch.cat((clones, *[splits] * CHILDREN_OF_A_SPLIT))
+    if len(born) < len(parents):
+        parents, new = parents[born], {name: column[born] for name, column in new.items()}
+    table.replace(place(len(table), gone, parents, new["means"]), new, most_rows(rules, ranks))
     judged = table["grad_count"] >= rules.min_observations
     for name in ("grad_sum", "grad_count"):
         table[name].masked_fill_(judged, 0)
@@ -253,15 +261,41 @@ def quaternion_matrices(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
 
 
-def death_causes(rows: dict[str, Tensor], radii: Tensor | None, rules: DensityRules) -> Tensor:
+def death_causes(
+    table: GaussianTable, rules: DensityRules, opacities: Tensor | None = None, pending: Pending | None = None
+) -> Tensor:
+    """Return why each row of a table is pruned, see `causes_of`.
+
+    Args:
+        table: the rows, with the largest radii since the last event.
+        rules: thresholds.
+        opacities: the logits after all steps, if they are known.
+        pending: the table's pending steps; None: there are none.
+    """
+    if opacities is None:
+        opacities = table["opacities"] if pending is None else pending.current("opacities")
+    scales = table["scales"]
+    if rules.max_scale is not None and pending is not None:
+        scales = pending.current("scales")
+    return causes_of(table["level"], scales, table["max_radii"], opacities, rules)
+
+
+def causes_of(
+    like: Tensor, scales: Tensor, radii: Tensor | None, opacities: Tensor, rules: DensityRules
+) -> Tensor:
     """Return why each row is pruned: `Cause.OPACITY`, else `Cause.SIZE` (screen or world); 0: it is kept."""
-    causes = torch.zeros_like(rows["level"])
+    causes = torch.zeros_like(like)
     if rules.max_scale is not None:
-        causes[rows["scales"].amax(dim=1) > math.log(rules.max_scale)] = Cause.SIZE
+        causes[scales.amax(dim=1) > math.log(rules.max_scale)] = Cause.SIZE
     if radii is not None and rules.max_screen_radius is not None:
         causes[radii > rules.max_screen_radius] = Cause.SIZE
-    causes[rows["opacities"] < opacity_logit(rules.min_opacity)] = Cause.OPACITY
+    causes[opacities < opacity_logit(rules.min_opacity)] = Cause.OPACITY
     return causes
+
+
+def most_rows(rules: DensityRules, ranks: Ranks) -> int | None:
+    """Return the most rows that a rank's share of the population needs; None: there is no limit."""
+    return None if rules.max_gaussians is None else -(-rules.max_gaussians // ranks.world_size)
 
 
 def _log(

@@ -39,8 +39,8 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.survey import Survey, survey
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import open_transport
-from blitzgs.ops.cull_mask import WORD_BITS
-from blitzgs.ops.view_sums import ViewSums, view_sums_
+from blitzgs.ops.blocks import WORD_BITS
+from blitzgs.ops.importance import ViewSums, view_sums_
 from blitzgs.table.layouts import CULL
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import SceneGate

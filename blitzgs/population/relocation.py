@@ -10,18 +10,22 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.selection import sampling_keys, smallest
+from blitzgs.distributed.selection import smallest
+from blitzgs.ops.copy_rows import put_rows_, take_rows
 from blitzgs.ops.relocation import MAX_COPIES, overlap
+from blitzgs.ops.sampling import sampling_keys
+from blitzgs.optim.table_adam import Pending
 from blitzgs.population.density import (
     CHILDREN_OF_A_SPLIT,
     DensityReport,
     DensityRules,
     child_ids,
     death_causes,
+    most_rows,
 )
 from blitzgs.spawn.candidates import spawn_features
 from blitzgs.spawn.lineage import Births, Cause, Lineage
-from blitzgs.table.blocks import morton_order
+from blitzgs.table.placement import place
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable, opacity_logit
 
 # Opacities are the weights of the draw, as integers in units of 2^-31, so that sums do not depend on the
@@ -42,8 +46,9 @@ def relocate(
     extent: float = 1.0,
     level_count: int = 1,
     lineage: Lineage | None = None,
+    pending: Pending | None = None,
 ) -> DensityReport:
-    """Replace dead Gaussians by copies of live ones, and let the population grow; no step may be pending.
+    """Replace dead Gaussians by copies of live ones, and let the population grow.
 
     Dead Gaussians are those that density control would prune. The number of copies is that of the dead plus
     the share `growth` of the population. Live Gaussians are drawn for copying in proportion to their opacity
@@ -55,7 +60,7 @@ def relocate(
     depends neither on the order of the rows nor on the number of ranks.
 
     Args:
-        table: changed in place; left in `morton_order`.
+        table: changed in place; the rows are those of `placement.place`.
         rules: thresholds for dead Gaussians, and the limit of the population.
         growth: share of the population that the event adds.
         time: time of the event, in images.
@@ -65,36 +70,37 @@ def relocate(
         extent: extent of the scene, in the unit of the means; only used for the lineage's features.
         level_count: number of octree levels; only used for the lineage's features.
         lineage: logs births and deaths, or None.
+        pending: the table's pending steps, of which the copied Gaussians take theirs; None: there are none.
 
     Returns:
         The report; `cloned` is the number of all copies on this rank, `relocated` that of the dead they
         replace.
     """
-    causes = death_causes(table.columns, table["max_radii"], rules)
-    dead = causes != 0
-    n_dead = int(dead.sum())
-    counts = torch.tensor([len(table), n_dead], device=table.device)
-    population, deaths = ranks.all_reduce(counts).tolist()
+    opacities = table["opacities"] if pending is None else pending.current("opacities")
+    dead = death_causes(table, rules, opacities, pending) != 0
+    weights = (opacities.double().sigmoid().float().double() * 2**_WEIGHT_BITS).long()
+    weights.masked_fill_(dead, 0)
+    own = torch.stack((dead.new_tensor(len(table), dtype=torch.int64), dead.sum(), weights.sum()))
+    both = torch.stack((own, ranks.all_reduce(own.clone())))
+    (_, n_dead, _), (population, deaths, total) = both.tolist()
     grown = math.floor(population * (1.0 + growth))
     wanted = max(population, grown if rules.max_gaussians is None else min(grown, rules.max_gaussians))
-    weights = (table["opacities"].double().sigmoid().float().double() * 2**_WEIGHT_BITS).long()
-    weights[dead] = 0
-    draws = draw(weights, wanted - population + deaths, table["id"], seed, time, ranks)
+    draws = draw(weights, total, wanted - population + deaths, table["id"], seed, time, ranks)
     # With a size that it knows, the host does not wait for the device.
     sources, gone = draws.nonzero().squeeze(1), torch.nonzero_static(dead, size=n_dead).squeeze(1)
-    parents = sources.repeat_interleave(draws[sources])
+    if pending is not None:
+        pending.catch_up(sources)
+    copies = draws[sources]
+    parents = sources.repeat_interleave(copies)
     features = None
     if lineage is not None:
         features = spawn_features(table, parents, torch.zeros_like(parents).bool(), time, extent, level_count)
-    _set_shares(table, sources, draws[sources] + 1, rules.min_opacity)
-    new = _copies(table, parents, draws[sources], time, step)
+    _set_shares(table, sources, copies + 1, rules.min_opacity)
+    new = _copies(table, parents, copies, time, step)
     if lineage is not None and features is not None:
         lineage.born(Births(new["id"], new["parent"], new["means"], features), step)
         lineage.died(table["id"][gone], torch.full_like(gone, Cause.RELOCATED), time, step)
-    lives = torch.cat((~dead, dead.new_ones(len(parents))))
-    kept = torch.nonzero_static(lives, size=len(lives) - n_dead).squeeze(1)
-    means = torch.cat((table["means"], new["means"])).index_select(0, kept)
-    table.renew(kept[morton_order(means)], new)
+    table.replace(place(len(table), gone, parents, new["means"]), new, most_rows(rules, ranks))
     held_back = max(0, grown - wanted) if ranks.rank == 0 else 0
     return DensityReport(cloned=len(new["id"]), split=0, pruned=0, held_back=held_back, relocated=len(gone))
 
@@ -125,7 +131,7 @@ def shared(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, T
     return depth.expm1().log(), scales.double() + factor[:, None]
 
 
-def draw(weights: Tensor, count: int, ids: Tensor, seed: int, time: int, ranks: Ranks) -> Tensor:
+def draw(weights: Tensor, total: int, count: int, ids: Tensor, seed: int, time: int, ranks: Ranks) -> Tensor:
     """Draw `count` times in proportion to weights, over all ranks.
 
     The expectation for each row is count w / sum(w), as in a multinomial draw. A row gets the integer part of
@@ -135,6 +141,7 @@ def draw(weights: Tensor, count: int, ids: Tensor, seed: int, time: int, ranks: 
 
     Args:
         weights: int64 [N_rank], 0 to 2^31, fewer than 2^31 over all ranks.
+        total: sum of the weights of all ranks.
         count: below 2^31.
         ids: int64 [N_rank], persistent.
         seed: seed of the run.
@@ -145,14 +152,14 @@ def draw(weights: Tensor, count: int, ids: Tensor, seed: int, time: int, ranks: 
         int64 [N_rank], how often each row was drawn, the same for the same ids at every world size. Zeros if
         all weights are 0.
     """
-    total = int(ranks.all_reduce(weights.sum()))
     if total == 0 or count <= 0:
         return torch.zeros_like(weights)
-    whole = weights * count // total
+    shares = weights * count
+    whole = shares.div(total, rounding_mode="floor")
     rest = count - int(ranks.all_reduce(whole.sum()))
     # Other draws use their event's time, which is >= 0, so a negative number gives separate keys.
-    keys = sampling_keys((weights * count % total).float(), ids, seed, -1 - time)
-    return (whole + smallest(keys, ids, rest, ranks)).clamp(max=MAX_COPIES - 1)
+    keys = sampling_keys((shares - whole * total).float(), ids, seed, -1 - time)
+    return whole.add_(smallest(keys, ids, rest, ranks)).clamp_(max=MAX_COPIES - 1)
 
 
 def _set_shares(table: GaussianTable, sources: Tensor, copies: Tensor, min_opacity: float) -> None:
@@ -184,19 +191,21 @@ def _keep_moments(table: GaussianTable, sources: Tensor, copies: Tensor, before:
     share = 1.0 / copies.double()
     dimmed = table["opacities"][sources].double().sigmoid() / before.double().sigmoid()
     for names, power in ((EXP_AVGS, 1), (EXP_AVG_SQS, 2)):
+        of_opacities, of_others = (dimmed**power).float(), (share**power).float()
         for name, parameter in zip(names, PARAMETERS, strict=True):
-            factor = ((dimmed if parameter == "opacities" else share) ** power).float()
-            column = table[name]
-            column[sources] *= factor.view(-1, *[1] * (column.dim() - 1))
+            factor = of_opacities if parameter == "opacities" else of_others
+            rows = take_rows(table[name], sources)
+            put_rows_(table[name], sources, rows.mul_(factor.view(-1, *[1] * (rows.dim() - 1))))
 
 
 def _copies(table: GaussianTable, rows: Tensor, counts: Tensor, time: int, step: int) -> dict[str, Tensor]:
     """Return new rows that copy each of `rows` as often as `counts` has it."""
     first = counts.cumsum(0) - counts
     # Use slots after those of clones and splits, which may have the same parents in the same event.
-    slots = torch.arange(len(rows), device=rows.device) - first.repeat_interleave(counts)
+    slots = torch.arange(len(rows), device=rows.device)
+    slots -= first.repeat_interleave(counts, output_size=len(rows))
     slots += CHILDREN_OF_A_SPLIT + 1
-    new = {name: table[name].index_select(0, rows) for name in (*PARAMETERS, "level")}
+    new = {name: take_rows(table[name], rows) for name in (*PARAMETERS, "level")}
     new |= table.inherited(rows)
     parents = table["id"][rows]
     return new | {

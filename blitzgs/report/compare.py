@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from blitzgs.config.files import to_dict
+from blitzgs.config.files import flat, to_dict
 from blitzgs.report import gather
 from blitzgs.report.gather import RunData, read_run
 from blitzgs.report.page import fitted
@@ -68,18 +68,10 @@ def labels(folders: Sequence[Path]) -> list[str]:
 
 def differences(configs: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Return [field, value in each run] of the fields that are not equal in all; "–" where there is none."""
-    flat = [dict(_flat(config)) for config in configs]
-    fields = dict.fromkeys(name for config in flat for name in config)
-    rows = ([name, *(str(config.get(name, "–")) for config in flat)] for name in fields)
+    found = [flat(config) for config in configs]
+    fields = dict.fromkeys(name for config in found for name in config)
+    rows = ([name, *(str(config.get(name, "–")) for config in found)] for name in fields)
     return [row for row in rows if len(set(row[1:])) > 1]
-
-
-def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def _views(runs: Sequence[RunData], metrics: Sequence[str]) -> list[tuple[str, list[list[Any] | None]]]:

@@ -10,17 +10,19 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
 
+from blitzgs.capture.cameras import camera_centres
 from blitzgs.runs import exposure
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import CAMERAS, RunCameras, load_cameras
 from blitzgs.runs.evaluation import METRICS
 from blitzgs.runs.folder import RunFolder, open_run
 from blitzgs.runs.previews import FOLDER, INDEX, PARTS, preview_file
-from blitzgs.viewer.world import up_direction
+from blitzgs.viewer.world import horizontal, up_direction
 
 Point = tuple[float, float | None, float]
 # A curve has at most this many points: means of its records.
@@ -130,7 +132,7 @@ def _thinned(points: list[Point]) -> list[Point]:
         (
             part[-1][0],
             None if part[-1][1] is None else round(part[-1][1], 1),
-            digits(_mean(p[2] for p in part)),
+            digits(fmean(p[2] for p in part)),
         )
         for part in parts
     ]
@@ -171,12 +173,7 @@ def plan(data: RunData) -> dict[str, Any] | None:
     if cameras is None or not cameras.cameras:
         return None
     poses = [np.asarray(camera.world_to_camera, dtype=np.float64) for camera in cameras.cameras]
-    centres = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
-    up = up_direction(poses)
-    east = np.array([1.0, 0, 0]) if abs(up[0]) < 0.9 else np.array([0, 1.0, 0])
-    east -= up * (east @ up)
-    east /= np.linalg.norm(east)
-    flat = np.stack([centres @ east, centres @ np.cross(up, east)], axis=1)
+    flat = camera_centres(np.stack(poses)) @ np.stack(horizontal(up_direction(poses)), axis=1)
     step = max(1e-9, float(np.ptp(flat, axis=0).max())) / 5000
     decimals = max(0, math.ceil(-math.log10(step)))
     others = _other_views(data)
@@ -299,8 +296,3 @@ def _mapping(value: object) -> dict[str, Any]:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _mean(values: Iterator[float]) -> float:
-    found = list(values)
-    return sum(found) / len(found)

@@ -7,10 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from blitzgs.distributed.group import Ranks
 from blitzgs.report import gather
 from blitzgs.report.gather import RunData, read_run
 from blitzgs.report.page import fitted, write_page
 from blitzgs.runs import files as run_files
+from blitzgs.viewer.studio import open_model
+from blitzgs.viewer.web import web_file
 
 _SCRIPTS = ("parts.js", "report.js")
 _SHOWN_EXTREMES = 4
@@ -92,3 +95,24 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8", errors="replace")[:200_000]
     except OSError as error:
         return str(error)
+
+
+# Size of the model in the report.
+LOOK_BYTES = 4_000_000
+
+
+def look_of(folder: Path) -> dict[str, str]:
+    """Return the newest model of a run as a page with its viewer ("html"), and what it lacks ("note").
+
+    The checkpoint is read into host memory, with the optimiser's moments.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint.
+        CheckpointError: all checkpoints are damaged.
+        ValueError: the model has no visible Gaussian.
+    """
+    found = web_file(open_model(folder, Ranks()), LOOK_BYTES)
+    note = f"{found.gaussians:,} of {found.of:,} Gaussians. {found.left_out}"
+    if found.left_out:
+        note += " blitzgs export RUN --html FILE writes more, blitzgs view RUN shows all."
+    return {"html": found.text, "note": note}

@@ -27,9 +27,8 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.sharding import global_positions
-from blitzgs.runs.disk_space import check_space, explain
 from blitzgs.runs.shard_file import file_digest, header_of, write_shard
-from blitzgs.util.output import is_lack_of_space, sync_to_disk
+from blitzgs.util.output import check_space, explain, is_lack_of_space, sync_to_disk
 
 FORMAT = 2
 MANIFEST = "manifest.json"

@@ -19,8 +19,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import RenderOptions
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.pixels import collect_images
-from blitzgs.frame.tiles import TileAssignment
+from blitzgs.frame.tiles import TileAssignment, collect_images
 from blitzgs.ops.photometric import ssim
 from blitzgs.runs.previews import Previews
 from blitzgs.util.memory import explain_memory

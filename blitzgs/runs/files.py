@@ -17,7 +17,7 @@ import torch
 
 import blitzgs
 from blitzgs.config.fields import Config
-from blitzgs.config.files import ConfigError, from_dict, load_config, to_dict
+from blitzgs.config.files import ConfigError, flat, from_dict, load_config, to_dict
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.optim.table_adam import TableAdam
@@ -76,6 +76,8 @@ class Progress:
         gate: digest of the spawn gate's files; empty without a gate, and in old checkpoints.
         stages: seconds of each kind of work besides the optimiser steps; see `TrainingState.stage`.
         events_left: (time, order, kind) of the events of the last step that a signal kept from running.
+        sorted_spread: spread of the blocks of all ranks when density events last sorted the rows, as
+            `blitzgs.training.events.densify` measures it; 0: they have not.
     """
 
     step: int
@@ -94,6 +96,7 @@ class Progress:
     gate: str = ""
     stages: dict[str, float] = dataclasses.field(default_factory=dict)
     events_left: list[tuple[Any, ...]] = dataclasses.field(default_factory=list)
+    sorted_spread: int = 0
 
 
 @dataclass
@@ -316,7 +319,7 @@ def check_resumable(saved: Config, wanted: Config) -> None:
     Raises:
         ConfigError: a field differs; the message names the first one.
     """
-    for name, old, new in _differences(to_dict(saved), to_dict(wanted), ""):
+    for name, old, new in _differences(saved, wanted):
         # The number of minutes may change: the rest of the run is then fitted into the rest of the new time.
         is_budget = name == "schedule.minutes" and old > 0 and new > 0
         if not (_is_free(name) or is_budget):
@@ -347,18 +350,13 @@ def _is_free(name: str) -> bool:
 
 
 def _changed_fields(saved: Config, found: Config) -> list[str]:
-    return [name for name, *_ in _differences(to_dict(saved), to_dict(found), "") if not _is_free(name)]
+    return [name for name, *_ in _differences(saved, found) if not _is_free(name)]
 
 
-def _differences(old: dict[str, Any], new: dict[str, Any], where: str) -> list[tuple[str, Any, Any]]:
-    found = []
-    for name in old | new:
-        path, a, b = where + name, old.get(name), new.get(name)
-        if isinstance(a, dict) and isinstance(b, dict):
-            found += _differences(a, b, path + ".")
-        elif a != b:
-            found.append((path, a, b))
-    return found
+def _differences(saved: Config, found: Config) -> list[tuple[str, Any, Any]]:
+    """Return the name and both values of the fields that differ."""
+    old, new = flat(to_dict(saved)), flat(to_dict(found))
+    return [(name, old[name], new[name]) for name in old if old[name] != new[name]]
 
 
 def peak_memory_bytes(device: torch.device) -> int:

@@ -25,7 +25,7 @@ from blitzgs.distributed.group import Ranks, resolve_device
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import RunCamera, RunCameras, checked_camera, load_cameras
 from blitzgs.runs.lod import scene_gate
-from blitzgs.runs.log import LOG
+from blitzgs.runs.log import LOG, records
 from blitzgs.table.table import PARAMETERS
 from blitzgs.view.gate import SceneGate, centres_of
 from blitzgs.view.views import CameraLike, Space, render_options, viewmat
@@ -208,13 +208,7 @@ class RunFolder:
 
     def log(self) -> list[dict[str, Any]]:
         """Return the records of the log, oldest first, without incomplete lines."""
-        path, records = self.path / LOG, []
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
-            try:
-                records.append(json.loads(line))
-            except (ValueError, RecursionError):
-                continue
-        return records
+        return list(records(self.path / LOG))
 
     def metrics(self) -> dict[str, dict[str, Any]]:
         """Return the evaluations: number of images seen, or split -> metrics, each view's under "views"."""

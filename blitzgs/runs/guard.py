@@ -126,13 +126,13 @@ def bad_column(table: GaussianTable, names: Iterable[str] = PARAMETERS) -> str |
     return None
 
 
-def check_table(table: GaussianTable, step: int) -> None:
-    """Check all parameters of this rank's Gaussians.
+def check_table(table: GaussianTable, step: int, names: Iterable[str] = PARAMETERS) -> None:
+    """Check parameters of this rank's Gaussians.
 
     Raises:
         NonFiniteError: names the step, the column and the Gaussians.
     """
-    if (culprit := bad_column(table)) is not None:
+    if (culprit := bad_column(table, names)) is not None:
         raise NonFiniteError(
             f"step {step}: {culprit}. Lower the learning rates (optimiser.*) or resume from a checkpoint"
         )

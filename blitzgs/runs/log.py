@@ -35,6 +35,8 @@ _LINE_SECONDS = 30.0
 
 # The loss and the PSNR that are shown are means over this number of records; the file has each record's own.
 _MEAN_RECORDS = 20
+# The remaining time follows from the speed over so many records, which resolution and population change.
+_RATE_RECORDS = 20
 
 # Events after the last image, which a run that is resumed there logs again.
 _AT_THE_END = ("population", "image_memory", "evaluation", "worst views")
@@ -83,7 +85,7 @@ class RunLog:
         self._recent: dict[str, deque[float]] = {}
         self._held_out: float | None = None
         self._run_id = run_id
-        self._first, self._started = done, time.monotonic()
+        self._marks = deque([(done, time.monotonic())], maxlen=_RATE_RECORDS)
         self.total = total
         self.console = Console(quiet=folder is None, highlight=False)
         if folder is None:
@@ -151,8 +153,9 @@ class RunLog:
         if self._progress is not None:
             self._progress.update(self._task, completed=t, total=self.total, description=text)
         elif self._file is not None:
-            rate = (time.monotonic() - self._started) / max(1, t - self._first)
-            left = timedelta(seconds=round(rate * (self.total - t)))
+            first, since = self._marks[0]
+            self._marks.append((t, now := time.monotonic()))
+            left = timedelta(seconds=round((now - since) / max(1, t - first) * (self.total - t)))
             self._print(f"{t:>7,}/{self.total:,} images  {text}  ETA {left}")
 
     def _shown(self, values: Mapping[str, float]) -> str:
@@ -285,6 +288,16 @@ class _Failures:
                     warnings.warn(
                         f"{kind}: {error}; training goes on, records may be missing there", stacklevel=4
                     )
+
+
+def records(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the records of a log, oldest first, without lines that a crash or a full disk left incomplete."""
+    if not path.exists():
+        return
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        with contextlib.suppress(ValueError, RecursionError):
+            if isinstance(record := json.loads(line), dict):
+                yield record
 
 
 def _drop_repeated(path: Path, run_id: str, done: int, total: int) -> None:

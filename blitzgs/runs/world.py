@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from blitzgs.call.covariances import quaternions
+from blitzgs.capture.cameras import Float64
+from blitzgs.capture.colmap import rotation_to_quat
 from blitzgs.capture.world import GEO, WorldFrame, read_frame
 from blitzgs.ops.harmonics import spherical_harmonics
 from blitzgs.runs.folder import Model
@@ -53,7 +54,7 @@ def in_world(model: Model, frame: WorldFrame) -> Model:
     return replace(
         model,
         means=(model.means.double() @ rotation.T).float(),
-        quats=_product(quaternions(rotation[None])[0], model.quats.double()).float(),
+        quats=_product(rotation_to_quat(frame.rotation), model.quats.double()).float(),
         sh=rotated_harmonics(model.sh, rotation),
         space=moved,
     )
@@ -78,7 +79,7 @@ def rotated_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
     return out
 
 
-def _product(left: Tensor, right: Tensor) -> Tensor:
+def _product(left: Float64, right: Tensor) -> Tensor:
     """Return the products of a quaternion [4] and quaternions [N, 4], w, x, y, z."""
     w, x, y, z = left.tolist()
     rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.colmap import FILES, count_images
+from blitzgs.capture.world import GEO, enu_frame, read_small
 from blitzgs.sfm.database import read_found, read_positions
 from blitzgs.sfm.engine import STAGES, Job, StageError, backend, decided, run_stage
 from blitzgs.sfm.photographs import Photographs, judge_positions
@@ -30,6 +31,7 @@ PAIRS = ("auto", "gps", "sequence", "exhaustive")
 MAPPERS = ("auto", "incremental", "global")
 WORK = "sfm"
 _STATE = "state.json"
+_SOURCE = "GPS of the photographs"
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,7 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
         if not models or not count_images(models[0]):
             raise StageError(_no_poses(photographs, work))
         _write_capture(models[0], photographs, capture)
+        _write_frame(Path(job.georeference), capture / GEO)
         return examine(capture, work, photographs, job, models)
 
 
@@ -179,3 +182,12 @@ def _write_capture(model: Path, photographs: Photographs, capture: Path) -> None
     sparse.mkdir(parents=True, exist_ok=True)
     for name in FILES:
         write_file(sparse / f"{name}.bin", (model / f"{name}.bin").read_bytes())
+
+
+def _write_frame(origin: Path, path: Path) -> None:
+    """Write the place of the capture in the world where GPS gave its origin; keep what a user has written."""
+    if not origin.exists() or (path.exists() and _SOURCE not in read_small(path)):
+        return
+    place = json.loads(origin.read_text())
+    frame = enu_frame(place["latitude"], place["longitude"], place["altitude"], _SOURCE)
+    write_file(path, json.dumps(frame.as_json(), indent=1))

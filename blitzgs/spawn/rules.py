@@ -8,8 +8,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from blitzgs.capture.capture import Capture
-from blitzgs.capture.fingerprint import capture_fingerprint
+from blitzgs.capture.capture import Capture, capture_fingerprint
 from blitzgs.config.fields import Config
 from blitzgs.config.files import to_dict, without_effect
 from blitzgs.distributed.group import Ranks

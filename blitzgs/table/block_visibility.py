@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.ops.cull_mask import WORD_BITS
+from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.pool import seen_blocks
 from blitzgs.ops.projection_types import MAX_VIEWS
 
@@ -96,7 +96,7 @@ def culled_blocks(cull: Tensor) -> Tensor:
     """Return, as bits, the views that leave out all rows of each block, int32 [N, columns / 32].
 
     Args:
-        cull: int32 [N, columns, 8], see `blitzgs.ops.cull_mask`; of whole blocks.
+        cull: int32 [N, columns, 8], see `blitzgs.ops.blocks`; of whole blocks.
     """
     bits = torch.arange(WORD_BITS, device=cull.device)
     length = max(1, _MAX_WORDS // max(1, cull[:1].numel()))

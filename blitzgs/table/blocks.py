@@ -137,6 +137,20 @@ class BlockIndex:
         return PendingSteps._make((*_PENDING_OF(table.columns), self._pending_table))
 
 
+def spread(bounds: Tensor, limit: float) -> Tensor:
+    """Return how large blocks are together, float64 []: the sum of the mean widths of their boxes.
+
+    The number of boxes that a plane cuts is proportional to this, if the plane lies anywhere with the same
+    probability (Crofton's formula). A step reads the rows of the blocks that the border of a view cuts.
+
+    Args:
+        bounds: float32 [blocks, 8], as `BlockIndex.bounds`.
+        limit: a larger width counts as this one: single far rows have no more weight.
+    """
+    widths = (bounds[:, 3:6].double() - bounds[:, :3]).clamp(min=0).sum(dim=1) / 2
+    return widths.clamp(max=limit).sum()
+
+
 def _level_ranges(level: Tensor, blocks: int) -> Tensor:
     """Return the coarsest and the finest level of each block, uint8 [blocks, 2]."""
     rest = level[-1:].expand(blocks * BLOCK_ROWS - len(level)) if blocks else level

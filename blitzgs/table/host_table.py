@@ -12,10 +12,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from blitzgs.table.table import GaussianTable
+from blitzgs.ops.copy_rows import take_rows
+from blitzgs.table.table import GROWTH, GaussianTable
 
-# Memory is allocated for this many times the present rows, so that a growing table is rarely moved.
-_GROWTH = 1.25
 MEMORY_INFO = Path("/proc/meminfo")
 
 
@@ -41,15 +40,9 @@ class HostTable(GaussianTable):
         """
         super().__init__(columns)
         self._pinned = pinned
-        self._memory: dict[str, Tensor] = {}
         for name in list(columns):
             del columns[name]
             self._store_raw(name, self.columns[name])
-
-    def __delitem__(self, name: str) -> None:
-        """Drop a column and free its memory."""
-        super().__delitem__(name)
-        del self._memory[name]
 
     def _store_raw(self, name: str, tensor: Tensor) -> None:
         memory = self._memory.get(name)
@@ -63,8 +56,14 @@ class HostTable(GaussianTable):
             self._memory.pop(name, None)
             self.columns[name] = tensor
             del memory
-            memory = self._memory[name] = _allocate(tensor, self._pinned)
+            memory = self._memory[name] = self._allocate(tensor, int(GROWTH * len(tensor)))
         self.columns[name] = memory[: len(tensor)].copy_(tensor)
+
+    def _allocate(self, like: Tensor, rows: int) -> Tensor:
+        return _allocate(like, rows, self._pinned)
+
+    def _reorder(self, name: str, order: Tensor) -> None:
+        self._store(name, take_rows(self[name], order))
 
 
 def available_bytes() -> int | None:
@@ -76,9 +75,9 @@ def available_bytes() -> int | None:
     return None
 
 
-def _allocate(like: Tensor, pinned: bool) -> Tensor:
-    """Allocate memory for `_GROWTH` times the rows of a tensor, on separate pages."""
-    rows = max(1, int(_GROWTH * len(like)))
+def _allocate(like: Tensor, rows: int, pinned: bool) -> Tensor:
+    """Allocate memory for rows like those of a tensor, on separate pages."""
+    rows = max(1, rows)
     size = rows * like.element_size() * math.prod(like.shape[1:])
     available = available_bytes()
     if available is not None and size > available:

@@ -8,8 +8,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from blitzgs.ops.blocks import BLOCK_ROWS
-from blitzgs.ops.cull_mask import SECTOR_WORDS, WORD_BITS, rows_of_sectors, sectors_of_rows
+from blitzgs.ops.blocks import BLOCK_ROWS, SECTOR_WORDS, WORD_BITS, rows_of_sectors, sectors_of_rows
 
 # The cull matrix, from the first importance pass on: which views leave a row out.
 CULL = "cull"
@@ -29,7 +28,7 @@ class Layout(Protocol):
 
 
 class BitSectors:
-    """Bits [N, words] by blocks of rows, as `blitzgs.ops.cull_mask` has them: [256 ceil(N / 256), words]."""
+    """Bits [N, words] by blocks of rows, as `blitzgs.ops.blocks` has them: [256 ceil(N / 256), words]."""
 
     def stored(self, column: Tensor) -> Tensor:
         """See `Layout.stored`."""

@@ -130,6 +130,11 @@ class Pool:
             None if mask is None else culled_blocks(sectors_in(mask)[: self._blocks]).to(self._device)
         )
 
+    @property
+    def bounds(self) -> Tensor:
+        """The bounds of all blocks of the table, on the device."""
+        return self._bounds[:-1]
+
     def _make_pool(self) -> None:
         """Allocate as many slots as the budget allows; a last, partial block has its own slot."""
         table = self.table

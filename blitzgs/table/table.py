@@ -7,14 +7,18 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from blitzgs.ops.take_rows import take_rows
+from blitzgs.ops.copy_rows import put_rows_, take_rows
 from blitzgs.table.layouts import LAYOUTS
 
+# A column that has to be moved to become longer gets memory for this many times its rows.
+GROWTH = 1.25
+# The same for a shard that has more rows than its share of the most.
+_PAST_MOST = 1.02
 # The learned parameters, before activation: log scales, opacity logits, unnormalised quaternions.
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 EXP_AVGS = tuple(f"exp_avg.{name}" for name in PARAMETERS)
@@ -54,6 +58,22 @@ class Column:
     def bytes(self) -> int:
         """Bytes of one row."""
         return self.dtype.itemsize * math.prod(self.shape)
+
+
+class Placement(NamedTuple):
+    """Which row of a table each new Gaussian gets, and which others move.
+
+    Attributes:
+        total: number of rows afterwards.
+        new: int64 [M], the row of each new Gaussian.
+        moved_from: int64 [K], rows that move because the table becomes shorter.
+        moved_to: int64 [K], where they move.
+    """
+
+    total: int
+    new: Tensor
+    moved_from: Tensor
+    moved_to: Tensor
 
 
 def schema(sh_degree: int) -> dict[str, Column]:
@@ -102,8 +122,9 @@ def as_stored(name: str, column: Tensor) -> Tensor:
 class GaussianTable:
     """One rank's Gaussians as named columns of equal length N.
 
-    The operations `append`, `keep`, `permute`, `renew` and `exchange` act on all columns, one column at a
-    time, so that peak memory exceeds the table by one column and not by a second table.
+    The operations `append`, `keep`, `permute`, `replace` and `exchange` act on all columns, one column at a
+    time, so that peak memory exceeds the table by one column and not by a second table. `replace` touches
+    only the rows that change; for that, columns that grow have memory for more rows than they hold.
 
     A column of `LAYOUTS` is converted whenever it is set, read or moved.
 
@@ -136,6 +157,8 @@ class GaussianTable:
                     f"got {tensor.dtype} {list(tensor.shape)} on {tensor.device}"
                 )
         self.columns: dict[str, Tensor] = {name: as_stored(name, column) for name, column in columns.items()}
+        # The memory of columns that have more of it than rows; they are its first rows.
+        self._memory: dict[str, Tensor] = {}
 
     @classmethod
     def create(cls, rows: Mapping[str, Tensor]) -> GaussianTable:
@@ -166,8 +189,9 @@ class GaussianTable:
         return LAYOUTS[name].rows(column, len(self)) if name in LAYOUTS else column
 
     def __delitem__(self, name: str) -> None:
-        """Drop a column."""
+        """Drop a column and free its memory."""
         del self.columns[name]
+        self._memory.pop(name, None)
 
     def __setitem__(self, name: str, tensor: Tensor) -> None:
         """Replace or add a column of the table's length; it moves with the others from then on."""
@@ -188,12 +212,38 @@ class GaussianTable:
     def release(self) -> dict[str, Tensor]:
         """Return all columns, [N, ...], and leave the table without any."""
         columns = {name: self[name] for name in self}
-        self.columns = {}
+        self.columns, self._memory = {}, {}
         return columns
 
     def _store_raw(self, name: str, stored: Tensor) -> None:
         """Store a column that already has its stored form."""
         self.columns[name] = stored
+        self._memory.pop(name, None)
+
+    def _allocate(self, like: Tensor, rows: int) -> Tensor:
+        """Allocate memory for rows like those of a column."""
+        return like.new_empty((rows, *like.shape[1:]))
+
+    def _lengthen(self, name: str, count: int, most: int | None) -> Tensor:
+        """Return a column of `count` rows that begins with the present ones, as many as fit.
+
+        Columns of `LAYOUTS` are returned row by row, and have to be stored.
+        """
+        if name in LAYOUTS:
+            old = self[name]
+            return torch.cat((old, old.new_empty((max(0, count - len(old)), *old.shape[1:]))))
+        old = self.columns[name]
+        if len(old) == count:
+            return old
+        memory = self._memory.get(name, old)
+        if len(memory) < count:
+            room = int(GROWTH * count)
+            if most is not None:
+                room = min(room, max(most, int(_PAST_MOST * count)))
+            memory = self._allocate(old, max(count, room))
+            memory[: len(old)].copy_(old)
+            self._memory[name], self.columns[name] = memory, memory[: len(old)]
+        return memory[: max(count, len(old))]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.columns)
@@ -280,19 +330,39 @@ class GaussianTable:
                 f"GaussianTable.permute: order must be int64 [{len(self)}], "
                 f"got {order.dtype} {list(order.shape)}"
             )
-        self._select(order)
+        for name in self._to_change():
+            self._reorder(name, order)
 
-    def renew(self, rows: Tensor, new: Mapping[str, Tensor]) -> None:
-        """Select old and new rows: row i becomes the old row `rows[i]`, or the new row `rows[i] - N`.
+    def _reorder(self, name: str, order: Tensor) -> None:
+        """Permute a column, which keeps the room that it has for more rows."""
+        old = self.columns[name]
+        room = len(self._memory.get(name, old))
+        if name in LAYOUTS or room == len(old):
+            self._store(name, take_rows(self[name], order))
+        else:
+            memory = self._allocate(old, room)
+            take_rows(old, order, memory[: len(old)])
+            self._memory[name], self.columns[name] = memory, memory[: len(old)]
+
+    def replace(self, placement: Placement, new: Mapping[str, Tensor], most: int | None = None) -> None:
+        """Let rows leave and new ones join; all other rows stay where they are, except those that move.
 
         Args:
-            rows: int64 [N'], each row at most once.
+            placement: of `blitzgs.table.placement.place`.
             new: as for `append`.
+            most: about the most rows that the table will ever have; None: unknown.
         """
         self._check_new(new)
-        # One column after the other, so that at most one column is in memory twice.
         for name in self._to_change():
-            self._store(name, take_rows(self[name], rows, new.get(name)))
+            column = self._lengthen(name, placement.total, most)
+            if len(placement.moved_from) > 0:
+                put_rows_(column, placement.moved_to, take_rows(column, placement.moved_from))
+            put_rows_(column, placement.new, new.get(name))
+            if name in LAYOUTS:
+                self._store(name, column[: placement.total])
+            elif placement.total != len(self.columns[name]):
+                self._memory.setdefault(name, column)
+                self.columns[name] = column[: placement.total]
 
     def exchange(self, destination_ranks: Tensor, ranks: RowExchange) -> None:
         """Move every row to a rank. Collective: every rank calls it. Rows arrive ordered by source rank.

@@ -10,16 +10,14 @@ import socket
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import blitzgs
-from blitzgs.capture.capture import Capture, MissingImagesError, load_capture
-from blitzgs.capture.check_files import damaged
-from blitzgs.capture.fingerprint import capture_fingerprint
+from blitzgs.capture.capture import Capture, MissingImagesError, capture_fingerprint, load_capture
+from blitzgs.capture.check_files import FindDamage, damaged
 from blitzgs.capture.images import ImageStore, decoded_shapes
 from blitzgs.capture.shared_images import SharedImages, size_of
-from blitzgs.config.fields import Config
-from blitzgs.config.files import ConfigError, to_dict
+from blitzgs.config.fields import Config, DataConfig
+from blitzgs.config.files import ConfigError, flat, to_dict
 from blitzgs.distributed.group import Ranks
 from blitzgs.view.views import Space
 
@@ -53,20 +51,7 @@ def open_capture(
     if not data.path:
         raise ConfigError("data.path: no capture given; use --data DIR")
     try:
-        capture = load_capture(
-            data.path,
-            images=data.images,
-            downscale=data.downscale,
-            split=data.split,
-            masks=data.masks,
-            undistort=data.undistort,
-            exif=data.exif,
-            allow_missing=data.allow_missing,
-            inside_only=data.inside_only,
-            sparse=data.sparse,
-            stray_cameras=data.stray_cameras,
-            find_damage=partial(_damaged_of_share, ranks),
-        )
+        capture = load_configured(data, partial(_damaged_of_share, ranks))
     except MissingImagesError as error:
         raise MissingImagesError(f"{error} ({remedy})") from error
     budget = min(data.cache_bytes, _host_memory() // 2)
@@ -77,6 +62,24 @@ def open_capture(
     background = config.model.background
     return capture, ImageStore(
         capture, left // ranks.local_world_size, threads, background=background, shared=shared
+    )
+
+
+def load_configured(data: DataConfig, find_damage: FindDamage = damaged) -> Capture:
+    """Call `load_capture` with the fields of a configuration."""
+    return load_capture(
+        data.path,
+        images=data.images,
+        downscale=data.downscale,
+        split=data.split,
+        masks=data.masks,
+        undistort=data.undistort,
+        exif=data.exif,
+        allow_missing=data.allow_missing,
+        inside_only=data.inside_only,
+        sparse=data.sparse,
+        stray_cameras=data.stray_cameras,
+        find_damage=find_damage,
     )
 
 
@@ -193,7 +196,7 @@ def check_alike(config: Config, capture: Capture, ranks: Ranks, resume: bool) ->
         return
     fields = {
         f"configuration field {name}": value
-        for name, value in _flatten(to_dict(config))
+        for name, value in flat(to_dict(config)).items()
         if name not in HOST_FIELDS
     }
     ranks.compare_across_ranks(
@@ -210,10 +213,3 @@ def code_fingerprint() -> str:
         digest.update(str(path.relative_to(root)).encode())
         digest.update(path.read_bytes())
     return f"{blitzgs.__version__}+{digest.hexdigest()[:12]}"
-
-
-def _flatten(fields: dict[str, Any], where: str = "") -> list[tuple[str, object]]:
-    flat: list[tuple[str, object]] = []
-    for name, value in fields.items():
-        flat += _flatten(value, f"{where}{name}.") if isinstance(value, dict) else [(where + name, value)]
-    return flat

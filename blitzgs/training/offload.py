@@ -106,6 +106,11 @@ class OffloadingStepper(Stepper):
         self._pool.reindex(self._optimiser.pending_table)
         self.table = self._pool.held
 
+    @property
+    def bounds(self) -> Tensor:
+        """See `Stepper.bounds`."""
+        return self._pool.bounds
+
     def catch_up(self, step: int) -> None:
         """See `Stepper.catch_up`; afterwards the table on the host is up to date."""
         self.write_back()

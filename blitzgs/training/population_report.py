@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from blitzgs.runs.files import memory_bytes, peak_memory_bytes
-from blitzgs.runs.log import LOG
+from blitzgs.runs.log import LOG, records
 from blitzgs.training.state import TrainingState
 from blitzgs.util.charts import line_chart
 from blitzgs.util.output import write_file
@@ -79,17 +79,12 @@ def write_picture(state: TrainingState, report: dict[str, Any]) -> None:
 def _logged(path: Path, run_id: str) -> list[tuple[int, int]]:
     """Return (images, Gaussians) of the events of run `run_id` that changed the population."""
     points: list[tuple[int, int]] = []
-    if not path.exists():
-        return points
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        try:
-            record = json.loads(line)
-            if record.get("run") != run_id:  # of a run that ended before its first checkpoint
-                continue
+    for record in records(path):
+        if record.get("run") != run_id:  # of a run that ended before its first checkpoint
+            continue
+        with contextlib.suppress(ValueError, LookupError, TypeError):
             if record.get("event") in ("pass_1", "pass_2"):
                 points.append((int(record["t"]), int(record["before"])))
             if record.get("event") in ("densify", "pass_1", "pass_2"):
                 points.append((int(record["t"]), int(record["gaussians"])))
-        except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-            continue  # torn when the disk was full or the process was killed
     return points

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import torch
 
-from blitzgs.capture.capture import Capture
-from blitzgs.capture.fingerprint import train_views_fingerprint
+from blitzgs.capture.capture import Capture, train_views_fingerprint
 from blitzgs.capture.images import Images
 from blitzgs.config.fields import Config
 from blitzgs.config.files import save_config
@@ -39,17 +38,16 @@ from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
+from blitzgs.training.budget import extended
 from blitzgs.training.curve import Curve
 from blitzgs.training.exposure import Exposures
-from blitzgs.training.extension import extended
 from blitzgs.training.inputs import check_alike, check_capture, check_resolution
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.population_report import PICTURE
-from blitzgs.training.sampler import BatchSampler
+from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
-from blitzgs.training.tour import tour_of
 from blitzgs.training.track_gains import differ, track_gains
 from blitzgs.training.view_level import keep_to_views
 from blitzgs.view.levels import Levels, measure_levels

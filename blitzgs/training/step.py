@@ -55,7 +55,7 @@ class Stepper:
         """Prepare to step.
 
         Args:
-            table: this rank's Gaussians, in `morton_order`.
+            table: this rank's Gaussians; neighbours in space should be neighbours in the table.
             optimiser: optimiser of the table.
             owners: records what the tiles cost.
             loss: weights of the loss.
@@ -71,6 +71,11 @@ class Stepper:
     def reindex(self) -> None:
         """Rebuild the block index after rows were added, removed or reordered, or the schedule changed."""
         self._blocks = BlockIndex(self.table, self._optimiser.pending_table)
+
+    @property
+    def bounds(self) -> Tensor:
+        """The bounds of all blocks of this rank's Gaussians, see `BlockIndex.bounds`."""
+        return self._blocks.bounds
 
     def catch_up(self, step: int) -> None:
         """Apply all pending optimiser steps; `step` is the last step taken."""

@@ -7,8 +7,7 @@ import dataclasses
 import math
 import warnings
 
-from blitzgs.capture.capture import Capture
-from blitzgs.capture.fingerprint import train_views_fingerprint
+from blitzgs.capture.capture import Capture, train_views_fingerprint
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.files import Progress
 from blitzgs.runs.lod import lod_gate, scene_gate

@@ -12,11 +12,16 @@ import hashlib
 import os
 import re
 import secrets
+import shutil
 import stat
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 # A file that `OutputFolder` leaves in its folder. Where it is missing, existing files belong to another
 # program or to the user.
@@ -74,11 +79,18 @@ def write_file(path: Path, content: bytes | str, sync: bool = True) -> None:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def check_replaceable(path: Path) -> None:
-    """Check that `path` does not exist or is a regular file.
+def check_replaceable(path: Path, ours: tuple[bytes, ...] = (), otherwise: str = "") -> None:
+    """Check that `path` does not exist, or is a regular file that may be replaced.
+
+    Args:
+        path: the file.
+        ours: if there are any, a file that is not empty must have one of these in its first 2000 bytes, or
+            at its start if they have 8 bytes or fewer.
+        otherwise: what else it is, as it follows in the error after "FILE exists".
 
     Raises:
         OSError: it is a link, a device, a folder or something else that must not be replaced.
+        FileExistsError: the file has none of `ours`.
     """
     try:
         mode = path.lstat().st_mode
@@ -88,6 +100,11 @@ def check_replaceable(path: Path) -> None:
         kinds = {stat.S_IFLNK: "a symbolic link", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe"}
         kind = kinds.get(stat.S_IFMT(mode), "a device or socket")
         raise OSError(f"{path} is {kind}, which is not overwritten: remove it or choose another name")
+    if ours:
+        with open(path, "rb") as file:
+            start = file.read(2000)
+        if start and not any(start.startswith(mark) if len(mark) <= 8 else mark in start for mark in ours):
+            raise FileExistsError(f"{path} exists{otherwise}: choose another name")
 
 
 class OutputFolder:
@@ -239,3 +256,22 @@ def sync_to_disk(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def check_space(folder: Path, columns: Mapping[str, Tensor]) -> None:
+    """Raise the error of a full disk if columns do not fit into the free space."""
+    needed = sum(column.numel() * column.element_size() for column in columns.values())
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise OSError(
+            errno.ENOSPC, f"{needed / 1e9:.2f} GB are needed and {free / 1e9:.2f} GB are free", str(folder)
+        )
+
+
+def explain(error: OSError) -> str:
+    """Return why a file was not written, and what to do where that is known."""
+    if is_lack_of_space(error):
+        return f"the disk is full ({error}); free some space or lower the number of checkpoints kept"
+    if error.errno == errno.EFBIG:
+        return f"a file is larger than is allowed ({error}); raise the limit (ulimit -f) or use another disk"
+    return str(error)

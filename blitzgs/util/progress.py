@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A progress bar for work on a sequence of images."""
+"""A progress bar for work on a sequence of images, and the seconds of the parts of a work."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+import psutil
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -36,3 +38,27 @@ def image_progress(what: str, shown: bool = True) -> Iterator[Report]:
     ) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+class Laps:
+    """The seconds of consecutive parts.
+
+    Attributes:
+        seconds: of each part so far, in order.
+    """
+
+    def __init__(self, since_start: bool = False) -> None:
+        """Begin the first part now, or (`since_start`) at the start of this process."""
+        self.seconds: dict[str, float] = {}
+        self._last = psutil.Process().create_time() if since_start else time.time()
+
+    def lap(self, name: str) -> None:
+        """End a part, which is called `name`, and begin the next one."""
+        now = time.time()
+        self.seconds[name] = self.seconds.get(name, 0.0) + max(0.0, now - self._last)
+        self._last = now
+
+    def text(self) -> str:
+        """Return all parts in a line."""
+        parts = ", ".join(f"{name} {seconds:.1f}" for name, seconds in self.seconds.items())
+        return f"set-up {sum(self.seconds.values()):.1f} s: {parts}"

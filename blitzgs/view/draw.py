@@ -16,8 +16,7 @@ from torch import Tensor
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import Frame, RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.pixels import collect_images
-from blitzgs.frame.tiles import TileAssignment, TileRanges
+from blitzgs.frame.tiles import TileAssignment, TileRanges, collect_images
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.table.pool import Pool

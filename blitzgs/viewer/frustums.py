@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from blitzgs.capture.colmap import rotation_to_quat
 from blitzgs.viewer.exhibit import Exhibit
 from blitzgs.viewer.world import World
 
@@ -51,7 +51,7 @@ class Frustums:
                 thickness=1.5,
                 thickness_units="screen",
                 color=TEST_COLOUR if index in test else TRAIN_COLOUR,
-                wxyz=quaternion(stance.rotation),
+                wxyz=rotation_to_quat(stance.rotation),
                 position=stance.position,
                 cast_shadow=False,
                 receive_shadow=False,
@@ -100,19 +100,3 @@ def frustum_size(world: World) -> float:
     np.fill_diagonal(distances, np.inf)
     nearest = float(np.median(distances.min(axis=1)))
     return float(np.clip(0.12 * nearest, 0.01, 0.2))
-
-
-def quaternion(rotation: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the unit quaternion (w, x, y, z) of a rotation [3, 3]."""
-    m = rotation
-    k = np.array(
-        [
-            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [0, m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-            [0, 0, m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
-            [0, 0, 0, m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    _, vectors = np.linalg.eigh(k + np.triu(k, 1).T)
-    found: npt.NDArray[np.float64] = vectors[:, -1]
-    return found if found[0] >= 0 else -found

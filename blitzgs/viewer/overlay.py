@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from html import escape
 
 import numpy as np
 
@@ -29,12 +30,12 @@ def overlay(visitor: Visitor, shown: Shown, memory: str) -> str:
         f"{picture.gaussians:,} Gaussians in view &middot; {picture.milliseconds:.1f} ms &middot; "
         f"{look.width}&times;{look.height}" + (f" &middot; {memory}" if memory else ""),
         "x {:.2f} &nbsp;y {:.2f} &nbsp;z {:.2f}".format(*place),
-        *((_escaped(frame.label(place)),) if (frame := visitor.exhibit.frame) is not None else ()),
+        *((escape(frame.label(place)),) if (frame := visitor.exhibit.frame) is not None else ()),
     ]
     if ask.camera is not None and shown.psnr is not None:
         name = visitor.exhibit.cameras[ask.camera].name
         part = "held out" if ask.camera in set(visitor.exhibit.test) else "trained on"
-        lines.append(f"{_escaped(name)} ({part}) &middot; <b>{shown.psnr:.2f} dB</b>")
+        lines.append(f"{escape(name)} ({part}) &middot; <b>{shown.psnr:.2f} dB</b>")
     if shown.low is not None and shown.high is not None:
         colours = {"depth": _TURBO, "count": _INFERNO}.get(look.mode, _GREY)
         lines.append(
@@ -68,7 +69,3 @@ def round_length(length: float) -> float:
     """Return the largest of 1, 2, 5, 10, 20, ... (or 0.5, 0.2, ...) that is no longer than a length."""
     power = 10.0 ** math.floor(math.log10(length))
     return max(factor * power for factor in (1, 2, 5) if factor * power <= length * (1 + 1e-9))
-
-
-def _escaped(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

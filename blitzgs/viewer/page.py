@@ -175,7 +175,7 @@ class Page:
         begin = time.thread_time()
         try:
             shown = visitor.take(ask, picture)
-            if shown is None:
+            if shown is None or visitor.client.client_id not in self.visitors:
                 return
             visitor.shown = shown
             sharp = ask.scale >= 1.0

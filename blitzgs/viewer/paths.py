@@ -8,11 +8,11 @@ backward (OpenGL). Angles are vertical fields of view in degrees.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -86,21 +86,8 @@ def interpolated(keys: Sequence[Keyframe], time: float, is_cycle: bool = False) 
 
 def _slerp(a: Array, b: Array, share: float) -> Array:
     """Turn from rotation `a` to `b` about one axis by a share of the angle."""
-    turn = a.T @ b
-    angle = math.acos(max(-1.0, min(1.0, (np.trace(turn) - 1) / 2)))
-    if angle < 1e-9:
-        return a
-    if angle > math.pi - 1e-4:  # the axis: the column of turn + 1 that is longest
-        columns = turn + np.eye(3)
-        axis = columns[:, np.linalg.norm(columns, axis=0).argmax()]
-        axis = axis / np.linalg.norm(axis)
-    else:
-        twist = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-        axis = twist / (2 * math.sin(angle))
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    part = share * angle
-    turned: Array = a @ (np.eye(3) + math.sin(part) * cross + (1 - math.cos(part)) * cross @ cross)
+    turn = cv2.Rodrigues(a.T @ b)[0]
+    turned: Array = a @ cv2.Rodrigues(share * turn)[0]
     return turned
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.capture.world import GEO, WorldFrame, read_frame
+from blitzgs.capture.world import GEO, GEOCENTRIC, WorldFrame, converted, pyproj_module, read_frame
 from blitzgs.config.fields import Config, ModelConfig
 from blitzgs.formats.gaussians import GaussianSource, is_antialiased
 from blitzgs.formats.models import offset_of
@@ -22,7 +22,8 @@ from blitzgs.runs.cameras import CAMERAS, load_cameras
 from blitzgs.runs.source import open_source
 from blitzgs.view.views import CameraLike, Space, render_options
 from blitzgs.viewer.studio import box_of
-from blitzgs.viewer.world import SCALE, World
+from blitzgs.viewer.web import web_scene
+from blitzgs.viewer.world import World
 
 Array = npt.NDArray[np.float64]
 
@@ -99,25 +100,8 @@ def open_city(path: Path) -> City:
 def _scene(
     middle: Array, space: Space, config: Config, cameras: Sequence[CameraLike], degree: int
 ) -> WebScene:
-    options = render_options(config, space, degree)
     world = World(space, cameras, middle / space.unit)
-    start = world.start()
-
-    def point(values: Array, scale: float = 1.0) -> tuple[float, float, float]:
-        x, y, z = (scale * values).tolist()
-        return x, y, z
-
-    return WebScene(
-        near=options.near_plane * space.unit,
-        far=options.far_plane * space.unit,
-        blur=options.eps2d,
-        antialiased=options.antialiased,
-        background=options.background,
-        up=point(world.up),
-        eye=point(start.position, space.unit / SCALE),
-        target=point(world.middle, space.unit / SCALE),
-        fov=start.fov,
-    )
+    return web_scene(world, render_options(config, space, degree), space.unit)
 
 
 def to_globe(frame: WorldFrame, origin: Array) -> Array:
@@ -135,22 +119,15 @@ def to_globe(frame: WorldFrame, origin: Array) -> Array:
         ImportError: pyproj is missing.
         ValueError: pyproj does not know the reference system, or the place is outside of it.
     """
-    try:
-        import pyproj
-    except ImportError as error:
-        raise ImportError('world coordinates need the package pyproj: pip install "blitzgs[geo]"') from error
-    try:
-        system = pyproj.CRS.from_user_input(frame.crs).to_3d()
-    except pyproj.exceptions.CRSError as error:
-        raise ValueError(f"{frame.source}: {error}") from error
     # Central differences over this length, in the unit of the capture.
     step = 10.0
     places = origin + step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    world = frame.to_world(places)
-    mapped = pyproj.Transformer.from_crs(system, "EPSG:4978", always_xy=True).transform(*world.T)
-    globe = np.stack(mapped, axis=1)
-    if not np.isfinite(globe).all():
-        raise ValueError(f"{frame.source}: {world[0].tolist()} is no place in {frame.name}")
+    pyproj = pyproj_module()
+    try:
+        system = pyproj.CRS.from_user_input(frame.crs).to_3d()
+        globe = converted(frame.to_world(places), system, GEOCENTRIC)
+    except (ValueError, pyproj.exceptions.CRSError) as error:
+        raise ValueError(f"{frame.source}: {error}") from error
     matrix = np.eye(4)
     matrix[:3, :3] = (globe[1:4] - globe[4:]).T / (2 * step)
     matrix[:3, 3] = globe[0]

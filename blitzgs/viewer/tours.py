@@ -10,7 +10,7 @@ import numpy as np
 
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.viewer.paths import CameraPath, Keyframe
-from blitzgs.viewer.world import SCALE, Array, Stance, World, looking
+from blitzgs.viewer.world import SCALE, Array, Stance, World, horizontal, looking
 
 Tour = Literal["orbit", "flight", "spline"]
 TOURS: tuple[Tour, ...] = get_args(Tour)
@@ -68,7 +68,7 @@ def _orbit(world: World, fov: float) -> list[Stance]:
     height = float(np.median(heights))
     # Cameras straight above the middle would leave no circle.
     radius = max(float(np.median(flat)), 0.7 * abs(height))
-    east, north = _horizontal(world.up)
+    east, north = horizontal(world.up)
     angles = np.arange(_CIRCLE) * 2 * math.pi / _CIRCLE
     places = [
         world.middle + radius * (math.cos(angle) * east + math.sin(angle) * north) + height * world.up
@@ -93,10 +93,3 @@ def _flight(world: World, fov: float) -> list[Stance]:
     behind = height / math.tan(-slope) if height > 0 and slope < -_FLAT else 0.0
     places = [world.middle + (along - behind) * ahead + height * world.up for along in ends]
     return [looking(place, place + view, world.up, fov) for place in places]
-
-
-def _horizontal(up: Array) -> tuple[Array, Array]:
-    side = np.eye(3)[int(np.abs(up).argmin())]
-    east = side - up * (side @ up)
-    east /= np.linalg.norm(east)
-    return east, np.cross(up, east)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from blitzgs.capture.colmap import quats_to_rotations
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Look, Picture
 from blitzgs.viewer import compare
@@ -123,14 +124,7 @@ class Visitor:
 
     def _read(self) -> Stance:
         camera = self.client.camera
-        w, x, y, z = camera.wxyz
-        rotation = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        rotation = quats_to_rotations(np.array([camera.wxyz], dtype=np.float64))[0]
         return Stance(np.array(camera.position, dtype=np.float64), rotation, float(camera.fov))
 
     def _on_camera(self, _: object) -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from blitzgs.formats.selection import opacity_length
 from blitzgs.formats.web_page import WebLevels, WebScene, WebSplats, estimated_bytes, frame_bytes, web_page
+from blitzgs.frame.frame import RenderOptions
 from blitzgs.runs.clean import contributions as measured
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import PARAMETERS, GaussianTable
@@ -125,8 +126,13 @@ def _splats(table: GaussianTable, rows: Tensor, degree: int, levels: bool) -> We
 
 
 def _scene(opened: Opened) -> WebScene:
-    exhibit, options = opened.exhibit, opened.subject.options
+    exhibit, lod = opened.exhibit, opened.subject.lod
     world = World(exhibit.space, exhibit.cameras, exhibit.box.mean(axis=0))
+    return web_scene(world, opened.subject.options, 1.0, None if lod is None else _levels(lod))
+
+
+def web_scene(world: World, options: RenderOptions, unit: float, lod: WebLevels | None = None) -> WebScene:
+    """Return how a page shows a scene, with so many units of the page's Gaussians to a trained one."""
     start = world.start()
 
     def point(values: np.ndarray) -> tuple[float, float, float]:
@@ -134,16 +140,16 @@ def _scene(opened: Opened) -> WebScene:
         return x, y, z
 
     return WebScene(
-        near=options.near_plane,
-        far=options.far_plane,
+        near=options.near_plane * unit,
+        far=options.far_plane * unit,
         blur=options.eps2d,
         antialiased=options.antialiased,
         background=options.background,
         up=point(world.up),
-        eye=point(start.position / SCALE),
-        target=point(world.middle / SCALE),
+        eye=point(start.position * (unit / SCALE)),
+        target=point(world.middle * (unit / SCALE)),
         fov=start.fov,
-        lod=None if opened.subject.lod is None else _levels(opened.subject.lod),
+        lod=lod,
     )
 
 

@@ -90,11 +90,17 @@ class World:
             distance = (
                 float(np.clip(np.median(np.linalg.norm(centres - self.middle, axis=1)), 0.2, distance)) * 1.3
             )
-        side = np.array([1.0, 0, 0]) if abs(self.up[0]) < 0.9 else np.array([0, 1.0, 0])
-        side -= self.up * (side @ self.up)
-        side /= np.linalg.norm(side)
-        away = np.cross(self.up, side) * -0.8 + self.up * 0.6
+        _, north = horizontal(self.up)
+        away = north * -0.8 + self.up * 0.6
         return looking(self.middle + away * distance, self.middle, self.up, fov)
+
+
+def horizontal(up: Array) -> tuple[Array, Array]:
+    """Return two directions across `up`, at right angles; for the z axis, x and y."""
+    east = np.array([1.0, 0, 0]) if abs(up[0]) < 0.9 else np.array([0, 1.0, 0])
+    east -= up * (east @ up)
+    east /= np.linalg.norm(east)
+    return east, np.cross(up, east)
 
 
 def looking(position: Array, target: Array, up: Array, fov: float) -> Stance:

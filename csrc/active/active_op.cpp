@@ -7,7 +7,6 @@
 #include <vector>
 
 #include "active/cull_mask.h"
-#include "active/morton_keys.h"
 #include "active/pool.h"
 #include "active/view_gate.h"
 #include "common/op.h"

@@ -323,6 +323,9 @@ struct CullInputs {
 };
 
 namespace BLITZGS_BACKEND {
+// keys [n]: the Morton codes (math/morton.h) of points [n, 3], without their lowest bit so that they fit a
+// signed integer. A table whose rows are in this order has neighbours in space in neighbouring rows.
+void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream);
 // Computes the bounds of the blocks that contain the rows `ids`, or of all blocks if ids is null.
 void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
                          Workspace&, CudaStream);

@@ -5,6 +5,7 @@
 
 #include "active/blocks.h"
 #include "common/parallel.h"
+#include "math/morton.h"
 
 namespace blitzgs::cpu {
 
@@ -123,6 +124,15 @@ void cull_blocks(const CullInputs& in, const ActiveList& list, Workspace& worksp
         list.ids[at] = block * kBlockRows + local;
         list.views[at++] = static_cast<std::int32_t>(mask);
       }
+    }
+  });
+}
+
+void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream) {
+  const MortonFrame frame = morton_frame_of(points, n);
+  parallel_for(0, n, 1 << 14, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      keys[i] = static_cast<std::int64_t>(morton_code(points + 3 * i, frame) >> 1);
     }
   });
 }

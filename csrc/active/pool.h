@@ -3,7 +3,7 @@
 // on the device holds some of its blocks. seen_blocks finds the blocks that some views may see; swap_blocks_
 // moves blocks between the table and the pool.
 //
-// A block is 256 consecutive rows (blocks/blocks.h). A slot is the memory of one block in the pool.
+// A block is 256 consecutive rows (active/blocks.h). A slot is the memory of one block in the pool.
 #pragma once
 #include <cstddef>
 #include <cstdint>

@@ -3,7 +3,7 @@
 
 #include "active/pool.h"
 #include "common/cuda.cuh"
-#include "exchange/copy_to_host.h"
+#include "exchange/transport.h"
 
 namespace blitzgs::cuda {
 

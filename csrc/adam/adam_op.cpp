@@ -3,6 +3,7 @@
 
 #include "adam/position_noise.h"
 #include "common/op.h"
+#include "common/rows.h"
 
 namespace blitzgs {
 namespace {
@@ -72,18 +73,18 @@ void position_noise_(Tensor means, const Tensor& quats_in, const Tensor& scales_
   DeviceScope scope(means);
   dispatch_floating(means, [&](auto zero) {
     using T = decltype(zero);
-    const PositionNoiseArgs<T> args{mutable_data<T>(means),
-                                    data<T>(quats),
-                                    data<T>(scales),
-                                    data<T>(opacities),
-                                    data<std::int64_t>(ids),
-                                    data<std::int32_t>(visible_ids),
-                                    visible,
-                                    seed,
-                                    step,
-                                    threshold,
-                                    strength};
-    backend::position_noise(args, scope.workspace, scope.stream);
+    const PositionNoise<T> args{mutable_data<T>(means),
+                                data<T>(quats),
+                                data<T>(scales),
+                                data<T>(opacities),
+                                data<std::int64_t>(ids),
+                                data<std::int32_t>(visible_ids),
+                                visible,
+                                seed,
+                                step,
+                                threshold,
+                                strength};
+    backend::for_each_row(args, scope.stream);
   });
 }
 

@@ -30,45 +30,39 @@ constexpr double kLeastGate = 0x1p-24;
 constexpr std::int64_t kPositionNoise = 1;
 
 template <class T>
-struct PositionNoiseArgs {
+struct PositionNoise {
   T* means;            // [N, 3]
   const T* quats;      // [N, 4]
   const T* scales;     // [N, 3]
   const T* opacities;  // [N]
   const std::int64_t* ids;
   const std::int32_t* visible_ids;
-  std::int64_t visible;
+  std::int64_t n;
   std::int64_t seed, step;
   double threshold, strength;
-};
 
-template <class T>
-BLITZGS_HD void position_noise_of(const PositionNoiseArgs<T>& args, std::int64_t u) {
-  const std::int64_t row = args.visible_ids[u];
-  const double opacity = sigmoid(static_cast<double>(args.opacities[row]));
-  const double gate = sigmoid(kGateSlope * (args.threshold - opacity));
-  if (!(gate >= kLeastGate)) return;
-  const Columns3<T> rotation = rotation_columns(normalize_quaternion(args.quats + 4 * row));
-  const Vec3<T> log_scale = load3(args.scales + 3 * row);
-  const Columns3<T> axes =
-      scaled_axes(rotation, Vec3<T>{std::exp(log_scale.x), std::exp(log_scale.y), std::exp(log_scale.z)});
-  std::uint64_t hash = 0;
-  for (const std::int64_t key : {args.ids[row], args.seed, kPositionNoise, args.step}) {
-    hash = hash_key(hash, key);
+  BLITZGS_HD void operator()(std::int64_t u) const {
+    const std::int64_t row = visible_ids[u];
+    const double opacity = sigmoid(static_cast<double>(opacities[row]));
+    const double gate = sigmoid(kGateSlope * (threshold - opacity));
+    if (!(gate >= kLeastGate)) return;
+    const Columns3<T> rotation = rotation_columns(normalize_quaternion(quats + 4 * row));
+    const Vec3<T> log_scale = load3(scales + 3 * row);
+    const Columns3<T> axes =
+        scaled_axes(rotation, Vec3<T>{std::exp(log_scale.x), std::exp(log_scale.y), std::exp(log_scale.z)});
+    std::uint64_t hash = 0;
+    for (const std::int64_t key : {ids[row], seed, kPositionNoise, step}) {
+      hash = hash_key(hash, key);
+    }
+    const Vec3<T> draw = {static_cast<T>(normal_of(hash_key(hash, 0))),
+                          static_cast<T>(normal_of(hash_key(hash, 1))),
+                          static_cast<T>(normal_of(hash_key(hash, 2)))};
+    const T factor = static_cast<T>(strength * gate);
+    const Vec3<T> moved =
+        load3(means + 3 * row) +
+        factor * (dot(axes.x, draw) * axes.x + dot(axes.y, draw) * axes.y + dot(axes.z, draw) * axes.z);
+    store3(moved, means + 3 * row);
   }
-  const Vec3<T> draw = {static_cast<T>(normal_of(hash_key(hash, 0))),
-                        static_cast<T>(normal_of(hash_key(hash, 1))),
-                        static_cast<T>(normal_of(hash_key(hash, 2)))};
-  const T factor = static_cast<T>(args.strength * gate);
-  const Vec3<T> moved =
-      load3(args.means + 3 * row) +
-      factor * (dot(axes.x, draw) * axes.x + dot(axes.y, draw) * axes.y + dot(axes.z, draw) * axes.z);
-  store3(moved, args.means + 3 * row);
-}
-
-namespace BLITZGS_BACKEND {
-template <class T>
-void position_noise(const PositionNoiseArgs<T>& args, Workspace&, CudaStream);
-}  // namespace BLITZGS_BACKEND
+};
 
 }  // namespace blitzgs

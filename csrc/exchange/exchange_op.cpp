@@ -4,7 +4,6 @@
 #include <vector>
 
 #include "common/op.h"
-#include "exchange/copy_to_host.h"
 #include "exchange/places_op.h"
 #include "exchange/scatter.h"
 #include "exchange/tile_costs.h"

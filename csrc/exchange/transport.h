@@ -57,6 +57,13 @@ namespace cuda {
 void device_barrier(const ControlWords&, std::int64_t number, const std::int64_t* values, int n_values,
                     std::int64_t first, double timeout_seconds, std::int64_t* host, Workspace&, CudaStream);
 void send_splats(const SendArguments&, CudaStream);
+
+// The address at which kernels of the current device access pinned memory of the host. Throws if the memory
+// is not pinned. Kernels write numbers for the host there themselves: a cudaMemcpyAsync would be done by
+// another engine of the GPU, and the stream would wait before and after it. The host may read them after it
+// has waited for the kernel.
+std::int64_t* device_address(std::int64_t* pinned);
+void copy_to_host(const std::int64_t* values, std::int64_t n, std::int64_t* host, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

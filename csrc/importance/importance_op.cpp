@@ -6,6 +6,7 @@
 #include <tuple>
 
 #include "common/op.h"
+#include "common/rows.h"
 #include "importance/mass_cut.h"
 #include "importance/view_sums.h"
 
@@ -124,26 +125,26 @@ void view_sums_(const std::vector<Tensor>& sums, const std::vector<Tensor>& spla
   }
   STD_TORCH_CHECK(0 <= rule && rule <= 2, "blitzgs::", kViewSums, ": rule must be 0, 1 or 2, got ", rule);
   DeviceScope scope(weights);
-  ViewSumsArgs args{data<std::int64_t>(weights),
-                    data<std::int32_t>(pixels),
-                    data<std::int32_t>(splats[3]),
-                    data<std::int32_t>(splats[2]),
-                    data<bool>(counts),
-                    data<std::int32_t>(splats[0]),
-                    data<std::int32_t>(splats[1]),
-                    visible,
-                    words,
-                    static_cast<std::int64_t*>(sums[0].mutable_data_ptr()),
-                    static_cast<std::int32_t*>(sums[1].mutable_data_ptr()),
-                    static_cast<std::int32_t*>(sums[2].mutable_data_ptr()),
-                    static_cast<std::uint32_t*>(sums[3].mutable_data_ptr()),
-                    static_cast<ScoreRule>(rule),
-                    eps,
-                    unit,
-                    {}};
+  ViewSums args{data<std::int64_t>(weights),
+                data<std::int32_t>(pixels),
+                data<std::int32_t>(splats[3]),
+                data<std::int32_t>(splats[2]),
+                data<bool>(counts),
+                data<std::int32_t>(splats[0]),
+                data<std::int32_t>(splats[1]),
+                visible,
+                words,
+                static_cast<std::int64_t*>(sums[0].mutable_data_ptr()),
+                static_cast<std::int32_t*>(sums[1].mutable_data_ptr()),
+                static_cast<std::int32_t*>(sums[2].mutable_data_ptr()),
+                static_cast<std::uint32_t*>(sums[3].mutable_data_ptr()),
+                static_cast<ScoreRule>(rule),
+                eps,
+                unit,
+                {}};
   std::transform(columns.begin(), columns.end(), args.columns,
                  [](std::int64_t column) { return static_cast<std::int32_t>(column); });
-  backend::view_sums(args, scope.stream);
+  backend::for_each_row(args, scope.stream);
 }
 
 }  // namespace

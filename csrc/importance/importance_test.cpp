@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "importance/importance.h"
-
 #include <algorithm>
 #include <cmath>
 #include <vector>
 
 #include "common/catch.h"
 #include "common/test_workspace.h"
-
-namespace {
+#include "importance/importance.h"
+#include "importance/mass_cut.h"
 
 using namespace blitzgs;
+
+namespace {
 
 // Two round splats on an image of 20 x 12, in one list per tile of 16 x 16, the nearer one first.
 template <class T>
@@ -105,4 +105,56 @@ TEST_CASE("contributions of tile ranges add up") {
   pair.survey(1, 1);
   REQUIRE(pair.weights == std::vector<std::int64_t>{0, 0});
   REQUIRE(pair.squares == std::vector<std::int64_t>{0, 0});
+}
+
+TEST_CASE("first digits grow with the number and fit their table") {
+  int before = -1;
+  for (std::int64_t number = 0; number < 100'000; ++number) {
+    const int digit = first_digit(number);
+    REQUIRE(digit >= before);
+    before = digit;
+  }
+  for (int exponent = 17; exponent < 63; ++exponent) {
+    const std::int64_t power = std::int64_t{1} << exponent;
+    REQUIRE(first_digit(power - 1) < first_digit(power));
+    REQUIRE(first_digit(power) > before);
+    before = first_digit(power);
+  }
+  REQUIRE(first_digit(std::numeric_limits<std::int64_t>::max()) == 1008);
+  REQUIRE(1008 < kFirstDigits);
+}
+
+TEST_CASE("a first digit leaves its numbers' leading bits and what is behind them") {
+  for (const std::int64_t number : {std::int64_t{1}, std::int64_t{9}, std::int64_t{31}, std::int64_t{1} << 40,
+                                    std::numeric_limits<std::int64_t>::max()}) {
+    MassSearch search{kAboveAllWeights, 0, 10, 0};
+    take_digit(search, true, first_digit(number), 3, 8);
+    REQUIRE(search.head == number >> search.shift);
+    REQUIRE(search.shift <= (kRounds - 1) * kDigitBits);
+    REQUIRE(search.missing == 7);
+    REQUIRE(search.held == 8);
+  }
+}
+
+TEST_CASE("the share of a total is rounded up and does not overflow") {
+  REQUIRE(share_of(100, 99, 100) == 99);
+  REQUIRE(share_of(101, 99, 100) == 100);
+  REQUIRE(share_of(1, 1, 1'000'000'000) == 1);
+  REQUIRE(share_of(7, 0, 1) == 0);
+  REQUIRE(share_of((std::int64_t{1} << 61) + 1, 999'999'999, 1'000'000'000) == 2'305'843'006'907'850'944);
+}
+
+TEST_CASE("a cut takes the heaviest and, of equal ones, those of the smallest ids") {
+  const std::vector<std::int64_t> weights{5, 1, 5, 0, 5, 80}, ids{30, 11, 10, 12, 20, 99};
+  const std::vector<std::int32_t> segments(6, 0), owners{0, 1, 2, 3, 4, 5};
+  SegmentSearch search{};
+  std::vector<std::int64_t> sums(kDigits, 0);
+  std::vector<std::int32_t> listed(7);
+  bool chosen[6];
+  // 90 of 96: the heaviest, and two of the three that weigh 5.
+  const MassCutArgs args{weights.data(), segments.data(), owners.data(), ids.data(), 6, 1, 90, 96,
+                         &search,        sums.data(),     listed.data(), chosen};
+  cpu::mass_cut(args, 0, kSteps, nullptr);
+  const std::vector<bool> found(chosen, chosen + 6);
+  REQUIRE(found == std::vector<bool>{false, false, true, false, true, true});
 }

@@ -25,35 +25,6 @@ namespace blitzgs {
 
 enum class ScoreRule : int { kWeight = 0, kRoot = 1, kDensity = 2 };
 
-struct ViewSumsArgs {
-  const std::int64_t* weights;
-  const std::int32_t* pixels;
-  const std::int32_t* radii;
-  const std::int32_t* camera_ids;
-  const bool* counts;
-  const std::int32_t* visible_ids;
-  const std::int32_t* splat_offsets;
-  std::int64_t n_visible, words;
-  std::int64_t* score;
-  std::int32_t* seen;
-  std::int32_t* counted;
-  std::uint32_t* cull;
-  ScoreRule rule;
-  double eps, unit;
-  std::int32_t columns[kMaxViews];
-};
-
-// The summand of a splat, in units of the score. `round` rounds to the nearest integer, ties to even; each
-// backend has its own function for it.
-template <class Round>
-BLITZGS_HD std::int64_t score_term(const ViewSumsArgs& args, std::int64_t splat, const Round& round) {
-  double term = static_cast<double>(args.weights[splat]) / 4294967296.0;
-  const double pixels = static_cast<double>(args.pixels[splat]) + args.eps;
-  if (args.rule == ScoreRule::kDensity) term = term / pixels;
-  if (args.rule == ScoreRule::kRoot) term = term / std::sqrt(pixels);
-  return round(term / args.unit);
-}
-
 // Clears the bits of one word of a Gaussian's row of the cull matrix after the other. It stores a word only
 // when the next bit is in another one, because stores would keep the loads of later splats waiting.
 struct CullRow {
@@ -72,27 +43,54 @@ struct CullRow {
   }
 };
 
-template <class Round>
-BLITZGS_HD void view_sums_of(const ViewSumsArgs& args, std::int64_t u, const Round& round) {
-  const std::int32_t id = args.visible_ids[u];
-  std::int64_t score = 0;
-  std::int32_t seen = 0, counted = 0;
-  CullRow cull{args.cull + id * args.words};
-  for (std::int64_t i = args.splat_offsets[u]; i < args.splat_offsets[u + 1]; ++i) {
-    score += score_term(args, i, round);
-    seen += args.radii[2 * i] > 0 || args.radii[2 * i + 1] > 0;
-    if (!args.counts[i]) continue;
-    ++counted;
-    cull.clear(args.columns[args.camera_ids[i]]);
-  }
-  cull.store();
-  args.score[id] += score;
-  args.seen[id] += seen;
-  args.counted[id] += counted;
-}
+struct ViewSums {
+  const std::int64_t* weights;
+  const std::int32_t* pixels;
+  const std::int32_t* radii;
+  const std::int32_t* camera_ids;
+  const bool* counts;
+  const std::int32_t* visible_ids;
+  const std::int32_t* splat_offsets;
+  std::int64_t n, words;
+  std::int64_t* score;
+  std::int32_t* seen;
+  std::int32_t* counted;
+  std::uint32_t* cull;
+  ScoreRule rule;
+  double eps, unit;
+  std::int32_t columns[kMaxViews];
 
-namespace BLITZGS_BACKEND {
-void view_sums(const ViewSumsArgs& args, CudaStream);
-}  // namespace BLITZGS_BACKEND
+  BLITZGS_HD void operator()(std::int64_t u) const {
+    const std::int32_t id = visible_ids[u];
+    std::int64_t sum = 0;
+    std::int32_t views = 0, views_counted = 0;
+    CullRow row{cull + id * words};
+    for (std::int64_t i = splat_offsets[u]; i < splat_offsets[u + 1]; ++i) {
+      sum += score_term(i);
+      views += radii[2 * i] > 0 || radii[2 * i + 1] > 0;
+      if (!counts[i]) continue;
+      ++views_counted;
+      row.clear(columns[camera_ids[i]]);
+    }
+    row.store();
+    score[id] += sum;
+    seen[id] += views;
+    counted[id] += views_counted;
+  }
+
+ private:
+  // The summand of a splat, in units of the score, rounded to the nearest integer, ties to even.
+  BLITZGS_HD std::int64_t score_term(std::int64_t splat) const {
+    double term = static_cast<double>(weights[splat]) / 4294967296.0;
+    const double area = static_cast<double>(pixels[splat]) + eps;
+    if (rule == ScoreRule::kDensity) term = term / area;
+    if (rule == ScoreRule::kRoot) term = term / std::sqrt(area);
+#ifdef __CUDA_ARCH__
+    return __double2ll_rn(term / unit);
+#else
+    return static_cast<std::int64_t>(std::nearbyint(term / unit));
+#endif
+  }
+};
 
 }  // namespace blitzgs

@@ -70,22 +70,6 @@ std::vector<ColmapCamera> read_cameras_text(std::istream& in, const std::string&
 ColmapImages read_images_text(std::istream& in, const std::string& name, bool with_points2d);
 ColmapPoints read_points_text(std::istream& in, const std::string& name, bool with_tracks);
 
-// Writers throw std::invalid_argument if columns differ in length. The caller has to check the stream for
-// errors. Numbers in text are the shortest that are read back as the same bits.
-void write_cameras_binary(std::ostream& out, const std::vector<ColmapCamera>& cameras);
-void write_images_binary(std::ostream& out, const ColmapImages& images);
-void write_points_binary(std::ostream& out, const ColmapPoints& points);
-
-void write_cameras_text(std::ostream& out, const std::vector<ColmapCamera>& cameras);
-void write_images_text(std::ostream& out, const ColmapImages& images);
-void write_points_text(std::ostream& out, const ColmapPoints& points);
-
-// Used by the writers of both formats.
-void check_columns(const std::vector<ColmapCamera>& cameras);
-void check_columns(const ColmapImages& images);
-void check_columns(const ColmapPoints& points);
-// Throws std::invalid_argument if the readers of text, which strip blanks, would change a name.
-void check_text_names(const ColmapImages& images);
 // Returns why a camera cannot be used, or an empty string.
 std::string camera_problem(const ColmapCamera& camera);
 

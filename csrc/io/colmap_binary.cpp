@@ -1,6 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <ostream>
-
 #include "io/colmap.h"
 
 namespace blitzgs::io {
@@ -12,11 +10,6 @@ constexpr std::uint64_t kImageBytes = 4 + 7 * 8 + 4 + 1 + 8;  // with an empty n
 constexpr std::uint64_t kPoint2dBytes = 2 * 8 + 8;
 constexpr std::uint64_t kPointBytes = 8 + 3 * 8 + 3 + 8 + 8;  // with an empty track
 constexpr std::uint64_t kTrackBytes = 4 + 4;
-
-template <class T>
-void put(std::ostream& out, const T& value) {
-  out.write(reinterpret_cast<const char*>(&value), sizeof value);
-}
 
 }  // namespace
 
@@ -101,52 +94,6 @@ ColmapPoints read_points_binary(std::istream& in, const std::string& name, bool 
   }
   reader.expect_end();
   return points;
-}
-
-void write_cameras_binary(std::ostream& out, const std::vector<ColmapCamera>& cameras) {
-  check_columns(cameras);
-  put<std::uint64_t>(out, cameras.size());
-  for (const ColmapCamera& camera : cameras) {
-    put(out, camera.id);
-    put<std::int32_t>(out, camera.model);
-    put(out, camera.width);
-    put(out, camera.height);
-    for (const double value : camera.params) put(out, value);
-  }
-}
-
-void write_images_binary(std::ostream& out, const ColmapImages& images) {
-  check_columns(images);
-  put<std::uint64_t>(out, images.ids.size());
-  for (std::size_t i = 0; i < images.ids.size(); ++i) {
-    put(out, images.ids[i]);
-    for (int k = 0; k < 4; ++k) put(out, images.quats[4 * i + k]);
-    for (int k = 0; k < 3; ++k) put(out, images.translations[3 * i + k]);
-    put(out, images.camera_ids[i]);
-    out.write(images.names[i].c_str(), static_cast<std::streamsize>(images.names[i].size() + 1));
-    put(out, images.point2d_offsets[i + 1] - images.point2d_offsets[i]);
-    for (std::uint64_t k = images.point2d_offsets[i]; k < images.point2d_offsets[i + 1]; ++k) {
-      put(out, images.points2d[2 * k]);
-      put(out, images.points2d[2 * k + 1]);
-      put(out, images.point3d_ids[k]);
-    }
-  }
-}
-
-void write_points_binary(std::ostream& out, const ColmapPoints& points) {
-  check_columns(points);
-  put<std::uint64_t>(out, points.ids.size());
-  for (std::size_t i = 0; i < points.ids.size(); ++i) {
-    put(out, points.ids[i]);
-    for (int k = 0; k < 3; ++k) put(out, points.positions[3 * i + k]);
-    out.write(reinterpret_cast<const char*>(&points.colors[3 * i]), 3);
-    put(out, points.errors[i]);
-    put(out, points.track_offsets[i + 1] - points.track_offsets[i]);
-    for (std::uint64_t k = points.track_offsets[i]; k < points.track_offsets[i + 1]; ++k) {
-      put(out, points.track_image_ids[k]);
-      put(out, points.track_point2d_ids[k]);
-    }
-  }
 }
 
 }  // namespace blitzgs::io

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 #include <limits>
-#include <stdexcept>
 
 #include "io/colmap.h"
 
@@ -58,53 +57,6 @@ std::string camera_problem(const ColmapCamera& camera) {
            std::to_string(camera.height);
   }
   return "";
-}
-
-namespace {
-
-void require(bool ok, const char* message) {
-  if (!ok) throw std::invalid_argument(message);
-}
-
-void check_offsets(const std::vector<std::uint64_t>& offsets, std::size_t records, std::size_t rows,
-                   const char* message) {
-  require(offsets.size() == records + 1 && offsets.front() == 0 && offsets.back() == rows &&
-              std::is_sorted(offsets.begin(), offsets.end()),
-          message);
-}
-
-}  // namespace
-
-void check_columns(const std::vector<ColmapCamera>& cameras) {
-  for (const ColmapCamera& camera : cameras) {
-    const std::string problem = camera_problem(camera);
-    require(problem.empty(), problem.c_str());
-  }
-}
-
-void check_columns(const ColmapImages& images) {
-  const std::size_t n = images.ids.size();
-  require(images.camera_ids.size() == n && images.quats.size() == 4 * n &&
-              images.translations.size() == 3 * n && images.names.size() == n,
-          "images: camera_ids [N], quats [N, 4], translations [N, 3] and names [N] must match ids [N]");
-  check_offsets(images.point2d_offsets, n, images.point3d_ids.size(),
-                "images: point2d_offsets [N + 1] must rise from 0 to the number of observations");
-  require(images.points2d.size() == 2 * images.point3d_ids.size(),
-          "images: points2d [O, 2] must match point3d_ids [O]");
-  for (const std::string& name : images.names) {
-    require(!name.empty() && name.find('\0') == std::string::npos && name.find('\n') == std::string::npos,
-            "images: a name is empty or has a NUL or line break in it");
-  }
-}
-
-void check_columns(const ColmapPoints& points) {
-  const std::size_t n = points.ids.size();
-  require(points.positions.size() == 3 * n && points.colors.size() == 3 * n && points.errors.size() == n,
-          "points: positions [M, 3], colors [M, 3] and errors [M] must match ids [M]");
-  check_offsets(points.track_offsets, n, points.track_image_ids.size(),
-                "points: track_offsets [M + 1] must rise from 0 to the number of track elements");
-  require(points.track_point2d_ids.size() == points.track_image_ids.size(),
-          "points: track_point2d_ids must match track_image_ids");
 }
 
 }  // namespace blitzgs::io

@@ -1,28 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <charconv>
-#include <ostream>
-#include <stdexcept>
-
 #include "io/colmap.h"
 #include "io/text_reader.h"
 
 namespace blitzgs::io {
 
 namespace {
-
-template <class T>
-void put(std::ostream& out, T value) {
-  char text[40];
-  const auto [end, error] = std::to_chars(text, text + sizeof text, value);
-  out.write(text, end - text);
-  static_cast<void>(error);  // 40 characters hold every double and 64-bit integer
-}
-
-template <class T>
-void put_after_blank(std::ostream& out, T value) {
-  out.put(' ');
-  put(out, value);
-}
 
 // Without the empty line of an image that has no observations, the next image stands here and would be lost.
 void skip_observations(TextReader& reader) {
@@ -105,72 +87,6 @@ ColmapPoints read_points_text(std::istream& in, const std::string& name, bool wi
     points.track_offsets.push_back(points.track_offsets.back() + length);
   }
   return points;
-}
-
-void write_cameras_text(std::ostream& out, const std::vector<ColmapCamera>& cameras) {
-  check_columns(cameras);
-  out << "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n# Number of cameras: ";
-  put(out, cameras.size());
-  out << '\n';
-  for (const ColmapCamera& camera : cameras) {
-    put(out, camera.id);
-    out << ' ' << find_camera_model(camera.model)->name;
-    put_after_blank(out, camera.width);
-    put_after_blank(out, camera.height);
-    for (const double value : camera.params) put_after_blank(out, value);
-    out << '\n';
-  }
-}
-
-void check_text_names(const ColmapImages& images) {
-  for (const std::string& name : images.names) {
-    if (kBlanks.find(name.front()) != kBlanks.npos || kBlanks.find(name.back()) != kBlanks.npos) {
-      throw std::invalid_argument("images: the name '" + name +
-                                  "' begins or ends with a blank, which readers of text strip; rename the "
-                                  "image or write the model as .bin");
-    }
-  }
-}
-
-void write_images_text(std::ostream& out, const ColmapImages& images) {
-  check_columns(images);
-  check_text_names(images);
-  out << "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
-      << "# Number of images: ";
-  put(out, images.ids.size());
-  out << '\n';
-  for (std::size_t i = 0; i < images.ids.size(); ++i) {
-    put(out, images.ids[i]);
-    for (int k = 0; k < 4; ++k) put_after_blank(out, images.quats[4 * i + k]);
-    for (int k = 0; k < 3; ++k) put_after_blank(out, images.translations[3 * i + k]);
-    put_after_blank(out, images.camera_ids[i]);
-    out << ' ' << images.names[i] << '\n';
-    for (std::uint64_t k = images.point2d_offsets[i]; k < images.point2d_offsets[i + 1]; ++k) {
-      if (k > images.point2d_offsets[i]) out.put(' ');
-      put(out, images.points2d[2 * k]);
-      put_after_blank(out, images.points2d[2 * k + 1]);
-      put_after_blank(out, images.point3d_ids[k]);
-    }
-    out << '\n';
-  }
-}
-
-void write_points_text(std::ostream& out, const ColmapPoints& points) {
-  check_columns(points);
-  out << "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n# Number of points: ";
-  put(out, points.ids.size());
-  out << '\n';
-  for (std::size_t i = 0; i < points.ids.size(); ++i) {
-    put(out, points.ids[i]);
-    for (int k = 0; k < 3; ++k) put_after_blank(out, points.positions[3 * i + k]);
-    for (int k = 0; k < 3; ++k) put_after_blank<int>(out, points.colors[3 * i + k]);
-    put_after_blank(out, points.errors[i]);
-    for (std::uint64_t k = points.track_offsets[i]; k < points.track_offsets[i + 1]; ++k) {
-      put_after_blank(out, points.track_image_ids[k]);
-      put_after_blank(out, points.track_point2d_ids[k]);
-    }
-    out << '\n';
-  }
 }
 
 }  // namespace blitzgs::io

@@ -54,9 +54,4 @@ ImageHeader read_tiff_header(ImageBytes file, const std::string& name);
 bool is_tiff(ImageBytes file);
 unsigned exif_orientation(ImageBytes tiff);  // 1 if there is none, or none that makes sense
 
-// Checks that a PNG is complete: its chunks and the checksums of those that a picture needs. A decoder
-// complains on the terminal before it fails. Throws FormatError with the name, the byte offset and the
-// reason.
-void check_png(ImageBytes file, const std::string& name);
-
 }  // namespace blitzgs::io

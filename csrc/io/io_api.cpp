@@ -6,8 +6,6 @@
 
 #include <algorithm>
 #include <atomic>
-#include <cerrno>
-#include <cstring>
 #include <fstream>
 #include <iterator>
 #include <memory>
@@ -41,11 +39,6 @@ constexpr std::int32_t type_of() {
   if constexpr (std::is_same_v<T, double>) return BLITZGS_IO_FLOAT64;
 }
 
-// Thrown if a file cannot be written; OSError in Python.
-struct WriteError : std::runtime_error {
-  using std::runtime_error::runtime_error;
-};
-
 // The columns of a call, taken in order.
 class Arguments {
  public:
@@ -58,11 +51,6 @@ class Arguments {
     if (column.type != type_of<T>()) throw std::logic_error("an argument has another type");
     return {static_cast<const T*>(column.data), column.size};
   }
-  template <class T>
-  std::vector<T> vector() {
-    const auto values = take<T>();
-    return {values.begin(), values.end()};
-  }
   template <class T = std::uint64_t>
   T number() {
     return take<T>()[0];
@@ -70,17 +58,6 @@ class Arguments {
   std::string text() {
     const Bytes bytes = take<std::uint8_t>();
     return {bytes.begin(), bytes.end()};
-  }
-  // Texts in one column, of which the next one has the ends.
-  std::vector<std::string> texts() {
-    const Bytes bytes = take<std::uint8_t>();
-    std::vector<std::string> out;
-    std::uint64_t begin = 0;
-    for (const std::uint64_t end : take<std::uint64_t>()) {
-      out.emplace_back(bytes.begin() + begin, bytes.begin() + end);
-      begin = end;
-    }
-    return out;
   }
 
  private:
@@ -137,15 +114,6 @@ std::ifstream opened(const std::string& path) {
   std::ifstream in(path, std::ios::binary);
   if (!in) throw io::FormatError(path, "cannot be opened");
   return in;
-}
-
-template <class Write>
-void to_file(const std::string& path, Write write) {
-  std::ofstream out(path, std::ios::binary | std::ios::trunc);
-  if (!out) throw WriteError(path + ": cannot be opened for writing: " + std::strerror(errno));
-  write(out);
-  out.close();
-  if (!out) throw WriteError(path + ": writing failed: " + std::strerror(errno));
 }
 
 void camera_models(Arguments&, Reply& reply) {
@@ -216,63 +184,6 @@ void read_points(Arguments& arguments, Reply& reply) {
   reply.add(std::move(points.track_point2d_ids));
 }
 
-void write_cameras(Arguments& arguments, Reply&) {
-  const std::string path = arguments.text();
-  const auto ids = arguments.take<std::uint32_t>();
-  const std::vector<std::string> models = arguments.texts();
-  const auto widths = arguments.take<std::uint64_t>();
-  const auto heights = arguments.take<std::uint64_t>();
-  const auto params = arguments.take<double>();
-  const auto ends = arguments.take<std::uint64_t>();
-  std::vector<io::ColmapCamera> cameras;
-  for (std::size_t i = 0; i < ids.size(); ++i) {
-    const io::CameraModel* known = io::find_camera_model(models[i]);
-    if (!known) throw std::invalid_argument("unknown camera model " + models[i]);
-    const std::uint64_t begin = i ? ends[i - 1] : 0;
-    cameras.push_back({ids[i], known->id, widths[i], heights[i],
-                       std::vector<double>(params.begin() + begin, params.begin() + ends[i])});
-  }
-  io::check_columns(cameras);
-  to_file(path, [&](std::ostream& out) {
-    is_text(path) ? io::write_cameras_text(out, cameras) : io::write_cameras_binary(out, cameras);
-  });
-}
-
-void write_images(Arguments& arguments, Reply&) {
-  const std::string path = arguments.text();
-  io::ColmapImages images;
-  images.ids = arguments.vector<std::uint32_t>();
-  images.quats = arguments.vector<double>();
-  images.translations = arguments.vector<double>();
-  images.camera_ids = arguments.vector<std::uint32_t>();
-  images.names = arguments.texts();
-  images.point2d_offsets = arguments.vector<std::uint64_t>();
-  images.points2d = arguments.vector<double>();
-  images.point3d_ids = arguments.vector<std::int64_t>();
-  // Before the file is opened, so that bad columns leave no file behind.
-  io::check_columns(images);
-  if (is_text(path)) io::check_text_names(images);
-  to_file(path, [&](std::ostream& out) {
-    is_text(path) ? io::write_images_text(out, images) : io::write_images_binary(out, images);
-  });
-}
-
-void write_points(Arguments& arguments, Reply&) {
-  const std::string path = arguments.text();
-  io::ColmapPoints points;
-  points.ids = arguments.vector<std::int64_t>();
-  points.positions = arguments.vector<double>();
-  points.colors = arguments.vector<std::uint8_t>();
-  points.errors = arguments.vector<double>();
-  points.track_offsets = arguments.vector<std::uint64_t>();
-  points.track_image_ids = arguments.vector<std::uint32_t>();
-  points.track_point2d_ids = arguments.vector<std::uint32_t>();
-  io::check_columns(points);
-  to_file(path, [&](std::ostream& out) {
-    is_text(path) ? io::write_points_text(out, points) : io::write_points_binary(out, points);
-  });
-}
-
 constexpr std::string_view kNumpyTypes[] = {"i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"};
 
 void read_ply(Arguments& arguments, Reply& reply) {
@@ -293,30 +204,9 @@ void read_ply(Arguments& arguments, Reply& reply) {
   reply.add_number(table.total);
 }
 
-void write_ply(Arguments& arguments, Reply&) {
-  const std::string path = arguments.text();
-  io::PlyTable table;
-  table.comments = arguments.texts();
-  const std::vector<std::string> names = arguments.texts();
-  const std::vector<std::string> types = arguments.texts();
-  for (std::size_t i = 0; i < names.size(); ++i) {
-    const auto found = std::find(std::begin(kNumpyTypes), std::end(kNumpyTypes), types[i]);
-    if (found == std::end(kNumpyTypes)) throw std::invalid_argument("ply: unknown type " + types[i]);
-    table.properties.push_back({names[i], static_cast<io::PlyType>(found - std::begin(kNumpyTypes))});
-  }
-  table.count = arguments.number();
-  table.rows = arguments.vector<std::uint8_t>();
-  to_file(path, [&](std::ostream& out) { io::write_ply(out, table); });
-}
-
 void check_jpeg(Arguments& arguments, Reply&) {
   const Bytes file = arguments.take<std::uint8_t>();
   io::check_jpeg(file, arguments.text());
-}
-
-void check_png(Arguments& arguments, Reply&) {
-  const Bytes file = arguments.take<std::uint8_t>();
-  io::check_png(file, arguments.text());
 }
 
 void read_image_header(Arguments& arguments, Reply& reply) {
@@ -368,15 +258,12 @@ struct Function {
 };
 #define BLITZGS_IO_FUNCTION(name) {#name, &name}
 constexpr Function kFunctions[] = {
-    BLITZGS_IO_FUNCTION(camera_models),  BLITZGS_IO_FUNCTION(read_cameras),
-    BLITZGS_IO_FUNCTION(read_images),    BLITZGS_IO_FUNCTION(read_points),
-    BLITZGS_IO_FUNCTION(write_cameras),  BLITZGS_IO_FUNCTION(write_images),
-    BLITZGS_IO_FUNCTION(write_points),   BLITZGS_IO_FUNCTION(read_ply),
-    BLITZGS_IO_FUNCTION(write_ply),      BLITZGS_IO_FUNCTION(check_jpeg),
-    BLITZGS_IO_FUNCTION(check_png),      BLITZGS_IO_FUNCTION(read_image_header),
-    BLITZGS_IO_FUNCTION(tiff_as_stored), BLITZGS_IO_FUNCTION(encode_qoi),
-    BLITZGS_IO_FUNCTION(decode_qoi),     BLITZGS_IO_FUNCTION(set_flag),
-    BLITZGS_IO_FUNCTION(flag_is_set),
+    BLITZGS_IO_FUNCTION(camera_models),     BLITZGS_IO_FUNCTION(read_cameras),
+    BLITZGS_IO_FUNCTION(read_images),       BLITZGS_IO_FUNCTION(read_points),
+    BLITZGS_IO_FUNCTION(read_ply),          BLITZGS_IO_FUNCTION(check_jpeg),
+    BLITZGS_IO_FUNCTION(read_image_header), BLITZGS_IO_FUNCTION(tiff_as_stored),
+    BLITZGS_IO_FUNCTION(encode_qoi),        BLITZGS_IO_FUNCTION(decode_qoi),
+    BLITZGS_IO_FUNCTION(set_flag),          BLITZGS_IO_FUNCTION(flag_is_set),
 };
 
 // Returns the status of a call, and the message of its exception.
@@ -389,8 +276,6 @@ std::pair<int, std::string> run(std::string_view name, Arguments arguments, Repl
     return {BLITZGS_IO_OK, ""};
   } catch (const io::FormatError& error) {
     return {BLITZGS_IO_FORMAT_ERROR, error.what()};
-  } catch (const WriteError& error) {
-    return {BLITZGS_IO_WRITE_ERROR, error.what()};
   } catch (const std::logic_error& error) {  // std::invalid_argument, mostly
     return {BLITZGS_IO_VALUE_ERROR, error.what()};
   } catch (const std::bad_alloc& error) {

@@ -22,7 +22,6 @@ enum blitzgs_io_type {
 enum blitzgs_io_status_code {
   BLITZGS_IO_OK,
   BLITZGS_IO_FORMAT_ERROR,  // a file is damaged
-  BLITZGS_IO_WRITE_ERROR,   // a file cannot be written
   BLITZGS_IO_VALUE_ERROR,   // arguments do not fit each other
   BLITZGS_IO_MEMORY_ERROR,
   BLITZGS_IO_ERROR,

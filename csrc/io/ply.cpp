@@ -5,7 +5,6 @@
 #include <array>
 #include <charconv>
 #include <optional>
-#include <ostream>
 #include <sstream>
 #include <string>
 
@@ -208,30 +207,9 @@ void swap_bytes(const Element& vertex, std::vector<std::uint8_t>& rows) {
   }
 }
 
-void check_writable(const PlyTable& table) {
-  const std::uint64_t row = table.row_bytes();
-  if (row == 0 || table.rows.size() / row != table.count || table.rows.size() % row != 0) {
-    throw std::invalid_argument("ply: " + std::to_string(table.rows.size()) + " bytes are not " +
-                                std::to_string(table.count) + " rows of " + std::to_string(row));
-  }
-  for (const PlyProperty& p : table.properties) {
-    if (p.name.empty() || p.name.find_first_of(" \t\r\n") != std::string::npos) {
-      throw std::invalid_argument("ply: '" + p.name + "' cannot name a property");
-    }
-  }
-  for (const std::string& line : table.comments) {
-    const bool known = line.starts_with("comment") || line.starts_with("obj_info");
-    if (!known || line.find('\n') != std::string::npos) {
-      throw std::invalid_argument("ply: '" + line + "' is not one comment or obj_info line");
-    }
-  }
-}
-
 }  // namespace
 
 int ply_type_bytes(PlyType type) { return kTypes[static_cast<std::size_t>(type)].bytes; }
-
-std::string_view ply_type_name(PlyType type) { return kTypes[static_cast<std::size_t>(type)].name; }
 
 std::uint64_t PlyTable::row_bytes() const {
   std::uint64_t bytes = 0;
@@ -277,20 +255,6 @@ PlyTable read_ply(std::istream& in, const std::string& name, std::uint64_t first
   if (header.encoding == Encoding::kBig) swap_bytes(*vertex, table.rows);
   if (first + table.count == table.total && vertex + 1 == header.elements.end()) reader.expect_end();
   return table;
-}
-
-void write_ply(std::ostream& out, const PlyTable& table) {
-  check_writable(table);
-  out << "ply\nformat binary_little_endian 1.0\n";
-  for (const std::string& line : table.comments) out << line << '\n';
-  // A stream would group the digits of a number where the program's locale does.
-  out << "element vertex " << std::to_string(table.count) << '\n';
-  for (const PlyProperty& p : table.properties) {
-    out << "property " << ply_type_name(p.type) << ' ' << p.name << '\n';
-  }
-  out << "end_header\n";
-  out.write(reinterpret_cast<const char*>(table.rows.data()),
-            static_cast<std::streamsize>(table.rows.size()));
 }
 
 }  // namespace blitzgs::io

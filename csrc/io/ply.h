@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // PLY: the vertex table of a file, as rows of scalar properties in native byte order.
 //
-// Reads ASCII and binary of either byte order; writes binary little endian. Elements after the vertices are
-// not read; list properties of the vertices are refused. Rows are packed in header order without padding, so
-// a binary little-endian file that has only vertices is written back byte for byte.
+// Reads ASCII and binary of either byte order. Elements after the vertices are not read; list properties of
+// the vertices are refused. Rows are packed in header order without padding.
 #pragma once
 #include <cstdint>
 #include <iosfwd>
@@ -18,7 +17,6 @@ namespace blitzgs::io {
 
 enum class PlyType : std::uint8_t { kInt8, kUint8, kInt16, kUint16, kInt32, kUint32, kFloat32, kFloat64 };
 int ply_type_bytes(PlyType type);
-std::string_view ply_type_name(PlyType type);  // as in a header: "char", ..., "float", "double"
 
 struct PlyProperty {
   std::string name;
@@ -39,8 +37,4 @@ struct PlyTable {
 // offset or header line, and reason.
 PlyTable read_ply(std::istream& in, const std::string& name, std::uint64_t first = 0,
                   std::uint64_t most = std::numeric_limits<std::uint64_t>::max());
-// Throws std::invalid_argument if the rows do not match the properties, or if a name is not allowed in a
-// header.
-void write_ply(std::ostream& out, const PlyTable& table);
-
 }  // namespace blitzgs::io

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "io/ply.h"
 
-#include <locale>
 #include <sstream>
 
 #include "common/catch.h"
@@ -10,17 +9,10 @@ using namespace blitzgs::io;
 
 namespace {
 
-PlyTable some_table() {
-  PlyTable table{{"comment by hand"}, {{"x", PlyType::kFloat32}, {"n", PlyType::kUint8}}, 3, {}};
-  for (std::uint8_t i = 0; i < 15; ++i) table.rows.push_back(i);
-  return table;
-}
-
-std::string written(const PlyTable& table) {
-  std::ostringstream out;
-  write_ply(out, table);
-  return out.str();
-}
+const std::string kTable =
+    std::string(
+        "ply\nformat binary_little_endian 1.0\ncomment by hand\nelement vertex 3\nproperty float x\n") +
+    "property uchar n\nend_header\n" + std::string("\0\1\2\3\4\5\6\7\10\11\12\13\14\15\16", 15);
 
 PlyTable parsed(const std::string& bytes) {
   std::istringstream in(bytes);
@@ -38,26 +30,12 @@ bool refused(const std::string& bytes) {
 
 }  // namespace
 
-TEST_CASE("a PLY table survives, and so do its bytes") {
-  const std::string bytes = written(some_table());
-  const PlyTable found = parsed(bytes);
+TEST_CASE("a PLY table is its rows, properties and comments") {
+  const PlyTable found = parsed(kTable);
   REQUIRE(found.count == 3);
-  REQUIRE(found.rows == some_table().rows);
-  REQUIRE(found.comments == some_table().comments);
-  REQUIRE(found.properties[1].name == "n");
-  REQUIRE(written(found) == bytes);
-}
-
-TEST_CASE("a locale that groups digits changes no count") {
-  struct Grouped : std::numpunct<char> {
-    std::string do_grouping() const override { return "\3"; }
-  };
-  PlyTable table{{}, {{"n", PlyType::kUint8}}, 1234, std::vector<std::uint8_t>(1234)};
-  const std::string bytes = written(table);
-  const std::locale before = std::locale::global(std::locale(std::locale(), new Grouped));
-  const std::string grouped = written(table);
-  std::locale::global(before);
-  REQUIRE(grouped == bytes);
+  REQUIRE(found.rows == std::vector<std::uint8_t>{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14});
+  REQUIRE(found.comments == std::vector<std::string>{"comment by hand"});
+  REQUIRE((found.properties[0].type == PlyType::kFloat32 && found.properties[1].name == "n"));
 }
 
 TEST_CASE("ASCII and big-endian PLY give the rows of the little-endian one") {
@@ -103,7 +81,7 @@ TEST_CASE("some rows are those rows of all") {
 }
 
 TEST_CASE("every truncation of a PLY file is refused, and wrong bytes are never worse") {
-  const std::string bytes = written(some_table());
+  const std::string& bytes = kTable;
   for (std::size_t n = 0; n < bytes.size(); ++n) REQUIRE(refused(bytes.substr(0, n)));
   int refusals = 0;
   for (std::size_t at = 0; at < bytes.size(); ++at) {
@@ -127,16 +105,4 @@ TEST_CASE("a PLY count beyond the file is refused before anything is allocated")
   REQUIRE(
       refused("ply\nformat binary_little_endian 1.0\nelement a 18446744073709551615\nproperty double q\n"
               "element vertex 1\nproperty float x\nend_header\n1234"));
-}
-
-TEST_CASE("tables that cannot stand in a file are not written") {
-  PlyTable table = some_table();
-  table.rows.pop_back();
-  REQUIRE_THROWS_AS(written(table), std::invalid_argument);
-  table = some_table();
-  table.properties[0].name = "two words";
-  REQUIRE_THROWS_AS(written(table), std::invalid_argument);
-  table = some_table();
-  table.comments = {"comment a\nend_header"};
-  REQUIRE_THROWS_AS(written(table), std::invalid_argument);
 }

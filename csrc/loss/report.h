@@ -34,7 +34,21 @@ struct Report {
   int n_targets;
 };
 
+// The loss of views from the partial sums that the photometric kernel wrote, in one launch:
+//   loss = offset + sum over i of (l1_weight parts[i][0] + ssim_weight parts[i][1]),  0 <= i < n.
+// Parts are added in a fixed order. CPU and CUDA agree to the rounding of doubles.
+
+template <class T>
+struct LossOfSums {
+  const double* parts;
+  std::int64_t n;
+  double l1_weight, ssim_weight, offset;
+  T* loss;
+};
+
 namespace BLITZGS_BACKEND {
+template <class T>
+void loss_of_sums(const LossOfSums<T>&, Workspace&, CudaStream);
 template <class T>
 void report(const Report<T>& report, Workspace&, CudaStream);
 }  // namespace BLITZGS_BACKEND

@@ -44,4 +44,27 @@ void report<float>(const Report<float>& report, Workspace&, CudaStream stream) {
   check_launch("report");
 }
 
+namespace {
+
+constexpr int kLossThreads = 512;
+
+// The loss (report.h), by one block.
+__global__ void __launch_bounds__(kLossThreads) loss_of_sums_kernel(const LossOfSums<float> args) {
+  double l1 = 0, ssim = 0;
+  for (std::int64_t i = threadIdx.x; i < args.n; i += kLossThreads) {
+    l1 += args.parts[2 * i], ssim += args.parts[2 * i + 1];
+  }
+  l1 = block_sum<kLossThreads>(l1), ssim = block_sum<kLossThreads>(ssim);
+  if (threadIdx.x > 0) return;
+  *args.loss = static_cast<float>(args.offset + args.l1_weight * l1 + args.ssim_weight * ssim);
+}
+
+}  // namespace
+
+template <>
+void loss_of_sums<float>(const LossOfSums<float>& args, Workspace&, CudaStream stream) {
+  loss_of_sums_kernel<<<1, kLossThreads, 0, stream>>>(args);
+  check_launch("loss_of_sums");
+}
+
 }  // namespace blitzgs::cuda

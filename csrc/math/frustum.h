@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // A conservative test whether a view may see a Gaussian, from its mean and an upper bound sigma on its
 // standard deviations. Three callers use these planes: the tests of table blocks and of their rows
-// (blocks/blocks.h) and the prefilter of the projection (project/project_cuda.cu).
+// (active/blocks.h) and the prefilter of the projection (project/project_cuda.cu).
 //
 // A Gaussian with axes up to sigma cannot be seen iff its mean lies behind the near plane, beyond the far
 // plane, or beyond one image border by more than a splat can reach: half-width of alpha >= 1/255 is at most

@@ -1,13 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
-// These tests compare every derivative of the maths headers with central differences in double, and the
-// forward formulas in float, at the ends of the float range, with those in double.
+#include <algorithm>
 #include <functional>
 #include <limits>
 #include <random>
 #include <vector>
 
 #include "common/catch.h"
+#include "math/exp.h"
 #include "math/gaussian.h"
+#include "math/lanes.h"
 #include "math/projection.h"
 #include "project/project_splat.h"
 
@@ -330,4 +331,31 @@ TEST_CASE("nothing that is not finite becomes a splat") {
       REQUIRE_FALSE(project_splat(camera, gaussian, options, &splat));
     }
   }
+}
+
+namespace {
+using Lanes = blitzgs::PlainLanes<float>;
+float exp2_of(float x) { return blitzgs::exp2_nonpositive(Lanes::broadcast(x)).v[3]; }
+}  // namespace
+
+TEST_CASE("2^x is accurate to an ulp for x <= 0") {
+  double worst = 0;
+  for (int i = 0; i <= 400000; ++i) {
+    const float x = -126.0f * static_cast<float>(i) / 400000.0f;
+    const double exact = std::exp2(static_cast<double>(x));
+    worst = std::max(worst, std::fabs(exp2_of(x) - exact) / exact);
+  }
+  REQUIRE(worst < 1.1e-7);
+  REQUIRE(exp2_of(0.0f) == 1.0f);
+  REQUIRE(exp2_of(-126.0f) == exp2_of(-1e30f));
+  REQUIRE(std::isnan(exp2_of(std::numeric_limits<float>::quiet_NaN())));
+}
+
+TEST_CASE("lanes treat NaN as the vector instructions do") {
+  const Lanes nan = Lanes::broadcast(std::numeric_limits<float>::quiet_NaN()), one = Lanes::broadcast(1.0f);
+  REQUIRE(Lanes::min(nan, one).v[0] == 1.0f);
+  REQUIRE(std::isnan(Lanes::min(one, nan).v[0]));
+  REQUIRE(!Lanes::greater_equal(nan, one).any());
+  REQUIRE(nan.to_int().v[0] == INT32_MIN);
+  REQUIRE(Lanes::iota().sum() == 28.0f);
 }

@@ -23,21 +23,6 @@
 
 namespace blitzgs {
 
-template <class T>
-struct DensityStatsArgs {
-  T* grad_sum;               // [N]
-  std::int32_t* grad_count;  // [N]
-  T* max_radii;              // [N]
-  const std::int32_t* visible_ids;
-  const std::int32_t* splat_offsets;
-  const T* v_means2d;
-  std::int64_t v_stride;
-  const T* conics;
-  const T* phi;
-  std::int64_t visible;
-  T half_width, half_height, weight;
-};
-
 // The radius of a splat in pixels, three standard deviations of its longer axis; 0 for a conic whose diagonal
 // is not positive. In double, because the determinant of a thin splat's conic is a small difference. If that
 // is less than the rounding of the conic's own numbers, the rounding takes its place: the splat is then at
@@ -55,25 +40,34 @@ BLITZGS_HD T three_sigma_radius(const T* conic) {
 }
 
 template <class T>
-BLITZGS_HD void density_stats_of(const DensityStatsArgs<T>& args, std::int64_t u) {
-  const std::int32_t id = args.visible_ids[u];
-  const std::int32_t begin = args.splat_offsets[u], end = args.splat_offsets[u + 1];
-  T sum = 0, radius = args.max_radii[id];
-  for (std::int32_t r = begin; r < end; ++r) {
-    const T* v = args.v_means2d + r * args.v_stride;
-    const T x = v[0] * args.half_width, y = v[1] * args.half_height;
-    sum += std::sqrt(x * x + y * y);
-    const T reach = three_sigma_radius(args.conics + 3 * std::int64_t{r});
-    radius = reach > radius ? reach : radius;
-  }
-  args.grad_sum[id] += (args.phi ? args.phi[id] : T(1)) * args.weight * sum;
-  args.grad_count[id] += end - begin;
-  args.max_radii[id] = radius;
-}
+struct DensityStats {
+  T* grad_sum;               // [N]
+  std::int32_t* grad_count;  // [N]
+  T* max_radii;              // [N]
+  const std::int32_t* visible_ids;
+  const std::int32_t* splat_offsets;
+  const T* v_means2d;
+  std::int64_t v_stride;
+  const T* conics;
+  const T* phi;
+  std::int64_t n;
+  T half_width, half_height, weight;
 
-namespace BLITZGS_BACKEND {
-template <class T>
-void density_stats(const DensityStatsArgs<T>& args, Workspace&, CudaStream);
-}  // namespace BLITZGS_BACKEND
+  BLITZGS_HD void operator()(std::int64_t u) const {
+    const std::int32_t id = visible_ids[u];
+    const std::int32_t begin = splat_offsets[u], end = splat_offsets[u + 1];
+    T sum = 0, radius = max_radii[id];
+    for (std::int32_t r = begin; r < end; ++r) {
+      const T* v = v_means2d + r * v_stride;
+      const T x = v[0] * half_width, y = v[1] * half_height;
+      sum += std::sqrt(x * x + y * y);
+      const T reach = three_sigma_radius(conics + 3 * std::int64_t{r});
+      radius = reach > radius ? reach : radius;
+    }
+    grad_sum[id] += (phi ? phi[id] : T(1)) * weight * sum;
+    grad_count[id] += end - begin;
+    max_radii[id] = radius;
+  }
+};
 
 }  // namespace blitzgs

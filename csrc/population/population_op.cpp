@@ -2,10 +2,12 @@
 #include "population/density_stats.h"
 
 #include "common/op.h"
+#include "common/rows.h"
+#include "population/copy_rows.h"
 #include "population/find_non_finite.h"
 #include "population/knn.h"
+#include "population/sampling.h"
 #include "population/spawn_features.h"
-#include "population/take_rows.h"
 #include "population/tree_sums.h"
 #include "population/voxel_keys.h"
 
@@ -39,20 +41,20 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
   DeviceScope scope(grad_sum);
   dispatch_floating(grad_sum, [&](auto zero) {
     using T = decltype(zero);
-    const DensityStatsArgs<T> args{mutable_data<T>(grad_sum),
-                                   mutable_data<std::int32_t>(grad_count),
-                                   mutable_data<T>(max_radii),
-                                   data<std::int32_t>(visible_ids),
-                                   data<std::int32_t>(splat_offsets),
-                                   data<T>(v_means2d),
-                                   v_means2d.stride(0),
-                                   data<T>(conics),
-                                   data_or_null<T>(phi),
-                                   visible,
-                                   static_cast<T>(width) / 2,
-                                   static_cast<T>(height) / 2,
-                                   static_cast<T>(weight)};
-    backend::density_stats(args, scope.workspace, scope.stream);
+    const DensityStats<T> args{mutable_data<T>(grad_sum),
+                               mutable_data<std::int32_t>(grad_count),
+                               mutable_data<T>(max_radii),
+                               data<std::int32_t>(visible_ids),
+                               data<std::int32_t>(splat_offsets),
+                               data<T>(v_means2d),
+                               v_means2d.stride(0),
+                               data<T>(conics),
+                               data_or_null<T>(phi),
+                               visible,
+                               static_cast<T>(width) / 2,
+                               static_cast<T>(height) / 2,
+                               static_cast<T>(weight)};
+    backend::for_each_row(args, scope.stream);
   });
 }
 
@@ -62,32 +64,78 @@ std::int64_t row_elements(const Tensor& column) {
   return elements;
 }
 
-Tensor take_rows(const Tensor& column, const Tensor& rows, const std::optional<Tensor>& fresh) {
-  constexpr const char* kOp = "take_rows";
-  STD_TORCH_CHECK(column.dim() >= 1, "blitzgs::take_rows: column must have rows, got ", shape_of(column));
-  check_shape(kOp, "rows", rows, {-1});
-  check_dtype(kOp, "rows", rows, ScalarType::Long);
-  const Tensor old = as_contiguous(column), places = as_contiguous(rows);
-  std::optional<Tensor> added;
-  if (fresh) {
-    check_dtype(kOp, "fresh", *fresh, column.scalar_type());
-    STD_TORCH_CHECK(fresh->dim() == column.dim() && row_elements(*fresh) == row_elements(column),
-                    "blitzgs::take_rows: rows of fresh must be like those of column, got ", shape_of(*fresh),
-                    " for ", shape_of(column));
-    added = as_contiguous(*fresh);
-  }
-  std::vector<std::int64_t> shape{places.size(0)};
-  for (std::int64_t axis = 1; axis < column.dim(); ++axis) shape.push_back(column.size(axis));
-  Tensor out = make_empty(old, shape);
-  const auto row_bytes = row_elements(old) * static_cast<std::int64_t>(old.element_size());
-  STD_TORCH_CHECK(row_bytes < (1 << 16), "blitzgs::take_rows: rows must be shorter than 64 KiB, got ",
+// Copies rows of `column` (absent: zeros) to `out`; from and to (copy_rows.h) are absent or int64 [n].
+void copy_rows(const char* op, Tensor& out, const std::optional<Tensor>& to, const Tensor* column,
+               const std::optional<Tensor>& from, std::int64_t n) {
+  const std::int64_t row_bytes = row_elements(out) * static_cast<std::int64_t>(out.element_size());
+  STD_TORCH_CHECK(row_bytes < (1 << 16), "blitzgs::", op, ": rows must be shorter than 64 KiB, got ",
                   row_bytes, " bytes");
-  DeviceScope scope(old);
-  backend::take_rows({static_cast<const std::byte*>(old.const_data_ptr()), data_or_null<std::byte>(added),
-                      static_cast<std::byte*>(out.mutable_data_ptr()), data<std::int64_t>(places),
-                      places.size(0), old.size(0), row_bytes},
-                     scope.workspace, scope.stream);
-  return out;
+  DeviceScope scope(out);
+  backend::copy_rows({column ? static_cast<const std::byte*>(column->const_data_ptr()) : nullptr,
+                      data_or_null<std::int64_t>(from), static_cast<std::byte*>(out.mutable_data_ptr()),
+                      data_or_null<std::int64_t>(to), n, row_bytes},
+                     scope.stream);
+}
+
+void check_rows_alike(const char* op, const char* name, const Tensor& rows, const Tensor& column) {
+  check_dtype(op, name, rows, column.scalar_type());
+  STD_TORCH_CHECK(rows.dim() == column.dim() && row_elements(rows) == row_elements(column), "blitzgs::", op,
+                  ": rows of ", name, " must be like those of column, got ", shape_of(rows), " for ",
+                  shape_of(column));
+}
+
+void take_rows_(Tensor out, const Tensor& column_in, const Tensor& rows_in) {
+  constexpr const char* kOp = "take_rows";
+  STD_TORCH_CHECK(column_in.dim() >= 1, "blitzgs::take_rows: column must have rows, got ",
+                  shape_of(column_in));
+  const std::optional<Tensor> rows = checked(kOp, "rows", rows_in, ScalarType::Long, {-1});
+  check_rows_alike(kOp, "out", out, column_in);
+  check_contiguous(kOp, "out", out);
+  const std::int64_t n = rows->size(0);
+  STD_TORCH_CHECK(out.size(0) == n, "blitzgs::take_rows: out must have ", n, " rows, got ", shape_of(out));
+  const Tensor column = as_contiguous(column_in);
+  copy_rows(kOp, out, std::nullopt, &column, rows, n);
+}
+
+void put_rows_(Tensor column, const Tensor& rows_in, const std::optional<Tensor>& fresh_in) {
+  constexpr const char* kOp = "put_rows_";
+  STD_TORCH_CHECK(column.dim() >= 1, "blitzgs::put_rows_: column must have rows, got ", shape_of(column));
+  check_contiguous(kOp, "column", column);
+  const std::optional<Tensor> rows = checked(kOp, "rows", rows_in, ScalarType::Long, {-1});
+  const std::int64_t n = rows->size(0);
+  if (!fresh_in) return copy_rows(kOp, column, rows, nullptr, std::nullopt, n);
+  check_rows_alike(kOp, "fresh", *fresh_in, column);
+  STD_TORCH_CHECK(fresh_in->size(0) == n, "blitzgs::put_rows_: fresh must have ", n, " rows, got ",
+                  shape_of(*fresh_in));
+  const Tensor fresh = as_contiguous(*fresh_in);
+  copy_rows(kOp, column, rows, &fresh, std::nullopt, n);
+}
+
+Tensor sampling_keys(const Tensor& weights_in, const Tensor& ids_in, std::int64_t seed, std::int64_t event) {
+  constexpr const char* kOp = "sampling_keys";
+  const Tensor weights = checked(kOp, "weights", weights_in, ScalarType::Float, {-1}),
+               ids = checked(kOp, "ids", ids_in, ScalarType::Long, {weights.size(0)});
+  Tensor keys = make_empty(weights, {weights.size(0)});
+  DeviceScope scope(weights);
+  backend::sampling_keys({data<float>(weights), data<std::int64_t>(ids), weights.size(0), seed, event,
+                          mutable_data<float>(keys)},
+                         scope.stream);
+  return keys;
+}
+
+Tensor key_histogram(const Tensor& keys_in, const Tensor& prefix_in, std::int64_t shift, std::int64_t width) {
+  constexpr const char* kOp = "key_histogram";
+  const Tensor keys = checked(kOp, "keys", keys_in, ScalarType::Float, {-1}),
+               prefix = checked(kOp, "prefix", prefix_in, ScalarType::Long, {1});
+  STD_TORCH_CHECK(width >= 1 && width <= kMaxDigitBits && shift >= 0 && shift + width <= 32, "blitzgs::", kOp,
+                  ": a digit must have 1 to ", kMaxDigitBits, " of 32 bits, got ", width, " after ", shift);
+  Tensor counts = make_empty(keys, {std::int64_t{1} << width}, ScalarType::Long);
+  DeviceScope scope(keys);
+  backend::key_histogram(
+      {data<float>(keys), data<std::int64_t>(prefix), keys.size(0), static_cast<int>(shift),
+       static_cast<int>(width), mutable_data<std::int64_t>(counts)},
+      scope.stream);
+  return counts;
 }
 
 Tensor find_non_finite(const std::vector<Tensor>& columns_in, const std::vector<Tensor>& nonzero_in) {
@@ -179,22 +227,22 @@ Tensor spawn_features(const std::vector<Tensor>& columns, const Tensor& rows_in,
                is_split = checked(kSpawnOp, "is_split", is_split_in, ScalarType::Bool, {rows.size(0)});
   Tensor features = make_empty(grad_sum, {rows.size(0), kSpawnFeatures});
   DeviceScope scope(grad_sum);
-  const SpawnFeaturesArgs args{data<float>(grad_sum),
-                               data<std::int32_t>(grad_count),
-                               data<float>(opacities),
-                               data<float>(scales),
-                               data<std::int32_t>(birth),
-                               data<std::uint8_t>(level),
-                               data<float>(moments),
-                               3 * moments.size(1),
-                               data<std::int64_t>(rows),
-                               data<bool>(is_split),
-                               rows.size(0),
-                               time,
-                               extent,
-                               static_cast<int>(level_count),
-                               mutable_data<float>(features)};
-  backend::spawn_features(args, scope.stream);
+  const SpawnFeatures args{data<float>(grad_sum),
+                           data<std::int32_t>(grad_count),
+                           data<float>(opacities),
+                           data<float>(scales),
+                           data<std::int32_t>(birth),
+                           data<std::uint8_t>(level),
+                           data<float>(moments),
+                           3 * moments.size(1),
+                           data<std::int64_t>(rows),
+                           data<bool>(is_split),
+                           rows.size(0),
+                           time,
+                           extent,
+                           static_cast<int>(level_count),
+                           mutable_data<float>(features)};
+  backend::for_each_row(args, scope.stream);
   return features;
 }
 
@@ -228,8 +276,8 @@ Tensor voxel_keys(const Tensor& points, const std::vector<double>& origin, doubl
   const VoxelGrid grid{{origin[0], origin[1], origin[2]}, voxel_size};
   dispatch_floating(rows, [&](auto zero) {
     using T = decltype(zero);
-    backend::voxel_keys(data<T>(rows), rows.size(0), grid, mutable_data<std::int64_t>(keys), scope.workspace,
-                        scope.stream);
+    backend::for_each_row(VoxelKeys<T>{data<T>(rows), grid, mutable_data<std::int64_t>(keys), rows.size(0)},
+                          scope.stream);
   });
   return keys;
 }
@@ -239,7 +287,10 @@ Tensor voxel_keys(const Tensor& points, const std::vector<double>& origin, doubl
 
 BLITZGS_REGISTER(m) {
   m.impl("density_stats_", TORCH_BOX(&blitzgs::density_stats_));
-  m.impl("take_rows", TORCH_BOX(&blitzgs::take_rows));
+  m.impl("take_rows_", TORCH_BOX(&blitzgs::take_rows_));
+  m.impl("put_rows_", TORCH_BOX(&blitzgs::put_rows_));
+  m.impl("sampling_keys", TORCH_BOX(&blitzgs::sampling_keys));
+  m.impl("key_histogram", TORCH_BOX(&blitzgs::key_histogram));
   m.impl("find_non_finite", TORCH_BOX(&blitzgs::find_non_finite));
   m.impl("tree_sums", TORCH_BOX(&blitzgs::tree_sums));
   m.impl("spawn_features", TORCH_BOX(&blitzgs::spawn_features));

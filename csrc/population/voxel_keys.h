@@ -32,10 +32,14 @@ BLITZGS_HD std::int64_t voxel_key(const T* point, const VoxelGrid& grid) {
   return key;
 }
 
-namespace BLITZGS_BACKEND {
 template <class T>
-void voxel_keys(const T* points, std::int64_t n, const VoxelGrid& grid, std::int64_t* keys, Workspace&,
-                CudaStream);
-}  // namespace BLITZGS_BACKEND
+struct VoxelKeys {
+  const T* points;
+  VoxelGrid grid;
+  std::int64_t* keys;
+  std::int64_t n;
+
+  BLITZGS_HD void operator()(std::int64_t i) const { keys[i] = voxel_key(points + 3 * i, grid); }
+};
 
 }  // namespace blitzgs

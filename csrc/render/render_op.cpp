@@ -8,10 +8,8 @@
 #include <vector>
 
 #include "common/op.h"
-#include "project/color_rows.h"
+#include "common/rows.h"
 #include "project/project_op.h"
-#include "render/arrange_splats.h"
-#include "render/gather_rows.h"
 
 namespace blitzgs {
 // Colours, tile lists, compositing and alphas in one op, because each call of an op takes the host
@@ -230,7 +228,8 @@ TensorList render(const Tensor& means2d, const Tensor& conics, Tensor splat_opac
   DeviceScope scope(alphas);
   dispatch_floating(alphas, [&](auto zero) {
     using T = decltype(zero);
-    backend::alphas_of(data<T>(transmittances), alphas.numel(), mutable_data<T>(alphas), scope.stream);
+    backend::for_each_row(Alphas<T>{data<T>(transmittances), mutable_data<T>(alphas), alphas.numel()},
+                          scope.stream);
   });
   TensorList found = std::apply([&](const auto&... tensors) { return TensorList{tensors..., alphas}; },
                                 std::tuple_cat(lists, outputs));

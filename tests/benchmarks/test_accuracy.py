@@ -1,18 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The accuracy benchmark measures an error that a test puts into the image or a gradient."""
+"""The accuracy benchmark measures an error that a test puts into it, and scenes are as stated."""
 
 import json
 import sys
 from dataclasses import asdict, replace
-from pathlib import Path
 
+import bm_accuracy
 import pytest
+import scenes
 import torch
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-
-import bm_accuracy  # noqa: E402
-from scenes import aerial  # noqa: E402
+from scenes import aerial
 
 from tests.helpers import needs_cuda
 
@@ -79,3 +76,37 @@ def test_an_interrupted_run_keeps_its_measurements(scene, tmp_path, monkeypatch,
     assert names == ["default", "antialiased"]
     for text in ((tmp_path / "accuracy.md").read_text(), capsys.readouterr().out):
         assert text.splitlines()[-1].startswith("| antialiased |")
+
+
+@pytest.mark.parametrize("name", ["aerial", "garden_like"])
+def test_seeded_shapes_and_ranges(name):
+    make = getattr(scenes, name)
+    first, again, other = make(5001, views=3), make(5001, views=3), make(5001, views=3, seed=1)
+    for key in ("means", "quats", "scales", "opacities", "sh"):
+        value = getattr(first, key)
+        assert len(value) == 5001 and bool(value.isfinite().all())
+        assert torch.equal(value, getattr(again, key))
+        assert not torch.equal(value, getattr(other, key))
+    assert first.sh.shape == (5001, 16, 3)
+    assert first.viewmats.shape == (3, 4, 4) and first.first_views(1).Ks.shape == (1, 3, 3)
+    torch.testing.assert_close(first.quats.norm(dim=1), torch.ones(5001))
+    torch.testing.assert_close(first.raw()["scales"].exp(), first.scales)
+    torch.testing.assert_close(first.raw()["opacities"].sigmoid(), first.opacities)
+    assert len(make(0).means) == 0
+
+
+def test_aerial_workload():
+    scene = aerial(100_000, views=4)
+    fractions = scene.centres_in_view()
+    assert float(fractions.min()) > 0.08 and float(fractions.max()) < 0.13
+    assert float(scene.means[:, :2].abs().max()) < 502
+    flattest = scene.scales.argmin(1) == 2
+    assert float(flattest.float().mean()) > 0.8
+
+
+def test_aerial_gaussians_lie_in_their_surface():
+    scene = aerial(50_000)
+    on_ground = scene.means[:, 2] < 0.2
+    w, x, y, z = scene.quats[on_ground].unbind(1)
+    up = 1 - 2 * (x * x + y * y)  # z component of the turned z axis
+    assert float(up.median()) > 0.95

@@ -215,19 +215,13 @@ def test_infinite_logits_are_fine(recwarn):
     assert not [w for w in recwarn if "blitzgs" in str(w.message)]
 
 
-def test_gsplats_default_of_the_tile_size_is_accepted():
-    scene = random_scene(n=20)
-    p = raw_parameters(scene)
-    assert torch.equal(raw(p, scene, tile_size=None)[0], raw(p, scene)[0])
-
-
 def test_what_gsplats_trainer_passes_is_accepted_where_it_has_no_effect():
     scene = random_scene(n=20)
     p = raw_parameters(scene)
     passed = {
         "packed": True, "absgrad": False, "sparse_grad": True, "rasterize_mode": "classic", "covars": None,
         "distributed": False, "camera_model": "".join(["pin", "hole"]), "with_ut": False,
-        "with_eval3d": False, "channel_chunk": 8, "segmented": True,
+        "with_eval3d": False, "channel_chunk": 8, "segmented": True, "tile_size": None,
     }  # fmt: skip
     assert torch.equal(raw(p, scene, **passed)[0], raw(p, scene)[0])
 

@@ -16,12 +16,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from blitzgs.capture.image_files import decode_rgb, read_header, read_whole
+from blitzgs.capture.image_files import check_png, decode_rgb, read_header, read_whole
 from blitzgs.capture.transforms import read_transforms
 from blitzgs.formats import native
 from blitzgs.formats.ply import read_ply, read_point_cloud
-from tests.capture.helpers import ROOT, reconstruction, smooth_image, write_image
-from tests.capture.image_bytes import tiff
+from tests.capture.helpers import ROOT, reconstruction, smooth_image, tiff, write_image
 from tests.formats.test_ply import gaussians, inria_file
 
 SETTINGS = settings(max_examples=150, deadline=None, derandomize=True)
@@ -71,7 +70,7 @@ def read_parts(path: str) -> None:
     if path.endswith(".tif"):
         native.tiff_as_stored(data, name)
     if path.endswith(".png"):
-        native.check_png(data, name)
+        check_png(data, path)
 
 
 READERS = {

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import dataclasses
 import os
-import struct
 import threading
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -259,24 +257,6 @@ def test_damaged_headers_are_named_at_load(tmp_path):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match=NAMES[1]):
             load_capture(tmp_path)
-
-
-def test_transparent_colours_of_a_palette_are_alpha(tmp_path):
-    write_capture(tmp_path, NAMES[:3])
-    path = tmp_path / "images" / NAMES[0]
-
-    def chunk(kind, data):
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = struct.pack(">IIBBBBB", 64, 48, 8, 3, 0, 0, 0)  # 8 bits, palette
-    rows = (b"\0" + bytes([0] * 32 + [1] * 32)) * 48
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"PLTE", bytes([9, 9, 9, 0, 255, 0]))
-        + chunk(b"tRNS", bytes([0, 255])) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
-    )  # fmt: skip
-    capture = load_capture(tmp_path)
-    image = ImageStore(capture, background=(1.0, 0.0, 0.0)).get(0)
-    assert capture.has_alpha and image[0, 0].tolist() == [255, 0, 0] and image[0, 63].tolist() == [0, 255, 0]
 
 
 def test_floating_point_pixels_with_alpha_are_refused_by_name(tmp_path):

@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from blitzgs.capture import colmap
 from blitzgs.capture.cameras import camera_centres
@@ -51,7 +52,7 @@ def write(root, form, rotations, centres, points):
         colmap.ColmapImages(
             ids=np.arange(1, COUNT + 1, dtype=np.uint32),
             camera_ids=np.ones(COUNT, dtype=np.uint32),
-            quats=np.stack([quaternion(rotation) for rotation in rotations]),
+            quats=Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]],
             translations=-np.einsum("nij,nj->ni", rotations, centres),
             names=NAMES,
             point2d_offsets=np.zeros(COUNT + 1, dtype=np.uint64),
@@ -65,19 +66,6 @@ def write(root, form, rotations, centres, points):
         ),
     )
     colmap.write_model(root / "sparse" / "0", model, text=form == "text")
-
-
-def quaternion(rotation):
-    w = np.sqrt(max(0.0, 1 + np.trace(rotation))) / 2
-    if w > 1e-3:
-        off = [
-            rotation[2, 1] - rotation[1, 2],
-            rotation[0, 2] - rotation[2, 0],
-            rotation[1, 0] - rotation[0, 1],
-        ]
-        return np.array([w, *(np.array(off) / (4 * w))])
-    values, vectors = np.linalg.eigh(rotation + rotation.T)
-    return np.array([0.0, *vectors[:, -1]])
 
 
 def quiet_load(root, **options):

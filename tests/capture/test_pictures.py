@@ -1,4 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Pictures that are written, and the former name of the folder."""
+
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -71,3 +76,12 @@ def test_comparison_strip_holds_all_three(tmp_path):
     assert all((found[:24, right - 4 : right] > 200).all() for right in (30, 64, 98)), "no label is cut off"
     with pytest.raises(ValueError, match="images of one height"):
         strip([render, render[:5]], ["a", "b"])
+
+
+def test_code_that_imports_the_former_name_gets_the_same_modules():
+    program = (
+        "from blitzgs.scene.pictures import save_image as former\n"
+        "from blitzgs.capture.pictures import save_image\n"
+        "assert former is save_image\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)

@@ -10,7 +10,7 @@ import pytest
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.layouts import read_layout
 from blitzgs.capture.points import file_points
-from tests.capture import project_files as files
+from tests.capture import helpers as files
 from tests.capture.helpers import write_capture
 
 UTM = np.array([412_345.0, 5_654_321.0, 120.0])

@@ -11,7 +11,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.capture.layouts import read_layout
 from blitzgs.capture.projects.metashape import read_metashape
 from blitzgs.capture.projects.realitycapture import read_realitycapture
-from tests.capture import project_files as files
+from tests.capture import helpers as files
 
 UTM = np.array([412_345.0, 5_654_321.0, 120.0])
 

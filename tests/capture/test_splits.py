@@ -1,9 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Splits by rule and by a capture's own files, and photographs that have no camera."""
+
+import itertools
+import json
+import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from blitzgs.capture.capture import load_capture
 from blitzgs.capture.splits import split_views
+from tests.capture.helpers import look_at, reconstruction, smooth_image, write_capture, write_image
 
 NAMES = ["a/1.jpg", "a/2.jpg", "b/1.jpg", "b/3.jpg"]
 ROOT = Path("/capture")
@@ -59,3 +67,182 @@ def test_invalid_splits_are_refused(tmp_path):
     (tmp_path / "all.txt").write_text("\n".join(NAMES))
     with pytest.raises(ValueError, match="leaves no training view of 4"):
         split_views(NAMES, PATHS, tmp_path, "all.txt")
+
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*the capture has no points"),
+    pytest.mark.filterwarnings("ignore:.* see none of the points"),
+    pytest.mark.filterwarnings("ignore:.*photographs have no camera"),
+]
+FRAMES = [f"images/f{i}.png" for i in range(6)]
+
+
+def frames(names=FRAMES):
+    found = []
+    for i, name in enumerate(names):
+        angle, pose = 2 * np.pi * i / 6, np.eye(4)
+        centre = np.array([4 * np.cos(angle), 4 * np.sin(angle), 0.5])
+        pose[:3, :3], pose[:3, 3] = look_at(centre).T @ np.diag([1.0, -1, -1]), centre
+        found.append({"file_path": name, "transform_matrix": pose.tolist()})
+    return found
+
+
+def write_images(root):
+    for seed, name in enumerate(FRAMES):
+        write_image(root / name, smooth_image(32, 48, seed))
+
+
+def write(root, file="transforms.json", names=FRAMES, **fields):
+    (root / file).write_text(json.dumps({"fl_x": 40.0, "frames": frames(names), **fields}))
+
+
+def split_of(root, **options):
+    capture = load_capture(root, **options)
+    train, test = ([capture.cameras[i].name for i in part] for part in (capture.train, capture.test))
+    return train, test, capture
+
+
+LISTS = [list(c) for c in itertools.product([None, [0, 1]], [None, [2], []], [None, [3], [2]])]
+
+
+@pytest.mark.parametrize(("train", "val", "test"), LISTS)
+def test_lists_are_followed_exactly(tmp_path, train, val, test):
+    write_images(tmp_path)
+    given = {"train_filenames": train, "val_filenames": val, "test_filenames": test}
+    # A name may begin with "./", as programs write it.
+    lists = {
+        key: [("./" if i % 2 else "") + FRAMES[i] for i in part]
+        for key, part in given.items()
+        if part is not None
+    }
+    write(tmp_path, **lists)
+    # The formula: held out is what val or test name; trained on is what train names, or without it the rest.
+    held_out = sorted({FRAMES[i] for part in (val, test) if part for i in part})
+    if not lists:
+        trained, held_out = FRAMES[1:], FRAMES[:1]  # every 8th
+    elif train is None:
+        trained = [name for name in FRAMES if name not in held_out]
+    else:
+        trained = [FRAMES[i] for i in train]
+    got_train, got_test, capture = split_of(tmp_path)
+    assert (got_train, got_test) == (trained, held_out)
+    assert capture.about.unused == (0 if train is None else len(FRAMES) - len({*trained, *held_out}))
+    assert len(capture.cameras) == len(FRAMES) - capture.about.unused
+    own = capture.about.split == "the capture's own split"
+    assert own == bool(lists) and all(key in capture.about.source.split for key in lists)
+    # A split that is asked for uses all frames.
+    assert len(split_of(tmp_path, split=3)[2].cameras) == len(FRAMES)
+
+
+@pytest.mark.parametrize("part", ["train", "val", "test"])
+def test_a_list_must_name_frames(tmp_path, part):
+    write_images(tmp_path)
+    write(tmp_path, **{f"{part}_filenames": [FRAMES[0], "images/gone.png"]})
+    with pytest.raises(ValueError, match=f"{part}_filenames name 1 images that are no frames .*gone.png"):
+        load_capture(tmp_path)
+    for wrong in ("a.png", None, [3]):
+        write(tmp_path, **{f"{part}_filenames": wrong})
+        with pytest.raises(ValueError, match=f"{part}_filenames must be a list"):
+            load_capture(tmp_path)
+
+
+def test_a_view_cannot_be_trained_on_and_held_out(tmp_path):
+    write_images(tmp_path)
+    write(tmp_path, train_filenames=FRAMES[:3], test_filenames=FRAMES[2:4])
+    with pytest.raises(ValueError, match=r"1 views are in train_filenames and also .*images/f2.png"):
+        load_capture(tmp_path)
+    assert len(split_of(tmp_path, split=0)[0]) == len(FRAMES)
+    write(tmp_path, train_filenames=[])
+    with pytest.raises(ValueError):
+        load_capture(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "parts", [c for n in (1, 2, 3) for c in itertools.combinations(["train", "val", "test"], n)]
+)
+def test_the_files_of_blenders_split_are_all_read(tmp_path, parts):
+    write_images(tmp_path)
+    names = {"train": FRAMES[:3], "val": FRAMES[3:4], "test": FRAMES[4:]}
+    for part in parts:
+        write(tmp_path, f"transforms_{part}.json", names[part])
+    if "train" not in parts:
+        with pytest.raises(ValueError, match="hold out every view"):
+            load_capture(tmp_path)
+        return
+    train, test, capture = split_of(tmp_path)
+    assert train == names["train"] and test == [
+        n for part in ("val", "test") if part in parts for n in names[part]
+    ]
+    assert capture.about.source.split == " and ".join(f"transforms_{part}.json" for part in parts)
+
+
+def test_what_is_beside_transforms_json_is_named(tmp_path):
+    write_images(tmp_path)
+    write(tmp_path)
+    write(tmp_path, "transforms_val.json", FRAMES[:1])
+    with pytest.warns(UserWarning, match="transforms.json is read, and transforms_val.json beside it not"):
+        load_capture(tmp_path)
+
+
+def models(root, counts, text=False):
+    names = [f"{i:02d}.png" for i in range(max(counts))]
+    for seed, name in enumerate(names):
+        write_image(root / "images" / name, smooth_image(48, 64, seed))
+    for number, count in enumerate(counts):
+        folder = root / "sparse" / str(number)
+        folder.mkdir(parents=True)
+        getattr(reconstruction(names[:count], 64, 48), "write_text" if text else "write_binary")(str(folder))
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("counts", [(2, 9), (9, 2), (3, 3), (1, 4, 9), (1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 5)])
+def test_the_largest_of_several_models_is_read(tmp_path, counts, text):
+    models(tmp_path, counts, text)
+    best = counts.index(max(counts))
+    with pytest.warns(
+        UserWarning, match=f"of {len(counts)} COLMAP models, the largest is used: sparse/{best} "
+    ):
+        capture = load_capture(tmp_path)
+    assert len(capture.cameras) == max(counts) and capture.about.source.cameras == f"sparse/{best}"
+    other = len(counts) - 1
+    named = load_capture(tmp_path, sparse=f"sparse/{other}")
+    assert len(named.cameras) == counts[other]
+    assert named.about.source.without_camera == max(counts) - counts[other]
+    everything = load_capture(tmp_path, sparse="all")
+    assert len(everything.cameras) == max(counts) and len(everything.points) == 20 * len(counts)
+    with pytest.raises(FileNotFoundError, match="data.sparse: .*sparse/77 has no complete COLMAP model"):
+        load_capture(tmp_path, sparse="sparse/77")
+
+
+def test_a_damaged_model_is_not_the_largest(tmp_path):
+    models(tmp_path, (4, 9))
+    (tmp_path / "sparse" / "1" / "images.bin").write_bytes(b"\xff" * 40)
+    assert len(load_capture(tmp_path).cameras) == 4
+
+
+def test_a_single_model_of_another_number_is_read(tmp_path):
+    write_capture(tmp_path, ["0.png", "1.png", "2.png"])
+    (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "1")
+    assert load_capture(tmp_path).about.source.cameras == "sparse/1"
+
+
+@pytest.mark.parametrize("form", ["colmap", "transforms"])
+def test_photographs_without_a_camera_are_counted(tmp_path, form):
+    if form == "colmap":
+        write_capture(tmp_path, [f"{i}.png" for i in range(4)])
+    else:
+        write_images(tmp_path)
+        write(tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", ".*no points|.*see none")
+        assert load_capture(tmp_path).about.source.without_camera == 0
+    for extra in ("x.png", "y.PNG", "notes.txt", "z_depth_0001.png", "z_mask.png"):
+        if not extra.endswith("txt"):
+            write_image(tmp_path / "images" / "w.png", smooth_image(48, 64))
+            (tmp_path / "images" / "w.png").rename(tmp_path / "images" / extra)
+        else:
+            (tmp_path / "images" / extra).write_text("")
+    count = 4 if form == "colmap" else len(FRAMES)
+    with pytest.warns(UserWarning, match=f"2 of {count + 2} photographs have no camera in .* not used"):
+        assert load_capture(tmp_path).about.source.without_camera == 2

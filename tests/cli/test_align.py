@@ -17,7 +17,7 @@ from blitzgs.runs.world import load_frame
 from blitzgs.viewer.overlay import overlay
 from blitzgs.viewer.studio import open_model
 from blitzgs.viewer.world import Stance, World
-from tests.capture import project_files as files
+from tests.capture import helpers as files
 from tests.training.tiny import OVERRIDES, as_flags
 
 TURN = Rotation.from_euler("z", 65, degrees=True).as_matrix()

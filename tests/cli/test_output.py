@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands whose output goes nowhere, and what their start costs."""
+"""Commands whose output goes nowhere, what their start costs, and what the Tab key completes."""
 
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 
 import pytest
 
 from blitzgs.cli import _NAMED_ERRORS, COMMANDS, _user_errors, main
+from blitzgs.cli.completion import script
 from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
 
 TRAIN = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.3", "log.every=1", "log.pictures=0")
@@ -31,22 +33,27 @@ def capture(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("buffered", ["", "1"])
+FULL = "standard output cannot be written (No space left on device)"
+
+
+# Without a buffer (PYTHONUNBUFFERED) the first line fails, with one the last flush. What is closed has none.
 @pytest.mark.parametrize(
-    ("redirection", "message"),
+    ("redirection", "unbuffered", "message"),
     [
-        ("2>&1 | head -n 1", None),
-        ("| head -n 1", None),
-        (">/dev/full", "standard output cannot be written (No space left on device)"),
-        (">/dev/full 2>&1", None),
-        (">&-", None),
-        (">&- 2>&-", None),
+        ("2>&1 | head -n 1", "1", None),
+        ("| head -n 1", "", None),
+        ("| head -n 1", "1", None),
+        (">/dev/full", "", FULL),
+        (">/dev/full", "1", FULL),
+        (">/dev/full 2>&1", "", None),
+        (">&-", "", None),
+        (">&- 2>&-", "1", None),
     ],
 )
-def test_a_training_outlives_its_output(capture, tmp_path, redirection, message, buffered):
+def test_a_training_outlives_its_output(capture, tmp_path, redirection, unbuffered, message):
     run, flags = tmp_path / "run", " ".join(TRAIN)
     script = f"$BLITZGS train --data '{capture}' --out '{run}' {flags} {redirection}; exit ${{PIPESTATUS[0]}}"
-    status, _, errors = shell(script, PYTHONUNBUFFERED=buffered)
+    status, _, errors = shell(script, PYTHONUNBUFFERED=unbuffered)
     assert status == 0 and message is None or message in errors
     assert json.loads((run / "summary.json").read_text())["images"] == 30
     assert list((run / "checkpoints").glob("checkpoint_*"))
@@ -138,3 +145,44 @@ def test_help_explains_fields(arguments, texts, capsys):
         main(["train", *arguments])
     shown = capsys.readouterr().out
     assert exit_.value.code == 0 and all(text in shown for text in texts), shown
+
+
+@pytest.mark.parametrize(
+    "words, completed",
+    [
+        (["tr"], ["train"]),
+        ([""], list(COMMANDS)),
+        (["gate", ""], ["fit", "sample", "evaluate", "replay"]),
+        (["gate", "fit", "--o"], ["--out"]),
+        (["train", "--data.downs"], ["--data.downscale"]),
+        (["render", "--split", ""], ["test", "train", "all"]),
+        (["render", "--split", "t"], ["test", "train"]),
+        (["view", ""], []),  # the shell's file names
+        (["completion", ""], ["bash", "zsh", "fish"]),
+    ],
+)
+def test_bash_completes(words, completed, tmp_path):
+    (tmp_path / "script").write_text(script("bash"))
+    program = (
+        'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _blitzgs; echo "${COMPREPLY[@]}"'
+    )
+    command = ["bash", "-c", program, "-", str(tmp_path / "script"), "blitzgs", *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == completed and not done.stderr
+
+
+def test_fish_completes(tmp_path):
+    lines = script("fish").splitlines()
+    assert any("-a train -d" in line for line in lines)
+    assert any("seen_subcommand_from render' -l split -x -a 'test train all'" in line for line in lines)
+    assert any("-l data.downscale -r" in line for line in lines)
+    if shutil.which("fish"):
+        (tmp_path / "script").write_text(script("fish"))
+        subprocess.run(["fish", "-n", str(tmp_path / "script")], check=True)
+
+
+def test_zsh_completes_by_the_script_of_bash(tmp_path):
+    assert script("zsh").startswith("autoload -U +X bashcompinit") and script("bash") in script("zsh")
+    if shutil.which("zsh"):
+        (tmp_path / "script").write_text(script("zsh"))
+        subprocess.run(["zsh", "-n", str(tmp_path / "script")], check=True)

@@ -1,13 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Fields of the configuration: files, overrides, help, and the recipes that have names."""
+
 import dataclasses
 import json
+import re
 import tempfile
+import typing
 from pathlib import Path
 
 import pytest
+import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from blitzgs.cli import main
+from blitzgs.config.describe import _meanings, describe, describe_all
 from blitzgs.config.fields import Config
 from blitzgs.config.files import (
     REMOVED,
@@ -19,7 +26,7 @@ from blitzgs.config.files import (
     to_dict,
 )
 from blitzgs.config.ranges import CHOICES, RANGES, flat_fields, problems
-from blitzgs.config.recipes import recipe_path
+from blitzgs.config.recipes import default_recipe, recipe_names, recipe_path
 from blitzgs.config.schedule import Schedule
 from blitzgs.optim.table_adam import BETA1, BETA2, EPS
 
@@ -295,3 +302,91 @@ def test_a_base_that_is_nowhere_names_the_recipes(tmp_path):
         ConfigError, match=r"base: smok: no such file in .*did you mean 'smoke'\? recipes are"
     ):
         load_config(tmp_path / "mine.yaml")
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "configuration.md"
+SECTIONS = {
+    name: kind for name, kind in typing.get_type_hints(Config).items() if dataclasses.is_dataclass(kind)
+}
+FIELDS = [
+    f"{section}.{field.name}" for section, kind in SECTIONS.items() for field in dataclasses.fields(kind)
+]
+
+
+@pytest.fixture(scope="module")
+def explained():
+    return describe_all()
+
+
+@pytest.mark.parametrize("name", [*FIELDS, "seed"])
+def test_every_field_is_explained(name, explained):
+    head, _, meaning = describe(name).partition("\n")
+    assert head.startswith(f"--{name}=") and len(meaning.split()) >= 2
+    assert name not in RANGES or str(RANGES[name]) in head
+    # The flag that is shown sets the default.
+    assert load_config(None, [head.split("   (")[0]]) == Config()
+    assert head in explained
+
+
+@pytest.mark.parametrize("kind", [Config, *SECTIONS.values()], ids=lambda kind: kind.__name__)
+def test_no_field_that_is_gone_is_explained(kind):
+    names = {field.name for field in dataclasses.fields(kind)}
+    assert set(_meanings(kind)) == names - (set(SECTIONS) if kind is Config else set())
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [("downscal", "did you mean downscale"), ("data.zzz", "no such field"), ("", "no such field")],
+)
+def test_an_unknown_field_is_named(wanted, message):
+    if wanted:
+        with pytest.raises(ConfigError, match=message):
+            describe(wanted)
+
+
+def test_the_page_of_the_configuration_is_up_to_date(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(["train", "--help-fields=markdown"])
+    made = capsys.readouterr().out
+    assert PAGE.read_text() == made, "blitzgs train --help-fields=markdown > docs/configuration.md"
+    rows = [line.split("|") for line in made.splitlines() if line.count("|") == 2]
+    assert sorted(re.findall("`([^`]+)`", ",".join(row[0] for row in rows))) == sorted([*FIELDS, "seed"])
+    assert all(len(row) == 3 and row[2].count("(") == row[2].count(")") for row in rows)
+
+
+def shown(capsys, *flags):
+    assert main(["train", "--show-config", *flags]) == 0
+    printed = capsys.readouterr()
+    return json.loads(printed.out), printed.err
+
+
+def test_every_recipe_has_a_name_and_can_be_loaded():
+    assert {"aerial", "aerial_cpu", "city", "compact", "paper", "smoke"} <= set(recipe_names())
+    for name in recipe_names():
+        assert recipe_path(name).name == f"{name}.yaml"
+        load_config(recipe_path(name))
+
+
+@pytest.mark.parametrize(
+    ("device", "recipe"), [("cpu", "aerial_cpu"), ("cuda", "aerial"), ("cuda:1", "aerial")]
+)
+def test_a_run_without_a_configuration_gets_the_recipe_of_its_device(capsys, device, recipe):
+    config, said = shown(capsys, "--device", device)
+    assert config == to_dict(load_config(recipe_path(recipe)))
+    assert f"recipe: {recipe} (choose another one with --config)" in said
+
+
+def test_the_recipe_follows_the_device_that_auto_finds(capsys, monkeypatch):
+    for has_gpu in (True, False):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda has_gpu=has_gpu: has_gpu)
+        assert f"recipe: {default_recipe(has_gpu)} " in shown(capsys)[1]
+
+
+def test_names_files_and_the_defaults_of_fields(capsys, tmp_path):
+    assert shown(capsys, "--config", "compact") == (to_dict(load_config(recipe_path("compact"))), "")
+    assert shown(capsys, "--config", "defaults")[0] == to_dict(load_config())
+    file = tmp_path / "aerial.yaml"
+    file.write_text("schedule: {iterations: 77}\n")
+    assert shown(capsys, "--config", str(file))[0]["schedule"]["iterations"] == 77
+    with pytest.raises(ConfigError, match="arial.yaml: no such file or recipe; did you mean 'aerial'"):
+        recipe_path("configs/arial.yaml")

@@ -1,13 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Schedules, and those whose pace changes during a run."""
+
+import itertools
 import math
+import random
 import re
+from dataclasses import replace
 
 import pytest
 import torch
 
 from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
-from blitzgs.config.files import ConfigError, load_config
+from blitzgs.config.files import ConfigError, from_dict, load_config, save_config, to_dict
+from blitzgs.config.pace import Pace
 from blitzgs.config.schedule import Schedule, stretched
+from blitzgs.optim.table_adam import BETA1, BETA2, EPS, TableAdam
+from tests.training.tiny import random_gaussians
 
 
 def all_events(config):
@@ -137,8 +145,9 @@ def test_size_pruning_starts_after_its_time():
 
 
 def test_learning_rates():
-    config = OptimiserConfig()
-    schedule = Schedule(ScheduleConfig(iterations=1_000, batch_size=4, position_decay=500))
+    config = OptimiserConfig(final=0.1)
+    times = ScheduleConfig(iterations=1_000, batch_size=4, densify_until=100, position_decay=500)
+    schedule = Schedule(times)
     table = schedule.learning_rates(config, extent=2.0).double()
     assert table.shape == (251, 6)
     assert not table[0].any()
@@ -147,7 +156,9 @@ def test_learning_rates():
         position = 2.0 * math.exp(
             (1 - fraction) * math.log(config.position) + fraction * math.log(config.position_final)
         )
-        others = [config.rotation, config.scale, config.opacity, config.sh_dc, config.sh_rest]
+        share = 0.1 ** min(max((step - 1) * 4 - 100, 0) / 400, 1.0)
+        colors = [config.sh_dc * share, config.sh_rest * share]
+        others = [config.rotation * share, config.scale * share, config.opacity, *colors]
         expected = torch.tensor([position, *others]).double()
         torch.testing.assert_close(table[step], 2.0 * expected, rtol=1e-6, atol=0.0)
 
@@ -168,3 +179,171 @@ def test_opacities_are_reset_while_densifying_and_after_the_density_event_of_the
     assert events.index((500, "densify")) + 1 == events.index((500, "reset_opacities"))
     schedule = Schedule(config)
     assert schedule.gathers_statistics(1_499) and not schedule.gathers_statistics(1_500)
+
+
+CHANGES = ((40, 0.5), (120, 2.5), (128, 0.01), (131, 3.0))
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.3, 4.0])
+def test_times_and_images_are_those_of_a_walk_image_by_image(scale):
+    pace, time = Pace(scale, CHANGES), 0.0
+    for image in range(400):
+        assert pace.time(image) == pytest.approx(time, rel=1e-12)
+        assert pace.image(pace.time(image)) == pytest.approx(image, rel=1e-12)
+        factor = ([1.0] + [f for begin, f in CHANGES if begin <= image])[-1]
+        time += 1 / (scale * factor)
+    images = torch.arange(400, dtype=torch.float64)
+    expected = torch.tensor([pace.time(image) for image in range(400)], dtype=torch.float64)
+    assert torch.equal(pace.times(images), expected)
+    assert pace.image(math.inf) == math.inf and pace.scale == scale * 3.0
+
+
+def phases_of(schedule, begin):
+    """Return all properties of the step that begins with an image, except for events and rates."""
+    return (
+        schedule.sh_degree(begin, 3),
+        schedule.reduction(begin),
+        schedule.gathers_statistics(begin),
+        schedule.has_lod_gate(begin),
+        schedule.has_spawn_gate(begin),
+        schedule.prunes_by_size(begin),
+    )
+
+
+def test_a_change_of_pace_does_not_change_past_events():
+    """A run that changes its pace at random has the events and rates of its last schedule."""
+    chance = random.Random(3)
+    for batch_size in (1, 4):
+        config = ScheduleConfig(
+            iterations=3_000,
+            batch_size=batch_size,
+            densify_from=50,
+            densify_until=1_500,
+            densify_every=40,
+            reset_every=300,
+            resolution=((4, 310), (2, 877)),
+            t1=700,
+            t2=1_600,
+            sh_every=100,
+            gate_from=900,
+            size_prune_after=400,
+            position_decay=2_500,
+            evaluate_every=333,
+        )
+        optimiser = OptimiserConfig(final=0.1)
+        schedule, happened, phases, step = Schedule(config), [], [], 0
+        rates = schedule.learning_rates(optimiser, 2.0)
+        while step < schedule.steps:
+            begin, step = step * batch_size, step + 1
+            phases.append(phases_of(schedule, begin))
+            happened += schedule.events(begin, begin + batch_size)
+            if step < schedule.steps and chance.random() < 0.05:
+                pace = (*config.pace, (step * batch_size, math.exp(chance.uniform(-1.5, 1.0))))
+                config = ScheduleConfig(**{**vars(config), "pace": pace})
+                schedule = Schedule(config)
+                before, rates = rates, schedule.learning_rates(optimiser, 2.0)
+                assert torch.equal(rates[: step + 1], before[: step + 1])
+                assert schedule.pace.image(schedule.pace.time(step * batch_size)) == step * batch_size
+        assert len(config.pace) > 10
+        assert happened == schedule.events(0, schedule.iterations)
+        assert phases == [phases_of(schedule, i * batch_size) for i in range(schedule.steps)]
+        assert len(set(phases)) > 5
+        kinds = [event.kind for event in happened]
+        assert kinds.count("pass_1") == kinds.count("pass_2") == 1
+        # Two events at one image become one; no other event is lost.
+        wanted = {math.floor(schedule.pace.image(time) + 1e-6) for time in range(50, 1_500, 40)}
+        assert [event.time for event in happened if event.kind == "densify"] == sorted(wanted)
+
+
+def test_rates_follow_the_configurations_own_times():
+    config = ScheduleConfig(iterations=1_000, position_decay=500, pace=((100, 0.5), (200, 4.0)))
+    optimiser = OptimiserConfig()
+    schedule = Schedule(config)
+    # 100 images are the first 100 of the configuration, 100 more the next 200, and 4 are one of the rest.
+    assert schedule.iterations == 200 + 700 * 4
+    table = schedule.learning_rates(optimiser, extent=2.0).double()
+    for image, time in ((0, 0), (60, 60), (100, 100), (150, 200), (200, 300), (600, 400), (2_999, 999.75)):
+        fall = (optimiser.position_final / optimiser.position) ** min(time / 500, 1)
+        assert table[image + 1, 0] == pytest.approx(2.0 * optimiser.position * fall, rel=1e-6)
+        assert table[image + 1, 3] == pytest.approx(optimiser.opacity, rel=1e-6)
+
+
+@pytest.mark.parametrize("factor", [0.1, 5.0])
+def test_pending_steps_are_the_same_after_a_change_of_pace(factor):
+    """Steps without a gradient on both sides of a change: dense Adam in float64, step by step."""
+    before = ScheduleConfig(iterations=200, position_decay=100)
+    config, changed_at, end = OptimiserConfig(), 60, 70
+    after = ScheduleConfig(iterations=200, position_decay=100, pace=((changed_at, factor),))
+    table, g = random_gaussians(200), torch.Generator().manual_seed(0)
+    for first, second in zip(table.exp_avgs, table.exp_avg_sqs, strict=True):
+        first.copy_(torch.randn(first.shape, generator=g))
+        second.copy_(torch.rand(second.shape, generator=g) + 0.1)
+    stand = torch.randint(1, changed_at, (200,), generator=g, dtype=torch.int32)
+    table["last_step"].copy_(stand)
+    table["moment_step"].copy_(stand)
+    means, first, second = (table[name].double() for name in ("means", "exp_avg.means", "exp_avg_sq.means"))
+    rates = Schedule(after).learning_rates(config, 3.0).double()
+    old_rates = Schedule(before).learning_rates(config, 3.0).double()
+    assert not torch.equal(rates[changed_at + 2 : end], old_rates[changed_at + 2 : end])
+    for step in range(2, end + 1):
+        rows = stand < step
+        first[rows] *= BETA1
+        second[rows] *= BETA2
+        corrected = first / (1 - BETA1**step)
+        root = (second / (1 - BETA2**step)).sqrt() + EPS
+        means[rows] -= (rates[step, 0] * corrected / root)[rows]
+    optimiser = TableAdam(config, Schedule(before), 3.0, "cpu")
+    # Some rows are caught up in between, the others are not.
+    optimiser.catch_up(table, torch.arange(0, 200, 3, dtype=torch.int32), changed_at - 5)
+    optimiser.follow(Schedule(after))
+    optimiser.catch_up(table, None, end)
+    torch.testing.assert_close(table["means"].double(), means, rtol=1e-6, atol=1e-7)
+    assert optimiser.position_rate(end) == pytest.approx(rates[end, 0].item())
+
+
+@pytest.mark.parametrize("pace", [(), ((300, 0.1), (700, 4.0))])
+def test_every_phase_begins_at_its_own_time(pace):
+    config = ScheduleConfig(sh_every=100, densify_until=600, gate_from=500, size_prune_after=450, pace=pace)
+    schedule = Schedule(config)
+    plain = Schedule(replace(config, pace=()))
+    for time in range(10, 4_000, 10):
+        image = schedule.pace.image(time)
+        # Avoid the image at which rounding decides.
+        for shift in (-2, 2):
+            assert (
+                phases_of(schedule, round(image) + shift)[1:]
+                == phases_of(plain, schedule.pace.time(round(image) + shift))[1:]
+            )
+
+
+def test_pace_is_read_and_written(tmp_path):
+    config = load_config(None, ["--schedule.pace=[[16, 0.25], [40, 3]]"])
+    assert config.schedule.pace == ((16, 0.25), (40, 3.0))
+    save_config(config, tmp_path / "config.yaml")
+    assert load_config(tmp_path / "config.yaml") == config == from_dict(to_dict(config))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["schedule.pace=[[16, 1], [16, 2]]"], r"schedule.pace: .* above 0 and increase, got \[16, 16\]"),
+        (["schedule.pace=[[16, 1e5]]"], r"schedule.pace: its factors must be in .*, got 100000.0"),
+        (["schedule.pace=[[0, 1]]"], r"schedule.pace: must be in .*, got \(\(0, 1.0\),\)"),
+        (["schedule.pace=[[16]]"], r"schedule.pace\[0\]: must be a list of 2 values, got \[16\]"),
+        (["schedule.pace=[[1.5, 2]]"], r"schedule.pace\[0\]\[0\]: must be an integer, got 1.5"),
+        (["schedule.pace=[[16, 9e3]]"], r"times schedule.scale must be at most 10,000,000 images"),
+        (["schedule.minutes=-1"], r"schedule.minutes: must be in \[0, 1,000,000\], got -1.0"),
+        (["schedule.minutes=3", "schedule.scale=0.5"], r"schedule.scale: must be 1 .*--minutes.* got 0.5"),
+    ],
+)
+def test_impossible_paces_and_budgets_are_refused(overrides, message):
+    with pytest.raises(ConfigError, match=message):
+        load_config(None, overrides)
+
+
+def test_every_piece_of_the_final_drift_has_its_own_step_numbers():
+    """A change of pace cannot happen within a step's images, so it happens between two steps."""
+    schedule = Schedule(ScheduleConfig(iterations=100, batch_size=4, pace=((8, 0.5),)))
+    assert schedule.iterations == 56  # 8 + 92 / 2 = 54, in steps of 4
+    for begin, end in itertools.pairwise(range(0, 60, 4)):
+        assert schedule.pace.time(begin) < schedule.pace.time(end)

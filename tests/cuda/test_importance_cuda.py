@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contributions on CUDA equal the renderer's bits, agree with the CPU in float64, and repeat."""
+"""Contributions on CUDA equal the renderer's bits; thresholds and views of many rows are those of the CPU."""
 
 import pytest
 import torch
 
+from blitzgs.ops.blocks import ActiveRows, gate_views_
+from blitzgs.ops.mass_cut import STEPS, MassCut
+from blitzgs.table.table import GaussianTable
+from blitzgs.view.gate import ViewGate
 from tests.cuda.scenes import Scene, ops, relative_error
+from tests.table.test_blocks import make_views
+from tests.view.test_gate import GATE, bits, kept_by_definition, make_scene
 
 
 def survey(scene, device="cuda", dtype=torch.float32, tile_size=16, begin=0, end=-1):
@@ -97,3 +103,50 @@ def test_other_tile_sizes_are_refused():
     splats, lists, grid, _ = survey(Scene(50), tile_size=16)
     with pytest.raises(RuntimeError, match="tile_size must be 16 on CUDA, got 64"):
         ops.contributions(*splats, lists[0], lists[1][:13], *grid[:3], 64, 0, -1)
+
+
+SHARE = 99, 100
+
+
+@pytest.mark.parametrize("n_segments", [4, 32])
+def test_cuda_equals_cpu_on_many_items(n_segments):
+    g = torch.Generator().manual_seed(2)
+    n = 300_000
+    owners = torch.arange(n, dtype=torch.int32).repeat_interleave(3)
+    segments = torch.randint(0, n_segments, (3 * n,), generator=g, dtype=torch.int32)
+    weights = (torch.randn(3 * n, generator=g) * 3 + 22).exp().long()
+    weights[::5] = 1 << 30
+    ids = torch.randperm(n, generator=g)
+    found = []
+    for device in ("cpu", "cuda"):
+        cut = MassCut.begin(*(t.to(device) for t in (weights, segments, owners, ids)), n_segments)
+        cut.take_steps(SHARE, 0, STEPS)
+        found.append(cut.chosen.cpu())
+    assert torch.equal(*found) and 0.1 < found[0].double().mean() < 0.99
+
+
+def gated(table, viewmats, gate, count):
+    """Gate the first `count` rows of lists with a capacity for all rows; return their views."""
+    device, capacity = table.device, len(table)
+    active = ActiveRows(
+        torch.arange(capacity, dtype=torch.int32, device=device),
+        torch.full((capacity,), -1, dtype=torch.int32, device=device),
+        torch.tensor([count], dtype=torch.int32, device=device),
+    )
+    gate_views_(active, table["means"], viewmats, gate.rules(table))
+    assert (active.views[count:] == -1).all()
+    return active.views[:count]
+
+
+# The launch has as many threads as fit on the GPU; the last sizes make them take turns.
+@pytest.mark.parametrize("count", [0, 1, 255, 257, 100_000, 1_000_000])
+def test_the_gpu_leaves_out_what_the_cpu_leaves_out(count):
+    table = make_scene(1_000_000)
+    viewmats, _ = make_views(32)
+    gate = ViewGate(GATE.reach(), 0xFFFF0FF1, [view * 2 if view % 3 else -1 for view in range(32)])
+    on_gpu = GaussianTable({name: table[name].cuda() for name in table})
+    expected = gated(table, viewmats, gate, count)
+    found = gated(on_gpu, viewmats.cuda(), gate, count).cpu()
+    _, close = kept_by_definition(table, viewmats)
+    assert torch.equal(bits(found, 32) | close[:count], bits(expected, 32) | close[:count])
+    assert count < 1000 or 0.1 < bits(found, 32).double().mean() < 0.9

@@ -127,25 +127,6 @@ def test_tile_ranges_cut_the_whole(scene):
         assert not part_sizes[:begin].any() and not part_sizes[end:].any()
 
 
-def test_capacity_beyond_the_count(scene):
-    splats = scene.project("cpu")
-    entries, offsets = lists(splats, scene.grid(), "cuda")
-    more, more_offsets = lists(splats, scene.grid(), "cuda", count=len(entries) + 1000)
-    assert torch.equal(more_offsets, offsets)
-    assert torch.equal(more, entries)
-
-
-def test_a_long_run_of_equal_depths():
-    scene = Scene(4000, views=1)
-    splats = list(scene.project("cpu"))
-    splats[6] = torch.ones_like(splats[6])
-    ids = torch.randperm(len(splats[0]), generator=torch.Generator().manual_seed(3))
-    entries, offsets = lists(splats, scene.grid(), "cuda", ids)
-    for tile in range(len(offsets) - 1):
-        order = ids[entries[offsets[tile] : offsets[tile + 1]].long()]
-        assert (order.diff() > 0).all()
-
-
 def test_no_splats(scene):
     splats = [t[:0] for t in scene.project("cpu")]
     entries, offsets = lists(splats, scene.grid(), "cuda")

@@ -6,15 +6,10 @@ import torch
 
 from blitzgs.ops.rasterize import RasterizeSaved
 from tests.cuda.scenes import Scene, ops, relative_error
+from tests.ops.splats import kept_by
 
 # Where rounding decides whether a splat takes part, the images differ by up to about alpha = 1/255.
 CUT_SHARE = 2e-3
-
-
-def kept_by(outputs):
-    """What the backward pass takes of the outputs of the forward pass."""
-    _, transmittances, last_ids, _, packed_splats, tile_order, _ = outputs
-    return [transmittances, last_ids, packed_splats, tile_order]
 
 
 class Job:
@@ -128,17 +123,6 @@ def test_packed_gradients_have_four_channels_at_most(scene):
     arguments = *job.saved("cuda", torch.float32, saved), renders, None, *job.grid
     with pytest.raises(RuntimeError, match="1 to 4 channels, got 9"):
         ops.rasterize_bwd(*arguments, False, True, table)
-
-
-def test_deterministic_gradients_repeat(scene):
-    job = Job(scene, 3)
-    saved = job.forward("cuda")
-    g = torch.Generator().manual_seed(7)
-    v = torch.randn(saved[0].shape, generator=g), torch.randn(saved[1].shape, generator=g)
-    first = job.backward("cuda", torch.float32, saved, *v, True, True)
-    for _ in range(3):
-        again = job.backward("cuda", torch.float32, saved, *v, True, True)
-        assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
 
 
 def test_tile_ranges_are_the_image_bit_for_bit(scene):

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.selection import mass_prefix, sampling_keys, smallest
+from blitzgs.distributed.selection import mass_prefix, smallest
+from blitzgs.ops.sampling import sampling_keys
 from tests.distributed.rank_harness import run_ranks
 
 ALONE = Ranks()

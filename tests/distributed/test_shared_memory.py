@@ -15,10 +15,10 @@ from blitzgs.distributed import shared_memory
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import MAX_VALUES, SharedMemory, control_words
 from blitzgs.frame import frame as pipeline
-from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import CollectiveTransport, PeerTransport
+from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.table.table import GaussianTable

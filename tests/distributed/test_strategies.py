@@ -11,10 +11,9 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
-from tests.distributed.test_training import sorted_table
+from tests.distributed.test_training import require_agreement
 from tests.helpers import needs_cuda
-from tests.training.tiny import tiny_config, tiny_scene
-from tests.training.tiny_runs import events_of, steps_of
+from tests.training.tiny import events_of, tiny_config, tiny_scene
 
 # 30 steps of 2 images, with a checkpoint after 10, and density events after 28, 36, 44 and 52 images.
 SETTINGS = (
@@ -41,7 +40,7 @@ RELOCATION = (
     "loss.opacity=0.01",
     "population.max_gaussians=450",
 )
-# The second importance pass at the end of density control keeps half.
+# The second importance pass at the end of density control keeps half. Then rates fall.
 PRUNED = (
     "population.importance=true",
     "population.score=weight",
@@ -50,6 +49,8 @@ PRUNED = (
     "schedule.t1=0",
     "schedule.densify_until=54",
     "schedule.t2=54",
+    "schedule.position_decay=60",
+    "optimiser.final=0.1",
 )
 OPTIONS = {
     "relocation": RELOCATION,
@@ -101,21 +102,9 @@ def test_two_ranks_agree_with_one(whole, tmp_path):
     options, folder, base = whole
     shutil.copytree(base, tmp_path / "run")
     run_ranks(_train, 2, tmp_path / "run", *options)
-    losses, events = steps_of(tmp_path / "run"), events_of(tmp_path / "run", "densify")
-    expected_losses, expected_events = steps_of(folder), events_of(folder, "densify")
-    expected_losses = [record for record in expected_losses if record["t"] > 20]
-    for got, want in zip(losses, expected_losses, strict=True):
-        assert got["gaussians"] == want["gaussians"]
-        assert abs(got["loss"] - want["loss"]) <= 1e-5 * want["loss"]
-    assert len(events) == 4 and sum(event["cloned"] for event in events) > 30
-    for got, want in zip(events, expected_events, strict=True):
-        names = ("t", "cloned", "split", "pruned", "relocated", "held_back", "gaussians")
-        assert [got[name] for name in names] == [want[name] for name in names]
-    got, want = sorted_table(tmp_path / "run"), sorted_table(folder)
-    for name in ("id", "parent", "birth", "level", "last_step", "moment_step"):
-        assert torch.equal(got[name], want[name]), name
-    for name in ("means", "quats", "scales", "opacities", "sh"):
-        assert (got[name] - want[name]).norm() <= 1e-5 * want[name].norm(), name
+    counts = ("t", "cloned", "split", "pruned", "relocated", "held_back", "gaussians")
+    events = require_agreement(tmp_path / "run", folder, counts)
+    assert sum(event["cloned"] for event in events) > 30
 
 
 def test_relocation_keeps_the_population_and_grows_to_the_cap(whole):

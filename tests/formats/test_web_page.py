@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The HTML file with a model: what is in it, read back without its own code."""
+"""Files for browsers, read back without their writers: GLB, streamed SOG, the HTML file with a model."""
 
 import base64
 import json
@@ -8,7 +8,14 @@ import zlib
 
 import numpy as np
 import pytest
+import torch
+from scipy.spatial.transform import Rotation
 
+from blitzgs.formats import gaussians as blocks
+from blitzgs.formats import glb
+from blitzgs.formats.gaussians import Gaussians
+from blitzgs.formats.glb import write_glb
+from blitzgs.formats.streamed_sog import write_streamed_sog
 from blitzgs.formats.web_page import (
     BLOCK,
     HARMONIC,
@@ -19,6 +26,8 @@ from blitzgs.formats.web_page import (
     packed,
     web_page,
 )
+from tests.formats.helpers import read_glb, some_gaussians
+from tests.formats.test_tiles import city
 
 SCENE = WebScene(0.01, 100.0, 0.3, False, (0.1, 0.2, 0.3), (0, 0, 1), (0, -3, 1), (0, 0, 0), 0.8)
 
@@ -125,3 +134,128 @@ def test_a_page_replaces_only_a_page(tmp_path):
         check_replaces_page(file)
     file.write_text(web_page(some_splats(5, 0), SCENE, "t"))
     check_replaces_page(file)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_reader_of_the_specification_finds_the_values(tmp_path, monkeypatch, degree):
+    monkeypatch.setattr(blocks, "BLOCK", 7)  # three blocks
+    model = some_gaussians(20, degree, levels=degree == 2)
+    model.comments = ["comment SplatRenderMode: mip", "comment offset 1.0 2.0 3.0"]
+    write_glb(tmp_path / "a.glb", model)
+    content, found = read_glb(tmp_path / "a.glb")
+    assert content["asset"]["extras"] == {"comments": model.comments}
+    assert content["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    extension = content["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+    assert extension["kernel"] == "ellipse" and extension["colorSpace"] == "srgb_rec709_display"
+
+    np.testing.assert_array_equal(found["POSITION"], model.means.numpy())
+    accessor = content["accessors"][0]
+    np.testing.assert_array_equal(np.float32(accessor["min"]), model.means.numpy().min(axis=0))
+    np.testing.assert_array_equal(np.float32(accessor["max"]), model.means.numpy().max(axis=0))
+    np.testing.assert_allclose(found["KHR_gaussian_splatting:SCALE"], np.exp(model.scales.numpy()), rtol=1e-6)
+    opacities = 1 / (1 + np.exp(-model.opacities.numpy().astype(np.float64)))
+    np.testing.assert_allclose(found["KHR_gaussian_splatting:OPACITY"][:, 0], opacities, rtol=1e-6)
+    # scipy's quaternions are x, y, z, w, as those of glTF.
+    expected = Rotation.from_quat(np.roll(model.quats.numpy(), -1, axis=1)).as_matrix()
+    quats = found["KHR_gaussian_splatting:ROTATION"]
+    np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1, rtol=1e-6)
+    np.testing.assert_allclose(Rotation.from_quat(quats).as_matrix(), expected, atol=1e-6)
+    k = 0
+    for d in range(degree + 1):
+        for n in range(2 * d + 1):
+            name = f"KHR_gaussian_splatting:SH_DEGREE_{d}_COEF_{n}"
+            np.testing.assert_array_equal(found[name], model.sh[:, k].numpy())
+            k += 1
+    colors = np.clip(0.5 + 0.28209479 * model.sh[:, 0].numpy(), 0, 1)
+    np.testing.assert_allclose(found["COLOR_0"][:, :3], colors, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(found["COLOR_0"][:, 3], opacities, atol=0.5 / 255 + 1e-6)
+    assert ("_LEVEL" in found) == (degree == 2)
+    if degree == 2:
+        np.testing.assert_array_equal(found["_LEVEL"][:, 0], model.levels.numpy())
+
+
+@pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0, 1, 0), (0.3, -0.9, 0.2)])
+def test_the_node_turns_the_models_up_to_plus_y(tmp_path, up):
+    write_glb(tmp_path / "a.glb", some_gaussians(3, 0), up)
+    content, _ = read_glb(tmp_path / "a.glb")
+    turned = Rotation.from_quat(content["nodes"][0]["rotation"]).apply(np.array(up) / np.linalg.norm(up))
+    np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-12)
+
+
+def test_what_no_viewer_could_show_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "a.glb"
+    with pytest.raises(ValueError, match="has no Gaussian"):
+        write_glb(path, some_gaussians(0, 0))
+    bad = some_gaussians(3, 0)
+    bad.scales[1, 1] = 200
+    with pytest.raises(ValueError, match="scales are not finite"):
+        write_glb(path, bad)
+    bad = some_gaussians(3, 0)
+    bad.means[2, 0] = torch.nan
+    with pytest.raises(ValueError, match=r"means has NaN.*number 2"):
+        write_glb(path, bad)
+    monkeypatch.setattr(glb, "_LARGEST", (1 << 20) + 100)
+    with pytest.raises(ValueError, match="a GLB file holds 4: choose"):
+        write_glb(path, some_gaussians(3, 3))
+    assert not list(tmp_path.iterdir())
+    path.write_bytes(b"ply\n")
+    with pytest.raises(FileExistsError, match="not a GLB file"):
+        write_glb(path, some_gaussians(3, 0))
+
+
+def test_a_zero_quaternion_is_no_rotation(tmp_path):
+    model = some_gaussians(2, 0)
+    model.quats[0] = 0
+    assert isinstance(model, Gaussians)
+    write_glb(tmp_path / "a.glb", model)
+    np.testing.assert_array_equal(
+        read_glb(tmp_path / "a.glb")[1]["KHR_gaussian_splatting:ROTATION"][0], [0, 0, 0, 1]
+    )
+
+
+def leaves(node):
+    low, high = (np.array(node["bound"][name]) for name in ("min", "max"))
+    assert (low < high).all() and ("lods" in node) != ("children" in node)
+    if "lods" in node:
+        yield node
+        return
+    assert len(node["children"]) == 2
+    inner = [node["children"][i]["bound"] for i in (0, 1)]
+    np.testing.assert_allclose(low, np.minimum(inner[0]["min"], inner[1]["min"]))
+    np.testing.assert_allclose(high, np.maximum(inner[0]["max"], inner[1]["max"]))
+    for child in node["children"]:
+        yield from leaves(child)
+
+
+def test_lods_have_the_trained_levels(tmp_path):
+    gsply = pytest.importorskip("gsply", reason="the extra formats is not installed")
+    pytest.importorskip("imagecodecs", reason="gsply reads SOG with imagecodecs")
+    model = city(1200)
+    done = write_streamed_sog(tmp_path / "city", model, most=600)
+    meta = json.loads((tmp_path / "city" / "lod-meta.json").read_text())
+    assert meta["version"] == 1 and meta["lodLevels"] == len(meta["counts"]) == 4
+    # LOD n lacks the n finest levels.
+    expected = [int((model.levels <= 3 - lod).sum()) for lod in range(4)]
+    assert meta["counts"] == expected and meta["count"] == sum(expected)
+    found, used = list(leaves(meta["tree"])), []
+    seen = {lod: [] for lod in range(4)}
+    for leaf in found:
+        low, high = (np.array(leaf["bound"][name]) for name in ("min", "max"))
+        for lod, place in leaf["lods"].items():
+            used.append(place["file"])
+            data = gsply.sogread(str(tmp_path / "city" / meta["filenames"][place["file"]]))
+            assert place["offset"] == 0 and len(data.means) == place["count"] <= 600
+            assert (data.means >= low - 1e-3).all() and (data.means <= high + 1e-3).all()
+            seen[int(lod)].append(data.means)
+    assert sorted(used) == list(range(len(meta["filenames"]))) and len(used) == done.tiles
+    assert len(found) >= 2
+    for lod, parts in seen.items():
+        means = np.concatenate(parts)
+        wanted = model.means[model.levels <= 3 - lod].numpy()
+        assert len(means) == len(wanted)
+        # 16 bits of the logarithm of each coordinate.
+        for axis in range(3):
+            error = np.abs(np.sort(means[:, axis]) - np.sort(wanted[:, axis]))
+            assert (error <= 1e-3 * (1 + np.abs(np.sort(wanted[:, axis])))).all()
+    assert done.gaussians == 1200
+    assert not [path for path in (tmp_path / "city").rglob("*") if path.suffix in (".tmp", ".sog")]

@@ -7,9 +7,15 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.shared_memory import Shared
-from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport.protocol import Exchange, ExchangeResult, Mark, Transport, unmarked
+from blitzgs.frame.transport.protocol import (
+    CapacityEstimate,
+    Exchange,
+    ExchangeResult,
+    Mark,
+    Transport,
+    unmarked,
+)
 from blitzgs.ops.projection_types import ProjectionInputs, Sizes
 
 

@@ -121,3 +121,9 @@ def with_capacity(column, capacity):
     padded = column.new_full((capacity, *column.shape[1:]), garbage)
     padded[: len(column)] = column
     return padded
+
+
+def kept_by(outputs: tuple) -> list[Tensor]:
+    """Return what the backward pass of the rasterisation takes of the outputs of the forward pass."""
+    _, transmittances, last_ids, _, packed_splats, tile_order = outputs[:6]
+    return [transmittances, last_ids, packed_splats, tile_order]

@@ -2,7 +2,7 @@
 import pytest
 import torch
 
-from blitzgs.ops.cull_mask import rows_of_sectors, sectors_of_rows
+from blitzgs.ops.blocks import rows_of_sectors, sectors_of_rows
 from blitzgs.table.layouts import CULL, sectors_in
 from tests.helpers import DEVICES
 from tests.training.tiny import random_gaussians

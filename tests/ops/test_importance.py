@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The instrumented rasterisation has the renderer's bits and agrees with the definition in float64."""
+"""The instrumented rasterisation has the renderer's bits; thresholds and features are exact."""
+
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -8,10 +10,14 @@ import torch
 import blitzgs
 from blitzgs.ops.importance import UNITS, splat_contributions
 from blitzgs.ops.intersect import intersect
+from blitzgs.ops.mass_cut import CHOICE_STEP, ROUNDS, STEPS, TIES_STEP, MassCut
 from blitzgs.ops.project import project
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.reference.importance import contributions as by_definition
-from tests.helpers import BACKENDS, random_scene
+from blitzgs.spawn.candidates import FEATURES, spawn_features
+from blitzgs.table.table import GaussianTable
+from tests.helpers import BACKENDS, DEVICES, random_scene
+from tests.population.test_density import LEVELS, random_table
 
 
 def lists_of(scene, tile_size=16):
@@ -162,3 +168,185 @@ def test_bad_arguments_of_contributions_are_named(change, error, message):
     }
     with pytest.raises(error, match=message):
         blitzgs.contributions(**{**given, "width": 40, "height": 32, **change})
+
+
+SHARE = 99, 100
+
+
+def by_sorting(weights, segments, ids, share):
+    """Return the chosen items by the definition: sorted by descending weight and ascending id."""
+    chosen = [False] * len(weights)
+    for segment in set(segments):
+        mine = [i for i, s in enumerate(segments) if s == segment]
+        mine.sort(key=lambda i: (-weights[i], ids[i]))
+        missing = sum(weights[i] for i in mine) * Fraction(*share)
+        for i in mine:
+            if missing <= 0:
+                break
+            chosen[i] = True
+            missing -= weights[i]
+    return chosen
+
+
+def items(kind, n_segments, seed=0):
+    """Weights [P], segments [P], owners [P] and ids [N]; each owner has an item in some of the segments."""
+    g = torch.Generator().manual_seed(seed)
+    n = 400
+    ids = torch.randperm(n, generator=g) * ((1 << 61) // n)
+    ids[0] = (1 << 63) - 1
+    pairs = torch.rand(n, n_segments, generator=g) < 0.6
+    pairs[:, 1:2] = False  # a segment without items
+    owners, segments = pairs.nonzero().unbind(1)
+    count = len(owners)
+    small = torch.randint(0, 1 << 50, (count,), generator=g) >> torch.randint(0, 50, (count,), generator=g)
+    weights = {
+        "many sizes": small,
+        "ties": torch.randint(0, 4, (count,), generator=g) * 1_234_567_890_123,
+        "all alike": torch.full((count,), 7),
+        "tiny": torch.randint(0, 40, (count,), generator=g),
+        "zeros": torch.zeros(count, dtype=torch.int64),
+    }[kind]
+    weights[:: n + 1] = 1 << 55
+    if kind == "zeros":
+        weights[:] = 0
+    return weights, segments.int(), owners.int(), ids
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("n_segments", [1, 3, 11])
+@pytest.mark.parametrize("kind", ["many sizes", "ties", "all alike", "tiny", "zeros"])
+@pytest.mark.parametrize("share", [(0, 1), (1, 2), (99, 100), (123_456_789, 1_000_000_000), (1, 1)])
+def test_mass_cuts_equal_sorting(device, n_segments, kind, share):
+    weights, segments, owners, ids = items(kind, n_segments)
+    expected = by_sorting(weights.tolist(), segments.tolist(), ids[owners].tolist(), share)
+    cut = MassCut.begin(*(t.to(device) for t in (weights, segments, owners, ids)), n_segments)
+    cut.take_steps(share, 0, STEPS)
+    assert cut.chosen.tolist() == expected
+    assert not cut.sums.any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_largest_weights(device):
+    weights = torch.tensor([(1 << 61) - 1, 1 << 60, (1 << 60) - 1, 1, 0])
+    ids = torch.tensor([4, 0, 3, 2, 1])
+    for share in ((1, 2), (3, 4), (999_999_999, 1_000_000_000), (1, 1)):
+        items = weights, torch.zeros(5, dtype=torch.int32), torch.arange(5, dtype=torch.int32), ids
+        cut = MassCut.begin(*(t.to(device) for t in items), 1)
+        cut.take_steps(share, 0, STEPS)
+        assert cut.chosen.tolist() == by_sorting(weights.tolist(), [0] * 5, ids.tolist(), share)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("kind", ["many sizes", "ties", "zeros"])
+def test_sums_of_parts_add_up(device, kind):
+    """Three ranks, the last without items, add up their sums after every scan."""
+    weights, segments, owners, ids = (t.to(device) for t in items(kind, 3))
+    expected = by_sorting(weights.tolist(), segments.tolist(), ids[owners.long()].tolist(), SHARE)
+    part = owners % 2
+    cuts = [
+        MassCut.begin(weights[part == p], segments[part == p], owners[part == p], ids, 3) for p in range(3)
+    ]
+    for step in range(0, CHOICE_STEP, 2):
+        if step == TIES_STEP:
+            assert [cut.has_ties() for cut in cuts] == [kind == "ties"] * 3
+        for cut in cuts:
+            cut.take_steps(SHARE, step, step + 1)
+        total = sum(cut.sums for cut in cuts)
+        for cut in cuts:
+            cut.sums.copy_(total)
+            cut.take_steps(SHARE, step + 1, step + 2)
+    for cut in cuts:
+        cut.take_steps(SHARE, CHOICE_STEP, STEPS)
+    chosen = torch.zeros(len(weights), dtype=torch.bool, device=device)
+    for p in range(2):
+        chosen[part == p] = cuts[p].chosen
+    assert chosen.tolist() == expected and ROUNDS == TIES_STEP // 2
+
+
+def test_errors_name_the_value():
+    def cut(**changes):
+        items = {
+            "weights": torch.ones(3, dtype=torch.int64),
+            "segments": torch.zeros(3, dtype=torch.int32),
+            "owners": torch.arange(3, dtype=torch.int32),
+            "ids": torch.arange(3),
+        }
+        return MassCut.begin(*(items | changes).values(), 2)
+
+    with pytest.raises(RuntimeError, match=r"share must be in \[0, 1\] with at most 9 decimals, got 3 / 2"):
+        cut().take_steps((3, 2), 0, STEPS)
+    with pytest.raises(RuntimeError, match=rf"steps must be in \[0, {STEPS}\], got 0 to {STEPS + 1}"):
+        cut().take_steps(SHARE, 0, STEPS + 1)
+    with pytest.raises(RuntimeError, match=r"segments must have shape \[3\], got \[2\]"):
+        cut(segments=torch.zeros(2, dtype=torch.int32)).take_steps(SHARE, 0, STEPS)
+    with pytest.raises(RuntimeError, match="owners must be Int, got Long"):
+        cut(owners=torch.arange(3)).take_steps(SHARE, 0, STEPS)
+
+
+def test_mass_cut_opcheck():
+    cut = MassCut.begin(*items("ties", 2), 2)
+    arguments = (*cut.items, cut.searches, cut.sums, cut.listed.zero_(), cut.chosen.zero_(), *SHARE, 0, STEPS)
+    torch.library.opcheck(torch.ops.blitzgs.mass_cut_, arguments)
+
+
+TIME, EXTENT = 700, 12.5
+
+
+def candidates(count, device="cpu"):
+    """A table, every third of its rows, and whether each is to be split."""
+    g = torch.Generator().manual_seed(4)
+    table = random_table(count)
+    table["birth"].copy_(torch.randint(0, TIME, (count,), generator=g))
+    table = GaussianTable({name: column.to(device) for name, column in table.columns.items()})
+    rows = torch.arange(count - 1, -1, -3, device=device)
+    return table, rows, torch.rand(len(rows), generator=g).to(device) < 0.5
+
+
+def expected(table, rows, is_split):
+    """The definition, column by column."""
+    of = {name: column.cpu()[rows.cpu()].double() for name, column in table.columns.items()}
+    views, level, scales = of["grad_count"], of["level"], of["scales"]
+    columns = {
+        "gradient": of["grad_sum"] / views.clamp(min=1),
+        "parent_opacity": of["opacities"].sigmoid(),
+        "parent_scale": scales.exp().mean(1) / EXTENT,
+        "parent_age": TIME - of["birth"],
+        "views": views,
+        "level": torch.where(is_split.cpu(), (level + 1).clamp(max=LEVELS - 1), level),
+        "time": torch.full_like(views, TIME),
+        "is_split": is_split.cpu().double(),
+        "parent_color_gradient": of["exp_avg_sq.sh"][:, 0].mean(1).sqrt(),
+        "parent_flatness": scales.amin(1).exp() / scales.amax(1).exp(),
+    }
+    return torch.stack([columns[name] for name in FEATURES], 1)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("count", [1, 1000])
+def test_spawn_features_match_the_formulas(device, count):
+    table, rows, is_split = candidates(count, device)
+    features = spawn_features(table, rows, is_split, TIME, EXTENT, LEVELS)
+    assert features.dtype == torch.float32
+    torch.testing.assert_close(features.cpu().double(), expected(table, rows, is_split), rtol=2e-7, atol=0)
+
+
+def test_wrong_arguments():
+    table = random_table(6)
+    rows, is_split = torch.arange(6), torch.zeros(6, dtype=torch.bool)
+    with pytest.raises(RuntimeError, match="rows must be Long, got Int"):
+        spawn_features(table, rows.int(), is_split, TIME, EXTENT, LEVELS)
+    with pytest.raises(RuntimeError, match=r"is_split must have shape \[6\], got \[5\]"):
+        spawn_features(table, rows, is_split[:5], TIME, EXTENT, LEVELS)
+    with pytest.raises(RuntimeError, match="extent must be positive"):
+        spawn_features(table, rows, is_split, TIME, 0.0, LEVELS)
+    with pytest.raises(RuntimeError, match="level_count must be positive"):
+        spawn_features(table, rows, is_split, TIME, EXTENT, 0)
+
+
+def test_spawn_features_opcheck():
+    table, rows, is_split = candidates(9)
+    names = ("grad_sum", "grad_count", "opacities", "scales", "birth", "level", "exp_avg_sq.sh")
+    torch.library.opcheck(
+        torch.ops.blitzgs.spawn_features,
+        ([table[name] for name in names], rows, is_split, TIME, EXTENT, LEVELS),
+    )

@@ -1,8 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Blocks and views that a device holds of a host's table."""
+
+import weakref
+
 import pytest
 import torch
 
+from blitzgs.ops import host
 from blitzgs.ops.blocks import BLOCK_ROWS
+from blitzgs.ops.host import PinnedNumbers
 from blitzgs.ops.pool import seen_blocks, swap_blocks_
 from blitzgs.table.blocks import BlockIndex
 from tests.helpers import DEVICES
@@ -111,3 +117,23 @@ def test_opcheck():
     torch.library.opcheck(
         torch.ops.blitzgs.swap_blocks_, (columns(512, "cpu"), columns(1024, "cpu"), 3, *lists)
     )
+
+
+class Event:
+    is_recorded = False
+
+    def query(self):
+        return self.is_recorded
+
+
+def test_memory_of_a_copy_that_is_not_read_is_kept_until_it_is_written(monkeypatch):
+    monkeypatch.setattr(host, "_abandoned", {})
+    events = [Event() for _ in range(3)]
+    pinned = [PinnedNumbers(torch.zeros(1), event, []) for event in events]
+    memory = [weakref.ref(piece.memory) for piece in pinned]
+    pinned.pop(0).abandon()
+    pinned.pop(0).abandon()
+    assert memory[0]() is not None and memory[1]() is not None
+    events[1].is_recorded = True
+    pinned.pop().abandon()
+    assert [found() is not None for found in memory] == [True, False, True]

@@ -10,7 +10,7 @@ import torch
 from blitzgs.ops.intersect import intersect, tile_counts
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.ops.splat_gradients import GradientBuffer, gradient_columns, packed_table
-from tests.ops.splats import Splats, dense_composite, near_a_cut, random_splats
+from tests.ops.splats import Splats, dense_composite, kept_by, near_a_cut, random_splats
 
 WIDTH, HEIGHT = 53, 37  # neither is a multiple of a tile
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,12 +36,6 @@ def forward(splats, n_cameras=1, tile_size=16, backgrounds=None, tile_begin=0, t
         tile_begin,
         tile_end,
     )
-
-
-def kept_by(outputs):
-    """What the backward pass takes of the outputs of the forward pass."""
-    _, transmittances, last_ids, _, packed_splats, tile_order, _ = outputs
-    return [transmittances, last_ids, packed_splats, tile_order]
 
 
 def backward(
@@ -96,19 +90,6 @@ def test_image_and_gradients_match_the_definition(channels, dtype, image_error, 
         assert (a - b).abs().max() <= gradient_error * b.abs().max()
 
 
-def test_gradcheck():
-    splats = random_splats(8, 9, 8, channels=2, dtype=torch.float64, smallest=2, opacity=(0.1, 0.9), seed=4)
-    tile_lists = lists(splats, width=9, height=8)
-    backgrounds = torch.rand(1, 2, dtype=torch.float64)
-    leaves = [t.requires_grad_() for t in (*splats.values(), backgrounds)]
-
-    def image(*values):
-        return rasterize(*values[:4], *tile_lists, n_cameras=1, width=9, height=8, backgrounds=values[4])
-
-    # Steps small enough that no pixel crosses the cut at 1/255.
-    assert torch.autograd.gradcheck(image, leaves, eps=1e-7, atol=1e-5, rtol=1e-4)
-
-
 def test_absolute_gradients_sum_each_pixels_gradient():
     splats = random_splats(30, WIDTH, HEIGHT, dtype=torch.float64, smallest=4)
     v_renders = torch.zeros(1, HEIGHT, WIDTH, 3, dtype=torch.float64)
@@ -140,35 +121,6 @@ def test_absolute_gradients_sum_each_pixels_gradient():
     (absolute,) = told
     assert torch.equal(absolute, found[4])
     assert torch.equal(means2d.grad, found[0])
-
-
-def test_gradient_is_zero_where_alpha_is_clipped():
-    splats = random_splats(1, WIDTH, HEIGHT, smallest=9, largest=10)
-    splats.means2d[0] = torch.tensor([20.5, 20.5])
-    splats.opacities[0] = 0.999
-    outputs = forward(splats)
-    v_renders = torch.zeros(1, HEIGHT, WIDTH, 3)
-    v_renders[0, 20, 20] = 1.0  # right at the centre: clipped
-    v_means, v_conics, v_opacities, v_colors, _ = backward(splats, outputs, v_renders)
-    assert not v_means.any()
-    assert not v_conics.any()
-    assert not v_opacities.any()
-    torch.testing.assert_close(v_colors, torch.full((1, 3), 0.99))
-
-
-def test_thousands_of_layers_stay_accurate():
-    """2300 faint layers cover every pixel, about as many as end a pixel."""
-    splats = random_splats(2300, WIDTH, HEIGHT, smallest=300, largest=900, opacity=(0.0041, 0.0044))
-    splats.means2d = (splats.means2d / 10 + 20).float()
-    v_renders = torch.rand(1, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
-    outputs = forward(splats)
-    assert outputs[2].min() > 2100
-    found = backward(splats, outputs, v_renders)
-    exact = splats.to(torch.float64)
-    expected = backward(exact, forward(exact), v_renders.double())
-    for a, b in zip(found, expected, strict=True):
-        assert (a - b).abs().max() <= 1e-4 * b.abs().max()
-        assert (a - b).norm() <= 2e-5 * b.norm()
 
 
 def test_last_ids_and_tile_work():

@@ -7,17 +7,11 @@ import torch
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
 from tests.helpers import DEVICES, needs_cuda
-from tests.ops.splats import Splats, random_splats, with_capacity
+from tests.ops.splats import Splats, kept_by, random_splats, with_capacity
 
 WIDTH, HEIGHT = 91, 70
 VIEW = (1, WIDTH, HEIGHT, 16)
 ops = torch.ops.blitzgs
-
-
-def kept_by(outputs):
-    """What the backward pass takes of the outputs of the forward pass."""
-    _, transmittances, last_ids, _, packed_splats, tile_order = outputs[:6]
-    return [transmittances, last_ids, packed_splats, tile_order]
 
 
 class Columns:

@@ -7,8 +7,10 @@ PYTHONS="/path/python3.10 /path/python3.13" names others than those in PATH.
 
 import json
 import os
+import re
 import shutil
 import subprocess
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -33,29 +35,38 @@ print(float(image[0, 16, 16, 0]), float(image[0, 16, 16, 1]))
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
 
-@pytest.fixture(scope="module", params=[(p, t) for p in PYTHONS for t in TORCHES], ids="-torch".join)
-def environment(request, tmp_path_factory):
-    """A fresh environment with the wheel; the PATH of its programs has no compiler."""
-    python, torch = request.param
+def fresh(folder, python, torch, *packages):
+    """Make an environment with a torch and other packages."""
     if shutil.which(python) is None:
         pytest.skip(f"{python} is not here")
-    assert WHEELS, "build the wheel first: make wheel"
-    folder = tmp_path_factory.mktemp("environment")
     uv = shutil.which("uv")
     if uv is None:
         pytest.skip("needs uv, whose environments share their files: pip install uv")
-    subprocess.run([uv, "venv", "-q", "--python", shutil.which(python), folder], check=True)
+    subprocess.run([uv, "venv", "-q", "--seed", "--python", shutil.which(python), folder], check=True)
     install = [uv, "pip", "install", "-q", "--python", folder / "bin" / "python", f"torch=={torch}"]
-    subprocess.run([*install, f"blitzgs[synth] @ file://{WHEELS[-1]}"], check=True)
+    subprocess.run([*install, *packages], check=True)
     return folder
+
+
+@pytest.fixture(scope="module", params=[(p, t) for p in PYTHONS for t in TORCHES], ids="-torch".join)
+def environment(request, tmp_path_factory):
+    """A fresh environment with the wheel; the PATH of its programs has no compiler."""
+    assert WHEELS, "build the wheel first: make wheel"
+    folder = tmp_path_factory.mktemp("environment")
+    return fresh(folder, *request.param, f"blitzgs[synth,view] @ file://{WHEELS[-1]}")
+
+
+def variables(environment):
+    """Return the variables for programs of an environment, which find no others."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "BLITZGS", "CUDA_HOME"))}
+    return kept | {"PATH": str(environment / "bin"), "PIP_NO_INDEX": "1"}
 
 
 def run(environment, *command):
     """Run a program of the environment and return its output."""
-    variables = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "BLITZGS", "CUDA_HOME"))}
     done = subprocess.run(
         [environment / "bin" / command[0], *command[1:]],
-        env=variables | {"PATH": str(environment / "bin"), "PIP_NO_INDEX": "1"},
+        env=variables(environment),
         cwd=environment,
         capture_output=True,
         text=True,
@@ -88,17 +99,33 @@ def test_a_first_model(environment):
     assert (environment / "model.ply").read_bytes().startswith(b"ply\n")
 
 
+def test_the_viewer_sends_pictures(environment):
+    """Runs after `test_a_first_model`, whose model it shows."""
+    command = [environment / "bin" / "blitzgs", "view", "model.ply", "--port", "0"]
+    page = subprocess.Popen(
+        command, env=variables(environment), cwd=environment, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        url = re.search(r"http://\S+", page.stdout.readline())[0]
+        assert b"<html" in urllib.request.urlopen(url, timeout=60).read().lower()
+        version = run(environment, "python", "-c", "import viser; print(viser.__version__)").strip()
+        orbit = {"middle": [0, 0, 0], "radius": 4, "height": 3, "size": [160, 90], "moves": True}
+        options = {"url": url, "version": version, "warm_up": 1, "seconds": 10} | orbit
+        client = str(ROOT / "benchmarks" / "view_client.py")
+        assert json.loads(run(environment, "python", client, json.dumps(options)))["pictures"] > 0
+        assert page.poll() is None
+    finally:
+        page.terminate()
+        page.wait(60)
+
+
 def test_the_sources_install(tmp_path):
-    """`pip install` of the archive builds the libraries of the CPU, with this environment's torch."""
+    """`pip install` of the archive builds the libraries for the torch of its environment."""
     assert ARCHIVES, "build the archive first: make sdist"
-    python = ROOT / ".venv" / "bin" / "python"
-    target = tmp_path / "target"
-    command = [python, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--target", target]
-    path = f"{python.parent}{os.pathsep}{os.environ['PATH']}"
-    environment = os.environ | {"BLITZGS_CUDA": "OFF", "PATH": path}
-    subprocess.run([*command, ARCHIVES[-1]], check=True, env=environment, cwd=tmp_path)
-    names = {path.name for path in (target / "blitzgs" / "_lib").iterdir()}
-    assert names == {"libblitzgs_cpu.so", "libblitzgs_io.so"}
-    variables = os.environ | {"PYTHONPATH": str(target)}
-    done = subprocess.run([python, "-c", CALL], capture_output=True, text=True, env=variables, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    environment = fresh(tmp_path / "environment", PYTHONS[-1], TORCHES[0])
+    install = [environment / "bin" / "python", "-m", "pip", "install", "-q", ARCHIVES[-1]]
+    subprocess.run(install, check=True, env=os.environ | {"BLITZGS_CUDA": "OFF"}, cwd=tmp_path)
+    found = json.loads(run(environment, "blitzgs", "doctor", "--json"))
+    lines = {line["name"] for line in found["lines"]}
+    assert found["ok"] and {"lib cpu", "lib io"} <= lines and "lib cuda" not in lines
+    run(environment, "python", "-c", CALL)

@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
+from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.counter_random import hash_keys
 from blitzgs.ops.relocation import MAX_COPIES
+from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.density import DensityRules
 from blitzgs.population.relocation import draw, relocate, shared
 from blitzgs.spawn.lineage import Cause
-from blitzgs.table.table import PARAMETERS, GaussianTable
+from blitzgs.table.table import EXP_AVG_SQS, PARAMETERS, GaussianTable
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import needs_cuda
 from tests.population.test_density import LEVELS, SEED, STEP, TIME, random_table
@@ -74,15 +77,15 @@ def test_draws_follow_the_weights_and_are_as_many_as_asked():
     weights[::7] = 0
     ids, total = torch.randperm(5000, generator=g)[:500], torch.zeros(500).double()
     for event in range(400):
-        drawn = draw(weights, 60, ids, SEED, event, Ranks())
+        drawn = draw(weights, int(weights.sum()), 60, ids, SEED, event, Ranks())
         assert int(drawn.sum()) == 60 and not drawn[weights == 0].any()
         total += drawn
     expected = 400 * 60 * weights / weights.sum()
     # A draw has a variance of at most its expectation.
     assert ((total - expected).abs() <= 5 * expected.sqrt() + 1).all()
-    assert draw(weights, 0, ids, SEED, 0, Ranks()).sum() == 0
-    assert draw(torch.zeros_like(weights), 60, ids, SEED, 0, Ranks()).sum() == 0
-    alone = draw(torch.tensor([5, 0]), 1000, torch.tensor([1, 2]), SEED, 0, Ranks())
+    assert draw(weights, int(weights.sum()), 0, ids, SEED, 0, Ranks()).sum() == 0
+    assert draw(torch.zeros_like(weights), 0, 60, ids, SEED, 0, Ranks()).sum() == 0
+    alone = draw(torch.tensor([5, 0]), 5, 1000, torch.tensor([1, 2]), SEED, 0, Ranks())
     assert alone.tolist() == [MAX_COPIES - 1, 0]
 
 
@@ -131,6 +134,30 @@ def test_matches_row_by_row(growth, cap):
                     wanted = old[name] if n == 1 else (old[name] * share).float()
                     np.testing.assert_allclose(row[name], wanted, rtol=2e-6, err_msg=name)
     assert not born
+
+
+def test_an_event_before_rows_catch_up_is_that_after_they_did():
+    optimiser = TableAdam(OptimiserConfig(), Schedule(ScheduleConfig()), 1.0, torch.device("cpu"))
+    tables = []
+    for waits in (False, True):
+        table = random_table(400)
+        table["last_step"].copy_(STEP - table["id"] % 7)
+        table["moment_step"].copy_(table["last_step"] - table["id"] % 3)
+        for name in EXP_AVG_SQS:
+            table[name].square_()
+        if not waits:
+            optimiser.catch_up(table, None, STEP)
+        pending = optimiser.pending(table, STEP) if waits else None
+        relocate(table, RULES, growth=0.2, ranks=Ranks(), pending=pending, **CALL)
+        if waits:
+            current = table["last_step"] == STEP
+            assert 100 < current.sum() < len(table) and current[table["birth"] == TIME].all()
+            optimiser.catch_up(table, None, STEP)
+        tables.append(table)
+    orders = [table["id"].argsort() for table in tables]
+    for name in tables[0]:
+        pair = (table[name][order] for table, order in zip(tables, orders, strict=True))
+        torch.testing.assert_close(*pair, rtol=2e-6, atol=2e-6, msg=lambda text, name=name: f"{name}: {text}")
 
 
 def test_no_live_gaussian_leaves_nothing_to_copy():

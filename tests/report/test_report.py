@@ -12,27 +12,16 @@ import pytest
 import torch
 
 from blitzgs.cli import main
-from blitzgs.cli.final_report import kept_warnings
+from blitzgs.cli.report import kept_warnings
 from blitzgs.report.compare import compare, differences, labels
 from blitzgs.report.gather import MAX_POINTS
 from blitzgs.report.page import MAX_BYTES
 from blitzgs.report.report import report
 from blitzgs.runs.folder import open_run
 from blitzgs.runs.previews import PARTS, Previews, preview_file
-from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
-from tests.training.tiny_runs import at_step, events_of, train
+from tests.browser import Browser, needs_chromium, wait_for
+from tests.training.tiny import OVERRIDES, as_flags, at_step, events_of, train, write_tiny_capture
 
-try:
-    from tests.browser import Browser, chromium, wait_for
-except ImportError:  # without websocket-client
-
-    def chromium():
-        return None
-
-
-needs_chromium = pytest.mark.skipif(
-    chromium() is None, reason="Chromium is missing: install it (Debian: apt-get install chromium)"
-)
 HOSTILE = "</script><img src=x onerror=\"document.title='hit'\">&amp;\u2028.jpg"
 
 

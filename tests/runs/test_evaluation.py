@@ -1,11 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-import math
+"""Figures of a model, where its files come from, and its exports in world coordinates."""
 
+import dataclasses
+import json
+import math
+import shutil
+import subprocess
+import sys
+
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from plyfile import PlyData
+from scipy.spatial.transform import Rotation
 
+import blitzgs
+from blitzgs.capture.world import WorldFrame
+from blitzgs.cli import main
+from blitzgs.distributed.group import Ranks
+from blitzgs.formats import gaussians as blocks
+from blitzgs.formats.models import FORMATS
+from blitzgs.formats.ply import read_ply
+from blitzgs.reference.gaussians import rotation_matrices, sh_basis
+from blitzgs.runs import checkpoint
 from blitzgs.runs.evaluation import correct_colours, image_metrics, load_lpips
+from blitzgs.runs.export import export, export_ply
+from blitzgs.runs.folder import open_run
+from blitzgs.runs.source import open_source, source_of
+from blitzgs.runs.world import in_world, load_frame, rotated_harmonics, save_frame
 
 
 def plain_ssim(x, y):
@@ -81,3 +104,142 @@ def test_lpips_is_a_torchscript_module(tmp_path):
     assert float(metric(torch.zeros(1, 3, 4, 4), torch.ones(1, 3, 4, 4))) == 1.0
     with pytest.raises(ValueError, match=r"missing.pt is not .*--lpips, log.lpips_weights"):
         load_lpips(str(tmp_path / "missing.pt"))
+
+
+def test_a_checkpoint_is_streamed_with_its_pending_steps(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(blocks, "BLOCK", 100)
+    model, streamed = open_run(trained[1]).model(), open_source(trained[1])
+    whole = source_of(model)
+    assert len(streamed) == len(whole) == len(model) > 300 and streamed.comments == whole.comments
+    sizes = [len(block) for block in streamed.blocks()]
+    assert max(sizes) == 100 and sum(sizes) == len(model)
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        found = torch.cat([getattr(block, name) for block in streamed.blocks()])
+        expected = torch.cat([getattr(block, name) for block in whole.blocks()])
+        assert torch.equal(found, expected), name
+    export(streamed, streamed.space, FORMATS["ply"], tmp_path / "a.ply")
+    export_ply(model, tmp_path / "b.ply")
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_a_damaged_checkpoint_is_passed_over(trained, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(trained[1], run)
+    newest = max((run / "checkpoints").glob("checkpoint_*"))
+    before = len(open_source(run))
+    broken = run / "checkpoints" / "checkpoint_999999"
+    shutil.copytree(newest, broken)
+    (broken / "manifest.json").write_text("{}")
+    with pytest.warns(UserWarning, match=f"checkpoint_999999 is damaged: .*; using {newest.name}"):
+        assert len(open_source(run)) == before
+    assert main(["export", str(broken), "--ply", str(tmp_path / "a.ply")]) == 1
+    assert "damaged" in capsys.readouterr().err
+    assert main(["export", str(newest), "--ply", str(tmp_path / "a.ply")]) == 0
+    assert len(read_ply(tmp_path / "a.ply")) == before
+
+
+_EXPORT = """
+import sys
+from pathlib import Path
+from blitzgs.formats.models import FORMATS
+from blitzgs.formats.selection import Selected, Selection
+from blitzgs.runs import checkpoint
+from blitzgs.runs.export import export
+from blitzgs.runs.source import open_source
+source = open_source(Path(sys.argv[1]))
+chosen = Selected(source, Selection(min_opacity=1e-9, sh_degree=0))
+export(chosen, source.space, FORMATS[sys.argv[2]], Path(sys.argv[3]))
+# Not `ru_maxrss`, which begins with the peak of the process that started this one.
+status = dict(line.split(":", 1) for line in open("/proc/self/status"))
+print(len(source), 1024 * int(status["VmHWM"].split()[0]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ply", "glb"])
+def test_fifty_million_gaussians_need_less_than_4_gb(trained, tmp_path, name):
+    """The peak of two sizes; each Gaussian costs a few bytes beyond the blocks."""
+    found = checkpoint.load(max((trained[1] / "checkpoints").glob("c*")), Ranks(), "cpu")
+    peaks = {}
+    for times in (250, 500):
+        columns = {key: column.repeat(times, *[1] * (column.dim() - 1)) for key, column in found[0].items()}
+        run = tmp_path / str(times)
+        checkpoint.save(run / "checkpoints", columns, found[1], Ranks())
+        del columns
+        command = [sys.executable, "-c", _EXPORT, str(run), name, str(run / f"a.{name}")]
+        count, peak = subprocess.run(command, capture_output=True, check=True, text=True).stdout.split()
+        peaks[int(count)] = int(peak)
+        shutil.rmtree(run)
+    (few, low), (many, high) = sorted(peaks.items())
+    assert few > 2 * blocks.BLOCK
+    each = max(0.0, (high - low) / (many - few))
+    print(f"{low / 1e6:.0f} MB for {few:,}, {high / 1e6:.0f} MB for {many:,}: {each:.1f} bytes each")
+    assert high + each * (50e6 - many) < 4e9
+
+
+TURN = Rotation.from_euler("xyz", [20, -50, 140], degrees=True).as_matrix()
+FRAME = WorldFrame("EPSG:32633", 1.75, TURN, np.array([512_345.678, 5_012_345.678, 250.125]), "test")
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_rotated_harmonics_show_the_same_colours(degree):
+    random = torch.Generator().manual_seed(degree)
+    sh = torch.randn(5, (degree + 1) ** 2, 3, generator=random)
+    directions = torch.nn.functional.normalize(
+        torch.randn(50, 3, generator=random, dtype=torch.float64), dim=1
+    )
+    rotation = torch.from_numpy(TURN)
+    before = torch.einsum("dk,nkc->dnc", sh_basis(directions, degree), sh.double())
+    turned = rotated_harmonics(sh, rotation).double()
+    after = torch.einsum("dk,nkc->dnc", sh_basis(directions @ rotation.T, degree), turned)
+    torch.testing.assert_close(after, before, atol=5e-6, rtol=0)
+
+
+def test_the_model_in_the_world_looks_the_same(trained):
+    run = blitzgs.open_run(trained[1])
+    model = run.model()
+    # The tiny run is too short to have colours that depend on the direction.
+    model = dataclasses.replace(model, sh=model.sh + 0.1 * torch.randn(model.sh.shape), sh_degree=3)
+    world = in_world(model, FRAME)
+    camera = run.cameras().cameras[0]
+    pose = np.array(camera.world_to_camera)
+    pose[:3, :3] = pose[:3, :3] @ TURN.T
+    pose[:3, 3] *= FRAME.scale
+    moved = dataclasses.replace(camera, world_to_camera=pose)
+    assert (world.render(moved) - model.render(camera)).abs().max() < 2e-3
+    rotations = rotation_matrices(torch.nn.functional.normalize(model.quats.double(), dim=1))
+    turned = rotation_matrices(torch.nn.functional.normalize(world.quats.double(), dim=1))
+    torch.testing.assert_close(turned, torch.from_numpy(TURN) @ rotations, atol=1e-6, rtol=0)
+    shifted = in_world(model, dataclasses.replace(FRAME, rotation=np.eye(3)))
+    assert shifted.means is model.means and shifted.sh is model.sh
+
+
+def test_world_coordinates_survive_a_ply_to_the_millimetre(trained, tmp_path):
+    """At 5e6 m, where neighbouring float32 numbers are half a metre apart."""
+    model = blitzgs.open_run(trained[1]).model()
+    space = model.space
+    capture = model.means.double().numpy() * space.unit + np.array(space.offset)
+    exact = FRAME.to_world(capture)
+    exported = export_ply(in_world(model, FRAME), tmp_path / "m.ply", crs=FRAME.crs)
+    content = json.loads((tmp_path / "m.ply.offset.json").read_text())
+    assert content["crs"] == "EPSG:32633" and tuple(content["offset"]) == exported.offset
+    vertices = PlyData.read(str(tmp_path / "m.ply"))["vertex"]
+    stored = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    assert np.abs(stored + content["offset"] - exact).max() < 1e-3
+    again = PlyData.read(str(tmp_path / "m.ply")).comments
+    assert "offset {!r} {!r} {!r}".format(*content["offset"]) in again
+
+
+def test_the_command_needs_to_know_the_world(trained, tmp_path, capsys):
+    flags = ["--coordinates", "world"]
+    assert main(["export", str(trained[1]), "--ply", str(tmp_path / "a.ply"), *flags]) == 1
+    assert (
+        "has no geo.json, so its place in the world is unknown: use blitzgs align" in capsys.readouterr().err
+    )
+    assert load_frame(trained[1]) is None
+    path = save_frame(trained[1], FRAME)
+    try:
+        assert main(["export", str(trained[1]), "--ply", str(tmp_path / "a.ply"), *flags]) == 0
+        assert json.loads((tmp_path / "a.ply.offset.json").read_text())["crs"] == "EPSG:32633"
+    finally:
+        path.unlink()

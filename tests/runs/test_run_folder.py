@@ -254,7 +254,7 @@ def test_damaged_records_of_the_log_do_not_end_a_run(copy):
     record = {"run": json.loads(manifest.read_text())["state"]["run"], "event": "densify", "t": 5}
     with open(folder / "log.jsonl", "a") as log:
         log.write(f"{json.dumps(record)}\n{'[' * 100_000}\n5\n")
-    assert blitzgs.open_run(folder).log()[-2:] == [record, 5]
+    assert blitzgs.open_run(folder).log()[-1] == record
     (folder / "summary.json").unlink()
     assert main(["train", "--out", str(folder), "--data", str(data), "--resume"]) == 0
     assert (folder / "summary.json").exists()

@@ -16,8 +16,7 @@ from blitzgs.spawn.fit import read_spawns
 from blitzgs.spawn.samples import read_sample
 from tests.conftest import LINEAGE
 from tests.spawn.test_spawn_gate import spawns
-from tests.training.tiny import OVERRIDES, as_flags
-from tests.training.tiny_runs import events_of
+from tests.training.tiny import OVERRIDES, as_flags, events_of
 
 pyarrow = pytest.importorskip("pyarrow")
 parquet = pytest.importorskip("pyarrow.parquet")

@@ -25,8 +25,7 @@ from blitzgs.training.trainer import Trainer
 from tests.conftest import LINEAGE
 from tests.distributed.rank_harness import run_ranks
 from tests.spawn.test_spawn_gate import candidates
-from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, as_flags, tiny_config
-from tests.training.tiny_runs import at_step, events_of
+from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, as_flags, at_step, events_of, tiny_config
 
 pytest.importorskip("pyarrow")
 pytest.importorskip("xgboost")

@@ -18,8 +18,7 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from tests.distributed.rank_harness import CONTEXT
-from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
-from tests.training.tiny_runs import steps_of
+from tests.training.tiny import OVERRIDES, as_flags, steps_of, write_tiny_capture
 
 TRIALS = int(os.environ.get("BLITZGS_TRIALS", "20"))
 INTERVAL = 0.5

@@ -280,37 +280,3 @@ def test_an_image_of_16k_by_16k_in_windows(backend):
         assert expected.values.abs().max() > 0
         # A float has 1e-3 px of a position at 16k.
         assert image_error(actual, expected.values, expected.cut) <= 1e-4
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_rows_of_nan_spread_nowhere(backend):
-    device, dtype = backend
-    scene = random_scene(n=200).to(dtype, device)
-    bad = torch.arange(0, 200, 3, device=device)
-    for name in ("means", "quats", "scales", "opacities", "colors"):
-        getattr(scene, name)[bad] = math.nan
-    leaves = scene.leaves()
-    renders, alphas, _ = blitzgs.rasterization(*leaves.arguments(), sh_degree=3)
-    good = torch.ones(200, dtype=torch.bool, device=device)
-    good[bad] = False
-    for name in ("means", "quats", "scales", "opacities", "colors"):
-        setattr(scene, name, getattr(scene, name)[good])
-    clean, clean_alphas, _ = blitzgs.rasterization(*scene.arguments(), sh_degree=3)
-    assert torch.equal(renders, clean) and torch.equal(alphas, clean_alphas)
-    renders.sum().backward()
-    for name in PARAMETERS:
-        assert getattr(leaves, name).grad.isfinite().all(), name
-    assert (leaves.means.grad[bad] == 0).all() and (leaves.means.grad[good] != 0).any()
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_nothing_visible_and_nothing_at_all(backend):
-    device, dtype = backend
-    for n in (0, 30):
-        scene = random_scene(n=n).to(dtype, device)
-        scene.means[:, 1] += 1e4
-        leaves = scene.leaves()
-        renders, alphas, _ = blitzgs.rasterization(*leaves.arguments(), sh_degree=3)
-        assert (renders == 0).all() and (alphas == 0).all()
-        renders.sum().backward()
-        assert (leaves.means.grad == 0).all()

@@ -11,7 +11,7 @@ from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
 from blitzgs.table.blocks import BlockIndex, morton_order
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from tests.helpers import DEVICES
-from tests.table.pending import caught_up, schedule_of, step_some
+from tests.training.tiny import caught_up, schedule_of, step_some
 
 WIDTH, HEIGHT, NEAR, FAR = 160, 120, 0.2, 60.0
 

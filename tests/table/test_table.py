@@ -2,6 +2,8 @@
 import pytest
 import torch
 
+from blitzgs.table.host_table import HostTable
+from blitzgs.table.placement import place
 from blitzgs.table.table import NO_PARENT, PARAMETERS, REQUIRED, ZERO_AT_BIRTH, GaussianTable, schema
 
 
@@ -43,17 +45,43 @@ def test_permute_keep_and_append_move_whole_rows():
     assert_rows_whole(table)
 
 
-@pytest.mark.parametrize("count, added", [(50, 9), (0, 9), (50, 0)])
-def test_renew_equals_append_keep_and_permute(count, added):
-    renewed, expected = filled_table(count), filled_table(count)
-    more = filled_table(added, seed=2)
-    new = {name: more[name] for name in more if not name.startswith("exp_avg")}
-    order = torch.randperm(count + added, generator=torch.Generator().manual_seed(1))
-    rows = order[: len(order) * 2 // 3]
-    renewed.renew(rows, new)
-    expected.append(new)
-    for name in expected:
-        assert torch.equal(renewed[name], expected[name][rows]), name
+@pytest.mark.parametrize("host", [False, True])
+def test_replace_writes_the_rows_that_change_and_no_others(host):
+    table = filled_table(700)
+    if host:
+        table = HostTable(dict(table.columns), pinned=False)
+    table["cull"] = torch.arange(2 * 700, dtype=torch.int32).view(700, 2) * 77
+    for leaving, joining in ((90, 90), (40, 130), (7, 9), (200, 20), (3, 3)):
+        count, more = len(table), filled_table(joining, seed=joining)
+        new = {name: more[name] for name in more if not name.startswith("exp_avg")}
+        new["cull"] = torch.full((joining, 2), joining, dtype=torch.int32)
+        before = {name: table[name].clone() for name in table}
+        gone = torch.randperm(count)[:leaving].sort().values
+        placement = place(count, gone, torch.randint(count, (joining,)), new["means"])
+        table.replace(placement, new, most=900)
+        for name in table:
+            rows = torch.zeros_like(before[name][:1]).expand(placement.total, *before[name].shape[1:]).clone()
+            kept = min(count, placement.total)
+            rows[:kept] = before[name][:kept]
+            rows[placement.moved_to] = before[name][placement.moved_from]
+            rows[placement.new] = new.get(name, torch.zeros_like(rows[:joining]))
+            assert torch.equal(table[name], rows), name
+        order = torch.randperm(len(table))
+        before = {name: table[name].clone() for name in table}
+        table.permute(order)
+        for name in table:
+            assert torch.equal(table[name], before[name][order]), name
+
+
+def test_a_growing_table_moves_its_columns_rarely():
+    table = filled_table(1000)
+    places, nothing = set(), torch.empty(0, dtype=torch.int64)
+    for _ in range(14):
+        more = {name: column[:50] for name, column in table.columns.items()}
+        table.replace(place(len(table), nothing, torch.arange(50), more["means"]), more, most=1650)
+        places.add(table["sh"].data_ptr())
+    assert len(table) == 1700 and len(places) <= 5
+    assert_rows_whole(table)
 
 
 def test_new_rows_start_with_zero_moments_and_statistics():
@@ -81,8 +109,9 @@ def test_new_rows_without_a_column_that_was_added_later_are_refused():
     table["phi"] = torch.arange(5.0)
     with pytest.raises(ValueError, match=r"new rows lack the columns \['phi'\]"):
         table.append(new)
+    placement = place(5, torch.tensor([2]), torch.tensor([0, 1]), new["means"])
     with pytest.raises(ValueError, match=r"new rows lack the columns \['phi'\]"):
-        table.renew(torch.arange(7), new)
+        table.replace(placement, new)
     table.append(new | table.inherited(torch.tensor([3, 1])))
     assert table["phi"].tolist() == [0, 1, 2, 3, 4, 3, 1]
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Batches have the photographs, masks and views of their cameras, although their memory is reused."""
+"""Batches: which views, and their photographs and masks although memory is reused."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -204,3 +205,86 @@ def test_memory_is_given_back_when_a_batch_cannot_be_assembled(capture, device, 
     finally:
         loader.close()
     assert failures == 10
+
+
+def along(views):
+    """A tour of views with consecutive numbers, which see the places around their own."""
+    return {"tour": list(range(views))}
+
+
+@pytest.mark.parametrize(
+    ("views", "batch_size", "tour"),
+    [(12, 4, {}), (96, 1, along(96)), (96, 4, along(96)), (100, 3, along(100))],
+)
+def test_an_epoch_visits_every_view_once(views, batch_size, tour):
+    sampler = BatchSampler(["same"] * views, batch_size, seed=3, **tour)
+    drawn = [view for step in range(5 * views) for view in sampler.batch(step)]
+    epochs = [tuple(drawn[views * epoch : views * (epoch + 1)]) for epoch in range(5)]
+    assert all(sorted(epoch) == list(range(views)) for epoch in epochs)
+    assert len(set(epochs)) == 5 and len({epoch[0] for epoch in epochs}) > 1
+
+
+def test_batches_hold_one_image_size_and_views_are_drawn_equally_often():
+    sizes = [(64, 48)] * 10 + [(48, 64)] * 5 + [(32, 32)]
+    sampler = BatchSampler(sizes, batch_size=4, seed=0)
+    seen = Counter()
+    for step in range(16 * 50 // 4):
+        batch = sampler.batch(step)
+        assert len(batch) == 4
+        assert len({sizes[view] for view in batch}) == 1
+        seen.update(batch)
+    assert all(abs(seen[view] - 50) <= 4 for view in range(16)), seen
+
+
+@pytest.mark.parametrize(
+    ("views", "tour"), [(9, {}), (50, {"tour": [7 * view % 50 for view in range(50)]})], ids=["free", "tour"]
+)
+def test_a_batch_depends_on_the_step_and_the_seed_alone(views, tour):
+    steps = range(120)
+    one, same, other = (BatchSampler([0] * views, 2, seed=seed, **tour) for seed in (1, 1, 2))
+    ahead = [same.batch(step) for step in reversed(steps)][::-1]
+    assert [one.batch(step) for step in steps] == ahead
+    assert [other.batch(step) for step in steps] != ahead
+
+
+def test_fewer_views_than_the_batch():
+    assert BatchSampler([0], 4, seed=0).batch(7) == [0, 0, 0, 0]
+    with pytest.raises(ValueError, match="no training views"):
+        BatchSampler([], 4, seed=0)
+
+
+def test_a_tour_stays_near_and_is_shuffled_there():
+    views = 400
+    sampler = BatchSampler([0] * views, 1, seed=0, **along(views))
+    drawn = np.array([sampler.batch(step)[0] for step in range(40 * views)]).reshape(40, views)
+    # Distances on the closed tour between views that follow each other. For independent draws, their mean is
+    # views / 4. Here a view moves by up to 1/8 of the tour: two such numbers differ by a third of that.
+    apart = np.abs(np.diff(drawn, axis=1))
+    apart = np.minimum(apart, views - apart)
+    assert apart.max() < 1.5 * views / 8
+    assert 0.6 * views / 24 < apart.mean() < 1.4 * views / 24
+    forward = (np.diff(drawn, axis=1) % views < views / 2).mean(axis=1)
+    assert 5 < (forward > 0.5).sum() < 35  # both directions occur
+    # Whatever the place of a view on the tour, it comes early in some epochs and late in others.
+    when = drawn.argsort(axis=1)
+    assert (abs(when.mean(axis=0) - (views - 1) / 2) < 5 * views / np.sqrt(12 * 40)).all()
+    assert (when.std(axis=0) > 0.5 * views / np.sqrt(12)).all()
+
+
+def test_views_of_all_sizes_follow_a_tour_together():
+    """Two cameras fly side by side; one has another image size, and every third view only."""
+    places = [*range(300), *range(0, 300, 3)]
+    sizes = ["large"] * 300 + ["small"] * 100
+    tour = sorted(range(400), key=lambda view: places[view])
+    sampler = BatchSampler(sizes, 2, seed=1, tour=tour)
+    for epoch in range(3):
+        batches = [sampler.batch(step) for step in range(200 * epoch, 200 * (epoch + 1))]
+        assert all(len({sizes[view] for view in batch}) == 1 for batch in batches)
+        assert sorted(view for batch in batches for view in batch) == list(range(400))
+        steps = np.abs(np.diff([places[batch[0]] for batch in batches]))
+        assert np.minimum(steps, 300 - steps).max() < 1.5 * 300 / 8 + 3
+
+
+def test_a_tour_names_each_view_once():
+    with pytest.raises(ValueError, match="each of the 50 views once, got 49"):
+        BatchSampler([0] * 50, 2, seed=1, tour=list(range(49)))

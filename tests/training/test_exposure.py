@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exposures of photographs are found against renders, keep their mean, and survive a resume."""
+"""Exposures and gains of photographs are found, keep their mean, and survive a resume."""
 
 import json
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import torch
 
 from blitzgs.cli import main
@@ -12,10 +13,12 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs.exposure import LEAST_SPREAD, stored
 from blitzgs.training.exposure import Exposures
+from blitzgs.training.inputs import open_capture
+from blitzgs.training.track_gains import _log_gains, differ, track_gains
 from blitzgs.training.trainer import Trainer
+from blitzgs_synth.generate import generate_city
 from tests.distributed.rank_harness import run_ranks
-from tests.training.tiny import tiny_config, tiny_scene
-from tests.training.tiny_runs import assert_same_table, stop_at
+from tests.training.tiny import assert_same_table, stop_at, tiny_config, tiny_scene
 
 GAINS = torch.tensor([0.8, 0.9, 1.0, 1.1, 1.2])
 BIASES = torch.tensor([0.02, 0.0, -0.02, 0.01, -0.01])
@@ -124,3 +127,32 @@ def test_any_number_of_ranks_measures_the_same_bits():
     assert (alone[:, 0] != 1).all()
     for found in run_ranks(measure_with, 3):
         assert torch.equal(found, alone)
+
+
+def test_gains_are_found_where_each_photograph_has_other_points():
+    rng = np.random.default_rng(0)
+    truth = rng.normal(0, 0.2, (12, 3))
+    truth -= truth.mean(0)
+    colors = rng.normal(4, 0.5, (900, 3))
+    rows = []
+    for view in range(12):
+        points = np.sort((np.arange(300) + 55 * view) % 900)
+        shown = colors[points] + truth[view] + rng.normal(0, 0.01, (300, 3))
+        shown[::10] += 2  # something stands before the point
+        rows.append((points, shown))
+    assert np.abs(_log_gains(rows, 900) - truth).max() < 0.05
+
+
+@pytest.mark.parametrize("exposure", [0.0, 0.2])
+def test_photographs_of_fields_differ_if_their_exposures_do(tmp_path, exposure):
+    pytest.importorskip("embreex")
+    folder = generate_city(
+        tmp_path / "fields", extent=60, views=8, width=96, height=64, points_per_view=80, oblique=0,
+        built=False, grain=2.0, exposure=exposure,
+    )  # fmt: skip
+    config = tiny_config(f"data.path={str(folder)!r}", "data.split=0")
+    capture, images = open_capture(config, Ranks())
+    gains = track_gains(capture, images, Ranks())
+    images.close()
+    assert gains is not None and torch.allclose(gains.mean(0), torch.ones(3).double())
+    assert differ(gains) == (exposure > 0)

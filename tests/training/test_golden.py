@@ -26,8 +26,7 @@ import torch
 from blitzgs.config.files import from_dict, to_dict
 from blitzgs.distributed.group import Ranks
 from blitzgs.training.trainer import Trainer
-from tests.training.tiny import tiny_config, tiny_scene
-from tests.training.tiny_runs import events_of, read_log, steps_of
+from tests.training.tiny import events_of, read_log, steps_of, tiny_config, tiny_scene
 
 GOLDEN = Path(__file__).with_name("golden.json")
 # 100 steps of 2 views: cloning, splitting, pruning by opacity and size, a reset of opacities, all SH degrees.

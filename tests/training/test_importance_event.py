@@ -31,16 +31,23 @@ from blitzgs.table.layouts import CULL
 from blitzgs.training.events import importance
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import on_each_device, run_ranks
-from tests.training import tiny_runs
-from tests.training.tiny import Images, tiny_config, tiny_scene
-from tests.training.tiny_runs import assert_same_table, events_of, read_log, stop_at
+from tests.training import tiny
+from tests.training.tiny import (
+    Images,
+    assert_same_table,
+    events_of,
+    read_log,
+    stop_at,
+    tiny_config,
+    tiny_scene,
+)
 
 # Density events at 20, 40, 60 and 80; the passes after those at 40 and 80.
 PASSES = ("population.importance=true", "schedule.t1=40", "schedule.t2=80", "log.pictures=0")
 
 
 def train(folder, *overrides, ranks=None, resume=False):
-    return tiny_runs.train(folder, *PASSES, *overrides, ranks=ranks, resume=resume)
+    return tiny.train(folder, *PASSES, *overrides, ranks=ranks, resume=resume)
 
 
 def pass_events(folder):

@@ -26,8 +26,7 @@ from blitzgs.training.agreement import MAX_STEPS, Agreement, SaveClock, StopRequ
 from blitzgs.training.events import save
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
-from tests.training.tiny import tiny_config, tiny_scene
-from tests.training.tiny_runs import at_step, read_log, steps_of
+from tests.training.tiny import at_step, read_log, steps_of, tiny_config, tiny_scene
 
 ROOT = Path(__file__).parents[2]
 

@@ -10,11 +10,19 @@ from blitzgs.config.files import ConfigError
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.guard import NonFiniteError
-from blitzgs.training.hints import small_batch_hint
+from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
+from blitzgs.training.understood import small_batch_hint
 from tests.helpers import DEVICES, needs_cuda
-from tests.training.tiny import tiny_config, tiny_scene
-from tests.training.tiny_runs import assert_same_table, events_of, steps_of, stop_at, train
+from tests.training.tiny import (
+    assert_same_table,
+    events_of,
+    steps_of,
+    stop_at,
+    tiny_config,
+    tiny_scene,
+    train,
+)
 
 
 @pytest.fixture(scope="module")
@@ -262,3 +270,24 @@ def test_cuda_trains_like_the_cpu_and_resumes_exactly(whole_run, tmp_path, monke
     resumed = Trainer(config, *tiny_scene(), tmp_path / "cut", ranks, resume=True)
     resumed.train()
     assert_same_table(resumed.state.table, whole.state.table)
+
+
+@pytest.mark.parametrize("strategy", ["density", "relocation"])
+def test_a_table_is_sorted_rarely_and_a_run_is_the_same_if_it_is_sorted_often(
+    tmp_path, monkeypatch, strategy
+):
+    options = (f"population.strategy={strategy}", "population.growth=0.2", "population.max_gaussians=700",
+               "schedule.densify_from=10", "schedule.densify_every=8", "schedule.densify_until=40",
+               "schedule.iterations=44", "model.deterministic=true")  # fmt: skip
+    tables = []
+    for name, sorts in (("rarely", [True, False, False, False]), ("often", [True] * 4)):
+        if all(sorts):
+            monkeypatch.setattr(densify, "MOST_SPREAD", 0.0)
+        trainer, _ = train(tmp_path / name, *options)
+        assert [event.get("sorted", 0) == 1 for event in events_of(tmp_path / name, "densify")] == sorts
+        table = trainer.state.table
+        order = table["id"].argsort()
+        tables.append({column: table[column][order] for column in table})
+    assert len(tables[0]["id"]) > 450
+    for column, values in tables[0].items():
+        assert torch.equal(values, tables[1][column]), column

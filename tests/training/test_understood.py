@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `train` prints of a capture before it trains, `--check`, and what it warns of or refuses."""
+"""What `train` says of a capture, memory and time before it trains, and what it refuses."""
 
+import dataclasses
 import json
 import warnings
 from types import SimpleNamespace
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -11,9 +13,24 @@ import pytest
 import torch
 
 from blitzgs.capture import colmap
+from blitzgs.capture.capture import load_capture
+from blitzgs.capture.lens import Lens
+from blitzgs.capture.undistort import rectify
 from blitzgs.cli import main
-from blitzgs.training.understood import HopelessCaptureError, check_worlds
-from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, as_flags, write_tiny_capture
+from blitzgs.config.fields import Config
+from blitzgs.config.files import load_config
+from blitzgs.config.recipes import recipe_path
+from blitzgs.config.schedule import Schedule
+from blitzgs.distributed.group import Ranks
+from blitzgs.training import inputs
+from blitzgs.training.estimate import _grown, estimate
+from blitzgs.training.understood import (
+    HopelessCaptureError,
+    check_worlds,
+    large_images_hint,
+    undistortion_note,
+)
+from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, as_flags, tiny_config, write_tiny_capture
 
 FLAGS = as_flags("config=defaults", *OVERRIDES, "schedule.iterations=10")
 
@@ -138,3 +155,153 @@ def test_a_run_keeps_its_near_plane(data, tmp_path, capsys):
     assert 0 < near <= 0.01
     cameras = json.loads((out / "cameras.json").read_text())
     assert len(cameras["cameras"]) == 8
+
+
+@pytest.mark.parametrize(
+    ("limit", "cache_bytes", "budget"),
+    [("1000000\n", 800_000, 250_000), ("1000000\n", 300_000, 150_000), ("max\n", 300_000, 150_000)],
+)
+def test_ranks_share_at_most_half_of_the_memory_of_a_container(
+    tmp_path, monkeypatch, limit, cache_bytes, budget
+):
+    write_tiny_capture(tmp_path / "capture")
+    (tmp_path / "memory.max").write_text(limit)
+    monkeypatch.setattr(inputs, "_CONTAINER_LIMIT", tmp_path / "memory.max")
+    config = tiny_config(f"data.path={tmp_path / 'capture'}", f"data.cache_bytes={cache_bytes}")
+    _, images = inputs.open_capture(config, Ranks(local_world_size=2))
+    assert images.compressed.budget == budget and images.decoded.budget == budget // 4 + budget
+
+
+def test_without_a_container_the_memory_of_the_host_counts(tmp_path, monkeypatch):
+    write_tiny_capture(tmp_path / "capture")
+    monkeypatch.setattr(inputs, "_CONTAINER_LIMIT", tmp_path / "missing")
+    monkeypatch.setattr(inputs.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 100}[name])
+    _, images = inputs.open_capture(tiny_config(f"data.path={tmp_path / 'capture'}"), Ranks())
+    assert images.compressed.budget == 4096 * 50
+
+
+def test_ranks_whose_photographs_do_not_fit_get_a_hint(tmp_path, monkeypatch):
+    write_tiny_capture(tmp_path / "capture")
+    _, images = inputs.open_capture(tiny_config(f"data.path={tmp_path / 'capture'}"), Ranks())
+    capture, size = images.capture, inputs.size_of(inputs.decoded_shapes(images.capture))
+    monkeypatch.setattr(inputs, "_host_memory", lambda: 4 * size)
+    assert inputs.sharing_hint(capture, 2 * size, 2) is None
+    assert inputs.sharing_hint(capture, 2 * size - 2, 1) is None
+    hint = inputs.sharing_hint(capture, 2 * size - 2, 2)
+    assert "each rank decodes the photographs for itself" in hint
+    assert "--data.cache_bytes=1_000_000_000," in hint  # rounded up to whole gigabytes
+    monkeypatch.setattr(inputs, "_host_memory", lambda: 4 * size - 4)
+    assert inputs.sharing_hint(capture, 2 * size - 2, 2) is None
+
+
+def test_the_ranks_of_a_host_divide_the_search_for_damage(tmp_path):
+    """Two hosts of two ranks: one rank of each host reads a file, and all ranks know what is wrong."""
+    files = [(tmp_path / f"{index}.png", None) for index in range(5)]
+    for index, (path, _) in enumerate(files):
+        path.write_bytes(
+            b"damaged" if index in (1, 4) else cv2.imencode(".png", np.ones((8, 8)))[1].tobytes()
+        )
+
+    class Rank(Ranks):
+        found: ClassVar = []
+
+        def all_gather_object(self, value):
+            self.found.append(value)
+            return self.found
+
+    results = [
+        inputs._damaged_of_share(Rank(rank=rank, world_size=4, local_world_size=2), files)
+        for rank in range(4)
+    ]
+    assert [list(found) for found in Rank.found] == [[4], [1], [4], [1]]
+    assert list(results[-1]) == [1, 4] and "1.png" in results[-1][1]
+
+
+def capture_of(*cameras):
+    return SimpleNamespace(cameras=list(cameras), train=list(range(len(cameras))))
+
+
+@pytest.mark.parametrize(
+    ("size", "downscale", "device", "flag"),
+    [
+        ((1600, 1200), 1, "cpu", None),
+        ((5472, 3648), 1, "cpu", "--data.downscale=5"),
+        ((2736, 1824), 2, "cpu", "--data.downscale=6"),
+        ((4000, 3000), 1, "cuda", None),
+        ((5472, 3648), 1, "cuda", "--data.downscale=3"),
+    ],
+)
+def test_large_photographs_get_the_flag(size, downscale, device, flag):
+    capture = capture_of(SimpleNamespace(width=size[0], height=size[1]))
+    hint = large_images_hint(capture, downscale, device)
+    assert hint is None if flag is None else flag in hint and f"{size[0]} x {size[1]}" in hint
+
+
+@pytest.mark.parametrize(
+    ("k1", "policy", "says"),
+    [(0.0, "crop", None), (-0.3, "crop", "(data.undistort=mask keeps all"), (-0.3, "mask", "lenses are und")],
+)
+def test_undistortion_says_the_sizes(k1, policy, says):
+    lens = Lens("SIMPLE_RADIAL", 400, 300, (250.0, 200.0, 150.0, k1))
+    form = rectify(lens, policy)
+    note = undistortion_note(
+        capture_of(SimpleNamespace(width=form.width, height=form.height, rectification=form))
+    )
+    if says is None:
+        assert note is None
+        return
+    assert f"1 photographs from 400 x 300 to {form.width} x {form.height}" in note
+    assert (says in note) or form.width * form.height >= 0.9 * 400 * 300
+
+
+VIEWS = 7  # of the tiny capture, without the one that is held out
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("capture")
+    write_tiny_capture(folder)
+    return load_capture(folder)
+
+
+def config_of(*overrides):
+    return load_config(None, [f"{text}" for text in overrides])
+
+
+def test_the_memory_of_a_known_population(capture):
+    found = estimate(config_of("population.max_gaussians=400", "schedule.batch_size=2"), capture, True, 2)
+    row = 3 * 59 * 4 + 42 + 180 + 500  # 59 parameters with two moments, and the widest column once more
+    assert found.gaussians == 400
+    assert found.device_bytes == 400 * row + 2 * WIDTH * HEIGHT * 100
+    assert found.host_bytes == 2_000_000_000 + 3 * VIEWS * WIDTH * HEIGHT
+    on_cpu = estimate(config_of("population.max_gaussians=400", "schedule.batch_size=2"), capture, False, 2)
+    assert on_cpu.device_bytes == 0
+    assert on_cpu.host_bytes == 400_000_000 + 3 * VIEWS * WIDTH * HEIGHT + found.device_bytes
+
+
+def test_a_lower_degree_takes_less(capture):
+    few, many = (
+        estimate(config_of("population.max_gaussians=400", f"model.sh_degree={degree}"), capture, True, 2)
+        for degree in (0, 3)
+    )
+    assert many.device_bytes - few.device_bytes == 400 * (3 * 45 * 4 + 180 - 12)
+
+
+def test_minutes_are_those_that_were_asked_for(capture):
+    assert estimate(config_of("schedule.minutes=7"), capture, False, 2).minutes == 7
+    one, four = (estimate(config_of(), capture, False, cores).minutes for cores in (1, 4))
+    assert one == pytest.approx(4 * four)
+
+
+def test_growth_ends_at_the_limit_and_its_mean_is_over_images():
+    times = {"iterations": 100, "densify_from": 10, "densify_until": 40, "densify_every": 10, "scale": 1.0}
+    schedule = Schedule(dataclasses.replace(Config().schedule, **times, batch_size=1))
+    assert [e.time for e in schedule.events(0, 100) if e.kind == "densify"] == [10, 20, 30]
+    most, mean = _grown(100, 130, 0.2, schedule)
+    assert (most, mean) == (130, pytest.approx((10 * 100 + 10 * 120 + 80 * 130) / 100))
+    assert _grown(100, 10**6, 0.2, schedule)[0] == 172
+
+
+def test_the_recipes_limit_the_population(capture):
+    found = estimate(load_config(recipe_path("smoke"), []), capture, False, 2)
+    assert len(capture.points) <= found.gaussians <= 100_000

@@ -26,9 +26,18 @@ from blitzgs.training.step import Stepper
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.gate import centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
-from tests.training import tiny_runs
-from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene, write_tiny_capture
-from tests.training.tiny_runs import assert_same_table, events_of, steps_of, stop_at
+from tests.training import tiny
+from tests.training.tiny import (
+    OVERRIDES,
+    as_flags,
+    assert_same_table,
+    events_of,
+    steps_of,
+    stop_at,
+    tiny_config,
+    tiny_scene,
+    write_tiny_capture,
+)
 
 # The passes follow the density event at 40 and come at 70; the window ends at 60; the mask is cleared at 85.
 FLAGS = (
@@ -44,7 +53,7 @@ FLAGS = (
 
 
 def train(folder, *overrides, resume=False):
-    return tiny_runs.train(folder, *FLAGS, *overrides, resume=resume)
+    return tiny.train(folder, *FLAGS, *overrides, resume=resume)
 
 
 @pytest.fixture(scope="module")

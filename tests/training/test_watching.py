@@ -13,8 +13,7 @@ from blitzgs.view.look import Look
 from blitzgs.view.views import viewmat
 from blitzgs.view.visible import VisibleFinder
 from tests.distributed.rank_harness import run_ranks
-from tests.training.tiny import tiny_config, tiny_scene
-from tests.training.tiny_runs import assert_same_table, train
+from tests.training.tiny import assert_same_table, tiny_config, tiny_scene, train
 
 
 class Recorder:

@@ -1,23 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A tiny capture rendered from random Gaussians by our own kernels: 8 views of 48 x 32 pixels."""
+"""A tiny capture that our own kernels rendered from random Gaussians: 8 views of 48 x 32 px; its runs."""
 
 from __future__ import annotations
 
+import json
+import os
+import signal
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from blitzgs.capture.image_files import reduced, reduced_mask
 from blitzgs.capture.images import ImageMemory
 from blitzgs.capture.lengths import Sight
-from blitzgs.capture.reduced import reduced, reduced_mask
 from blitzgs.config.fields import Config
 from blitzgs.config.files import load_config
+from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import RenderOptions, Views
-from blitzgs.table.table import GaussianTable
+from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, lazy_adam_step_
+from blitzgs.table.table import PARAMETERS, GaussianTable
+from blitzgs.training.trainer import Trainer
 
 WIDTH, HEIGHT, COUNT = 48, 32, 400
 
@@ -174,7 +183,14 @@ def write_tiny_capture(folder: Path) -> None:
 
     import cv2
 
-    from blitzgs.capture.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints, write_model
+    from blitzgs.capture.colmap import (
+        ColmapCamera,
+        ColmapImages,
+        ColmapModel,
+        ColmapPoints,
+        rotation_to_quat,
+        write_model,
+    )
 
     capture, images = tiny_scene()
     (folder / "images").mkdir(parents=True)
@@ -188,7 +204,7 @@ def write_tiny_capture(folder: Path) -> None:
         ColmapImages(
             ids=np.arange(1, 9, dtype=np.uint32),
             camera_ids=np.ones(8, dtype=np.uint32),
-            quats=np.stack([quaternion(pose[:3, :3]) for pose in poses]),
+            quats=np.stack([rotation_to_quat(pose[:3, :3]) for pose in poses]),
             translations=poses[:, :3, 3],
             names=[camera.name for camera in capture.cameras],
             point2d_offsets=np.zeros(9, dtype=np.uint64),
@@ -204,15 +220,78 @@ def write_tiny_capture(folder: Path) -> None:
     write_model(folder / "sparse" / "0", model)
 
 
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of a rotation matrix: the dominant eigenvector of Bar-Itzhack's symmetric matrix."""
-    m = rotation
-    matrix = np.array(
-        [
-            [m[0, 0] + m[1, 1] + m[2, 2], 0, 0, 0],
-            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], 0, 0],
-            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    return np.linalg.eigh(matrix, UPLO="L")[1][:, -1]
+def train(
+    folder: Path, *overrides: str, scale: float = 1.0, ranks: Ranks | None = None, resume: bool = False
+) -> tuple[Trainer, dict[str, Any] | None]:
+    """Train the tiny capture; return the trainer and its summary, None if it was stopped."""
+    trainer = Trainer(tiny_config(*overrides), *tiny_scene(scale), folder, ranks or Ranks(), resume)
+    return trainer, trainer.train()
+
+
+def at_step(monkeypatch, number: int, action: Callable[[Trainer], object]) -> None:
+    """Call `action(trainer)` after step `number`."""
+    step = Trainer.step
+
+    def changed(self, taken):
+        step(self, taken)
+        if taken == number:
+            action(self)
+
+    monkeypatch.setattr(Trainer, "step", changed)
+
+
+def stop_at(monkeypatch, number: int) -> None:
+    """Ask the process to stop after step `number`."""
+    at_step(monkeypatch, number, lambda trainer: os.kill(os.getpid(), signal.SIGTERM))
+
+
+def read_log(folder: Path) -> list[dict[str, Any]]:
+    """Return the records of a run's log."""
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+def steps_of(folder: Path) -> list[dict[str, Any]]:
+    """Return the records of steps in a run's log."""
+    return [record for record in read_log(folder) if "loss" in record]
+
+
+def events_of(folder: Path, event: str) -> list[dict[str, Any]]:
+    """Return the records of one kind of event in a run's log."""
+    return [record for record in read_log(folder) if record.get("event") == event]
+
+
+def assert_same_table(a: GaussianTable, b: GaussianTable) -> None:
+    """Check that two tables hold the same bits."""
+    assert len(a) == len(b)
+    for name in a:
+        assert torch.equal(a[name], b[name]), name
+
+
+def _state(table: GaussianTable) -> AdamState:
+    groups = table.parameters, table.exp_avgs, table.exp_avg_sqs
+    return AdamState(*groups, table["last_step"], table["moment_step"])
+
+
+def schedule_of(rates: Tensor) -> AdamSchedule:
+    """Return the schedule with these learning rates, [S + 1, 6]."""
+    return AdamSchedule(rates, 0.9, 0.999, 1e-15)
+
+
+def caught_up(table: GaussianTable, schedule: AdamSchedule, step: int) -> GaussianTable:
+    """Return a copy of a table with no pending steps up to `step`."""
+    copy = GaussianTable({name: table[name].clone() for name in table})
+    lazy_adam_catch_up_(_state(copy), schedule, step)
+    return copy
+
+
+def step_some(
+    table: GaussianTable, ids: Tensor, schedule: AdamSchedule, step: int, generator: torch.Generator
+) -> Tensor:
+    """Take a step with random gradients of about half of the rows `ids`; return these rows, int32 [U]."""
+    stepped = ids[torch.rand(len(ids), generator=generator).to(ids.device) < 0.5]
+    grads = [
+        torch.randn((len(stepped), *table[name].shape[1:]), generator=generator).to(ids.device)
+        for name in PARAMETERS
+    ]
+    lazy_adam_step_(_state(table), schedule, step, grads, stepped)
+    return stepped

@@ -1,14 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No image name makes a file land outside its folder, or replace an input or another image's file."""
+"""Files and terminals: names, progress, laps and charts."""
 
 import os
+import re
+import time
 from pathlib import Path
+from xml.etree import ElementTree
 
+import psutil
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from blitzgs.util.charts import line_chart
 from blitzgs.util.output import OutputFolder, new_file, write_file
+from blitzgs.util.progress import Laps, image_progress
+from blitzgs.util.terminal import printable
 
 PARTS = st.sampled_from(
     ["..", ".", "a", "A", "a.png", "a.jpg", "a.png.jpg", "b", "ä🏙", "x" * 300, "\udcff.png", ""]
@@ -140,3 +147,94 @@ def test_a_full_disk_names_the_file_that_was_asked_for(tmp_path):
         partial.symlink_to("/dev/full")
         partial.write_bytes(b"x")
     assert caught.value.filename == str(path) and not list(tmp_path.iterdir())
+
+
+NAMESPACE = "{http://www.w3.org/2000/svg}"
+
+
+@pytest.mark.parametrize(
+    ("points", "most", "columns", "rows"),
+    [
+        (
+            [(0, 1547), (750, 10411)],
+            None,
+            ["0", "200", "400", "600"],
+            ["0", "2.5k", "5k", "7.5k", "10k", "12.5k"],
+        ),
+        (
+            [(0, 3), (30_000, 1e6)],
+            None,
+            ["0", "10k", "20k", "30k"],
+            ["0", "200k", "400k", "600k", "800k", "1M"],
+        ),
+        ([(5, 0.5)], 1.0, ["0", "1", "2", "3", "4", "5"], ["0", "0.2", "0.4", "0.6", "0.8", "1"]),
+        ([(0, 0)], None, ["0", "0.2", "0.4", "0.6", "0.8", "1"], ["0", "0.2", "0.4", "0.6", "0.8", "1"]),
+    ],
+)
+def test_axes_have_round_numbers(points, most, columns, rows):
+    chart = ElementTree.fromstring(line_chart({"": points}, "images", "Gaussians", most))
+    labels = list(chart.iter(f"{NAMESPACE}text"))
+    assert [label.text for label in labels if label.get("text-anchor") == "middle"] == columns
+    below = [label for label in labels if label.get("text-anchor") == "end" and label.text != "images"]
+    assert [label.text for label in below] == rows
+
+
+def test_a_label_is_below_its_point():
+    chart = line_chart({"": [(0, 1), (600, 2), (750, 3)]}, "images", "Gaussians")
+    (line,) = re.findall(r'polyline points="([^"]*)"', chart)
+    x = line.split()[1].split(",")[0]
+    assert f'<text x="{x}" y="333.0" text-anchor="middle" fill="black">600</text>' in chart
+
+
+def test_names_of_lines_are_above_the_chart():
+    names = ("one", "two", "three")
+    chart = ElementTree.fromstring(line_chart({name: [(0, 0), (1, 1)] for name in names}, "x", "y"))
+    labels = {label.text: float(label.get("y")) for label in chart.iter(f"{NAMESPACE}text")}
+    top = float(chart.find(f"{NAMESPACE}polyline").get("points").split()[1].split(",")[1])
+    assert labels["one"] < labels["two"] < labels["three"] < top
+    assert float(chart.get("viewBox").split()[3]) == 360 + 2 * 14
+
+
+def test_parts_add_up_from_the_start_of_the_process(monkeypatch):
+    begin = psutil.Process().create_time()
+    laps = Laps(since_start=True)
+    for seconds, name in ((2, "imports"), (5, "capture"), (4, "clock set back"), (6.5, "capture")):
+        monkeypatch.setattr(time, "time", lambda at=begin + seconds: at)
+        laps.lap(name)
+    assert laps.seconds == pytest.approx({"imports": 2, "capture": 5.5, "clock set back": 0})
+    assert laps.text() == "set-up 7.5 s: imports 2.0, capture 5.5, clock set back 0.0"
+
+
+def count(shown):
+    with image_progress("Counting", shown) as report:
+        for done in range(1, 4):
+            report(done, 3)
+
+
+def test_a_terminal_shows_how_far_the_work_is(capsys, monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    count(True)
+    shown = capsys.readouterr()
+    assert "Counting" in shown.err and "3/3" in shown.err and not shown.out
+    count(False)
+    assert not capsys.readouterr().err
+
+
+def test_a_file_gets_no_bar(capsys, monkeypatch):
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    count(True)
+    assert not capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("plain, ünïcode 🏙\n\tand more", "plain, ünïcode 🏙\n\tand more"),
+        ("a\x1b[31mred", "a\\x1b[31mred"),
+        ("\x07\x00\x7f\r", "\\x07\\x00\\x7f\\r"),
+        ("\x9b2J", "\\x9b2J"),
+        ("gpj.\u202e", "gpj.\\u202e"),
+    ],
+)
+def test_control_characters_are_escaped(text, shown):
+    assert printable(text) == shown

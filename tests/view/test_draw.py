@@ -1,16 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
+"""What is drawn of a table, and which of its blocks and rows are visible."""
+
 import numpy as np
 import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.population.initialisation import _seen_by_more
 from blitzgs.runs.folder import open_run
-from blitzgs.table.table import PARAMETERS
+from blitzgs.table.table import PARAMETERS, GaussianTable
+from blitzgs.view import point_blocks
 from blitzgs.view.draw import Drawer, Subject, intrinsics, table_of_parameters
+from blitzgs.view.gate import LodGate, SceneGate
+from blitzgs.view.levels import measure_levels
 from blitzgs.view.look import Look
+from blitzgs.view.point_blocks import BLOCK_POINTS, PointBlocks
 from blitzgs.view.views import render_options, viewmat
+from blitzgs.view.visible import VisibleFinder
 from tests.distributed.rank_harness import run_ranks
+from tests.helpers import DEVICES
+from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
 
 
 def subject_of(model, part=slice(None)):
@@ -119,3 +131,89 @@ def test_impossible_looks_are_refused(change, what):
     fields = {"viewmat": np.eye(4), "K": intrinsics(8, 8, 1.0), "width": 8, "height": 8}
     with pytest.raises(ValueError, match=what):
         Look(**(fields | change))
+
+
+def flat_scene(points, cameras, seed=0):
+    """Points of a wide, flat scene, a third of them at one place, and cameras above it."""
+    g = torch.Generator().manual_seed(seed)
+    cloud = (
+        torch.randn(points, 3, generator=g, dtype=torch.float64) * torch.tensor([50.0, 80.0, 3.0]).double()
+    )
+    cloud[: points // 3] = cloud[:1]
+    centres = torch.randn(cameras, 3, generator=g, dtype=torch.float64) * 60
+    centres[:, 2] = 40.0
+    return cloud, centres
+
+
+@pytest.mark.parametrize("count", [1, 2, BLOCK_POINTS, BLOCK_POINTS + 1, 3000])
+def test_every_point_is_between_the_bounds_of_its_block(count):
+    points, centres = flat_scene(count, 9)
+    blocks = PointBlocks.of(points)
+    assert sorted(blocks.order.tolist()) == list(range(count))
+    distances = (points[blocks.order] - centres[:, None]).norm(dim=2)
+    parts = list(blocks.distances(centres))
+    assert torch.equal(torch.cat([some for some, _, _ in parts]), centres)
+    for bounds, tightest in ((1, torch.amin), (2, torch.amax)):
+        bound = torch.cat([part[bounds] for part in parts])
+        for block, own in enumerate(distances.split(BLOCK_POINTS, dim=1)):
+            edge = tightest(own, dim=1)
+            assert (bound[:, block] <= edge).all() if bounds == 1 else (bound[:, block] >= edge).all()
+    chosen = torch.arange(len(blocks)) % 2 == 0
+    expected = [points[rows] for rows in blocks.order.split(BLOCK_POINTS)[::2]]
+    assert torch.equal(blocks.points_of(chosen), torch.cat(expected))
+
+
+@pytest.mark.parametrize("pairs", [1, 200, 1 << 20])
+@pytest.mark.parametrize(("count", "cameras"), [(700, 1), (6000, 150), (40, 300)])
+def test_levels_and_visible_voxels_are_those_of_all_distances(monkeypatch, pairs, count, cameras):
+    monkeypatch.setattr(point_blocks, "_PAIRS", pairs)
+    points, centres = flat_scene(count, cameras, seed=count)
+    distances = np.linalg.norm(points.numpy()[None] - centres.numpy()[:, None], axis=2)
+    levels = measure_levels(points, centres, 2.0, 0.001)
+    d_max = np.quantile(np.quantile(distances, 0.999, axis=1), 0.999)
+    assert levels.reference_distance == pytest.approx(d_max, rel=1e-12)
+    d_min = np.quantile(np.quantile(distances, 0.001, axis=1), 0.001)
+    assert levels.count == round(np.log2(d_max / d_min)) + 1
+    for share in (0.0, 0.3, 0.9, 1.0):
+        for farthest in (5.0, 45.0, 90.0, 300.0):
+            seen = (distances <= farthest).sum(axis=0) / cameras > share
+            assert _seen_by_more(points, centres, farthest, share).tolist() == seen.tolist()
+
+
+LIMITS = (NEAR, FAR, 0.3)
+OPTIONS = RenderOptions(sh_degree=0, near_plane=NEAR, far_plane=FAR)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_rows_outside_the_views_are_left_out_and_the_image_stays_the_same(device):
+    table, views = make_table(device=device), Views(*make_views(device=device), WIDTH, HEIGHT)
+    found = VisibleFinder(table).find(*views.as_arguments(), LIMITS)
+    ids, bits = found.active.listed()
+    assert found.table is table and torch.equal(found.rows_of(ids), ids)
+    assert seen(table, views.viewmats, views.Ks) <= allowed((ids, bits))
+    assert len(ids) < 0.8 * len(table)
+    whole = pipeline.forward(table, views, OPTIONS).renders
+    assert whole.any() and torch.equal(pipeline.forward(table, views, OPTIONS, found.active).renders, whole)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_gate_leaves_out_the_rows_that_it_leaves_out_of_the_whole_table(device):
+    table, views = make_table(device=device), Views(*make_views(device=device), WIDTH, HEIGHT)
+    table["level"] = (torch.arange(len(table), device=device) % 6).to(torch.uint8)
+    lod = SceneGate(LodGate(20.0, 2.0, 6, 4), 1.0, table, Ranks(device=torch.device(device)))
+    gated = lod.active(table, views.viewmats)
+    found = VisibleFinder(table, lod).find(*views.as_arguments(), LIMITS).active
+    image, expected = (pipeline.forward(table, views, OPTIONS, rows).renders for rows in (found, gated))
+    assert torch.equal(image, expected)
+    assert not torch.equal(image, pipeline.forward(table, views, OPTIONS).renders)
+    assert int(found.considered()) < int(gated.considered()) < len(table)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_table_without_rows_is_found_empty(device):
+    table = make_table(device=device)
+    table.keep(torch.zeros(len(table), dtype=torch.bool, device=device))
+    views = Views(*make_views(device=device), WIDTH, HEIGHT)
+    found = VisibleFinder(GaussianTable(table.columns)).find(*views.as_arguments(), LIMITS)
+    assert len(found.active.listed()[0]) == 0
+    assert not pipeline.forward(found.table, views, OPTIONS, found.active).renders.any()

@@ -25,9 +25,8 @@ from blitzgs.training.step import Stepper
 from blitzgs.view.gate import SAMPLE, LodGate, SceneGate, ViewGate, centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.helpers import DEVICES
-from tests.table.pending import caught_up, schedule_of, step_some
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
-from tests.training.tiny import random_gaussians, tiny_config
+from tests.training.tiny import caught_up, random_gaussians, schedule_of, step_some, tiny_config
 
 # Distances of `make_table` are up to 60 or so: the gate cuts through the scene at every level.
 GATE = LodGate(reference_distance=45.0, fork=2.0, count=6, finest=4)

@@ -22,8 +22,7 @@ import cv2
 
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
-from blitzgs.report.look import look_of
-from blitzgs.report.report import write_report
+from blitzgs.report.report import look_of, write_report
 from blitzgs.runs.folder import open_run
 from blitzgs.viewer.studio import Studio, open_model
 from blitzgs.viewer.web import web_file

@@ -21,12 +21,8 @@ from blitzgs.runs.folder import open_run
 from blitzgs.training.trainer import Trainer
 from blitzgs.viewer.paths import from_json
 from blitzgs.viewer.studio import Studio, open_model
-from tests.browser import Browser, chromium, wait_for
+from tests.browser import Browser, needs_chromium, wait_for
 from tests.training.tiny import tiny_config, tiny_scene
-
-needs_chromium = pytest.mark.skipif(
-    chromium() is None, reason="Chromium is missing: install it (Debian: apt-get install chromium)"
-)
 
 
 def settled(studio):

@@ -1,37 +1,36 @@
-"""The page of a tileset in a headless Chromium, from the server of `blitzgs view`."""
+# SPDX-License-Identifier: Apache-2.0
+"""Tiles of the viewer and their tileset."""
 
 import json
+import re
 import threading
 
 import numpy as np
 import pytest
 
-from blitzgs.cli.serve import tiles_server
+from blitzgs.capture.world import WorldFrame, enu_frame
+from blitzgs.cli import main
+from blitzgs.cli.view import tiles_server
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import save_ply
 from blitzgs.formats.tiles import write_tiles
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.runs.folder import open_run
 from blitzgs.view.draw import Drawer
 from blitzgs.view.look import Look
 from blitzgs.viewer.studio import open_model
-from blitzgs.viewer.world import looking
-from tests.browser import Browser, chromium, wait_for
-from tests.formats.test_tiles import SCENE, city
+from blitzgs.viewer.tileset import open_city, to_globe
+from tests.browser import Browser, needs_chromium, wait_for
+from tests.formats.helpers import read_glb
+from tests.formats.test_tiles import SCENE, city, nodes
+from tests.viewer.test_parts import camera_at
 
-needs_chromium = pytest.mark.skipif(
-    chromium() is None, reason="Chromium is missing: install it (Debian: apt-get install chromium)"
-)
 WIDTH, HEIGHT = 320, 240
 K = np.array([[280.0, 0, 160], [0, 280, 120], [0, 0, 1]])
-UP = np.array([0.0, 0, 1])
 
 
 def pose(eye, target=(20, 15, 0)):
-    stance = looking(np.array(eye, float), np.array(target, float), UP, 1.0)
-    matrix = np.eye(4)
-    matrix[:3, :3] = stance.rotation.T
-    matrix[:3, 3] = -stance.rotation.T @ stance.position
-    return matrix
+    return camera_at(eye, target)
 
 
 @pytest.fixture(scope="module")
@@ -48,13 +47,6 @@ def shown(tmp_path_factory):
         server.shutdown()
 
 
-def go(browser, url):
-    browser.call("Page.navigate", url=url)
-    wait_for(lambda: browser.evaluate("location.href") == url, 30, "the page is open")
-    wait_for(lambda: browser.evaluate("typeof blitzgs !== 'undefined'"), 30, "the program runs")
-    browser.evaluate("blitzgs.ready")
-
-
 def settle(browser, view):
     call = f"blitzgs.settle({json.dumps(view.tolist())}, {json.dumps(K.tolist())}, {WIDTH}, {HEIGHT})"
     return browser.evaluate(call)
@@ -68,7 +60,7 @@ def pixels(browser):
 @needs_chromium
 def test_nearer_views_load_more_tiles_and_farther_ones_show_fewer(shown):
     _, browser, url = shown
-    go(browser, url)
+    browser.go(url)
     far = settle(browser, pose((20, -300, 150)))
     near = settle(browser, pose((20, 4, 5)))
     assert 0 < far["shown"] < near["shown"] and far["gaussians"] < near["gaussians"]
@@ -85,7 +77,7 @@ def test_nearer_views_load_more_tiles_and_farther_ones_show_fewer(shown):
 @needs_chromium
 def test_with_all_tiles_the_picture_is_that_of_our_renderer(shown):
     folder, browser, url = shown
-    go(browser, url + "?error=1e-9")
+    browser.go(url + "?error=1e-9")
     opened = open_model(folder / "city.ply", Ranks())
     view = pose((20, -6, 9))
     state = settle(browser, view)
@@ -101,7 +93,7 @@ def test_with_all_tiles_the_picture_is_that_of_our_renderer(shown):
 @needs_chromium
 def test_a_budget_is_kept_and_missing_tiles_are_said(shown):
     folder, browser, url = shown
-    go(browser, url + "?budget=28000&error=0.01")
+    browser.go(url + "?budget=28000&error=0.01")
     first = settle(browser, pose((8, 8, 4), (2, 2, 1)))
     assert first["shown"] == first["wanted"] == 7  # pages of 4,096 Gaussians
     other = settle(browser, pose((32, 22, 4), (38, 28, 1)))
@@ -133,3 +125,105 @@ def test_damaged_folders_are_refused(tmp_path):
     (folder / "tileset.json").write_text(good)
     with pytest.raises(OSError, match=r"cannot listen on 203\.0\.113\.1:0"):
         tiles_server(folder, "203.0.113.1", 0)
+
+
+def contents(folder):
+    tileset = json.loads((folder / "tileset.json").read_text())
+    found = [node["content"]["uri"] for node, _ in nodes(tileset["root"]) if "content" in node]
+    return tileset, np.concatenate([read_glb(folder / uri)[1]["POSITION"] for uri in found])
+
+
+def test_a_run_is_written_as_tiles(trained, tmp_path, capsys):
+    _, run = trained
+    folder = tmp_path / "city"
+    assert (
+        main(["export", str(run), "--tiles", str(folder), "--processes", "1", "--tile-gaussians", "50"]) == 0
+    )
+    model = open_run(run).model()
+    out = capsys.readouterr().out
+    assert re.search(rf"city: {len(model):,} Gaussians in \d+ tiles, \d+\.\d MB", out)
+    assert f"blitzgs view {folder}" in out
+    tileset, positions = contents(folder)
+    wanted = model.means.double().numpy() * model.space.unit
+    np.testing.assert_allclose(np.sort(positions, axis=0), np.sort(wanted, axis=0), rtol=1e-6, atol=1e-6)
+    # The page begins where `blitzgs view` does, in the unit of the capture.
+    view, scene = tileset["extras"]["view"], open_city(run).scene
+    assert view["eye"] == list(scene.eye) and view["near"] == scene.near > 0
+    far = np.linalg.norm(np.array(view["eye"]) - view["target"])
+    assert 0.1 * model.space.extent < far / model.space.unit < 10 * model.space.extent
+
+
+def test_a_file_is_written_as_tiles_and_flags_choose(tmp_path, capsys):
+    save_ply(tmp_path / "m.ply", city(800))
+    flags = ["--tiles", str(tmp_path / "t"), "--crop", "0", "0", "-9", "20", "99", "99", "--processes", "1"]
+    assert main(["export", str(tmp_path / "m.ply"), *flags]) == 0
+    means = city(800).means.numpy()
+    inside = (means[:, 0] <= 20) & (means[:, 1] <= 99) & (means[:, 2] <= 99)
+    _, positions = contents(tmp_path / "t")
+    assert len(positions) == inside.sum() and positions[:, 0].max() <= 20
+    capsys.readouterr()
+    for flags, reason in (
+        (["--tiles", str(tmp_path / "t")], "is not an empty folder"),
+        (["--tiles", str(tmp_path / "u"), "--max-mb", "3"], "--max-mb is not for --tiles"),
+        (["--ply", str(tmp_path / "u.ply"), "--processes", "3"], "--processes is for --tiles"),
+    ):
+        assert main(["export", str(tmp_path / "m.ply"), *flags]) == 1
+        assert reason in capsys.readouterr().err
+    (tmp_path / "cut.ply").write_bytes((tmp_path / "m.ply").read_bytes()[:-100])
+    assert main(["export", str(tmp_path / "cut.ply"), "--tiles", str(tmp_path / "u")]) == 1
+    assert "cut.ply" in capsys.readouterr().err and not (tmp_path / "u").exists()
+
+
+def geodetic(globe):
+    """Return latitude, longitude (degrees) and height of EPSG:4978 coordinates, by iteration."""
+    x, y, z = globe
+    a, f = 6378137.0, 1 / 298.257223563
+    e2, p = f * (2 - f), np.hypot(x, y)
+    latitude = np.arctan2(z, p * (1 - e2))
+    for _ in range(10):
+        n = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
+        height = p / np.cos(latitude) - n
+        latitude = np.arctan2(z, p * (1 - e2 * n / (n + height)))
+    return np.degrees(latitude), np.degrees(np.arctan2(y, x)), height
+
+
+def test_a_georeferenced_run_lies_on_the_globe(trained, tmp_path):
+    pytest.importorskip("pyproj", reason="the extra geo is not installed")
+    import pyproj
+
+    easting, northing = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(8.5, 47.3)
+    frame = WorldFrame("EPSG:32632", translation=np.array([easting, northing, 400.0]), source="geo.json")
+    matrix = to_globe(frame, np.zeros(3))
+    latitude, longitude, height = geodetic(matrix[:3, 3])
+    np.testing.assert_allclose([latitude, longitude, height], [47.3, 8.5, 400.0], atol=1e-6)
+    # To first order east, north and up, turned by the convergence, stretched by the zone's scale and height.
+    turned = enu_frame(47.3, 8.5, 400.0, "").rotation.T @ matrix[:3, :3]
+    convergence = np.radians(-0.5 * np.sin(np.radians(47.3)))
+    scale = (1 + 400 / 6.38e6) / (0.9996 * (1 + ((easting - 500_000) / 6.37e6) ** 2 / 2))
+    east = [scale * np.cos(convergence), -scale * np.sin(convergence), 0]
+    np.testing.assert_allclose(np.abs(turned[:, 0]), np.abs(east), atol=3e-6)
+    np.testing.assert_allclose(turned[:, 2], [0, 0, 1], atol=1e-5)
+    place = geodetic((matrix @ [300.0, 200.0, 5.0, 1.0])[:3])
+    expected = pyproj.Transformer.from_crs(32632, 4326, always_xy=True).transform(
+        easting + 300, northing + 200
+    )
+    np.testing.assert_allclose(place[:2], expected[::-1], atol=1e-7)  # 1 cm
+    # An ENU frame of its own: no map projection.
+    local = enu_frame(47.3, 8.5, 400.0, "gps")
+    np.testing.assert_allclose(to_globe(local, np.zeros(3))[:3, :3], local.rotation, atol=1e-7)
+    with pytest.raises(ValueError, match="a file: "):
+        to_globe(WorldFrame("EPSG:99999999", source="a file"), np.zeros(3))
+
+
+def test_geo_json_of_a_run_is_used(trained, tmp_path):
+    pytest.importorskip("pyproj", reason="the extra geo is not installed")
+    _, run = trained
+    local = enu_frame(47.3, 8.5, 400.0, "gps")
+    (run / "geo.json").write_text(json.dumps(local.as_json()))
+    try:
+        model = open_city(run)
+        expected = local.to_world(model.offset)
+        np.testing.assert_allclose(model.transform()[:3, 3], expected, atol=1e-4)
+    finally:
+        (run / "geo.json").unlink()
+    assert abs(open_city(run).transform()[:3, 3]).max() == 0

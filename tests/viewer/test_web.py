@@ -21,11 +21,8 @@ from blitzgs.view.views import viewmat
 from blitzgs.viewer.studio import open_model
 from blitzgs.viewer.web import contributions, web_file
 from blitzgs.viewer.world import World, looking
-from tests.browser import Browser, chromium, wait_for
+from tests.browser import Browser, needs_chromium, wait_for
 
-needs_chromium = pytest.mark.skipif(
-    chromium() is None, reason="Chromium is missing: install it (Debian: apt-get install chromium)"
-)
 WIDTH, HEIGHT = 160, 120
 # The header of a model with octree levels; levels 2 and 3 end before the far half of the scene.
 LOD = "comment lod reference_distance 8.0 fork 2.0 levels 4 finest 3"
@@ -68,13 +65,6 @@ def rendered(opened, pose, K, width=WIDTH, height=HEIGHT, lod=True):  # noqa: N8
     return drawer.draw(Look(pose, K, width, height, lod=lod)).values.astype(int)
 
 
-def go(browser, file):
-    browser.call("Page.navigate", url=file.as_uri())
-    wait_for(lambda: browser.evaluate("location.href") == file.as_uri(), 30, "the file is open")
-    wait_for(lambda: browser.evaluate("typeof blitzgs !== 'undefined'"), 30, "the page's program runs")
-    browser.evaluate("blitzgs.ready")
-
-
 @pytest.fixture(scope="module")
 def browser():
     with Browser("about:blank", 640, 480) as browser:
@@ -96,7 +86,7 @@ def test_the_picture_is_that_of_our_renderer(browser, tmp_path, comments, degree
     opened = write_model(tmp_path / "m.ply", comments, degree)
     file = tmp_path / "m.html"
     file.write_text(web_file(opened, 10_000_000).text)
-    go(browser, file)
+    browser.go(file.as_uri())
     for pose, K in views(opened):  # noqa: N806
         wanted, found = rendered(opened, pose, K), shown(browser, pose, K)
         assert wanted.std() > 20
@@ -112,7 +102,7 @@ def test_mouse_and_wheel_move_and_reset_goes_back(browser, tmp_path):
     opened = write_model(tmp_path / "m.ply", count=600)
     file = tmp_path / "m.html"
     file.write_text(web_file(opened, 10_000_000).text)
-    go(browser, file)
+    browser.go(file.as_uri())
     assert re.fullmatch(r"5\d\d of 5\d\d Gaussians", browser.evaluate("figures.textContent"))
 
     def picture():
@@ -177,7 +167,7 @@ def test_a_run_and_its_checkpoints_are_exported(browser, trained, tmp_path, caps
     file = tmp_path / "out" / "run.html"
     assert main(["export", str(trained[1]), "--html", str(file)]) == 0
     assert re.search(r"run.html: [\d,]+ of [\d,]+ Gaussians, 0.\d MB", capsys.readouterr().out)
-    go(browser, file)
+    browser.go(file.as_uri())
     opened = open_model(trained[1], Ranks())
     camera = opened.exhibit.cameras[0]
     pose, K = viewmat(camera, opened.exhibit.space), np.asarray(camera.K)  # noqa: N806

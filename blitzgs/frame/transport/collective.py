@@ -7,9 +7,15 @@ import torch.distributed as dist
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport.protocol import Arrived, ExchangeResult, Mark, Traffic, unmarked
+from blitzgs.frame.transport.protocol import (
+    Arrived,
+    CapacityEstimate,
+    ExchangeResult,
+    Mark,
+    Traffic,
+    unmarked,
+)
 from blitzgs.frame.transport.way_back import CollectiveWayBack
 from blitzgs.ops.host import to_host
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from blitzgs.frame.capacity import CapacityEstimate
-from blitzgs.frame.transport.protocol import Arrived, ExchangeResult, Mark, unmarked
+from blitzgs.frame.transport.protocol import Arrived, CapacityEstimate, ExchangeResult, Mark, unmarked
 from blitzgs.ops.host import HostCopy
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes
 

@@ -44,9 +44,15 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.capacity import CapacityEstimate
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport.protocol import Arrived, ExchangeResult, Mark, Traffic, unmarked
+from blitzgs.frame.transport.protocol import (
+    Arrived,
+    CapacityEstimate,
+    ExchangeResult,
+    Mark,
+    Traffic,
+    unmarked,
+)
 from blitzgs.frame.transport.way_back import PeerWayBack
 from blitzgs.ops.host import current_stream
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of

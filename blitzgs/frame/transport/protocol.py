@@ -17,7 +17,8 @@ each have one transport; `way_back` returns the gradients for the latter two.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from torch import Tensor
@@ -25,7 +26,6 @@ from torch import Tensor
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, Sizes, Splats
 
 if TYPE_CHECKING:
-    from blitzgs.frame.capacity import CapacityEstimate
     from blitzgs.frame.tiles import TileAssignment
     from blitzgs.ops.splat_gradients import SplatGradients
 
@@ -196,3 +196,32 @@ class Transport(Protocol):
             sizes: the sizes to allocate; None: the host first waits for the numbers.
             mark: called at the end of the stages "project" and "exchange".
         """
+
+
+class CapacityEstimate:
+    """Estimates the sizes that the next frame needs from the largest recent ones. Threads may share it.
+
+    If the host waited for the sizes, the device would be idle meanwhile. Instead, the host queues all the
+    work with the estimate, and reads the true sizes while the device works. If the estimate was too small,
+    the host queues the work again (`blitzgs.frame.run`).
+
+    Attributes:
+        sizes: the present estimate; None before the first frame has ended.
+    """
+
+    def __init__(self, sizes: Sizes | None = None) -> None:
+        """Begin with an estimate, or with none; without one the first attempt waits for its sizes."""
+        self.sizes = None if sizes is None else Sizes._make(max(1, size) for size in sizes)
+        self._lock = threading.Lock()
+
+    def learn(self, needed: Sequence[int]) -> None:
+        """Update the estimate with the sizes that a frame needed."""
+        with self._lock:
+            before = self.sizes or Sizes(0, 0, 0)
+            # Views differ, so the estimate exceeds the largest recent size, and it shrinks slowly.
+            self.sizes = Sizes(
+                *[
+                    max(1, n * 9 // 8, size - size // 256)
+                    for n, size in zip(Sizes(*needed), before, strict=True)
+                ]
+            )

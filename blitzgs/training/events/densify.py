@@ -7,6 +7,7 @@ import dataclasses
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from blitzgs.config.schedule import Event
 from blitzgs.population.density import STATISTICS, DensityReport, DensityRules, decay_opacities, densify
@@ -14,7 +15,14 @@ from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit
 from blitzgs.population.redistribution import redistribute
 from blitzgs.population.relocation import relocate
 from blitzgs.runs.guard import ModelLostError, check_table
+from blitzgs.table.blocks import spread
+from blitzgs.table.host_table import HostTable
+from blitzgs.table.table import PARAMETERS
 from blitzgs.training.state import TrainingState
+
+# The table is sorted again when the spread of its blocks exceeds that of the sorted table by this factor
+# (docs/decisions/population.md).
+MOST_SPREAD = 4.0
 
 
 def run(state: TrainingState, event: Event) -> None:
@@ -24,13 +32,22 @@ def run(state: TrainingState, event: Event) -> None:
         NonFiniteError: a parameter is not finite.
         ModelLostError: no Gaussian is left.
     """
-    step = state.progress.step
-    state.catch_up()
-    check_table(state.table, step)
-    if state.config.population.opacity_decay > 0:
-        decay_opacities(state.table, state.config.population.opacity_decay)
+    step, population = state.progress.step, state.config.population
+    if population.opacity_decay > 0:
+        state.catch_up()
+        decay_opacities(state.table, population.opacity_decay)
+    else:
+        state.stepper.write_back()
+    # The largest column, sh, does not decide anything; it is checked with each record of the log.
+    check_table(state.table, step, PARAMETERS[:-1])
     limit = population_limit(state)
     report = change_population(state, event.time, density_rules(state, event.time, limit))
+    moved = redistribute(state.table, state.ranks, state.config.ranks.max_imbalance)
+    # Views copy whole blocks of a table in host memory.
+    is_sorted = moved or isinstance(state.table, HostTable)
+    if is_sorted:
+        state.sort()
+    state.stepper.reindex()
     counts = _over_all_ranks(state, dataclasses.asdict(report) | {"gaussians": len(state.table)})
     if counts["gaussians"] == 0:
         raise ModelLostError(
@@ -38,13 +55,37 @@ def run(state: TrainingState, event: Event) -> None:
             "and points belong together, or prune less (population.min_opacity, prune_screen_radius, "
             "prune_world_scale; schedule.size_prune_after)"
         )
-    if redistribute(state.table, state.ranks, state.config.ranks.max_imbalance):
+    _keep_sorted(state, counts, is_sorted)
+    if moved:
         counts["redistributed"] = 1
-        state.sort()
-    state.stepper.reindex()
     peak = max(state.progress.peak_gaussians, counts["gaussians"])
     state.progress = dataclasses.replace(state.progress, peak_gaussians=peak)
     _log(state, event, counts, limit)
+
+
+def _spread(state: TrainingState) -> Tensor:
+    """Return the spread of this rank's blocks in thousandths of the scene's extent, int64 []."""
+    extent = state.space.extent
+    return (spread(state.stepper.bounds, extent) * (1000 / extent)).long().to(state.ranks.device)
+
+
+def _keep_sorted(state: TrainingState, counts: dict[str, int], is_sorted: bool) -> None:
+    """Sort the table if its blocks have become too large; no result depends on it. Every rank calls this.
+
+    Args:
+        state: state of the run.
+        counts: of the event over all ranks; "spread" goes, and "sorted" comes if this sorts the table.
+        is_sorted: whether the event has sorted it.
+    """
+    spread_now = counts.pop("spread")
+    if not is_sorted:
+        if spread_now <= MOST_SPREAD * state.progress.sorted_spread:
+            return
+        counts["sorted"] = 1
+        state.sort()
+        state.stepper.reindex()
+        spread_now = _over_all_ranks(state, {})["spread"]
+    state.progress = dataclasses.replace(state.progress, sorted_spread=spread_now)
 
 
 def population_limit(state: TrainingState) -> GrowthLimit | None:
@@ -61,9 +102,10 @@ def population_limit(state: TrainingState) -> GrowthLimit | None:
 
 
 def _over_all_ranks(state: TrainingState, counts: dict[str, int]) -> dict[str, int]:
-    """Return the sums of named counts over all ranks."""
-    values = state.ranks.all_reduce(torch.tensor(list(counts.values()), device=state.ranks.device))
-    return dict(zip(counts, values.tolist(), strict=True))
+    """Return the sums of named counts over all ranks, and of the "spread" of the blocks."""
+    own = torch.tensor(list(counts.values()), dtype=torch.int64, device=state.ranks.device)
+    values = state.ranks.all_reduce(torch.cat((own, _spread(state)[None])))
+    return dict(zip((*counts, "spread"), values.tolist(), strict=True))
 
 
 def _log(state: TrainingState, event: Event, counts: dict[str, int], limit: GrowthLimit | None) -> None:
@@ -85,7 +127,7 @@ def _log(state: TrainingState, event: Event, counts: dict[str, int], limit: Grow
 
 
 def change_population(state: TrainingState, time: int, rules: DensityRules) -> DensityReport:
-    """Run the strategy of `population.strategy`; no optimiser step may be pending. Every rank calls this."""
+    """Run the strategy of `population.strategy`. Every rank calls this."""
     population, progress = state.config.population, state.progress
     call: dict[str, Any] = {
         "time": time,
@@ -95,6 +137,7 @@ def change_population(state: TrainingState, time: int, rules: DensityRules) -> D
         "ranks": state.ranks,
         "extent": state.space.extent,
         "lineage": state.lineage,
+        "pending": state.optimiser.pending(state.table, progress.step),
     }
     if population.strategy == "relocation":
         report = relocate(state.table, rules, growth=population.growth, **call)

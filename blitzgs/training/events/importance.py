@@ -67,7 +67,7 @@ def run(state: TrainingState, event: Event) -> None:
     state.stepper.reindex()
     progress = state.progress
     milestones = progress.milestones | {f"before_{event.kind}": before, f"after_{event.kind}": after}
-    state.progress = dataclasses.replace(progress, milestones=milestones)
+    state.progress = dataclasses.replace(progress, milestones=milestones, sorted_spread=0)
     view_level.choose_views(state)
     counts = {"before": before, "gaussians": after, "views": views}
     state.log.event(event.time, event.kind, counts)

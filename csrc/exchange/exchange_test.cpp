@@ -1,0 +1,161 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <cstdlib>
+#include <vector>
+
+#include "common/catch.h"
+#include "common/test_workspace.h"
+#include "exchange/scatter.h"
+#include "exchange/tile_costs.h"
+
+using namespace blitzgs;
+
+namespace {
+
+struct NoWorkspace final : Workspace {
+  void* allocate_bytes(std::size_t) override { std::abort(); }
+};
+
+SplatGroups make_groups(const std::vector<std::int64_t>& sizes) {
+  SplatGroups groups{};
+  for (const std::int64_t size : sizes) {
+    const int m = groups.count++;
+    groups.size[m] = size;
+    groups.start[m] = m ? groups.start[m - 1] + groups.size[m - 1] : 0;
+  }
+  return groups;
+}
+
+}  // namespace
+
+TEST_CASE("scattered splats arrive in order, and their sums return", "[scatter]") {
+  const int n = 9000, n_ranks = 3;  // more than one chunk
+  std::vector<std::int32_t> a(2 * n), b(n);
+  std::vector<std::int64_t> masks(n), sizes(n_ranks);
+  for (int i = 0; i < n; ++i) {
+    a[2 * i] = i, a[2 * i + 1] = -i, b[i] = 7 * i;
+    masks[i] = (i % 2 ? 1 : 0) | (i % 5 ? 0 : 4);  // rank 1 gets nothing, some splats go nowhere
+    for (int m = 0; m < n_ranks; ++m) sizes[m] += (masks[i] >> m) & 1;
+  }
+  const SplatGroups groups = make_groups(sizes);
+  const std::int64_t total = groups.start[2] + groups.size[2];
+  std::vector<std::int32_t> packed(3 * total);
+  std::vector<SplatPlace> places(place_runs(n) * n_ranks);
+  ScatterTargets targets{};
+  for (int m = 0; m < n_ranks; ++m) {
+    targets.words[m][0] = packed.data() + 3 * groups.start[m];
+    targets.words[m][1] = targets.words[m][0] + 2 * groups.size[m];
+  }
+  NoWorkspace workspace;
+  cpu::scatter({{{a.data(), b.data()}, {0, 2, 3}, 2}, masks.data(), n}, groups, targets, places.data(),
+               workspace, nullptr);
+
+  std::vector<std::int32_t> a2(2 * total), b2(total);
+  cpu::gather(packed.data(), groups, {{a2.data(), b2.data()}, {0, 2, 3}, 2}, workspace, nullptr);
+  std::size_t at = 0;
+  for (int m = 0; m < n_ranks; ++m) {
+    for (int i = 0; i < n; ++i) {
+      if (((masks[i] >> m) & 1) == 0) continue;
+      REQUIRE((a2[2 * at] == i && a2[2 * at + 1] == -i && b2[at] == 7 * i));
+      ++at;
+    }
+  }
+  REQUIRE(at == b2.size());
+
+  std::vector<double> values(3 * total), x(n, -1.0), y(2 * n, -1.0);
+  for (std::int64_t i = 0; i < total; ++i) {
+    const double weight = i < groups.start[2] ? 1.0 : 10.0;
+    values[3 * i] = weight * b2[i];
+    values[3 * i + 1] = weight;
+    values[3 * i + 2] = 2 * weight;
+  }
+  cpu::sum<double>({values.data(), 3, n, places.data(), groups}, {{x.data(), y.data()}, {0, 1, 3}, 2},
+                   workspace, nullptr);
+  for (int i = 0; i < n; ++i) {
+    const double weight = (masks[i] & 1 ? 1.0 : 0.0) + (masks[i] & 4 ? 10.0 : 0.0);
+    REQUIRE(x[i] == weight * b[i]);
+    REQUIRE((y[2 * i] == weight && y[2 * i + 1] == 2 * weight));
+  }
+}
+
+TEST_CASE("splats beyond a group's size are dropped", "[scatter]") {
+  const std::int32_t column[4] = {1, 2, 3, 4};
+  const std::int64_t masks[4] = {1, 1, 1, 1};
+  std::int32_t packed[4] = {-1, -1, -1, -1};
+  SplatPlace place;
+  ScatterTargets targets{};
+  targets.words[0][0] = packed;
+  NoWorkspace workspace;
+  cpu::scatter({{{column}, {0, 1}, 1}, masks, 4}, make_groups({2}), targets, &place, workspace, nullptr);
+  REQUIRE((packed[0] == 1 && packed[1] == 2 && packed[2] == -1));
+  REQUIRE((place.first == 0 && place.bits == 15));
+}
+
+namespace {
+
+using Halves = std::vector<std::uint16_t>;
+using Bounds = std::vector<std::int64_t>;
+
+// The bounds of views of `tiles` tiles with a tile cost of 8; a view without pieces has no cost of its own.
+Bounds bounds_of(const std::vector<Halves>& views, const std::vector<Halves>& similar, std::int64_t tiles,
+                 std::int64_t grain, std::int64_t parts) {
+  std::vector<const std::uint16_t*> costs, alike;
+  for (const Halves& view : views) costs.push_back(view.empty() ? nullptr : view.data());
+  for (const Halves& view : similar) alike.push_back(view.data());
+  Bounds bounds(parts + 1, -1);
+  TestWorkspace workspace;
+  cpu::divide_tiles({costs.data(), static_cast<std::int64_t>(costs.size()), alike.data(),
+                     static_cast<std::int64_t>(alike.size()), tiles, grain, 8},
+                    parts, workspace, bounds.data());
+  return bounds;
+}
+
+Halves stored(const std::vector<float>& costs, std::int64_t grain) {
+  const auto tiles = static_cast<std::int64_t>(costs.size());
+  Halves pieces((tiles + grain - 1) / grain);
+  cpu::store_tile_costs(costs.data(), tiles, grain, pieces.data());
+  return pieces;
+}
+
+}  // namespace
+
+TEST_CASE("costs are stored as float16, rounded to nearest even", "[tile_costs]") {
+  // 0, 1, 2049 (between 2048 and 2050), 2051, the largest half, more than it, the smallest half, half of it.
+  const std::vector<float> costs{0, 1, 2049, 2051, 65504, 1e9f, 0x1p-24f, 0x1p-25f, 0x1.8p-24f};
+  REQUIRE(stored(costs, 1) == Halves{0, 0x3c00, 0x6800, 0x6802, 0x7bff, 0x7bff, 1, 0, 2});
+}
+
+TEST_CASE("a stored cost is the mean over a piece, also over a short last one", "[tile_costs]") {
+  REQUIRE(stored({1, 3, 2, 2, 1}, 2) == Halves{0x4000, 0x4000, 0x3c00});
+  REQUIRE(stored({0, 0, 6}, 4) == Halves{0x4000});
+}
+
+TEST_CASE("the bound is the one nearest to the share, the later of two", "[tile_costs]") {
+  const Halves zeros(3, 0);
+  REQUIRE(bounds_of({zeros}, {}, 3, 1, 1) == Bounds{0, 3});
+  REQUIRE(bounds_of({zeros}, {}, 3, 1, 2) == Bounds{0, 2, 3});
+  REQUIRE(bounds_of({zeros}, {}, 3, 1, 8) == Bounds{0, 0, 1, 1, 2, 2, 2, 3, 3});
+  // 8 + 1024 in the first tile, then 8 each: half of the cost is inside the first tile.
+  REQUIRE(bounds_of({{0x6400, 0, 0}}, {}, 3, 1, 2) == Bounds{0, 1, 3});
+}
+
+TEST_CASE("bounds in later stretches", "[tile_costs]") {
+  const Halves zeros(1000, 0);
+  REQUIRE(bounds_of({zeros, zeros}, {}, 1000, 1, 4) == Bounds{0, 500, 1000, 1500, 2000});
+}
+
+TEST_CASE("a view without costs has the mean of similar ones, or zeros", "[tile_costs]") {
+  const Halves one(4, 0x3c00), three(4, 0x4200), two(4, 0x4000), zeros(4, 0), other{0x6400, 0, 0x4900, 0};
+  for (std::int64_t parts = 1; parts < 12; ++parts) {
+    REQUIRE(bounds_of({{}, other}, {one, three}, 4, 1, parts) == bounds_of({two, other}, {}, 4, 1, parts));
+    REQUIRE(bounds_of({other, {}}, {}, 4, 1, parts) == bounds_of({other, zeros}, {}, 4, 1, parts));
+  }
+}
+
+TEST_CASE("pieces spread over their tiles", "[tile_costs]") {
+  // Two views of five tiles in pieces of two: costs 8 + 8 twice, 8 + 0 twice and 8 + 1016 once.
+  const Halves coarse{0x4800, 0, 0x63f0}, fine{0x4800, 0x4800, 0, 0, 0x63f0};
+  for (std::int64_t parts = 1; parts < 12; ++parts) {
+    REQUIRE(bounds_of({coarse, coarse}, {}, 5, 2, parts) == bounds_of({fine, fine}, {}, 5, 1, parts));
+    REQUIRE(bounds_of({{}, coarse}, {coarse}, 5, 2, parts) == bounds_of({fine, fine}, {}, 5, 1, parts));
+  }
+}

@@ -1,0 +1,107 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <cmath>
+#include <vector>
+
+#include "common/catch.h"
+#include "common/test_workspace.h"
+#include "loss/photometric.h"
+#include "loss/report.h"
+
+using namespace blitzgs;
+
+namespace {
+
+// Sums over one image of every pixel's |x - y| and SSIM, and the gradient of the weighted sums.
+struct Run {
+  std::vector<float> x, y, gradient;
+  double l1 = 0, ssim = 0;
+};
+
+Run run(int width, int height, float l1_weight, float ssim_weight, int nudge = -1, float step = 0) {
+  Run r;
+  for (int i = 0; i < 3 * width * height; ++i) {
+    r.x.push_back(0.5f + 0.4f * std::sin(0.9f * static_cast<float>(i)));
+    r.y.push_back(0.5f + 0.4f * std::sin(0.9f * static_cast<float>(i) + 0.3f));
+  }
+  if (nudge >= 0) r.x[static_cast<std::size_t>(nudge)] += step;
+  r.gradient.assign(r.x.size(), NAN);
+  blitzgs::PhotometricArgs<float> args{};
+  args.renders = r.x.data();
+  args.targets = r.y.data();
+  args.l1_weights = &l1_weight;
+  args.ssim_weights = &ssim_weight;
+  args.v_renders = r.gradient.data();
+  args.views = 1;
+  args.width = width;
+  args.height = height;
+  args.tile_size = 16;
+  args.tiles_x = (width + 15) / 16;
+  args.tiles_y = (height + 15) / 16;
+  args.tile_end = args.tiles_x * args.tiles_y;
+  double total = 0;
+  for (int k = 0; k < blitzgs::kSsimTaps; ++k) total += std::exp(-(k - 5) * (k - 5) / 4.5);
+  for (int k = 0; k < blitzgs::kSsimTaps; ++k) {
+    args.window[k] = static_cast<float>(std::exp(-(k - 5) * (k - 5) / 4.5) / total);
+  }
+  std::vector<double> parts(2 * static_cast<std::size_t>(blitzgs::cpu::photometric_parts(args)));
+  args.parts = parts.data();
+  blitzgs::TestWorkspace workspace;
+  blitzgs::cpu::photometric(args, workspace, nullptr);
+  for (std::size_t i = 0; i < parts.size(); i += 2) r.l1 += parts[i], r.ssim += parts[i + 1];
+  return r;
+}
+
+}  // namespace
+
+TEST_CASE("one window has the textbook SSIM") {
+  const double mx = 0.4, my = 0.5, xx = 0.2, yy = 0.3, xy = 0.23;
+  const double c1 = 0.0001, c2 = 0.0009;
+  const double expected = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2) /
+                          ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2));
+  REQUIRE(blitzgs::ssim_terms(mx, mx - my, xx + yy, xx + yy - 2 * xy).value ==
+          Approx(expected).epsilon(1e-12));
+}
+
+TEST_CASE("the gradient is that of the sums, for images smaller and larger than a strip") {
+  for (const int height : {3, 70}) {
+    const int width = 9;
+    const Run exact = run(width, height, 0.0f, 1.0f);
+    for (const int at : {0, 40, 3 * width * height - 1}) {
+      const double up = run(width, height, 0.0f, 1.0f, at, 2e-3f).ssim;
+      const double down = run(width, height, 0.0f, 1.0f, at, -2e-3f).ssim;
+      REQUIRE((up - down) / 4e-3 ==
+              Approx(exact.gradient[static_cast<std::size_t>(at)]).epsilon(0.05).margin(0.05));
+    }
+    double l1 = 0;
+    for (std::size_t i = 0; i < exact.x.size(); ++i) l1 += std::fabs(exact.x[i] - exact.y[i]);
+    REQUIRE(exact.l1 == Approx(l1).epsilon(1e-6));
+  }
+}
+
+TEST_CASE("owned columns are the interval of a contiguous tile range") {
+  blitzgs::PhotometricArgs<float> args{};
+  args.width = 50;
+  args.height = 40;
+  args.tile_size = 16;
+  args.tiles_x = 4;
+  args.tiles_y = 3;
+  args.tile_begin = 5;  // second tile of the second tile row
+  args.tile_end = 9;    // first tile of the third
+  REQUIRE(blitzgs::owned_columns(args, 0, 0).begin == blitzgs::owned_columns(args, 0, 0).end);
+  REQUIRE(blitzgs::owned_columns(args, 0, 16).begin == 16);
+  REQUIRE(blitzgs::owned_columns(args, 0, 31).end == 50);
+  REQUIRE(blitzgs::owned_columns(args, 0, 32).begin == 0);
+  REQUIRE(blitzgs::owned_columns(args, 0, 39).end == 16);
+  REQUIRE(blitzgs::owned_columns(args, 1, 0).begin == blitzgs::owned_columns(args, 1, 0).end);
+}
+
+TEST_CASE("a report is the sums of the parts and the cost of the rank's own tiles", "[report]") {
+  const std::vector<double> parts{1, 10, 2, 20, 3, 30, 4, 40};  // two views, two parts
+  const std::vector<std::int32_t> work{7, 8, 9};
+  std::vector<double> out(7, -1);
+  Report<double> report{parts.data(), 2, 2, work.data(), 1, 2, {}, 1};
+  report.targets[0] = {out.data(), out.data() + 2, out.data() + 4};
+  TestWorkspace workspace;
+  cpu::report(report, workspace, nullptr);
+  REQUIRE(out == std::vector<double>{3, 7, 30, 70, -1, 8, -1});
+}

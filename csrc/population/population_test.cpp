@@ -1,0 +1,77 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "common/catch.h"
+#include "common/test_workspace.h"
+#include "population/density_stats.h"
+#include "population/knn.h"
+#include "population/voxel_keys.h"
+
+using namespace blitzgs;
+
+TEST_CASE("the radius is three standard deviations of the longer axis, rounded up") {
+  const double round[3] = {1.0 / 16, 0, 1.0 / 16};  // sigma 4: the root term is clamped at sqrt(0.1)
+  REQUIRE(blitzgs::three_sigma_radius(round) == std::ceil(3 * std::sqrt(16 + std::sqrt(0.1))));
+  const double angle = 0.6, c = std::cos(angle), s = std::sin(angle);
+  const double a = 1.0 / 100, b = 1.0 / 4;  // sigma 10 and 2
+  const double turned[3] = {c * c * a + s * s * b, c * s * (a - b), s * s * a + c * c * b};
+  REQUIRE(blitzgs::three_sigma_radius(turned) == Approx(30).margin(1));
+  const double inverted[3] = {-1, 0, 1};
+  REQUIRE(blitzgs::three_sigma_radius(inverted) == 0);
+}
+
+TEST_CASE("the radius of a thin splat is right as long as floats can tell, and then large") {
+  const double angle = 0.7, c = std::cos(angle), s = std::sin(angle);
+  for (const double sigma : {30.0, 100.0, 300.0, 1000.0, 3000.0, 9000.0}) {
+    const double a = 1 / (sigma * sigma), b = 1 / 0.3;
+    const float conic[3] = {static_cast<float>(c * c * a + s * s * b), static_cast<float>(c * s * (a - b)),
+                            static_cast<float>(s * s * a + c * c * b)};
+    const double found = blitzgs::three_sigma_radius(conic);
+    CHECK(found > 3 * std::min(sigma, 1000.0) * 0.8);
+    if (sigma <= 300) CHECK(found == Approx(3 * sigma).epsilon(0.05));
+  }
+}
+
+TEST_CASE("nearest neighbours match brute force, around duplicates and a point that is not finite") {
+  std::vector<double> points;
+  for (int i = 0; i < 200; ++i) {
+    const double t = 0.37 * i;
+    for (const double x : {std::sin(t), std::cos(1.7 * t), std::floor(t) / 10}) points.push_back(x);
+  }
+  std::copy_n(points.data(), 3, points.data() + 3 * 50);
+  points[3 * 9 + 1] = std::numeric_limits<double>::quiet_NaN();
+  const int n = 200, k = 6;
+  std::vector<double> distances(n * k);
+  blitzgs::TestWorkspace workspace;
+  blitzgs::cpu::knn_distances(points.data(), n, k, distances.data(), workspace, nullptr);
+  for (int i = 0; i < n; ++i) {
+    std::vector<double> all;
+    for (int j = 0; j < n; ++j) {
+      double square = 0;
+      for (int axis = 0; axis < 3; ++axis) square += std::pow(points[3 * i + axis] - points[3 * j + axis], 2);
+      if (j != i && std::isfinite(square)) all.push_back(std::sqrt(square));
+    }
+    all.resize(n, std::numeric_limits<double>::infinity());
+    std::sort(all.begin(), all.end());
+    for (int j = 0; j < k; ++j) {
+      if (std::isinf(all[j])) {
+        REQUIRE(std::isinf(distances[i * k + j]));
+      } else {
+        REQUIRE(distances[i * k + j] == Approx(all[j]).margin(1e-15));
+      }
+    }
+  }
+}
+
+TEST_CASE("voxel keys pack x, y, z into 21 bits each and clamp") {
+  const VoxelGrid grid{{-1.0, 0.0, 2.0}, 0.5};
+  const double inside[3] = {0.25, 0.75, 4.0};
+  REQUIRE(voxel_key(inside, grid) == (2 | (std::int64_t{1} << 21) | (std::int64_t{4} << 42)));
+  const double below[3] = {-100.0, -100.0, -100.0};
+  REQUIRE(voxel_key(below, grid) == 0);
+  const double nan[3] = {std::numeric_limits<double>::quiet_NaN(), 0.0, 0.0};
+  REQUIRE(voxel_key(nan, grid) == -1);
+}

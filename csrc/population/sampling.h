@@ -1,0 +1,66 @@
+// SPDX-License-Identifier: Apache-2.0
+// Sampling without replacement in proportion to weights, by exponential races (Efraimidis and Spirakis 2006):
+// each item has the key -log(u) / weight, u uniform in (0, 1), and those with the smallest keys are chosen.
+//
+//   sampling_keys: weights float [n], ids int64 [n], seed, event -> keys float [n]
+//
+// u depends on (seed, event, id) alone (math/counter_random.h). The key of weight 0 is infinite.
+//
+//   key_histogram: keys float [n], prefix int64 [1], shift, width -> counts int64 [2^width]
+//
+// counts the keys with ordered bits b, b >> (shift + width) = prefix, by the digit (b >> shift) mod 2^width;
+// blitzgs/distributed/selection.py finds the k-th smallest key over all ranks by such counts. Each op reads
+// its inputs once.
+#pragma once
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+
+#include "common/kernel.h"
+#include "math/counter_random.h"
+
+namespace blitzgs {
+
+struct SamplingKeys {
+  const float* weights;
+  const std::int64_t* ids;
+  std::int64_t n, seed, event;
+  float* keys;
+};
+
+BLITZGS_HD float sampling_key(const SamplingKeys& args, std::int64_t i) {
+  const std::uint64_t hash = hash_key(hash_key(hash_key(0, args.seed), args.event), args.ids[i]);
+  return static_cast<float>(-std::log(uniform_of(hash)) / static_cast<double>(args.weights[i]));
+}
+
+constexpr int kMaxDigitBits = 11;
+
+struct KeyHistogram {
+  const float* keys;
+  const std::int64_t* prefix;
+  std::int64_t n;
+  int shift, width;      // width at most kMaxDigitBits
+  std::int64_t* counts;  // set to zero first
+};
+
+// Maps a float to 32 bits with the same order; -0 equals 0.
+BLITZGS_HD std::uint32_t ordered_bits(float key) {
+  key += 0.0f;
+  std::uint32_t bits;
+  std::memcpy(&bits, &key, sizeof(bits));
+  return bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
+}
+
+// The digit of a key; -1 if its bits before it are not the prefix.
+BLITZGS_HD int digit_of(const KeyHistogram& args, std::int64_t prefix, float key) {
+  const std::uint64_t head = std::uint64_t{ordered_bits(key)} >> args.shift;
+  if (static_cast<std::int64_t>(head >> args.width) != prefix) return -1;
+  return static_cast<int>(head & ((std::uint64_t{1} << args.width) - 1));
+}
+
+namespace BLITZGS_BACKEND {
+void sampling_keys(const SamplingKeys&, CudaStream);
+void key_histogram(const KeyHistogram&, CudaStream);
+}  // namespace BLITZGS_BACKEND
+
+}  // namespace blitzgs
