@@ -38,11 +38,42 @@ def decompose(covars: Tensor) -> Decomposed:
         matrices = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].view(-1, 3, 3).double()
         finite = matrices.isfinite().all(dim=(1, 2))
         matrices = torch.where(finite[:, None, None], matrices, torch.eye(3, device=covars.device).double())
-        variances, axes = torch.linalg.eigh(matrices)
-        # The sign of an eigenvector is arbitrary, but a rotation must have the determinant 1.
-        axes[:, :, 2] *= torch.linalg.det(axes).sign()[:, None]
+        axes, variances = _principal_axes(matrices)
         scales = variances.clamp(min=0).sqrt().masked_fill_(~finite[:, None], torch.nan)
         return Decomposed(upper, _quaternions(axes).to(covars.dtype), scales.to(covars.dtype))
+
+
+def _principal_axes(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a rotation, axes in columns [N, 3, 3], and variances [N, 3] of symmetric matrices [N, 3, 3].
+
+    `torch.linalg.eigh` is slow on a GPU for many small matrices. The eigenvalue that is farthest from both
+    others has a closed form (Smith 1961), its axis is a cross product, and a rotation in the plane across
+    this axis diagonalises the rest (Eberly 2014, "A Robust Eigensolver for 3 x 3 Symmetric Matrices").
+    """
+    size = matrices.abs().amax(dim=(1, 2), keepdim=True).clamp(min=torch.finfo(matrices.dtype).tiny)
+    matrices = matrices / size
+    unit = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
+    mean = matrices.diagonal(dim1=1, dim2=2).mean(dim=1)[:, None, None]
+    rest = matrices - mean * unit
+    spread = (rest.square().sum(dim=(1, 2)) / 6).sqrt()
+    determinant = (rest[:, 0] * torch.linalg.cross(rest[:, 1], rest[:, 2])).sum(dim=1)
+    cosine = (determinant / (2 * spread**3)).nan_to_num_(nan=0).clamp_(-1, 1)
+    apart = (2 * spread * (cosine.abs().acos() / 3).cos()).copysign(cosine)
+    # The rows of what is left span the plane across the axis.
+    rows = rest - apart[:, None, None] * unit
+    crosses = torch.linalg.cross(rows, rows.roll(1, dims=1))
+    each = torch.arange(len(rows), device=rows.device)
+    axis = crosses[each, crosses.square().sum(dim=2).argmax(dim=1)]
+    length = axis.norm(dim=1, keepdim=True)
+    axis = torch.where(length > 0, axis / length, unit[0])  # no length: all axes are equal
+    across = torch.nn.functional.normalize(torch.linalg.cross(axis, unit[axis.abs().argmin(dim=1)]), dim=1)
+    frame = torch.stack([axis, across, torch.linalg.cross(axis, across)], dim=2)
+    turned = frame.mT @ matrices @ frame
+    angle = torch.atan2(2 * turned[:, 1, 2], turned[:, 1, 1] - turned[:, 2, 2]) / 2
+    cos, sin = angle.cos()[:, None], angle.sin()[:, None]
+    u, v = frame[:, :, 1], frame[:, :, 2]
+    axes = torch.stack([axis, cos * u + sin * v, cos * v - sin * u], dim=2)
+    return axes, (axes * (matrices @ axes)).sum(dim=1) * size[:, :, 0]
 
 
 def _quaternions(rotations: Tensor) -> Tensor:

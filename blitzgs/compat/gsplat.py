@@ -241,23 +241,29 @@ class MCMCStrategy(Strategy):
         min_opacity: Gaussians up to this opacity are dead.
         verbose: whether each refinement prints what it did.
         noise_opacity_t: opacity at which the noise falls to a half.
-        noise_opacity_k: only 100.
+        noise_opacity_k: steepness of this fall.
+
+    Raises:
+        ValueError: `refine_every` is no number of steps.
     """
 
     cap_max: int = 1_000_000
     noise_lr: float = 5e5
     refine_start_iter: int = 500
     refine_stop_iter: int = 25_000
+    noise_injection_stop_iter: int = -1
     refine_every: int = 100
     min_opacity: float = 0.005
     verbose: bool = False
-    noise_injection_stop_iter: int = -1
     noise_opacity_t: float = 0.005
     noise_opacity_k: float = _NOISE_STEEPNESS
 
     def __post_init__(self) -> None:
-        if self.noise_opacity_k != _NOISE_STEEPNESS:
-            raise ValueError(f"noise_opacity_k must be {_NOISE_STEEPNESS:g}, got {self.noise_opacity_k}")
+        if self.refine_every != int(self.refine_every) or self.refine_every < 1:
+            raise ValueError(
+                f"refine_every must be a whole number of steps, got {self.refine_every}; the order of the "
+                "arguments is that of gsplat's main branch, so pass them by name"
+            )
 
     def initialize_state(self) -> dict[str, Any]:
         """Return the state, which is empty."""
@@ -296,9 +302,14 @@ class MCMCStrategy(Strategy):
         _catch_up(optimizers)
         means, quats, scales, opacities = (params[name].detach() for name in _REQUIRED)
         ids = torch.arange(len(means), device=means.device)
+        logits, threshold = opacities.view(-1), self.noise_opacity_t
+        if self.noise_opacity_k != _NOISE_STEEPNESS:
+            # The kernel's steepness is fixed: opacities are stretched about its threshold instead.
+            stretch = self.noise_opacity_k / _NOISE_STEEPNESS
+            logits, threshold = torch.logit(0.5 + stretch * (logits.sigmoid() - threshold), eps=1e-7), 0.5
         position_noise_(
-            means, quats, scales, opacities.view(-1), ids, ids.int(), seed=torch.initial_seed() & (2**31 - 1),
-            step=step, threshold=self.noise_opacity_t, strength=lr * self.noise_lr,
+            means, quats, scales, logits, ids, ids.int(), seed=torch.initial_seed() & (2**31 - 1),
+            step=step, threshold=threshold, strength=lr * self.noise_lr,
         )  # fmt: skip
 
     def _refine(self, params: Params, optimizers: Optimizers, step: int, scene: Any) -> None:

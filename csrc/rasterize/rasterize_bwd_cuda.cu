@@ -85,9 +85,11 @@ __device__ __forceinline__ void flush_group(BackwardShared<CHANNELS, DETERMINIST
 }
 
 // Returns the state of a pixel behind its last entry, and writes the pixel's gradient to shared.v_render.
+// That of a pixel without splats (last is 0) counts as zero, also if it is NaN, as that of 1 / depth is
+// there.
 template <int CHANNELS, bool WIDE, class Shared>
 __device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(Shared& shared, const BackwardArguments& args,
-                                                               const Pixel& pixel, int camera) {
+                                                               const Pixel& pixel, int last, int camera) {
   BackwardPixel<CHANNELS> state;
   state.transmittance = pixel.inside ? args.saved.transmittances[pixel.index] : 1.f;
   const ChannelChunk& chunk = args.chunk;
@@ -97,7 +99,8 @@ __device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(Shared& shared, c
 #pragma unroll
   for (int k = 0; k < CHANNELS; ++k) {
     const bool present = pixel.inside && k < chunk.count;
-    state.v[k] = present ? v_render[chunk.first + k] : 0.f;
+    const float v = present ? v_render[chunk.first + k] : 0.f;
+    state.v[k] = last > 0 ? v : 0.f;
     shared.v_render[pixel.subtile].v[k][threadIdx.x % kHalfWarp] = state.v[k];
   }
   if (pixel.inside && args.backgrounds) {
@@ -143,8 +146,8 @@ __global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
   if (thread == 0) shared.last = 0;
   if (thread < 2) shared.splat[thread][kBatch] = -1;
   shared.batch.init(thread);
-  auto state = start_pixel<CHANNELS, WIDE>(shared, args, pixel, tile.camera);
   const int pixel_last = pixel.inside ? args.saved.last_ids[pixel.index] : 0;
+  auto state = start_pixel<CHANNELS, WIDE>(shared, args, pixel, pixel_last, tile.camera);
   int list_last = pixel_last;  // the maximum over the pixels that share a list
   for (int step = DETERMINISTIC ? kHalfWarp : kHalfWarp / 2; step > 0; step /= 2) {
     list_last = max(list_last, __shfl_xor_sync(kFullWarp, list_last, step));

@@ -44,6 +44,9 @@ BackwardState<T> start_backward(const TileJob<T>& tile) {
       state.transmittance[pixel] = tile.saved.transmittances[in];
       state.last[pixel] = tile.saved.last_ids[in];
       state.last_in_row[row] = std::max(state.last_in_row[row], state.last[pixel]);
+      // The gradient of a pixel without splats reaches none, also if it is NaN, as that of 1 / depth is
+      // there.
+      if (state.last[pixel] == 0) continue;
       T behind = tile.saved.v_alphas ? -tile.saved.v_alphas[in] : T(0);
       for (int c = 0; c < n_channels; ++c) {
         const T v = tile.saved.v_renders[in * n_channels + c];

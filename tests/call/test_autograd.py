@@ -330,3 +330,25 @@ def test_options_without_compile_support_are_named(options):
     leaves = random_scene(n=20).leaves()
     with pytest.raises(Exception, match="not supported under torch.compile"):
         torch.compile(lambda s: rasterize_scene(s, **options)[0], fullgraph=True, backend="aot_eager")(leaves)
+
+
+@pytest.mark.parametrize("options", [{"absgrad": True}, {"render_mode": "RGB+ED"}, {"channels": 7}], ids=str)
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_gradient_of_a_pixel_without_gaussians_reaches_none(device, options):
+    """It is NaN in losses of 1 / depth, as that of gsplat's trainer."""
+    scene = random_scene(n=12).to(torch.float32, device)
+    options = dict(options)
+    if channels := options.pop("channels", 0):
+        scene = replace(scene, colors=torch.rand(12, channels, device=device), sh_degree=None)
+    gradients = []
+    for at_empty_pixels in (0.0, torch.nan):
+        own = replace(scene, **{n: getattr(scene, n).detach().requires_grad_() for n in PARAMETERS})
+        image, alphas, _ = rasterize_scene(own, **options)
+        empty = alphas == 0
+        assert 0 < empty.sum() < empty.numel()
+        given = torch.where(empty, at_empty_pixels, torch.ones_like(image))
+        torch.autograd.backward([image, alphas], [given, given[..., :1]])
+        gradients.append([getattr(own, name).grad for name in PARAMETERS])
+    for expected, found in zip(*gradients, strict=True):
+        assert expected.any()
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)

@@ -8,6 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import blitzgs
+from blitzgs.call.covariances import decompose
+from blitzgs.reference.gaussians import covariance_factors
 from tests.helpers import BACKENDS, DEVICES, random_scene, rasterize_scene, relative_error
 
 
@@ -99,6 +101,25 @@ def test_neighbours(backend):
     distances.fill_diagonal_(math.inf)
     expected = distances.sort(dim=1).values[:, :3]
     assert relative_error(blitzgs.knn(points, 3), expected) < 1e-6
+
+
+@pytest.mark.parametrize(
+    "scales",
+    [(3, 2, 1), (1, 1e-5, 2e-5), (1, 2, 1e-7), (1, 1, 1), (1, 1, 0.5), (1, 0.5, 0.5), (1, 0, 0), (0, 0, 0)],
+    ids=str,
+)
+@pytest.mark.parametrize("size", [1e-20, 1, 1e15])
+@pytest.mark.parametrize("device", DEVICES)
+def test_decomposed_covariances_are_the_given_ones(device, size, scales):
+    g = torch.Generator().manual_seed(0)
+    quats = torch.randn(500, 4, generator=g, dtype=torch.float64)
+    quats[0] = torch.tensor([1.0, 0, 0, 0])  # the axes are those of the world
+    jitter = torch.randn(500, 3, generator=g) * torch.tensor([0, 1e-9, 1e-15])[torch.arange(500) % 3, None]
+    factors = covariance_factors(quats, size * torch.tensor(scales).double() * (1 + jitter.double()))
+    covars = (factors @ factors.mT).to(device)
+    found = decompose(covars)
+    again = covariance_factors(found.quats, found.scales)
+    assert (again @ again.mT - covars).abs().max() <= 1e-14 * (size * max(scales)) ** 2
 
 
 def arguments(meta):

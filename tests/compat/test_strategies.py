@@ -162,8 +162,9 @@ def test_the_mcmc_strategy_is_gsplats(lazy, monkeypatch):
     same(ours, theirs)
 
 
-def test_the_noise_has_the_strength_of_the_paper():
-    n, opacity, lr = 20_000, 0.004, 1e-3
+@pytest.mark.parametrize("opacity,steepness", [(0.004, 100), (0.05, 30), (0.0, 700)])
+def test_the_noise_has_the_strength_of_the_paper(opacity, steepness):
+    n, lr = 20_000, 1e-3
     params = {
         "means": torch.zeros(n, 3), "quats": torch.tensor([1.0, 2, 0, 0]).repeat(n, 1),
         "scales": torch.tensor([0.5, 0.3, 0.1]).log().repeat(n, 1),
@@ -171,13 +172,13 @@ def test_the_noise_has_the_strength_of_the_paper():
     }  # fmt: skip
     params = {name: torch.nn.Parameter(value) for name, value in params.items()}
     optimizers = {name: torch.optim.Adam([p]) for name, p in params.items()}
-    strategy = MCMCStrategy(noise_injection_stop_iter=2, noise_lr=1e3)
+    strategy = MCMCStrategy(noise_injection_stop_iter=2, noise_lr=1e3, noise_opacity_k=steepness)
     strategy.check_sanity(params, optimizers)
     strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, {}, lr=lr)
     moved = params["means"].detach().clone()
     turn = torch.tensor([[1, 0, 0], [0, -0.6, -0.8], [0, 0.8, -0.6]])  # of the quaternion
     covariance = turn @ torch.diag(torch.tensor([0.25, 0.09, 0.01])) @ turn.T
-    expected = covariance @ covariance / (1 + math.exp(-100 * (0.005 - opacity))) ** 2
+    expected = covariance @ covariance / (1 + math.exp(-steepness * (0.005 - opacity))) ** 2
     assert relative_error(moved.T @ moved / n, expected) < 0.05
     strategy.step_post_backward(params, optimizers, {}, 2, {}, lr=lr)
     assert torch.equal(params["means"], moved)
@@ -205,5 +206,5 @@ def test_wrong_parameters_and_optimisers_are_named():
     optimizers["quats"].add_param_group({"params": [params["scales"]]})
     with pytest.raises(ValueError, match="optimizer of quats"):
         DefaultStrategy().check_sanity(params, optimizers)
-    with pytest.raises(ValueError, match="noise_opacity_k"):
-        MCMCStrategy(noise_opacity_k=50)
+    with pytest.raises(ValueError, match="a whole number of steps, got 0.005; .* by name"):
+        MCMCStrategy(1_000, 5e5, 500, 25_000, 100, 0.005)  # the order of gsplat 1.5
