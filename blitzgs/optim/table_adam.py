@@ -127,8 +127,8 @@ class Pending:
         """Return what a column of `PARAMETERS` (not "sh") is with all pending steps; no row catches up."""
         table, device = self._table, self._device
         values, last_step = (table[column].to(device, copy=True) for column in (name, "last_step"))
-        moments = ([table[f"{moment}.{name}"].to(device)] for moment in ("exp_avg", "exp_avg_sq"))
-        state = AdamState([values], *moments, last_step, table["moment_step"].to(device))
+        moments = [[table[f"{moment}.{name}"].to(device)] for moment in ("exp_avg", "exp_avg_sq")]
+        state = AdamState([values], moments[0], moments[1], last_step, table["moment_step"].to(device))
         lazy_adam_catch_up_(state, self._optimiser.schedule_of(name), self._step)
         return values.to(table.device)
 
