@@ -4,6 +4,7 @@ import torch
 
 from blitzgs.ops.blocks import rows_of_sectors, sectors_of_rows
 from blitzgs.table.layouts import CULL, sectors_in
+from blitzgs.table.placement import place
 from tests.helpers import DEVICES
 from tests.training.tiny import random_gaussians
 
@@ -53,9 +54,10 @@ def test_a_table_s_mask_moves_with_its_rows(n, device):
     table.append({name: table[name][:70] for name in table})
     check(left + 70)
     assert table[CULL][left:].any()
-    rows = torch.randperm(left + 75, generator=generator).to(device)[: left + 10]
-    table.renew(rows, {name: table[name][5:10] for name in table})
-    check(left + 10)
+    gone = torch.arange(0, left + 70, 5, device=device)
+    more = {name: table[name][5:10].clone() for name in table}
+    table.replace(place(left + 70, gone, torch.arange(5, 10, device=device), more["means"]), more)
+    check(left + 75 - len(gone))
     kept = table[CULL]
     assert torch.equal(table.release()[CULL], kept) and not table.columns
 
