@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from blitzgs.capture.colmap import FILES, read_model, write_model
-from blitzgs.util.output import write_file
+from blitzgs.util.output import PARTIAL, write_file
 from blitzgs_synth.dataset import colmap_model
 from blitzgs_synth.flight import plan_flight
 from blitzgs_synth.options import CityOptions
@@ -174,6 +174,9 @@ def _write(folder: Path, options: CityOptions, processes: int, progress: Progres
     cloud = track(city, views, corners, options.seed, lambda seen, count: each(seen, count, processes))
     write_model(folder / "sparse" / "0", colmap_model(views, cloud))
     shutil.rmtree(folder / CORNERS)
+    for path in list((folder / "images").iterdir()):
+        if PARTIAL.fullmatch(path.name):  # of a generation that was killed
+            path.unlink(missing_ok=True)
     write_file(folder / MANIFEST, json.dumps(options.manifest(), indent=2) + "\n")
 
 

@@ -188,6 +188,7 @@ def test_a_killed_generation_continues_and_redoes_torn_photographs(city, tmp_pat
     torn = pictures[0].read_bytes()
     pictures[0].write_bytes(torn[: len(torn) // 2])
     (partial / "corners" / "00001.npz").write_bytes(b"PK")
+    (partial / "images" / ".0123456789ab.partial").touch()
     untouched = pictures[2].stat().st_mtime_ns
     generate_city(out, **SMALL)
     assert digests(out) == digests(city)
