@@ -231,7 +231,6 @@ class PopulationConfig:
         strategy: what a density event does: "density" (clone and split by gradients, prune) or "relocation"
             (3DGS-MCMC: Gaussians that would be pruned are replaced by copies of others, drawn by opacity, and
             the population grows by `growth`).
-        relocate: with "density" too, replace Gaussians that would be pruned by copies of others.
         growth: share of the population that "relocation" adds at each event.
         grad_threshold: mean norm of the 2D-mean gradient (half-image units) above which a Gaussian is
             densified.
@@ -239,7 +238,6 @@ class PopulationConfig:
             all are split.
         min_opacity: Gaussians of lower opacity are pruned.
         reset_opacity: cap of the opacities at each `schedule.reset_every`.
-        opacity_decay: share of its opacity that every Gaussian loses at each density event.
         prune_screen_radius: Gaussians with a larger radius, in pixels, are pruned after
             `schedule.size_prune_after`.
         prune_world_scale: Gaussians with a larger axis, relative to extent, are pruned after the same time.
@@ -279,13 +277,11 @@ class PopulationConfig:
     """
 
     strategy: str = "density"
-    relocate: bool = False
     growth: float = 0.05
     grad_threshold: float = 2e-4
     clone_scale: float = 0.01
     min_opacity: float = 0.005
     reset_opacity: float = 0.01
-    opacity_decay: float = 0.0
     prune_screen_radius: float = 20.0
     prune_world_scale: float = 0.1
     max_gaussians: int = 0
@@ -355,13 +351,11 @@ class RanksConfig:
             Gloo) or "auto" ("peer" if it works, else "collective").
         share_gpus: if a host has fewer GPUs than ranks, let several ranks use one GPU, in turns; slow, for
             development.
-        max_imbalance: Gaussians are redistributed when the largest shard exceeds the smallest by this factor.
     """
 
     timeout_seconds: float = 120.0
     transport: str = "auto"
     share_gpus: bool = False
-    max_imbalance: float = 1.1
 
 
 @dataclass(frozen=True)

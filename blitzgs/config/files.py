@@ -48,9 +48,12 @@ REMOVED: Mapping[str, Any] = {
     "loss.size": 0.0,
     "population.absolute_gradients": False,
     "population.absolute_threshold": Ignored(),
+    "population.relocate": False,
+    "population.opacity_decay": 0.0,
     "view.first_levels": Ignored(),
     "view.level_ratio": Ignored(),
     "ranks.half_exchange": False,
+    "ranks.max_imbalance": Ignored(),
 }
 
 

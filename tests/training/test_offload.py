@@ -86,14 +86,12 @@ VARIANTS = {
         "view.smooth=true",
     ),
     "relocation": (
-        "population.relocate=true",
+        "population.strategy=relocation",
         "population.min_opacity=0.08",
-        "population.reset_opacity=0.09",
         "loss.opacity=0.01",
     ),
     "resets": (
         "schedule.reset_every=15",
-        "population.opacity_decay=0.01",
         "optimiser.position_noise=1000",
         "model.antialiased=true",
     ),
