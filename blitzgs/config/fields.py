@@ -109,6 +109,9 @@ class LodConfig:
 # The largest factor by which `schedule.images_per_view` makes a run longer.
 MAX_STRETCH = 4.0
 
+# The opacities that `schedule.reset_every` leaves are at most this.
+RESET_OPACITY = 0.01
+
 # The limits of the `loss.opacity` that a run computes from `loss.opacity_total`: about the range that was
 # measured (docs/decisions/recipe.md).
 LEAST_OPACITY, MAX_OPACITY = 0.005, 0.05
@@ -135,7 +138,7 @@ class ScheduleConfig:
             all. Everything else has the full resolution: importance passes, the cull mask, evaluation.
         densify_from, densify_until, densify_every: density events happen at from, from + every, ... < until.
         size_prune_after: density events later than this also prune by size.
-        reset_every: all opacities are capped at `population.reset_opacity` at every multiple of this before
+        reset_every: all opacities are capped at `RESET_OPACITY` (0.01) at every multiple of this before
             `densify_until`; 0: never.
         gate_from: from here on `population.gate` judges the candidates of density events; no effect without a
             gate.
@@ -237,7 +240,6 @@ class PopulationConfig:
         clone_scale: Gaussians up to this largest axis (relative to extent) are cloned, larger ones split; 0:
             all are split.
         min_opacity: Gaussians of lower opacity are pruned.
-        reset_opacity: cap of the opacities at each `schedule.reset_every`.
         prune_screen_radius: Gaussians with a larger radius, in pixels, are pruned after
             `schedule.size_prune_after`.
         prune_world_scale: Gaussians with a larger axis, relative to extent, are pruned after the same time.
@@ -281,7 +283,6 @@ class PopulationConfig:
     grad_threshold: float = 2e-4
     clone_scale: float = 0.01
     min_opacity: float = 0.005
-    reset_opacity: float = 0.01
     prune_screen_radius: float = 20.0
     prune_world_scale: float = 0.1
     max_gaussians: int = 0

@@ -50,6 +50,7 @@ REMOVED: Mapping[str, Any] = {
     "population.absolute_threshold": Ignored(),
     "population.relocate": False,
     "population.opacity_decay": 0.0,
+    "population.reset_opacity": 0.01,
     "view.first_levels": Ignored(),
     "view.level_ratio": Ignored(),
     "ranks.half_exchange": False,

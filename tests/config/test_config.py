@@ -129,7 +129,12 @@ def test_relocation_has_no_candidates_for_a_gate():
 
 def test_a_removed_field_is_named_unless_it_had_no_effect():
     old = ["optimiser.beta1=0.9", "model.far=1e6", "schedule.placed=[]", "schedule.adaptive_limit=0.3"]
-    old += ["population.relocate=false", "population.opacity_decay=0", "ranks.max_imbalance=1.02"]
+    old += [
+        "population.relocate=false",
+        "population.reset_opacity=1e-2",
+        "population.opacity_decay=0",
+        "ranks.max_imbalance=1.02",
+    ]
     assert load_config(None, old) == from_dict({"loss": {"size": 0.0}}) == Config()
     for name, value in (("schedule.adaptive", "true"), ("ranks.half_exchange", "true"), ("loss.size", "0.1")):
         with pytest.raises(ConfigError, match=rf"{name}: this field was removed: .* leave the field out, or"):
@@ -145,10 +150,10 @@ def test_two_weights_of_the_opacity_term_are_refused():
 
 
 def test_opacities_are_capped_above_the_limit_of_pruning_only_where_they_are_reset():
-    flags = ["population.min_opacity=0.02", "population.reset_opacity=0.01"]
-    assert load_config(None, flags).population.min_opacity == 0.02
-    with pytest.raises(ConfigError, match="population.reset_opacity: must be above population.min_opacity"):
-        load_config(None, [*flags, "schedule.reset_every=3000"])
+    flag = "population.min_opacity=0.02"
+    assert load_config(None, [flag]).population.min_opacity == 0.02
+    with pytest.raises(ConfigError, match=r"population.min_opacity: must be below 0.01, .* got 0.02"):
+        load_config(None, [flag, "schedule.reset_every=3000"])
 
 
 def test_every_number_has_a_range_and_every_default_lies_in_it():
