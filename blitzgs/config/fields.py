@@ -41,8 +41,6 @@ class DataConfig:
         cache_bytes: memory for compressed images, of all ranks of a host together, at most half of the host's
             memory; decoded images take what these leave, and up to a quarter of it in addition. If all
             decoded images fit into half of it, the ranks of a host share them.
-        threads: decoder threads of each rank. 0: the cores that the process may use, shared by the ranks of
-            the host, less two for each rank; at least 2, at most 32.
         prefetch: number of batches to upload ahead; photographs are decoded for more batches ahead.
     """
 
@@ -58,7 +56,6 @@ class DataConfig:
     sparse: str = "largest"
     stray_cameras: str = "drop"
     cache_bytes: int = 8_000_000_000
-    threads: int = 0
     prefetch: int = 3
 
 
@@ -308,12 +305,12 @@ class ViewConfig:
 
     Attributes:
         lod: from `schedule.densify_until` on, views leave out Gaussians that are too small for their
-            distance. The trained model is evaluated and rendered in the same way.
+            distance. The trained model is evaluated and rendered in the same way. Views that would keep at
+            least 80 % of all Gaussians are rendered with all of them.
         footprint: the smallest footprint that `lod` keeps: opacity times size in pixels of a training view.
             0: a Gaussian is as small as the octree voxel that it descends from, as in the paper.
-        most_kept: views that would keep at least this share of all Gaussians are rendered with all of them.
         smooth: opacities fade out over half a level around the distance at which `lod` would cut them off.
-            All views then have the gate, and `most_kept` is ignored. Needs `lod`.
+            All views then have the gate. Needs `lod`.
         cull: from the first importance pass on, a training view leaves out the Gaussians that did not count
             in it at the last pass. This ends halfway between the last pass and the end of the run. Needs
             `population.importance`.
@@ -321,7 +318,6 @@ class ViewConfig:
 
     lod: bool = False
     footprint: float = 0.0
-    most_kept: float = 0.8
     smooth: bool = False
     cull: bool = False
 

@@ -49,7 +49,6 @@ _LENGTH = Range(0, 1e6)
 RANGES: Mapping[str, Range] = {
     "data.downscale": Range(1, 1000),
     "data.cache_bytes": Range(0, 2**50),
-    "data.threads": Range(0, 1024),
     "data.prefetch": Range(0, 1000),
     "model.sh_degree": Range(0, 3),
     "model.background": Range(0, 1),
@@ -105,7 +104,6 @@ RANGES: Mapping[str, Range] = {
     "population.pass2_keep": _SHARE,
     "population.pass2_views": Range(0, 1e6),
     "view.footprint": Range(0, 1000),
-    "view.most_kept": Range(0, 1),
     "memory.resident_gb": Range(0, 1e6),
     "ranks.timeout_seconds": Range(1, 1e6),
     "log.every": _EVERY,

@@ -129,12 +129,8 @@ def test_relocation_has_no_candidates_for_a_gate():
 
 def test_a_removed_field_is_named_unless_it_had_no_effect():
     old = ["optimiser.beta1=0.9", "model.far=1e6", "schedule.placed=[]", "schedule.adaptive_limit=0.3"]
-    old += [
-        "population.relocate=false",
-        "population.reset_opacity=1e-2",
-        "population.opacity_decay=0",
-        "ranks.max_imbalance=1.02",
-    ]
+    old += ["data.threads=4", "population.relocate=false", "population.opacity_decay=0", "view.most_kept=0.8"]
+    old += ["population.reset_opacity=1e-2", "ranks.max_imbalance=1.02"]
     assert load_config(None, old) == from_dict({"loss": {"size": 0.0}}) == Config()
     for name, value in (("schedule.adaptive", "true"), ("ranks.half_exchange", "true"), ("loss.size", "0.1")):
         with pytest.raises(ConfigError, match=rf"{name}: this field was removed: .* leave the field out, or"):
