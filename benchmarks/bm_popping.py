@@ -45,7 +45,7 @@ from blitzgs.ops.blocks import ActiveRows
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import load_cameras
 from blitzgs.runs.files import TrainedModel
-from blitzgs.runs.lod import level_fork
+from blitzgs.runs.lod import MOST_KEPT, level_fork
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.charts import line_chart
 from blitzgs.view.gate import LodGate, SceneGate, centres_of
@@ -266,7 +266,7 @@ def _gate(model: TrainedModel, smooth: bool, ranks: Ranks) -> SceneGate:
     count = progress.level_count
     finest = count - 1 if progress.finest_level is None else progress.finest_level
     gate = LodGate(progress.reference_distance, level_fork(config), count, finest, smooth)
-    return SceneGate(gate, math.inf if smooth else config.view.most_kept, model.table, ranks)
+    return SceneGate(gate, math.inf if smooth else MOST_KEPT, model.table, ranks)
 
 
 def _flight(

@@ -41,8 +41,6 @@ class DataConfig:
         cache_bytes: memory for compressed images, of all ranks of a host together, at most half of the host's
             memory; decoded images take what these leave, and up to a quarter of it in addition. If all
             decoded images fit into half of it, the ranks of a host share them.
-        threads: decoder threads of each rank. 0: the cores that the process may use, shared by the ranks of
-            the host, less two for each rank; at least 2, at most 32.
         prefetch: number of batches to upload ahead; photographs are decoded for more batches ahead.
     """
 
@@ -58,7 +56,6 @@ class DataConfig:
     sparse: str = "largest"
     stray_cameras: str = "drop"
     cache_bytes: int = 8_000_000_000
-    threads: int = 0
     prefetch: int = 3
 
 
@@ -109,6 +106,9 @@ class LodConfig:
 # The largest factor by which `schedule.images_per_view` makes a run longer.
 MAX_STRETCH = 4.0
 
+# The opacities that `schedule.reset_every` leaves are at most this.
+RESET_OPACITY = 0.01
+
 # The limits of the `loss.opacity` that a run computes from `loss.opacity_total`: about the range that was
 # measured (docs/decisions/recipe.md).
 LEAST_OPACITY, MAX_OPACITY = 0.005, 0.05
@@ -135,7 +135,7 @@ class ScheduleConfig:
             all. Everything else has the full resolution: importance passes, the cull mask, evaluation.
         densify_from, densify_until, densify_every: density events happen at from, from + every, ... < until.
         size_prune_after: density events later than this also prune by size.
-        reset_every: all opacities are capped at `population.reset_opacity` at every multiple of this before
+        reset_every: all opacities are capped at `RESET_OPACITY` (0.01) at every multiple of this before
             `densify_until`; 0: never.
         gate_from: from here on `population.gate` judges the candidates of density events; no effect without a
             gate.
@@ -231,15 +231,12 @@ class PopulationConfig:
         strategy: what a density event does: "density" (clone and split by gradients, prune) or "relocation"
             (3DGS-MCMC: Gaussians that would be pruned are replaced by copies of others, drawn by opacity, and
             the population grows by `growth`).
-        relocate: with "density" too, replace Gaussians that would be pruned by copies of others.
         growth: share of the population that "relocation" adds at each event.
         grad_threshold: mean norm of the 2D-mean gradient (half-image units) above which a Gaussian is
             densified.
         clone_scale: Gaussians up to this largest axis (relative to extent) are cloned, larger ones split; 0:
             all are split.
         min_opacity: Gaussians of lower opacity are pruned.
-        reset_opacity: cap of the opacities at each `schedule.reset_every`.
-        opacity_decay: share of its opacity that every Gaussian loses at each density event.
         prune_screen_radius: Gaussians with a larger radius, in pixels, are pruned after
             `schedule.size_prune_after`.
         prune_world_scale: Gaussians with a larger axis, relative to extent, are pruned after the same time.
@@ -279,13 +276,10 @@ class PopulationConfig:
     """
 
     strategy: str = "density"
-    relocate: bool = False
     growth: float = 0.05
     grad_threshold: float = 2e-4
     clone_scale: float = 0.01
     min_opacity: float = 0.005
-    reset_opacity: float = 0.01
-    opacity_decay: float = 0.0
     prune_screen_radius: float = 20.0
     prune_world_scale: float = 0.1
     max_gaussians: int = 0
@@ -311,12 +305,12 @@ class ViewConfig:
 
     Attributes:
         lod: from `schedule.densify_until` on, views leave out Gaussians that are too small for their
-            distance. The trained model is evaluated and rendered in the same way.
+            distance. The trained model is evaluated and rendered in the same way. Views that would keep at
+            least 80 % of all Gaussians are rendered with all of them.
         footprint: the smallest footprint that `lod` keeps: opacity times size in pixels of a training view.
             0: a Gaussian is as small as the octree voxel that it descends from, as in the paper.
-        most_kept: views that would keep at least this share of all Gaussians are rendered with all of them.
         smooth: opacities fade out over half a level around the distance at which `lod` would cut them off.
-            All views then have the gate, and `most_kept` is ignored. Needs `lod`.
+            All views then have the gate. Needs `lod`.
         cull: from the first importance pass on, a training view leaves out the Gaussians that did not count
             in it at the last pass. This ends halfway between the last pass and the end of the run. Needs
             `population.importance`.
@@ -324,7 +318,6 @@ class ViewConfig:
 
     lod: bool = False
     footprint: float = 0.0
-    most_kept: float = 0.8
     smooth: bool = False
     cull: bool = False
 
@@ -355,13 +348,11 @@ class RanksConfig:
             Gloo) or "auto" ("peer" if it works, else "collective").
         share_gpus: if a host has fewer GPUs than ranks, let several ranks use one GPU, in turns; slow, for
             development.
-        max_imbalance: Gaussians are redistributed when the largest shard exceeds the smallest by this factor.
     """
 
     timeout_seconds: float = 120.0
     transport: str = "auto"
     share_gpus: bool = False
-    max_imbalance: float = 1.1
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ class Ignored:
 # Fields of earlier versions, each with the value that stands for what BlitzGS does now. Files and checkpoints
 # that have this value are still read.
 REMOVED: Mapping[str, Any] = {
+    "data.threads": Ignored(),
     "model.far": 1e6,
     "model.eps2d": 0.3,
     "model.initial_opacity": 0.1,
@@ -48,9 +49,14 @@ REMOVED: Mapping[str, Any] = {
     "loss.size": 0.0,
     "population.absolute_gradients": False,
     "population.absolute_threshold": Ignored(),
+    "population.relocate": False,
+    "population.opacity_decay": 0.0,
+    "population.reset_opacity": 0.01,
     "view.first_levels": Ignored(),
+    "view.most_kept": 0.8,
     "view.level_ratio": Ignored(),
     "ranks.half_exchange": False,
+    "ranks.max_imbalance": Ignored(),
 }
 
 

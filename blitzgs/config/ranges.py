@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, get_args
 
-from blitzgs.config.fields import MAX_STRETCH, Config, ScheduleConfig, ScoreRule, Transport
+from blitzgs.config.fields import MAX_STRETCH, RESET_OPACITY, Config, ScheduleConfig, ScoreRule, Transport
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,6 @@ _LENGTH = Range(0, 1e6)
 RANGES: Mapping[str, Range] = {
     "data.downscale": Range(1, 1000),
     "data.cache_bytes": Range(0, 2**50),
-    "data.threads": Range(0, 1024),
     "data.prefetch": Range(0, 1000),
     "model.sh_degree": Range(0, 3),
     "model.background": Range(0, 1),
@@ -93,8 +92,6 @@ RANGES: Mapping[str, Range] = {
     "population.grad_threshold": Range(0, 1e30),
     "population.clone_scale": _LENGTH,
     "population.min_opacity": Range(0, 1, high_open=True),
-    "population.reset_opacity": Range(0, 1, low_open=True, high_open=True),
-    "population.opacity_decay": Range(0, 1, high_open=True),
     "population.prune_screen_radius": _LENGTH,
     "population.prune_world_scale": _LENGTH,
     "population.max_gaussians": Range(0, 1e11),
@@ -107,10 +104,8 @@ RANGES: Mapping[str, Range] = {
     "population.pass2_keep": _SHARE,
     "population.pass2_views": Range(0, 1e6),
     "view.footprint": Range(0, 1000),
-    "view.most_kept": Range(0, 1),
     "memory.resident_gb": Range(0, 1e6),
     "ranks.timeout_seconds": Range(1, 1e6),
-    "ranks.max_imbalance": Range(1, 1e6),
     "log.every": _EVERY,
     "log.pictures": Range(0, 1e6),
     "log.checkpoint_seconds": Range(0, 1e9),
@@ -142,10 +137,10 @@ def problems(config: Config) -> Iterator[str]:
         yield f"optimiser.position: must be 0 or at least 1e-20, got {config.optimiser.position}"
     yield from _problems_of_length(schedule)
     yield from _problems_of_resolution(schedule)
-    if schedule.reset_every > 0 and not population.min_opacity < population.reset_opacity:
+    if schedule.reset_every > 0 and not population.min_opacity < RESET_OPACITY:
         yield (
-            f"population.reset_opacity: must be above population.min_opacity ({population.min_opacity}), or "
-            f"all Gaussians are pruned; got {population.reset_opacity}"
+            f"population.min_opacity: must be below {RESET_OPACITY}, the cap of schedule.reset_every, or all "
+            f"Gaussians are pruned; got {population.min_opacity}"
         )
     if config.loss.opacity > 0 and config.loss.opacity_total > 0:
         yield (

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import softplus
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
@@ -171,23 +170,6 @@ def cap_opacities(table: GaussianTable, opacity: float) -> None:
     table["opacities"].clamp_(max=opacity_logit(opacity))
     table["exp_avg.opacities"].zero_()
     table["exp_avg_sq.opacities"].zero_()
-
-
-@torch.no_grad()
-def decay_opacities(table: GaussianTable, share: float) -> None:
-    """Reduce the opacity of every row by a share of itself; no optimiser step may be pending.
-
-    The logit l of the opacity o becomes that of (1 - share) o: l + log(1 - share) - log(1 + share e^l), which
-    neither cancels where o is close to 1 nor overflows.
-
-    Args:
-        table: changed in place.
-        share: in [0, 1).
-    """
-    if share > 0:
-        # In float64, so that CPU and GPU round to the same float32 numbers.
-        logits = table["opacities"].double()
-        table["opacities"].copy_(logits + (math.log1p(-share) - softplus(logits + math.log(share))))
 
 
 def child_ids(parents: Tensor, time: int, slots: Tensor) -> Tensor:

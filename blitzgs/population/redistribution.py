@@ -9,8 +9,11 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.sharding import global_positions, imbalance, shard_sizes
 from blitzgs.table.table import GaussianTable
 
+# Rows are moved when the largest shard exceeds the smallest by this factor.
+MAX_IMBALANCE = 1.1
 
-def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = 1.1) -> bool:
+
+def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = MAX_IMBALANCE) -> bool:
     """If the shards have become unequal, move the row at position p of the global order to rank p mod M.
 
     Collective: every rank calls it. All columns are moved; each shard has its rows in the global order.

@@ -12,6 +12,8 @@ from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import LodGate, SceneGate
 from blitzgs.view.levels import FOOTPRINT_STEPS
 
+# Views that would keep at least this share of all Gaussians are rendered with all of them.
+MOST_KEPT = 0.8
 # Gaussians move after the training views were chosen, and held-out views see a little more or less.
 _SLACK = 0.9
 
@@ -19,7 +21,7 @@ _SLACK = 0.9
 def lod_gate(config: Config, progress: Progress) -> LodGate | None:
     """Return the LOD gate at a point of a run; None if it is not open, or no training view has it.
 
-    If every training view is rendered with all Gaussians (`view.most_kept`), the coarse levels have never
+    If every training view is rendered with all Gaussians (`MOST_KEPT`), the coarse levels have never
     been trained to stand alone. A view from farther away would then show holes where it leaves out the fine
     ones. Smooth levels fade in every training view.
     """
@@ -57,4 +59,4 @@ def scene_gate(config: Config, progress: Progress, table: GaussianTable, ranks: 
     # visible jump.
     if gate.smooth:
         return SceneGate(gate, math.inf, table, ranks)
-    return SceneGate(gate, config.view.most_kept, table, ranks, _SLACK * progress.least_kept)
+    return SceneGate(gate, MOST_KEPT, table, ranks, _SLACK * progress.least_kept)

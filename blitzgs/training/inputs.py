@@ -22,7 +22,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.view.views import Space
 
 # Fields that may differ between the hosts of a job.
-HOST_FIELDS = ("data.path", "data.cache_bytes", "data.threads")
+HOST_FIELDS = ("data.path", "data.cache_bytes")
 # The least width and height of reduced photographs: a window of SSIM has 11 pixels.
 LEAST_SIDE = 11
 # The largest memory of a container in bytes, or "max" (Linux, control groups 2).
@@ -58,10 +58,10 @@ def open_capture(
     factors = [factor for factor, _ in config.schedule.resolution]
     shared, taken = _share_decoded(decoded_shapes(capture, factors), budget // 2, ranks)
     left = max(0, budget - taken)  # this rank's budget may be below that of the rank which made the memory
-    threads = data.threads or _decoder_threads(ranks.local_world_size)
     background = config.model.background
+    local = ranks.local_world_size
     return capture, ImageStore(
-        capture, left // ranks.local_world_size, threads, background=background, shared=shared
+        capture, left // local, _decoder_threads(local), background=background, shared=shared
     )
 
 
@@ -146,7 +146,7 @@ def sharing_hint(
 
 
 def _decoder_threads(local_ranks: int) -> int:
-    """Return how many threads each rank of this host decodes with, see `DataConfig.threads`."""
+    """Return how many threads each rank of this host decodes with: its cores, less two, from 2 to 32."""
     return min(max(len(os.sched_getaffinity(0)) // local_ranks - 2, 2), 32)
 
 

@@ -155,7 +155,7 @@ def test_popping_is_measured_once(tmp_path, monkeypatch):
 
 
 # 26 steps of 4 images.
-TINY = ["--gpus", "0", "--held-out", "2", "--scale", "0.004", "--log.every=8", "--data.threads=1"]
+TINY = ["--gpus", "0", "--held-out", "2", "--scale", "0.004", "--log.every=8"]
 
 
 @pytest.fixture

@@ -129,6 +129,8 @@ def test_relocation_has_no_candidates_for_a_gate():
 
 def test_a_removed_field_is_named_unless_it_had_no_effect():
     old = ["optimiser.beta1=0.9", "model.far=1e6", "schedule.placed=[]", "schedule.adaptive_limit=0.3"]
+    old += ["data.threads=4", "population.relocate=false", "population.opacity_decay=0", "view.most_kept=0.8"]
+    old += ["population.reset_opacity=1e-2", "ranks.max_imbalance=1.02"]
     assert load_config(None, old) == from_dict({"loss": {"size": 0.0}}) == Config()
     for name, value in (("schedule.adaptive", "true"), ("ranks.half_exchange", "true"), ("loss.size", "0.1")):
         with pytest.raises(ConfigError, match=rf"{name}: this field was removed: .* leave the field out, or"):
@@ -144,10 +146,10 @@ def test_two_weights_of_the_opacity_term_are_refused():
 
 
 def test_opacities_are_capped_above_the_limit_of_pruning_only_where_they_are_reset():
-    flags = ["population.min_opacity=0.02", "population.reset_opacity=0.01"]
-    assert load_config(None, flags).population.min_opacity == 0.02
-    with pytest.raises(ConfigError, match="population.reset_opacity: must be above population.min_opacity"):
-        load_config(None, [*flags, "schedule.reset_every=3000"])
+    flag = "population.min_opacity=0.02"
+    assert load_config(None, [flag]).population.min_opacity == 0.02
+    with pytest.raises(ConfigError, match=r"population.min_opacity: must be below 0.01, .* got 0.02"):
+        load_config(None, [flag, "schedule.reset_every=3000"])
 
 
 def test_every_number_has_a_range_and_every_default_lies_in_it():
@@ -266,7 +268,7 @@ def test_the_papers_configuration_has_the_papers_values():
     assert (schedule.densify_from, schedule.densify_until, schedule.densify_every) == (2_000, 32_000, 1_000)
     assert (schedule.t1, schedule.t2, schedule.gate_from) == (16_000, 34_000, 24_000)
     assert (schedule.size_prune_after, schedule.sh_every, schedule.position_decay) == (3_000, 1_000, 50_000)
-    assert schedule.reset_every == 0 and population.opacity_decay == 0
+    assert schedule.reset_every == 0
     assert (rates.position, rates.position_final) == (1.6e-4, 1.6e-6)
     assert (rates.sh_dc, rates.sh_rest) == (7.5e-3, pytest.approx(7.5e-3 / 20))
     assert (rates.opacity, rates.scale, rates.rotation) == (2e-2, 7e-3, 1e-3)

@@ -15,7 +15,6 @@ from blitzgs.population.cleaning import floaters, views_counting
 from blitzgs.population.density import (
     DensityRules,
     cap_opacities,
-    decay_opacities,
     densify,
     rotations,
 )
@@ -185,15 +184,6 @@ def test_capping_opacities_lowers_those_above_and_clears_their_moments():
     torch.testing.assert_close(after[~low], torch.full_like(after[~low], 0.01))
     assert not table["exp_avg.opacities"].any() and not table["exp_avg_sq.opacities"].any()
     assert torch.equal(table["exp_avg.means"], others)
-
-
-def test_decaying_opacities_takes_the_same_share_of_each():
-    table = random_table(200)
-    table["opacities"][:3] = torch.tensor([-30.0, 0.0, 15.0])
-    table["opacities"][3] = 200.0
-    before = table["opacities"].double().sigmoid()
-    decay_opacities(table, 0.2)
-    torch.testing.assert_close(table["opacities"].double().sigmoid(), 0.8 * before, rtol=2e-6, atol=0)
 
 
 def test_children_have_their_parents_phi_and_cull_row():

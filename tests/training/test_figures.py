@@ -49,7 +49,7 @@ def test_figures_of_training_views_are_called_so(tmp_path, capsys):
 
 
 def test_a_model_without_gaussians_is_no_result(tmp_path):
-    config = tiny_config("population.min_opacity=0.98", "population.reset_opacity=0.99")
+    config = tiny_config("population.min_opacity=0.98")
     running = Trainer(config, *tiny_scene(), tmp_path / "a", Ranks())
     with pytest.raises(ModelLostError, match="the density event after 20 images pruned the last Gaussian"):
         running.train()

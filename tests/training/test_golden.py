@@ -43,9 +43,9 @@ OVERRIDES = (
     "population.grad_threshold=1e-3",
     "population.clone_scale=0.025",
     "population.prune_screen_radius=12",
-    "population.reset_opacity=0.03",
-    "population.min_opacity=0.025",
+    "population.min_opacity=0.0099",
     "loss.scale=1.0",
+    "loss.opacity=0.2",
     "model.antialiased=true",
     "log.every=10",
     "log.pictures=0",
@@ -142,7 +142,7 @@ def test_training_repeats_the_golden_curves(golden, tmp_path):
         ("optimiser", "scale", 1.1),
         ("loss", "scale", 1.1),
         ("loss", "ssim", 1.2),
-        ("population", "reset_opacity", 1.1),
+        ("schedule", "reset_every", 1.1),
     ],
 )
 def test_the_tolerance_tells_a_small_change(golden, tmp_path, section, field, factor):

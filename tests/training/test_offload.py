@@ -71,7 +71,6 @@ VARIANTS = {
         "schedule.t2=48",
         "view.cull=true",
         "view.lod=true",
-        "view.most_kept=1",
         "schedule.densify_until=40",
         "schedule.evaluate_every=25",
         "schedule.checkpoint_every=35",
@@ -86,14 +85,12 @@ VARIANTS = {
         "view.smooth=true",
     ),
     "relocation": (
-        "population.relocate=true",
+        "population.strategy=relocation",
         "population.min_opacity=0.08",
-        "population.reset_opacity=0.09",
         "loss.opacity=0.01",
     ),
     "resets": (
         "schedule.reset_every=15",
-        "population.opacity_decay=0.01",
         "optimiser.position_noise=1000",
         "model.antialiased=true",
     ),
@@ -185,7 +182,7 @@ def test_two_ranks_share_a_run_beyond_their_memory(tmp_path):
 
 def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypatch):
     stop_at(monkeypatch, 15)  # the mask is cleared later
-    trainer, _ = train(tmp_path, RESIDENT, "schedule.iterations=30", "view.lod=true", "view.most_kept=1",
+    trainer, _ = train(tmp_path, RESIDENT, "schedule.iterations=30", "view.lod=true",
                        "schedule.densify_until=10", "population.importance=true", "population.pass1_keep=1",
                        "schedule.t1=12", "schedule.t2=0", "view.cull=true")  # fmt: skip
     model, ranks = run_files.open_model(tmp_path, Ranks()), Ranks()

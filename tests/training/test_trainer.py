@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs.config.files import ConfigError
+from blitzgs.config.files import ConfigError, to_dict
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.guard import NonFiniteError
@@ -65,13 +65,29 @@ def test_what_a_run_leaves_behind(whole_run):
     assert_same_table(model.table, trainer.state.table)
 
 
+def _of_an_earlier_version(config):
+    """Return `to_dict` of a configuration, with fields of earlier versions."""
+    values = to_dict(config)
+    values["data"]["threads"], values["ranks"]["max_imbalance"], values["view"]["most_kept"] = 6, 1.3, 0.8
+    values["population"] |= {"relocate": False, "opacity_decay": 0.0, "reset_opacity": 0.01}
+    return values
+
+
 def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
-    """50 steps, SIGTERM, resume and 50 more steps give the bits of the uninterrupted run."""
+    """50 steps, SIGTERM, resume and 50 more steps give the bits of the uninterrupted run.
+
+    The first 50 are those of an earlier version, whose configuration has fields that are gone.
+    """
     _, whole, _ = whole_run
+    for module in ("blitzgs.config.files", "blitzgs.runs.files"):
+        monkeypatch.setattr(f"{module}.to_dict", _of_an_earlier_version)
     stop_at(monkeypatch, 50)
     first, summary = train(tmp_path)
     assert summary is None and first.state.progress.step == 50
     monkeypatch.undo()
+    written = tmp_path / "config.yaml"
+    assert "max_imbalance: 1.3" in written.read_text()
+    assert run_files.load_config(written) == first.state.config
     second, summary = train(tmp_path, resume=True)
     assert summary is not None
     assert_same_table(second.state.table, whole.state.table)

@@ -44,7 +44,6 @@ from tests.training.tiny import (
 FLAGS = (
     "view.lod=true",
     "view.cull=true",
-    "view.most_kept=0.95",
     "population.importance=true",
     "schedule.densify_until=60",
     "schedule.t1=40",
@@ -228,9 +227,10 @@ def test_render_honours_the_gate(tmp_path):
     np.testing.assert_allclose(np.load(path), image.numpy(), rtol=0, atol=1e-5)
 
 
-def test_a_gate_that_no_training_view_has_is_not_applied_elsewhere(tmp_path):
+def test_a_gate_that_no_training_view_has_is_not_applied_elsewhere(tmp_path, monkeypatch):
     """Coarse levels that no training view shows alone are not shown alone by any other view."""
-    trainer, _ = train(tmp_path, "view.most_kept=0.0")
+    monkeypatch.setattr("blitzgs.runs.lod.MOST_KEPT", 0.0)
+    trainer, _ = train(tmp_path)
     progress = trainer.state.progress
     assert progress.finest_level is not None and set(progress.gated_views) == {"0"}
     assert [event["gated_views"] for event in events_of(tmp_path, "lod_gate")][-1] == 0

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from blitzgs.config.schedule import Event
-from blitzgs.population.density import STATISTICS, DensityReport, DensityRules, decay_opacities, densify
+from blitzgs.population.density import STATISTICS, DensityReport, DensityRules, densify
 from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit
-from blitzgs.population.redistribution import redistribute
+from blitzgs.population.redistribution import MAX_IMBALANCE, redistribute
 from blitzgs.population.relocation import relocate
 from blitzgs.runs.guard import ModelLostError, check_table
 from blitzgs.table.blocks import spread
@@ -32,17 +32,12 @@ def run(state: TrainingState, event: Event) -> None:
         NonFiniteError: a parameter is not finite.
         ModelLostError: no Gaussian is left.
     """
-    step, population = state.progress.step, state.config.population
-    if population.opacity_decay > 0:
-        state.catch_up()
-        decay_opacities(state.table, population.opacity_decay)
-    else:
-        state.stepper.write_back()
+    state.stepper.write_back()
     # The largest column, sh, does not decide anything; it is checked with each record of the log.
-    check_table(state.table, step, PARAMETERS[:-1])
+    check_table(state.table, state.progress.step, PARAMETERS[:-1])
     limit = population_limit(state)
     report = change_population(state, event.time, density_rules(state, event.time, limit))
-    moved = redistribute(state.table, state.ranks, state.config.ranks.max_imbalance)
+    moved = redistribute(state.table, state.ranks, MAX_IMBALANCE)
     # Views copy whole blocks of a table in host memory.
     is_sorted = moved or isinstance(state.table, HostTable)
     if is_sorted:
@@ -144,12 +139,8 @@ def change_population(state: TrainingState, time: int, rules: DensityRules) -> D
         for name in STATISTICS:
             state.table[name].zero_()
         return report
-    moved = relocate(state.table, rules, growth=0.0, **call) if population.relocate else None
     veto = state.veto if state.schedule.has_spawn_gate(time) else None
-    report = densify(state.table, rules, veto=veto, **call)
-    if moved is None:
-        return report
-    return dataclasses.replace(report, cloned=report.cloned + moved.cloned, relocated=moved.relocated)
+    return densify(state.table, rules, veto=veto, **call)
 
 
 def training_pixels(state: TrainingState) -> int:
