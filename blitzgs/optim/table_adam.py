@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 
+import torch
 from torch import Tensor
 
 from blitzgs.config.fields import OptimiserConfig
@@ -19,6 +20,8 @@ from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 
 # Adam's constants for one view a step.
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
+# Rows with 48 coefficients are about 200 MB together.
+_PART = 1 << 18
 
 
 class TableAdam:
@@ -63,7 +66,7 @@ class TableAdam:
     def catch_up(
         self, table: GaussianTable, ids: Tensor | None, step: int, count: Tensor | None = None
     ) -> None:
-        """Apply the pending steps up to `step` to the rows `ids` (int32 [A]; None: all).
+        """Apply the pending steps up to `step` to the rows `ids` (int32 or int64 [A]; None: all).
 
         ``count``, int32 [1]: only the first `count` of `ids` are rows.
         """
@@ -117,7 +120,10 @@ class TableAdam:
 
 
 class Pending:
-    """The pending steps of a table's rows, for code that changes few of them between two steps."""
+    """The pending steps of a table's rows, for code that changes few of them between two steps.
+
+    Of a table in host memory, the optimiser's device has `_PART` rows at a time.
+    """
 
     def __init__(self, optimiser: TableAdam, table: GaussianTable, step: int) -> None:
         self._optimiser, self._table, self._step = optimiser, table, step
@@ -126,18 +132,27 @@ class Pending:
     def current(self, name: str) -> Tensor:
         """Return what a column of `PARAMETERS` (not "sh") is with all pending steps; no row catches up."""
         table, device = self._table, self._device
-        values, last_step = (table[column].to(device, copy=True) for column in (name, "last_step"))
-        moments = [[table[f"{moment}.{name}"].to(device)] for moment in ("exp_avg", "exp_avg_sq")]
-        state = AdamState([values], moments[0], moments[1], last_step, table["moment_step"].to(device))
-        lazy_adam_catch_up_(state, self._optimiser.schedule_of(name), self._step)
-        return values.to(table.device)
+        size = max(1, len(table)) if table.device == device else _PART
+        columns = (name, "last_step", f"exp_avg.{name}", f"exp_avg_sq.{name}", "moment_step")
+        current = []
+        for part in zip(*(table[column].split(size) for column in columns), strict=True):
+            values, last_step = (column.to(device, copy=True) for column in part[:2])
+            exp_avg, exp_avg_sq, moment_step = (column.to(device) for column in part[2:])
+            state = AdamState([values], [exp_avg], [exp_avg_sq], last_step, moment_step)
+            lazy_adam_catch_up_(state, self._optimiser.schedule_of(name), self._step)
+            current.append(values.to(table.device))
+        return current[0] if len(current) == 1 else torch.cat(current)
 
     def catch_up(self, rows: Tensor) -> None:
         """Apply the pending steps of some rows (int64 [M], each once)."""
-        table = self._table
-        if table.device == self._device:
-            self._optimiser.catch_up(table, rows.int(), self._step)
+        if self._table.device == self._device:
+            self._optimiser.catch_up(self._table, rows, self._step)
             return
+        for part in rows.split(_PART):
+            self._catch_up_part(part)
+
+    def _catch_up_part(self, rows: Tensor) -> None:
+        table = self._table
         names = (*PARAMETERS, *EXP_AVGS, *EXP_AVG_SQS, "last_step", "moment_step")
         part = {name: take_rows(table[name], rows).to(self._device) for name in names}
         params, exp_avgs, exp_avg_sqs = (

@@ -25,6 +25,7 @@ from blitzgs.runs import checkpoint, exposure
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.guard import bad_column, check_before_saving
 from blitzgs.runs.identity import check_own
+from blitzgs.table.blocks import sort_rows
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
@@ -128,6 +129,8 @@ class TrainedModel:
         """
         if self.pool_bytes == 0:
             return self.table
+        if self.config.memory.resident_gb == 0:
+            sort_rows(self.table)
         self.table = HostTable(self.table.release(), pinned=device.type == "cuda")
         return Pool(self.table, device, self.pool_bytes, None)
 
@@ -211,8 +214,13 @@ def restore(
     why = "the newest sound one" if loaded.refused else "the newest"
     skipped = f"; {len(loaded.refused)} newer refused" if loaded.refused else ""
     progress, space, config = parsed(state, folder / CHECKPOINTS / loaded.name)
+    table = GaussianTable(loaded.columns)
+    if len(list((folder / CHECKPOINTS / loaded.name).glob("shard_*"))) != ranks.world_size:
+        # Each rank had an order of its own, and the spread is of another number of blocks.
+        sort_rows(table)
+        progress.sorted_spread = 0
     return Restored(
-        GaussianTable(loaded.columns),
+        table,
         progress,
         space,
         config,

@@ -51,6 +51,11 @@ def morton_order(means: Tensor) -> Tensor:
     return torch.sort(morton_keys(_without_far(means.float())), stable=True).indices
 
 
+def sort_rows(table: GaussianTable) -> None:
+    """Sort a table in Morton order, so that blocks of rows are small in space."""
+    table.permute(morton_order(table["means"]))
+
+
 def _without_far(points: Tensor) -> Tensor:
     """Return points [N, 3] whose finite coordinates lie at most `_REACH` spans outside the quantiles.
 

@@ -259,6 +259,11 @@ class GaussianTable:
         return {name: self.row_of(name).bytes for name in self}
 
     @property
+    def memory_bytes(self) -> int:
+        """Bytes of the memory of all columns, with that for rows to come."""
+        return sum(column.untyped_storage().nbytes() for column in self.columns.values())
+
+    @property
     def device(self) -> torch.device:
         """Device of the columns."""
         return self.columns["means"].device
@@ -334,9 +339,9 @@ class GaussianTable:
             self._reorder(name, order)
 
     def _reorder(self, name: str, order: Tensor) -> None:
-        """Permute a column, which keeps the room that it has for more rows."""
+        """Permute a column, which keeps the room that it has for more rows, as far as `GROWTH` gives it."""
         old = self.columns[name]
-        room = len(self._memory.get(name, old))
+        room = min(len(self._memory.get(name, old)), int(GROWTH * len(old)))
         if name in LAYOUTS or room == len(old):
             self._store(name, take_rows(self[name], order))
         else:

@@ -33,7 +33,7 @@ from blitzgs.runs.log import LOG, RunLog
 from blitzgs.runs.world import save_frame
 from blitzgs.spawn.lineage import Lineage, initial_births, ledger_of
 from blitzgs.spawn.rules import lineage_subject, open_spawn_gate
-from blitzgs.table.blocks import morton_order
+from blitzgs.table.blocks import sort_rows
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
@@ -128,6 +128,8 @@ def set_up(
         tour = tour_of([capture.cameras[i] for i in capture.train], capture.points)
     sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed, schedule, tour)
     if config.memory.resident_gb > 0:
+        if restored is not None and restored.config.memory.resident_gb == 0:
+            sort_rows(table)  # as events do for a table in host memory
         table = HostTable(table.release(), pinned=ranks.device.type == "cuda")
     stepper = _stepper(
         config, table, optimiser, owners, space.extent, UpcomingCameras(sampler, capture.train, views)
@@ -325,7 +327,7 @@ def first_gaussians(
     # A row of the table has some 750 bytes, so each rank makes only its own rows, on its device.
     share = slice(ranks.rank, None, ranks.world_size)
     table = first.table(config.model.sh_degree, INITIAL_OPACITY, home, share)
-    table.permute(morton_order(table["means"]))
+    sort_rows(table)
     return table, Progress(
         step=0,
         sh_degree=0,
@@ -349,7 +351,7 @@ def _of_file(
         raise ValueError(f"{path} (model.start) holds {count:,} Gaussians: {limit}")
     columns = trained_columns(with_degree(found, degree), space, ranks)
     table = GaussianTable.create({name: column.to(home) for name, column in columns.items()})
-    table.permute(morton_order(table["means"]))
+    sort_rows(table)
     return table, Progress(
         step=0,
         sh_degree=known,

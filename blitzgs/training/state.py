@@ -26,7 +26,7 @@ from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.log import RunLog
 from blitzgs.spawn.candidates import Veto
 from blitzgs.spawn.lineage import Lineage
-from blitzgs.table.blocks import morton_order
+from blitzgs.table.blocks import sort_rows
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.curve import Curve
@@ -174,8 +174,8 @@ class TrainingState:
         self.stepper.catch_up(self.progress.step)
 
     def sort(self) -> None:
-        """Sort the table in Morton order, so that blocks of rows are small in space."""
-        self.table.permute(morton_order(self.table["means"]))
+        """Sort the table (`sort_rows`)."""
+        sort_rows(self.table)
 
     def population(self) -> int:
         """Count the Gaussians of all ranks; every rank calls this."""

@@ -21,7 +21,7 @@ from blitzgs.view.levels import FOOTPRINT_LEVELS, footprint_levels, footprint_si
 def follow_schedule(state: TrainingState, begin: int) -> None:
     """Open the LOD gate, if the step at [begin, begin + B) is the first that has it.
 
-    With `view.footprint`, levels follow opacities and scales as often as density control came before.
+    With `view.footprint`, levels follow opacities and scales (`Schedule.has_new_levels`).
 
     Collective: every rank calls this before every step.
     """

@@ -19,6 +19,7 @@ from blitzgs.population.density import (
     rotations,
 )
 from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit, rows_that_fit
+from blitzgs.table.placement import place
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from tests.helpers import needs_cuda
 
@@ -248,10 +249,12 @@ def test_a_gpu_holds_more_than_a_small_table_and_less_than_its_memory():
 @pytest.mark.cuda
 @needs_cuda
 def test_a_table_on_the_host_is_limited_by_the_memory_of_the_host(monkeypatch):
-    table, ranks = random_table(1000), Ranks(device=torch.device("cuda"), local_world_size=2)
+    table, ranks = random_table(999), Ranks(device=torch.device("cuda"), local_world_size=2)
     sizes = table.row_bytes.values()
     monkeypatch.setattr(growth, "available_bytes", lambda: 2_000_000_000)
-    available = 1_000_000_000 + 1000 * sum(sizes)
+    nothing, new = torch.empty(0, dtype=torch.int64), {name: table[name][:1] for name in table}
+    table.replace(place(999, nothing, nothing.new_zeros(1), new["means"]), new)
+    available = 1_000_000_000 + 1250 * sum(sizes)
     assert memory_limit(table, ranks) == rows_that_fit(1000, sum(sizes), max(sizes), available, 0)
     monkeypatch.setattr(growth, "available_bytes", lambda: None)
     assert memory_limit(table, ranks) is None

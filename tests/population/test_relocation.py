@@ -13,6 +13,7 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.counter_random import hash_keys
 from blitzgs.ops.relocation import MAX_COPIES
+from blitzgs.optim import table_adam
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.density import DensityRules
 from blitzgs.population.relocation import draw, relocate, shared
@@ -136,7 +137,9 @@ def test_matches_row_by_row(growth, cap):
     assert not born
 
 
-def test_an_event_before_rows_catch_up_is_that_after_they_did():
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_an_event_before_rows_catch_up_is_that_after_they_did(monkeypatch, elsewhere):
+    monkeypatch.setattr(table_adam, "_PART", 90)
     optimiser = TableAdam(OptimiserConfig(), Schedule(ScheduleConfig()), 1.0, torch.device("cpu"))
     tables = []
     for waits in (False, True):
@@ -148,6 +151,8 @@ def test_an_event_before_rows_catch_up_is_that_after_they_did():
         if not waits:
             optimiser.catch_up(table, None, STEP)
         pending = optimiser.pending(table, STEP) if waits else None
+        if elsewhere and pending is not None:
+            pending._device = torch.device("cpu:0")  # as if the table were in host memory
         relocate(table, RULES, growth=0.2, ranks=Ranks(), pending=pending, **CALL)
         if waits:
             current = table["last_step"] == STEP

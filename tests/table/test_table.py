@@ -80,7 +80,13 @@ def test_a_growing_table_moves_its_columns_rarely():
         more = {name: column[:50] for name, column in table.columns.items()}
         table.replace(place(len(table), nothing, torch.arange(50), more["means"]), more, most=1650)
         places.add(table["sh"].data_ptr())
+        row_bytes = sum(table.row_bytes.values())
+        assert len(table) * row_bytes <= table.memory_bytes <= max(1650, 1.02 * len(table)) * row_bytes
     assert len(table) == 1700 and len(places) <= 5
+    more = {name: column[:0] for name, column in table.columns.items()}
+    table.replace(place(len(table), torch.arange(900), nothing, more["means"]), more, most=1650)
+    table.permute(torch.randperm(800))
+    assert table.memory_bytes == 1000 * row_bytes
     assert_rows_whole(table)
 
 

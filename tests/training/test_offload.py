@@ -9,6 +9,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import files as run_files
 from blitzgs.runs.evaluation import render_view
 from blitzgs.runs.lod import scene_gate
+from blitzgs.table.blocks import morton_order
 from blitzgs.table.pool import Pool, PoolError
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.trainer import Trainer
@@ -201,6 +202,19 @@ def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypat
     scene.write_back()
     for name in whole:
         assert torch.equal(model.table[name], whole[name]), name
+
+
+def test_rows_are_sorted_for_a_pool_or_for_another_number_of_ranks(tmp_path):
+    """Density events sort the rows rarely, and those of each rank alone."""
+    train(tmp_path / "one", "schedule.iterations=20")
+    run_ranks(_train, 2, tmp_path / "two", ("schedule.iterations=20",))
+    restored = run_files.restore(tmp_path / "two", Ranks())
+    assert restored.progress.sorted_spread == 0
+    scene = run_files.open_model(tmp_path / "one", Ranks(), resident_gb=0.1).scene(torch.device("cpu"))
+    config = tiny_config(*SETTINGS, "schedule.iterations=20", RESIDENT)
+    resumed = Trainer(config, *street(), tmp_path / "one", Ranks(), resume=True)
+    for table in (restored.table, scene.table, resumed.state.table):
+        assert torch.equal(morton_order(table["means"]), torch.arange(len(table)))
 
 
 def test_a_batch_that_does_not_fit_is_named(tmp_path):
