@@ -261,7 +261,6 @@ void check_alignment(const AdamArgs<float>& args) {
 template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream) {
   static_assert(std::is_same_v<T, float>);
-  check_alignment(args);
   AdamArgs<float> behind = args;
   behind.step = args.target();
   for (AdamColumn<float>& column : behind.columns) column.grad = nullptr;
@@ -277,6 +276,7 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
     return;
   }
   if (args.n == 0) return;
+  check_alignment(args);
   if (catches_up) catch_up(behind, workspace, stream);
   if (!args.with_gradient()) return;
   const auto kernel =
