@@ -5,7 +5,9 @@
 
 #include "adam/lazy_adam_device.cuh"
 #include "adam/pending_rows.cuh"
+#include "adam/position_noise.h"
 #include "common/cuda.cuh"
+#include "common/rows.cuh"
 
 namespace blitzgs::cuda {
 
@@ -293,5 +295,6 @@ void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules
 
 template void lazy_adam<float>(const AdamArgs<float>&, Workspace&, CudaStream);
 template void final_rules<float>(const AdamArgs<float>&, std::int64_t, PendingSteps<float>*, CudaStream);
+template void for_each_row(const PositionNoise<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda
