@@ -130,12 +130,12 @@ def kernels_in_source() -> dict[Kernel, str]:
     """Every kernel of csrc and its file."""
     found = {}
     for path in sorted((ROOT / "csrc").rglob("*.cu*")):
-        for name, parameters in _KERNEL.findall(path.read_text()):
-            found[name, _pieces(parameters)] = str(path.relative_to(ROOT))
-    # One kernel does the rows of several structs, each of which counts.
-    file = found.pop(("row_kernel", 1))
-    rows = re.findall(r"for_each_row\(const (\w+).*&, CudaStream\);", (ROOT / file).read_text())
-    return found | dict.fromkeys(((name, 1) for name in rows), file)
+        text, file = path.read_text(), str(path.relative_to(ROOT))
+        found |= {(name, _pieces(parameters)): file for name, parameters in _KERNEL.findall(text)}
+        # One kernel does the rows of several structs, each of which counts.
+        found |= {(name, 1): file for name in re.findall(r"template void for_each_row\(const (\w+)", text)}
+    del found["row_kernel", 1]
+    return found
 
 
 def kernel_of(signature: str) -> Kernel | None:

@@ -16,9 +16,6 @@ from blitzgs.ops.intersect import pixels_of_tiles, tile_counts
 if TYPE_CHECKING:
     from blitzgs.distributed.group import Ranks
 
-
-from blitzgs.distributed.group import Ranks
-
 # The loss of an owned pixel reads pixels up to this distance: 5 px for its window, and 5 more for the
 # gradient.
 LOSS_HALO = 10

@@ -112,7 +112,7 @@ class AdamSchedule(AdamTables):
         self.tables = [table, lr_table, rules]
 
     def of_group(self, group: int) -> AdamSchedule:
-        """Return the schedule for a parameter alone (`AdamState.alone`) with the rates of one group."""
+        """Return the schedule for a parameter alone (`AdamState`) with the rates of one group."""
         alone = copy.copy(self)
         table, rates = self.table.clone(), self.lr_table[:, group, None].repeat(1, GROUPS)
         tails = table[:, _TAILS].view(-1, ORDERS, GROUPS)
@@ -189,7 +189,7 @@ class GrowingSchedule(AdamTables):
         """Apply the missed steps up to the last one, as `lazy_adam_catch_up_` does with these arguments."""
         with below_autograd():
             torch.ops.blitzgs.lazy_adam_catch_up_(state, self.tables, *self.constants(self.row), rows, count)
-        if rows is None:
+        if rows is None and count is None:
             self.current = self.last
 
 

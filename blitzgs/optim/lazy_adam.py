@@ -245,7 +245,7 @@ class LazyAdam(torch.optim.Optimizer):
         for _, _, param in self._places():
             state = self.state.get(param)
             if state:
-                state["step"] = torch.tensor(float(state["step"]), dtype=torch.float32, device="cpu")
+                state["step"] = _counter(state["step"])
 
     def append(self, rows: Mapping[str, Tensor]) -> dict[str, Parameter]:
         """Add rows at the end of every parameter; their moments are zero.
@@ -331,13 +331,17 @@ class LazyAdam(torch.optim.Optimizer):
         """Return the state of a parameter and its schedule; make or correct them where needed."""
         state: dict[str, Any] = self.state[param]
         if not state:
-            state["step"] = torch.tensor(0.0, dtype=torch.float32, device="cpu")
+            state["step"] = _counter(0)
             state.update({name: torch.zeros_like(param) for name in MOMENTS})
         for name in _STEPS:
             # gsplat's strategies append float zeros. The value is right for rows whose moments are zero.
             if name in state and state[name].dtype != torch.int32:
                 state[name] = state[name].int()
-        step, betas = int(state["step"]), tuple(group["betas"])
+        taken = state["step"]
+        # Code that moves an optimiser's state to a device moves this too; others keep a plain number.
+        if not (isinstance(taken, Tensor) and taken.is_cpu and taken.dtype == torch.float32):
+            state["step"] = taken = _counter(taken)
+        step, betas = int(taken), tuple(group["betas"])
         schedule: GrowingSchedule | None = group[_SCHEDULES].get(index)
         if schedule is not None and (schedule.last != step or schedule.betas != betas or schedule.is_full()):
             if _STEPS[0] in state:
@@ -352,6 +356,11 @@ class LazyAdam(torch.optim.Optimizer):
             place = torch.full((len(param),), schedule.row, dtype=torch.int32, device=param.device)
             state.update({name: place.clone() for name in _STEPS})
         return state, schedule
+
+
+def _counter(steps: Any) -> Tensor:
+    """Return a number of steps in a new tensor, as the op counts it and `torch.optim.Adam` keeps it."""
+    return torch.tensor(float(steps), dtype=torch.float32, device="cpu")
 
 
 def _move(move: Callable[..., None], param: Tensor, state: Mapping[str, Any], *arguments: Any) -> None:

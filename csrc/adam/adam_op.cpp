@@ -28,6 +28,7 @@ void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<T
   constexpr const char* kOp = "lazy_adam_catch_up_";
   AdamTensors state(kOp, state_in, tables, {step, explicit_steps, beta1, beta2, eps});
   const std::optional<Tensor> list = state.checked_rows(ids);
+  if (count) check_device(kOp, "count", *count, state.like(), state.name(0));
   const std::int64_t n = max_listed(kOp, count, list ? list->numel() : state.rows());
   DeviceScope scope(state.like());
   dispatch_floating(state.like(), [&](auto zero) {

@@ -5,7 +5,9 @@
 
 #include "adam/lazy_adam_device.cuh"
 #include "adam/pending_rows.cuh"
+#include "adam/position_noise.h"
 #include "common/cuda.cuh"
+#include "common/rows.cuh"
 
 namespace blitzgs::cuda {
 
@@ -261,7 +263,6 @@ void check_alignment(const AdamArgs<float>& args) {
 template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream) {
   static_assert(std::is_same_v<T, float>);
-  check_alignment(args);
   AdamArgs<float> behind = args;
   behind.step = args.target();
   for (AdamColumn<float>& column : behind.columns) column.grad = nullptr;
@@ -277,6 +278,7 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
     return;
   }
   if (args.n == 0) return;
+  check_alignment(args);
   if (catches_up) catch_up(behind, workspace, stream);
   if (!args.with_gradient()) return;
   const auto kernel =
@@ -293,5 +295,6 @@ void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules
 
 template void lazy_adam<float>(const AdamArgs<float>&, Workspace&, CudaStream);
 template void final_rules<float>(const AdamArgs<float>&, std::int64_t, PendingSteps<float>*, CudaStream);
+template void for_each_row(const PositionNoise<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda

@@ -61,15 +61,16 @@ struct AdamTensors {
   int first() const { return kAdamColumns - count(); }
 
   const Tensor& like() const { return params[0]; }
+  const char* name(int column) const { return alone ? "the parameter" : kAdamNames[column]; }
   std::int64_t rows() const { return like().size(0); }
 
   // Checks a list of rows, int32 [n] or int64 [n] or [1, n] (as sparse tensors have them); none: all rows.
   std::optional<Tensor> checked_rows(const std::optional<Tensor>& ids) const {
-    if (!ids || ids->scalar_type() != ScalarType::Long || ids->dim() != 2)
-      return checked(op, "ids", ids,
-                     ids && ids->scalar_type() == ScalarType::Long ? ScalarType::Long : ScalarType::Int,
-                     {-1});
-    return checked(op, "ids", *ids, ScalarType::Long, {1, -1});
+    if (!ids) return std::nullopt;
+    check_device(op, "ids", *ids, like(), name(0));
+    const bool is_long = ids->scalar_type() == ScalarType::Long;
+    if (is_long && ids->dim() == 2) return checked(op, "ids", *ids, ScalarType::Long, {1, -1});
+    return checked(op, "ids", *ids, is_long ? ScalarType::Long : ScalarType::Int, {-1});
   }
 
   // The kernel's arguments for the rows of a list (`checked_rows`). Gradients are null; the caller sets them.
@@ -122,8 +123,8 @@ struct AdamTensors {
       const Tensor& grad = held.emplace_back(as_contiguous(grads[c]));
       check_dtype(op, "grads", grad, like().scalar_type());
       STD_TORCH_CHECK(grad.dim() >= 1 && grad.size(0) == n && grad.numel() == n * width(c), "blitzgs::", op,
-                      ": the gradient of ", alone ? "the parameter" : kAdamNames[c], " must have ", n,
-                      " rows of ", width(c), " values, got ", shape_of(grad));
+                      ": the gradient of ", name(c), " must have ", n, " rows of ", width(c), " values, got ",
+                      shape_of(grad));
     }
     DeviceScope scope(like());
     dispatch_floating(like(), [&](auto zero) {
@@ -161,6 +162,11 @@ struct AdamTensors {
                       " must have ", values, " values in each of ", rows(), " rows, got ",
                       shape_of(params[c]));
     }
+    for (const auto& [what, tensor] :
+         {std::pair{"last_step", &last_step}, std::pair{"moment_step", &moment_step},
+          std::pair{"table", &table}, std::pair{"lr_table", &lr_table}}) {
+      check_device(op, what, *tensor, like(), name(0));
+    }
     check_in_place(op, "last_step", last_step, ScalarType::Int, {rows()});
     check_in_place(op, "moment_step", moment_step, ScalarType::Int, {rows()});
     check_in_place(op, "table", table, ScalarType::Double, {-1, kAdamTable});
@@ -171,13 +177,13 @@ struct AdamTensors {
   }
 
   void check_column(const Tensor& tensor, int column) const {
-    const char* name = alone ? "the parameter" : kAdamNames[column];
-    check_dtype(op, name, tensor, like().scalar_type());
-    check_contiguous(op, name, tensor);
-    STD_TORCH_CHECK(tensor.dim() >= 1 && tensor.size(0) == rows(), "blitzgs::", op, ": ", name, " must have ",
-                    rows(), " rows, got ", shape_of(tensor));
-    STD_TORCH_CHECK(tensor.numel() == params[column].numel(), "blitzgs::", op, ": the moments of ", name,
-                    " must have its shape ", shape_of(params[column]));
+    check_device(op, "a parameter or moment", tensor, like(), name(0));
+    check_dtype(op, name(column), tensor, like().scalar_type());
+    check_contiguous(op, name(column), tensor);
+    STD_TORCH_CHECK(tensor.dim() >= 1 && tensor.size(0) == rows(), "blitzgs::", op, ": ", name(column),
+                    " must have ", rows(), " rows, got ", shape_of(tensor));
+    STD_TORCH_CHECK(tensor.numel() == params[column].numel(), "blitzgs::", op, ": the moments of ",
+                    name(column), " must have its shape ", shape_of(params[column]));
   }
 };
 

@@ -72,6 +72,14 @@ inline void check_dtype(const char* op, const char* name, const Tensor& tensor, 
                   torch::headeronly::toString(tensor.scalar_type()));
 }
 
+// Checks that a tensor is on the device of `like`, which the message calls `of`. A kernel that reads memory
+// of the host ends all further work of the process on the GPU.
+inline void check_device(const char* op, const char* name, const Tensor& tensor, const Tensor& like,
+                         const char* of) {
+  STD_TORCH_CHECK(tensor.is_cpu() == like.is_cpu() && tensor.get_device_index() == like.get_device_index(),
+                  "blitzgs::", op, ": ", name, " must be on the device of ", of);
+}
+
 inline void check_contiguous(const char* op, const char* name, const Tensor& tensor) {
   STD_TORCH_CHECK(tensor.is_contiguous(), "blitzgs::", op, ": ", name, " must be contiguous");
 }
@@ -237,9 +245,7 @@ inline SplatCount checked_splat_count(const char* op, const std::optional<Tensor
   if (!n_splats) return {capacity, nullptr};
   check_dtype(op, "n_splats", *n_splats, ScalarType::Long);
   check_shape(op, "n_splats", *n_splats, {1});
-  STD_TORCH_CHECK(
-      n_splats->is_cpu() == splats.is_cpu() && n_splats->get_device_index() == splats.get_device_index(),
-      "blitzgs::", op, ": n_splats must be on the device of the splats");
+  check_device(op, "n_splats", *n_splats, splats, "the splats");
 #ifdef BLITZGS_BACKEND_CUDA
   return {capacity, data<std::int64_t>(*n_splats)};
 #else

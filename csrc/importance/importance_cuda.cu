@@ -5,6 +5,8 @@
 #include <type_traits>
 
 #include "common/cuda.cuh"
+#include "common/rows.cuh"
+#include "importance/view_sums.h"
 #include "rasterize/forward.cuh"
 
 namespace blitzgs::cuda {
@@ -196,5 +198,7 @@ void contributions<float>(const ContributionInput<float>& in, const Contribution
                {static_cast<unsigned>(order.n_tiles), Tile::kThreads, stream, sizeof(ContributionShared)},
                args);
 }
+
+template void for_each_row(const ViewSums&, CudaStream);
 
 }  // namespace blitzgs::cuda

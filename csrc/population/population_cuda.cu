@@ -1,7 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/cuda.cuh"
+#include "common/rows.cuh"
+#include "population/density_stats.h"
 #include "population/find_non_finite.h"
+#include "population/spawn_features.h"
 #include "population/tree_sums.h"
+#include "population/voxel_keys.h"
 
 namespace blitzgs::cuda {
 
@@ -64,5 +68,9 @@ void tree_sums(const TreeSumsArgs& args, CudaStream stream) {
   launch_early("tree_sums", tree_sums_kernel, {blocks_for(args.n_rows, kThreads), kThreads, stream, bytes},
                args);
 }
+
+template void for_each_row(const DensityStats<float>&, CudaStream);
+template void for_each_row(const SpawnFeatures&, CudaStream);
+template void for_each_row(const VoxelKeys<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/cuda.cuh"
+#include "common/rows.cuh"
 #include "project/project_device.cuh"
 #include "render/render.h"
 
@@ -102,5 +103,7 @@ void arrange_splats(const ArrangeSplats& moves, bool back, CudaStream stream) {
   arrange_splats_kernel<<<blocks_for(moves.n, kThreads), kThreads, 0, stream>>>(moves, back);
   check_launch("arrange_splats");
 }
+
+template void for_each_row(const Alphas<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda

@@ -290,7 +290,21 @@ def test_adam_goes_on_from_our_state_and_we_from_adams(backend, adam_first, opti
             assert current.param_groups[0]["lr"] == reference.param_groups[0]["lr"]
 
 
-@pytest.mark.parametrize("copy_of", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def with_counters(optimizer, kind):
+    for state in optimizer.state.values():
+        state["step"] = kind(state["step"])
+    return optimizer
+
+
+@pytest.mark.parametrize(
+    "copy_of",
+    [
+        copy.deepcopy,
+        lambda x: pickle.loads(pickle.dumps(x)),
+        lambda x: with_counters(x, int),
+        lambda x: with_counters(x, torch.Tensor.double),
+    ],
+)
 def test_a_copy_continues(copy_of):
     pair = Pair(("cpu", torch.float64))
     for _ in range(5):
@@ -316,6 +330,8 @@ def test_catching_up_some_rows_of_some_parameters():
     pair.ours.catch_up(pair.lazy["means"])  # one parameter, not in a list
     assert relative_error(pair.lazy["means"], pair.dense["means"]) < 1e-11
     assert torch.equal(pair.lazy["sh"], before["sh"])
+    pair.ours.catch_up(pair.lazy["sh"], count=torch.tensor([2], dtype=torch.int32))
+    assert (pair.lazy["sh"] != before["sh"]).any(dim=(1, 2)).nonzero()[:, 0].tolist() == [0, 1]
     pair.require_equal()
 
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from blitzgs.optim import LazyAdam
+from tests.helpers import needs_cuda
 
 
 @pytest.mark.parametrize(
@@ -80,6 +81,22 @@ def test_wrong_use_is_refused():
     param.grad = torch.ones_like(param)
     optimizer.state[param]["exp_avg"] = torch.zeros(5, 3)
     with pytest.raises(ValueError, match="a parameter has 4 rows and its exp_avg 5"):
+        optimizer.step()
+
+
+@pytest.mark.cuda
+@needs_cuda
+def test_memory_of_another_device_is_refused():
+    """Kernels that read it would end all work of the process on the GPU."""
+    param = torch.nn.Parameter(torch.ones(4, 3, device="cuda"))
+    optimizer = LazyAdam([param])
+    for _ in range(2):
+        param.grad = torch.ones_like(param).to_sparse(1)
+        optimizer.step()
+    with pytest.raises(RuntimeError, match="ids must be on the device of the parameter"):
+        optimizer.catch_up(rows=torch.tensor([1], dtype=torch.int32))
+    optimizer.state[param]["exp_avg"] = torch.zeros(4, 3)
+    with pytest.raises(RuntimeError, match="a parameter or moment must be on the device of the parameter"):
         optimizer.step()
 
 
