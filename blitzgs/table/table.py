@@ -240,7 +240,7 @@ class GaussianTable:
             room = int(GROWTH * count)
             if most is not None:
                 room = min(room, max(most, int(_PAST_MOST * count)))
-            memory = self._allocate(old, max(count, room))
+            memory = self._allocate(old, room)
             memory[: len(old)].copy_(old)
             self._memory[name], self.columns[name] = memory, memory[: len(old)]
         return memory[: max(count, len(old))]
