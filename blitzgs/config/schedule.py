@@ -134,6 +134,13 @@ class Schedule:
         """Tell whether a later density event uses the statistics of the step at [begin, begin + B)."""
         return self.pace.time(begin) < self._config.densify_until
 
+    def is_last_density_event(self, time: int) -> bool:
+        """Tell whether no other density event follows that at `time`."""
+        first, every = self._config.densify_from, self._config.densify_every
+        # `time` is rounded down, so the next event is the first at `time + 1` or later.
+        following = math.ceil((self.pace.time(time + 1) - first) / every)
+        return first + following * every >= self._config.densify_until
+
     def has_lod_gate(self, begin: int) -> bool:
         """Tell whether the step at [begin, begin + B) may leave out Gaussians by their octree levels.
 

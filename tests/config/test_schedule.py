@@ -181,6 +181,15 @@ def test_opacities_are_reset_while_densifying_and_after_the_density_event_of_the
     assert schedule.gathers_statistics(1_499) and not schedule.gathers_statistics(1_500)
 
 
+@pytest.mark.parametrize("scale", [0.37, 1.0, 3.3])
+@pytest.mark.parametrize("until", [1_499, 1_500, 1_501])
+def test_the_last_density_event_is_known(scale, until):
+    config = ScheduleConfig(scale=scale, iterations=3_000, densify_until=until, densify_every=100)
+    schedule = Schedule(config)
+    times = [event.time for event in schedule.events(0, schedule.iterations) if event.kind == "densify"]
+    assert [schedule.is_last_density_event(time) for time in times] == [*[False] * (len(times) - 1), True]
+
+
 CHANGES = ((40, 0.5), (120, 2.5), (128, 0.01), (131, 3.0))
 
 

@@ -50,7 +50,7 @@ def run(state: TrainingState, event: Event) -> None:
             "and points belong together, or prune less (population.min_opacity, prune_screen_radius, "
             "prune_world_scale; schedule.size_prune_after)"
         )
-    _keep_sorted(state, counts, is_sorted)
+    _keep_sorted(state, event, counts, is_sorted)
     if moved:
         counts["redistributed"] = 1
     peak = max(state.progress.peak_gaussians, counts["gaussians"])
@@ -64,17 +64,21 @@ def _spread(state: TrainingState) -> Tensor:
     return (spread(state.stepper.bounds, extent) * (1000 / extent)).long().to(state.ranks.device)
 
 
-def _keep_sorted(state: TrainingState, counts: dict[str, int], is_sorted: bool) -> None:
+def _keep_sorted(state: TrainingState, event: Event, counts: dict[str, int], is_sorted: bool) -> None:
     """Sort the table if its blocks have become too large; no result depends on it. Every rank calls this.
+
+    After the last event the order stays for the rest of the run, so that sorting always pays.
 
     Args:
         state: state of the run.
+        event: the event.
         counts: of the event over all ranks; "spread" goes, and "sorted" comes if this sorts the table.
         is_sorted: whether the event has sorted it.
     """
     spread_now = counts.pop("spread")
     if not is_sorted:
-        if spread_now <= MOST_SPREAD * state.progress.sorted_spread:
+        is_compact = spread_now <= MOST_SPREAD * state.progress.sorted_spread
+        if is_compact and not state.schedule.is_last_density_event(event.time):
             return
         counts["sorted"] = 1
         state.sort()

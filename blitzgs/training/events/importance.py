@@ -62,8 +62,8 @@ def run(state: TrainingState, event: Event) -> None:
     after = state.population()
     if after == 0:
         raise ModelLostError(_nothing_kept(state, event, before))
-    if redistribute(state.table, state.ranks, max_imbalance=0):
-        state.sort()
+    redistribute(state.table, state.ranks, max_imbalance=0)
+    state.sort()
     state.stepper.reindex()
     progress = state.progress
     milestones = progress.milestones | {f"before_{event.kind}": before, f"after_{event.kind}": after}
