@@ -28,14 +28,13 @@ from blitzgs.capture.cameras import (
     scaled_matrix,
 )
 from blitzgs.capture.check_files import FindDamage, damaged
-from blitzgs.capture.files import MissingImagesError as MissingImagesError
-from blitzgs.capture.files import existing
 from blitzgs.capture.image_files import ImageHeader, read_header
 from blitzgs.capture.layouts import Source, SourceView, read_layout
 from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_extent
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.masks import excluded_share, find_masks
-from blitzgs.capture.names import check_inside
+from blitzgs.capture.names import MissingImagesError as MissingImagesError
+from blitzgs.capture.names import check_inside, existing
 from blitzgs.capture.points import SourcePoints
 from blitzgs.capture.projects.find import FoundProject, folder_of, project_at
 from blitzgs.capture.splits import split_capture, without_unused

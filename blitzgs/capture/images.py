@@ -29,7 +29,6 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.capture.bounded_cache import BoundedCache as BoundedCache
 from blitzgs.capture.cameras import Camera, same_shape
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.check_files import FileCheck, mask_error
@@ -42,6 +41,7 @@ from blitzgs.capture.image_files import (
     reduced,
     reduced_mask,
 )
+from blitzgs.capture.shared_images import BoundedCache as BoundedCache
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.capture.undistort import Rectification
 from blitzgs.formats import native

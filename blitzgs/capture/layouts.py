@@ -14,8 +14,8 @@ import numpy as np
 
 from blitzgs.capture import colmap, transforms
 from blitzgs.capture.cameras import Float64
-from blitzgs.capture.files import ImageFinder
 from blitzgs.capture.lens import Lens
+from blitzgs.capture.names import ImageFinder
 from blitzgs.capture.points import SourcePoints, file_points, transforms_points
 from blitzgs.capture.projects.find import FoundProject, find_project, read_project
 from blitzgs.capture.world import WorldFrame, frame_beside

@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
-from blitzgs.capture.files import read_lines
 from blitzgs.capture.layouts import SourceView
+from blitzgs.capture.names import read_lines
 
 DEFAULT_EVERY = 8
 

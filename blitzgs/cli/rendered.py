@@ -13,7 +13,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.capture.own_cameras import read_cameras
+from blitzgs.capture.usable import read_cameras
 from blitzgs.cli.arguments import chosen_views
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files

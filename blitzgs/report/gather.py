@@ -19,9 +19,8 @@ from blitzgs.capture.cameras import camera_centres
 from blitzgs.runs import exposure
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import CAMERAS, RunCameras, load_cameras
-from blitzgs.runs.evaluation import METRICS
+from blitzgs.runs.evaluation import FOLDER, INDEX, METRICS, PARTS, preview_file
 from blitzgs.runs.folder import RunFolder, open_run
-from blitzgs.runs.previews import FOLDER, INDEX, PARTS, preview_file
 from blitzgs.viewer.world import horizontal, up_direction
 
 Point = tuple[float, float | None, float]

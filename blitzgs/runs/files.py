@@ -23,8 +23,8 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint, exposure
 from blitzgs.runs.checkpoint import CheckpointError
+from blitzgs.runs.folder_checks import check_own
 from blitzgs.runs.guard import bad_column, check_before_saving
-from blitzgs.runs.identity import check_own
 from blitzgs.table.blocks import sort_rows
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Pool

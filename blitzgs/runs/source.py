@@ -22,7 +22,7 @@ from blitzgs.runs import checkpoint
 from blitzgs.runs import files as run_files
 from blitzgs.runs.checkpoint import CheckpointError, Shard
 from blitzgs.runs.folder import Model
-from blitzgs.runs.identity import check_own
+from blitzgs.runs.folder_checks import check_own
 from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.shard_file import header_of, read_rows
 from blitzgs.table.table import GaussianTable

@@ -20,8 +20,16 @@ import numpy as np
 
 from blitzgs.capture.colmap import FILES, count_images
 from blitzgs.capture.world import GEO, enu_frame, read_small
-from blitzgs.sfm.database import read_found, read_positions
-from blitzgs.sfm.engine import STAGES, Job, StageError, backend, decided, run_stage
+from blitzgs.sfm.engine import (
+    STAGES,
+    Job,
+    StageError,
+    backend,
+    decided,
+    read_found,
+    read_positions,
+    run_stage,
+)
 from blitzgs.sfm.photographs import Photographs, judge_positions
 from blitzgs.sfm.report import Reconstruction, examine
 from blitzgs.util.output import write_file

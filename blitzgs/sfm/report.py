@@ -17,8 +17,7 @@ from blitzgs.capture.colmap import ColmapModel, Float64, count_images, read_mode
 from blitzgs.capture.layouts import SourceView
 from blitzgs.capture.lengths import find_apart
 from blitzgs.capture.lens import Lens
-from blitzgs.sfm.database import Found, read_found, read_positions
-from blitzgs.sfm.engine import Job
+from blitzgs.sfm.engine import Found, Job, read_found, read_positions
 from blitzgs.sfm.photographs import Photographs
 from blitzgs.util.output import write_file
 

@@ -8,6 +8,7 @@ import math
 import time
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +16,35 @@ import torch
 from torch import Tensor
 
 from blitzgs.capture.images import Images
+from blitzgs.frame.frame import Views
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
 from blitzgs.ops.host import current_stream
-from blitzgs.training.batch import Batch
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.view.views import VIEW_NUMBERS, ViewSet, unpack_views
+
+
+@dataclass(frozen=True)
+class Batch:
+    """One step's views and photographs on the device.
+
+    Attributes:
+        indices: the B cameras of the batch, as indices into the capture.
+        views: the same cameras as the renderer takes them, at the resolution of the step.
+        targets: uint8 [B, H, W, 3]; on several ranks, undefined outside the pixels that this rank's loss
+            reads.
+        masks: uint8 [B, H, W], 0 = excluded pixel; None when no view of the batch has a mask.
+        samples: float32 [B], number of values in a view's mean: 3 x its pixels that count, at least 1.
+        ranges: the tiles of each rank; None on one rank.
+    """
+
+    indices: list[int]
+    views: Views
+    targets: Tensor
+    masks: Tensor | None
+    samples: Tensor
+    ranges: TileRanges | None
+
 
 # Photographs are decoded further ahead than batches are uploaded: for every batch that is uploaded ahead,
 # those of this number of later batches. Decoding one takes as long as several steps on a fast GPU.

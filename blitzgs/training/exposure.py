@@ -12,7 +12,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.exposure import FILE, SHARED, effective
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.util.output import write_file
 
 # One step in so many measures the photographs of its batch, at one pixel in so many of each row and column.

@@ -17,7 +17,7 @@ from blitzgs.ops.photometric import photometric_fwd_bwd
 if TYPE_CHECKING:
     from blitzgs.frame.frame import Frame
     from blitzgs.table.table import GaussianTable
-    from blitzgs.training.batch import Batch
+    from blitzgs.training.batches import Batch
 
 
 class LossTerms(NamedTuple):

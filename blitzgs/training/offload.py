@@ -20,7 +20,7 @@ from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.position_noise import PositionNoise
 from blitzgs.table.block_visibility import Cameras
 from blitzgs.table.pool import Pool
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.training.loss import LossTerms
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper

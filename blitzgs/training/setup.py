@@ -44,7 +44,7 @@ from blitzgs.training.exposure import Exposures
 from blitzgs.training.inputs import check_alike, check_capture, check_resolution
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
-from blitzgs.training.population_report import PICTURE
+from blitzgs.training.records import PICTURE
 from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper

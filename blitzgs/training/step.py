@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from blitzgs.optim.table_adam import TableAdam
     from blitzgs.population.position_noise import PositionNoise
     from blitzgs.table.table import GaussianTable
-    from blitzgs.training.batch import Batch
+    from blitzgs.training.batches import Batch
     from blitzgs.training.exposure import Exposures
     from blitzgs.view.visible import Scene
 

@@ -33,11 +33,18 @@ from blitzgs.training.agreement import MAX_STEPS, Agreement, StopRequest
 from blitzgs.training.batches import MAX_MASKED, BatchLoader
 from blitzgs.training.budget import Budget
 from blitzgs.training.events import evaluate, events_left, handle_all, save
-from blitzgs.training.glances import Glances
-from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
+from blitzgs.training.events.evaluate import Glances
+from blitzgs.training.records import (
+    MemoryMeter,
+    StepRecord,
+    describe,
+    log_step,
+    measure_step,
+    population_report,
+    write_picture,
+)
 from blitzgs.training.setup import set_up
 from blitzgs.training.state import never
-from blitzgs.training.step_report import StepRecord, log_step, measure_step
 from blitzgs.training.understood import hints_of, largest_size
 from blitzgs.training.watching import Watching
 from blitzgs.util.output import write_file

@@ -8,6 +8,7 @@ import math
 import warnings
 
 from blitzgs.capture.capture import Capture, train_views_fingerprint
+from blitzgs.config.schedule import Event
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.files import Progress
 from blitzgs.runs.lod import level_fork, lod_gate, scene_gate
@@ -113,3 +114,13 @@ def batch_gate(state: TrainingState, indices: list[int]) -> ViewGate | None:
     if not (lod_views or masked):
         return None
     return ViewGate(lod.reach() if lod is not None else [math.inf], lod_views, columns if masked else ())
+
+
+def clear_cull(state: TrainingState, event: Event) -> None:
+    """Delete the cull mask and free its memory."""
+    if CULL not in state.table:
+        return
+    state.stepper.write_back()
+    del state.table[CULL]
+    state.stepper.reindex()
+    state.log.event(event.time, "clear_cull", {}, "the cull mask is cleared")

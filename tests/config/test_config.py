@@ -20,13 +20,15 @@ from blitzgs.config.files import (
     REMOVED,
     ConfigError,
     config_hash,
+    default_recipe,
     from_dict,
     load_config,
+    recipe_names,
+    recipe_path,
     save_config,
     to_dict,
 )
 from blitzgs.config.ranges import CHOICES, RANGES, flat_fields, problems
-from blitzgs.config.recipes import default_recipe, recipe_names, recipe_path
 from blitzgs.config.schedule import Schedule
 from blitzgs.optim.table_adam import BETA1, BETA2, EPS
 

@@ -14,15 +14,16 @@ from blitzgs.config.schedule import Event, EventKind
 from blitzgs.population.importance import SweepStoppedError
 from blitzgs.runs.files import Progress
 from blitzgs.table.pool import PoolError
-from blitzgs.training.events import clear_cull, densify, evaluate, importance, reset_opacities, save
+from blitzgs.training.events import densify, evaluate, importance, save
 from blitzgs.training.state import TrainingState
+from blitzgs.training.view_level import clear_cull
 
 HANDLERS: Mapping[EventKind, Callable[[TrainingState, Event], object]] = {
     "densify": densify.run,
-    "reset_opacities": reset_opacities.run,
+    "reset_opacities": densify.reset_opacities,
     "pass_1": importance.run,
     "pass_2": importance.run,
-    "clear_cull": clear_cull.run,
+    "clear_cull": clear_cull,
     "evaluate": evaluate.run,
     "checkpoint": save.run,
 }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The event that clones, splits, prunes and relocates Gaussians."""
+"""The events that clone, split, prune and relocate Gaussians, and that cap their opacities."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from blitzgs.config.fields import RESET_OPACITY
 from blitzgs.config.schedule import Event
-from blitzgs.population.density import STATISTICS, DensityReport, DensityRules, densify
+from blitzgs.population.density import STATISTICS, DensityReport, DensityRules, cap_opacities, densify
 from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit
 from blitzgs.population.redistribution import MAX_IMBALANCE, redistribute
 from blitzgs.population.relocation import relocate
@@ -166,3 +167,15 @@ def density_rules(state: TrainingState, time: int, limit: GrowthLimit | None) ->
         max_gaussians=None if limit is None else limit.count,
         min_observations=population.min_observations,
     )
+
+
+def reset_opacities(state: TrainingState, event: Event) -> None:
+    """Cap all opacities at `RESET_OPACITY` and clear their moments (Kerbl et al. 2023, section 5).
+
+    The pending optimiser steps are applied first, because they would otherwise move the opacities with
+    moments that no longer exist.
+    """
+    state.catch_up()
+    cap_opacities(state.table, RESET_OPACITY)
+    state.curve.restart()
+    state.log.event(event.time, "reset_opacities", {"opacity": RESET_OPACITY})
