@@ -90,32 +90,20 @@ class About:
     """What `load_capture` decided, for messages."""
 
     source: Source
-    split: str
-    """What decided on the held-out views."""
+    split: str  # what decided on the held-out views
+    # The cameras whose pose is wrong; they are left out unless `stray_cameras` keeps them.
     strays: list[StrayCamera]
-    """The cameras whose pose is wrong; they are left out unless `stray_cameras` keeps them."""
-    unused: int
-    """Number of frames that are in no list of the file's own split."""
-    missing: int
-    """Number of views whose image is not on disk."""
-    blind: int
-    """Number of views that see none of the points."""
-    random_points: bool
-    """Whether the capture has no points, so that training starts from random ones."""
-    points_from: str = ""
-    """The file of the points, relative to the capture."""
-    colors_from: str = ""
-    """What in it gives their colours; empty: nothing."""
-    with_alpha: int = 0
-    """Number of photographs that have alpha."""
-    extra_bands: int = 0
-    """Number of photographs with a band that is neither colour nor alpha; it is not used."""
-    with_mask: int = 0
-    """Number of photographs that have a mask."""
-    mask_share: float | None = None
-    """Mean share of the pixels that masks exclude, of a few masks."""
-    damaged: int = 0
-    """Number of views that `allow_missing` left out because their image or mask is damaged."""
+    unused: int  # number of frames that are in no list of the file's own split
+    missing: int  # number of views whose image is not on disk
+    blind: int  # number of views that see none of the points
+    random_points: bool  # whether the capture has no points, so that training starts from random ones
+    points_from: str = ""  # the file of the points, relative to the capture
+    colors_from: str = ""  # what in it gives their colours; empty: nothing
+    with_alpha: int = 0  # number of photographs that have alpha
+    extra_bands: int = 0  # number of photographs with a band that is neither colour nor alpha; it is not used
+    with_mask: int = 0  # number of photographs that have a mask
+    mask_share: float | None = None  # mean share of the pixels that masks exclude, of a few masks
+    damaged: int = 0  # number of views that `allow_missing` left out because their image or mask is damaged
 
 
 def load_capture(

@@ -48,17 +48,13 @@ class ColmapImages:
 
     ids: npt.NDArray[np.uint32] = _empty("u4", 0)
     camera_ids: npt.NDArray[np.uint32] = _empty("u4", 0)
-    quats: Float64 = _empty("f8", 0, 4)
-    """[N, 4] w, x, y, z."""
-    translations: Float64 = _empty("f8", 0, 3)
-    """[N, 3]."""
+    quats: Float64 = _empty("f8", 0, 4)  # [N, 4] w, x, y, z
+    translations: Float64 = _empty("f8", 0, 3)  # [N, 3]
     names: list[str] = field(default_factory=list)
+    # [N + 1]; all zero when the observations were not read.
     point2d_offsets: npt.NDArray[np.uint64] = _empty("u8", 1)
-    """[N + 1]; all zero when the observations were not read."""
-    points2d: Float64 = _empty("f8", 0, 2)
-    """[O, 2] pixels."""
-    point3d_ids: npt.NDArray[np.int64] = _empty("i8", 0)
-    """[O]; -1 where the observation has no point."""
+    points2d: Float64 = _empty("f8", 0, 2)  # [O, 2] pixels
+    point3d_ids: npt.NDArray[np.int64] = _empty("i8", 0)  # [O]; -1 where the observation has no point
 
 
 @dataclass
@@ -66,14 +62,11 @@ class ColmapPoints:
     """M points. The track of point i is rows track_offsets[i] to track_offsets[i + 1]."""
 
     ids: npt.NDArray[np.int64] = _empty("i8", 0)
-    positions: Float64 = _empty("f8", 0, 3)
-    """[M, 3] world."""
-    colors: npt.NDArray[np.uint8] = _empty("u1", 0, 3)
-    """[M, 3]."""
-    errors: Float64 = _empty("f8", 0)
-    """[M] mean reprojection error in pixels; -1 = unknown."""
+    positions: Float64 = _empty("f8", 0, 3)  # [M, 3] world
+    colors: npt.NDArray[np.uint8] = _empty("u1", 0, 3)  # [M, 3]
+    errors: Float64 = _empty("f8", 0)  # [M] mean reprojection error in pixels; -1 = unknown
+    # [M + 1]; right even when the tracks themselves were not read.
     track_offsets: npt.NDArray[np.uint64] = _empty("u8", 1)
-    """[M + 1]; right even when the tracks themselves were not read."""
     track_image_ids: npt.NDArray[np.uint32] = _empty("u4", 0)
     track_point2d_ids: npt.NDArray[np.uint32] = _empty("u4", 0)
 
@@ -91,8 +84,8 @@ class ColmapModel:
     cameras: list[ColmapCamera] = field(default_factory=list)
     images: ColmapImages = field(default_factory=ColmapImages)
     points: ColmapPoints = field(default_factory=ColmapPoints)
+    # The file of the points. With a suffix of `POINT_SUFFIXES`, `points` is empty: the caller reads it.
     points_path: Path | None = None
-    """The file of the points. With a suffix of `POINT_SUFFIXES`, `points` is empty: the caller reads it."""
 
 
 @cache

@@ -28,16 +28,11 @@ _TRIPLES = 500
 
 @dataclass
 class ControlPoint:
-    """A surveyed place and its marks.
+    """A surveyed place and its marks."""
 
-    Attributes:
-        name: of the point.
-        world: east, north, height.
-        marks: photograph's name, x and y in its pixels; the corner of the first pixel is (0, 0).
-    """
-
-    name: str
-    world: Float64
+    name: str  # of the point
+    world: Float64  # east, north, height
+    # photograph's name, x and y in its pixels; the corner of the first pixel is (0, 0).
     marks: list[tuple[str, float, float]] = field(default_factory=list)
 
 
@@ -105,25 +100,16 @@ def _add(points: dict[str, ControlPoint], name: str, image: str, words: Sequence
 
 @dataclass
 class Placed:
-    """A control point in the coordinates of a capture.
+    """A control point in the coordinates of a capture."""
 
-    Attributes:
-        point: surveyed place and marks.
-        position: [3] in the capture's own world; None: `problem` says why there is none.
-        problem: why it is not used; empty: it is.
-        cameras: of its marks.
-        pixels: [M, 2] its marks.
-        offset: [3] in world units, the fitted place minus the surveyed one.
-        reprojection: root mean square distance in pixels of the surveyed place from the marks.
-    """
-
-    point: ControlPoint
-    position: Float64 | None = None
-    problem: str = ""
-    cameras: list[Camera] = field(default_factory=list)
-    pixels: Float64 = field(default_factory=lambda: np.zeros((0, 2)))
+    point: ControlPoint  # surveyed place and marks
+    position: Float64 | None = None  # [3] in the capture's own world; None: `problem` says why there is none
+    problem: str = ""  # why it is not used; empty: it is
+    cameras: list[Camera] = field(default_factory=list)  # of its marks
+    pixels: Float64 = field(default_factory=lambda: np.zeros((0, 2)))  # [M, 2] its marks
+    # [3] in world units, the fitted place minus the surveyed one.
     offset: Float64 = field(default_factory=lambda: np.full(3, math.nan))
-    reprojection: float = math.nan
+    reprojection: float = math.nan  # root mean square distance in pixels of the surveyed place from the marks
 
 
 def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Float64) -> list[Placed]:

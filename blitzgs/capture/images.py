@@ -54,22 +54,15 @@ _Key: TypeAlias = tuple[str, int, int]
 
 @dataclass(frozen=True)
 class ImageMemory:
-    """The largest host memory that images have taken so far, its limits, and the number of decodings.
+    """The largest host memory that images have taken so far, its limits, and the number of decodings."""
 
-    Attributes:
-        compressed_bytes: bytes of compressed images.
-        compressed_budget: limit of these bytes.
-        decoded_bytes: bytes of decoded images and masks, without those that a caller holds; in memory that
-            several processes share, those of all processes.
-        decoded_budget: limit of these bytes at present; it may have been larger before (`ImageStore`).
-        decoded: number of decodings of images and masks.
-    """
-
-    compressed_bytes: int
-    compressed_budget: int
+    compressed_bytes: int  # bytes of compressed images
+    compressed_budget: int  # limit of these bytes
+    # Bytes of decoded images and masks, without those that a caller holds; in memory that several processes
+    # share, those of all processes.
     decoded_bytes: int
-    decoded_budget: int
-    decoded: int
+    decoded_budget: int  # limit of these bytes at present; it may have been larger before (`ImageStore`)
+    decoded: int  # number of decodings of images and masks
 
     def __str__(self) -> str:
         """Return the figures as text, in gigabytes."""

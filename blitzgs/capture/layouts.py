@@ -34,24 +34,18 @@ class SourceView:
     mask_path: Path | None
     lens: Lens
     world_to_camera: Float64
-    part: str | None = None
-    """See `transforms.Frame.part`."""
+    part: str | None = None  # see `transforms.Frame.part`
 
 
 @dataclass(frozen=True)
 class Source:
     """Which files were read, and what of them was not."""
 
-    cameras: str
-    """The model or files that the poses are from, relative to the capture."""
-    split: str = ""
-    """What in the files decides on the split."""
-    notes: tuple[str, ...] = ()
-    """What the reader decided between fields or files, and what has no effect."""
-    without_camera: int = 0
-    """Photographs beside those of the views that have no camera."""
-    frame: WorldFrame | None = None
-    """Where the capture lies in the world; None: the files do not say."""
+    cameras: str  # the model or files that the poses are from, relative to the capture
+    split: str = ""  # what in the files decides on the split
+    notes: tuple[str, ...] = ()  # what the reader decided between fields or files, and what has no effect
+    without_camera: int = 0  # photographs beside those of the views that have no camera
+    frame: WorldFrame | None = None  # where the capture lies in the world; None: the files do not say
 
 
 def read_layout(

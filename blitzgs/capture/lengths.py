@@ -61,10 +61,8 @@ class StrayCamera:
     """A camera that lies apart from all others and hardly shows a point: its pose is wrong."""
 
     name: str
-    distance: float
-    """From the middle of all cameras, in world units."""
-    others: float
-    """Largest such distance of the cameras that are together."""
+    distance: float  # from the middle of all cameras, in world units
+    others: float  # largest such distance of the cameras that are together
 
 
 def sampled(points: Float64, views: int) -> Float64:
@@ -143,9 +141,9 @@ def depths_seen(camera: Camera, points: Float64) -> Float64:
 class Sight:
     """What the views see of the points, by a sample of them."""
 
+    # [V] depth of the nearest points that each view sees, without the nearest 2 % of them; infinite for a
+    # view that sees none.
     nearest: Float64
-    """[V] depth of the nearest points that each view sees, without the nearest 2 % of them; infinite for a
-    view that sees none."""
     names: list[str]
 
     @classmethod

@@ -130,12 +130,9 @@ class SourcePoints:
     colors: npt.NDArray[np.uint8]
     track_lengths: npt.NDArray[np.int64] | None = None
     errors: Float64 | None = None
-    path: Path | None = None
-    """The file or model that has them; None: there are none."""
-    colors_from: str = ""
-    """What in it gives the colours; empty: nothing."""
-    crs: Any = None
-    """The reference system that the file names (pyproj's); None: it names none."""
+    path: Path | None = None  # the file or model that has them; None: there are none
+    colors_from: str = ""  # what in it gives the colours; empty: nothing
+    crs: Any = None  # the reference system that the file names (pyproj's); None: it names none
 
 
 def file_points(path: Path) -> SourcePoints:

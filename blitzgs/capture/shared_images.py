@@ -81,15 +81,11 @@ _TOKEN_BYTES, _ALIGNMENT = 16, 64
 
 
 class SharedMemoryOffer(NamedTuple):
-    """How other processes of the host find the memory of `SharedImages`.
+    """How other processes of the host find the memory of `SharedImages`."""
 
-    Attributes:
-        path: file under /proc that is this memory, while the process that made it lives.
-        token: the first bytes of the memory. They tell it from another one that has the same path in another
-            container.
-    """
-
-    path: str
+    path: str  # file under /proc that is this memory, while the process that made it lives
+    # The first bytes of the memory. They tell it from another one that has the same path in another
+    # container.
     token: bytes
 
 

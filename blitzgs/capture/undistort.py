@@ -30,11 +30,9 @@ class Rectification:
     lens: Lens
     width: int
     height: int
-    x0: int
-    """Column of the old pixel grid at which the new image begins (negative: left of the old image)."""
+    x0: int  # column of the old pixel grid at which the new image begins (negative: left of the old image)
     y0: int
-    has_invalid: bool
-    """Whether some pixels of the new image were not seen."""
+    has_invalid: bool  # whether some pixels of the new image were not seen
 
     @property
     def is_identity(self) -> bool:

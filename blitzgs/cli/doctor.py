@@ -54,23 +54,14 @@ _REINSTALL = "pip install --force-reinstall --no-deps blitzgs (in a checkout: ma
 
 @dataclass
 class Line:
-    """A line of the report.
+    """A line of the report."""
 
-    Attributes:
-        name: what was looked at.
-        state: see `HELP`.
-        text: what was found.
-        remedy: what mends it; "": nothing has to be mended.
-        required: BlitzGS cannot do without it.
-        values: figures for programs.
-    """
-
-    name: str
-    state: State
-    text: str
-    remedy: str = ""
-    required: bool = True
-    values: dict[str, Any] = field(default_factory=dict)
+    name: str  # what was looked at
+    state: State  # see `HELP`
+    text: str  # what was found
+    remedy: str = ""  # what mends it; "": nothing has to be mended
+    required: bool = True  # BlitzGS cannot do without it
+    values: dict[str, Any] = field(default_factory=dict)  # figures for programs
 
 
 class ProbeError(Exception):

@@ -32,25 +32,16 @@ _SAMPLE = 50_000
 
 @dataclass(frozen=True)
 class Rendered:
-    """A model and the views to render of it.
+    """A model and the views to render of it."""
 
-    Attributes:
-        subject: the model, with this rank's Gaussians.
-        space: maps the trained world to the capture's.
-        box: corners of a box that holds nearly all Gaussians, float64 [2, 3], trained units.
-        cameras: all cameras; pictures are named by all of them.
-        indices: those to render.
-        inputs: files that must not be overwritten.
-        exposures: gain and bias, float32 [2, 3], of cameras by their indices.
-    """
-
-    subject: Subject
-    space: Space
+    subject: Subject  # the model, with this rank's Gaussians
+    space: Space  # maps the trained world to the capture's
+    # Corners of a box that holds nearly all Gaussians, float64 [2, 3], trained units.
     box: npt.NDArray[np.float64]
-    cameras: Sequence[CameraLike]
-    indices: Sequence[int]
-    inputs: Sequence[Path]
-    exposures: dict[int, Tensor]
+    cameras: Sequence[CameraLike]  # all cameras; pictures are named by all of them
+    indices: Sequence[int]  # those to render
+    inputs: Sequence[Path]  # files that must not be overwritten
+    exposures: dict[int, Tensor]  # gain and bias, float32 [2, 3], of cameras by their indices
 
 
 def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> Rendered:

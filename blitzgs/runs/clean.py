@@ -57,16 +57,11 @@ def contributions(
 
 @dataclass(frozen=True)
 class Cleaned:
-    """What cleaning leaves.
+    """What cleaning leaves."""
 
-    Attributes:
-        kept: bool [N].
-        picture: of what goes, as JPEG; None: nothing goes.
-        psnr: mean PSNR of the held-out views before and after; None: there are no photographs.
-    """
-
-    kept: Tensor
-    picture: bytes | None
+    kept: Tensor  # bool [N]
+    picture: bytes | None  # of what goes, as JPEG; None: nothing goes
+    # Mean PSNR of the held-out views before and after; None: there are no photographs.
     psnr: tuple[float, float] | None
 
     def write_picture(self, path: Path) -> None:

@@ -28,17 +28,12 @@ _MAX_ROUNDING = 0.01
 
 @dataclass(frozen=True)
 class Exported:
-    """What a caller has to tell the user about a written file.
+    """What a caller has to tell the user about a written file."""
 
-    Attributes:
-        offset: add this to x, y, z to get coordinates of the capture's world; None: they are already.
-        sidecar: file that has the offset.
-        rounding: largest rounding error of a coordinate in float32, in the capture's unit.
-    """
-
+    # Add this to x, y, z to get coordinates of the capture's world; None: they are already.
     offset: tuple[float, float, float] | None
-    sidecar: Path | None
-    rounding: float
+    sidecar: Path | None  # file that has the offset
+    rounding: float  # largest rounding error of a coordinate in float32, in the capture's unit
 
 
 def export_ply(model: Model, path: Path, coordinates: str = "auto", crs: str = "") -> Exported:

@@ -55,68 +55,52 @@ FREE_FIELDS = (
 
 @dataclass
 class Progress:
-    """The progress of a run; saved with every checkpoint.
+    """The progress of a run; saved with every checkpoint."""
 
-    Attributes:
-        step: number of optimiser steps taken.
-        sh_degree: spherical-harmonics degree of the last step.
-        level_count: number of octree levels K.
-        peak_gaussians: largest number of Gaussians so far.
-        seconds: seconds of training so far, without evaluations.
-        milestones: number of Gaussians at named points of the run, such as "before_pass_1".
-        ledger: ledger of the lineage (`blitzgs.spawn.lineage.Ledger`), if births and deaths are logged.
-        reference_distance: d_0 of the levels (`blitzgs.view.levels.Levels`), in the unit of the means.
-        finest_level: finest level that the LOD gate keeps; None: there is no gate at this point of the run.
-        gated_views: for each training view, in order, "1" if it has the LOD gate and "0" if the gate would
-            keep almost all Gaussians; empty without a gate.
-        least_kept: the smallest share of the Gaussians that a training view keeps with the LOD gate; 0
-            without a gate, and in old checkpoints.
-        train_views: digest of the names of the training views, in their order; empty in old checkpoints.
-        curve: result of `blitzgs.training.curve.Curve.saved`; empty in old checkpoints.
-        gate: digest of the spawn gate's files; empty without a gate, and in old checkpoints.
-        stages: seconds of each kind of work besides the optimiser steps; see `TrainingState.stage`.
-        events_left: (time, order, kind) of the events of the last step that a signal kept from running.
-        sorted_spread: spread of the blocks of all ranks when density events last sorted the rows, as
-            `blitzgs.training.events.densify` measures it; 0: they have not.
-    """
-
-    step: int
-    sh_degree: int
-    level_count: int
-    peak_gaussians: int
-    seconds: float
+    step: int  # number of optimiser steps taken
+    sh_degree: int  # spherical-harmonics degree of the last step
+    level_count: int  # number of octree levels K
+    peak_gaussians: int  # largest number of Gaussians so far
+    seconds: float  # seconds of training so far, without evaluations
+    # Number of Gaussians at named points of the run, such as "before_pass_1".
     milestones: dict[str, int] = dataclasses.field(default_factory=dict)
+    # Ledger of the lineage (`blitzgs.spawn.lineage.Ledger`), if births and deaths are logged.
     ledger: dict[str, int] = dataclasses.field(default_factory=dict)
+    # d_0 of the levels (`blitzgs.view.levels.Levels`), in the unit of the means.
     reference_distance: float = 0.0
+    # Finest level that the LOD gate keeps; None: there is no gate at this point of the run.
     finest_level: int | None = None
+    # For each training view, in order, "1" if it has the LOD gate and "0" if the gate would keep almost all
+    # Gaussians; empty without a gate.
     gated_views: str = ""
+    # The smallest share of the Gaussians that a training view keeps with the LOD gate; 0 without a gate, and
+    # in old checkpoints.
     least_kept: float = 0.0
+    # Digest of the names of the training views, in their order; empty in old checkpoints.
     train_views: str = ""
+    # Result of `blitzgs.training.curve.Curve.saved`; empty in old checkpoints.
     curve: dict[str, Any] = dataclasses.field(default_factory=dict)
-    gate: str = ""
+    gate: str = ""  # digest of the spawn gate's files; empty without a gate, and in old checkpoints
+    # Seconds of each kind of work besides the optimiser steps; see `TrainingState.stage`.
     stages: dict[str, float] = dataclasses.field(default_factory=dict)
+    # (time, order, kind) of the events of the last step that a signal kept from running.
     events_left: list[tuple[Any, ...]] = dataclasses.field(default_factory=list)
+    # Spread of the blocks of all ranks when density events last sorted the rows, as
+    # `blitzgs.training.events.densify` measures it; 0: they have not.
     sorted_spread: int = 0
 
 
 @dataclass
 class TrainedModel:
-    """A model read from a run's checkpoint, without pending optimiser steps, ready to render.
-
-    Attributes:
-        config: configuration of the run.
-        progress: progress of the run at the checkpoint.
-        space: maps between the trained world and the capture's world.
-        table: this rank's Gaussians.
-        exposures: gain and bias of each training photograph, [T, 2, 3]; None if the run has none.
-        pool_bytes: bytes of a device that the Gaussians may take, if the run trained with a pool; else 0.
-    """
+    """A model read from a run's checkpoint, without pending optimiser steps, ready to render."""
 
     config: Config
-    progress: Progress
-    space: Space
-    table: GaussianTable
+    progress: Progress  # progress of the run at the checkpoint
+    space: Space  # maps between the trained world and the capture's world
+    table: GaussianTable  # this rank's Gaussians
+    # Bytes of a device that the Gaussians may take, if the run trained with a pool; else 0.
     pool_bytes: int = 0
+    # Gain and bias of each training photograph, [T, 2, 3]; None if the run has none.
     exposures: torch.Tensor | None = None
 
     def scene(self, device: torch.device) -> Scene:
@@ -168,24 +152,15 @@ def save(
 
 @dataclass
 class Restored:
-    """The content of a run's checkpoint.
+    """The content of a run's checkpoint."""
 
-    Attributes:
-        table: this rank's Gaussians.
-        progress: progress of the run at the checkpoint.
-        space: maps between the trained world and the capture's world.
-        config: configuration of the run.
-        run_id: identifies the run in its log.
-        source: name of the checkpoint and why it was chosen, as text.
-        shared: tensors that are the same on all ranks: `TileOwners.columns`, and those of the exposures.
-    """
-
-    table: GaussianTable
-    progress: Progress
-    space: Space
+    table: GaussianTable  # this rank's Gaussians
+    progress: Progress  # progress of the run at the checkpoint
+    space: Space  # maps between the trained world and the capture's world
     config: Config
-    run_id: str
-    source: str
+    run_id: str  # identifies the run in its log
+    source: str  # name of the checkpoint and why it was chosen, as text
+    # Tensors that are the same on all ranks: `TileOwners.columns`, and those of the exposures.
     shared: dict[str, torch.Tensor]
 
 

@@ -32,18 +32,11 @@ from blitzgs.view.views import Space
 
 @dataclass
 class RunSource:
-    """Gaussians of a run, a `GaussianSource`.
+    """Gaussians of a run, a `GaussianSource`."""
 
-    Attributes:
-        trained: the Gaussians in the trained world.
-        space: maps between the trained world and the capture's world.
-        comments: header lines.
-        config: configuration of the run.
-    """
-
-    trained: GaussianSource
-    space: Space
-    comments: list[str]
+    trained: GaussianSource  # the Gaussians in the trained world
+    space: Space  # maps between the trained world and the capture's world
+    comments: list[str]  # header lines
     config: Config
 
     def __len__(self) -> int:

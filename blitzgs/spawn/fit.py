@@ -42,27 +42,17 @@ HELD_OUT = 0.25
 
 @dataclass(frozen=True)
 class Spawns:
-    """The spawns of one run, K of them, without its initial Gaussians.
+    """The spawns of one run, K of them, without its initial Gaussians."""
 
-    Attributes:
-        name: name of the run.
-        scene: fingerprint of its capture.
-        schedule: fields of its configuration that decide how long Gaussians live.
-        features: float32 [K, F], see `candidates.FEATURES`; NaN where the log is older than a feature.
-        survived: bool [K].
-        parents: int64 [K].
-        positions: float32 [K, 3], where they were born.
-        initial_survival: share of the run's initial Gaussians that reached its final model.
-    """
-
-    name: str
-    scene: str
-    schedule: dict[str, Any]
+    name: str  # name of the run
+    scene: str  # fingerprint of its capture
+    schedule: dict[str, Any]  # fields of its configuration that decide how long Gaussians live
+    # float32 [K, F], see `candidates.FEATURES`; NaN where the log is older than a feature.
     features: NDArray[np.float32]
-    survived: NDArray[np.bool_]
-    parents: NDArray[np.int64]
-    positions: NDArray[np.float32]
-    initial_survival: float = math.nan
+    survived: NDArray[np.bool_]  # bool [K]
+    parents: NDArray[np.int64]  # int64 [K]
+    positions: NDArray[np.float32]  # float32 [K, 3], where they were born
+    initial_survival: float = math.nan  # share of the run's initial Gaussians that reached its final model
 
     @property
     def times(self) -> NDArray[np.float32]:

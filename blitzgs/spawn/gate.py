@@ -47,19 +47,12 @@ class GateError(ValueError):
 
 @dataclass(frozen=True)
 class GateInfo:
-    """What a gate was fitted on.
+    """What a gate was fitted on."""
 
-    Attributes:
-        features: names of the model's inputs, in order.
-        schedule: fields of the configurations of the runs that it was fitted on.
-        scenes: {"name": fingerprint} of the captures.
-        auc: measured figures, see `blitzgs.spawn.fit`.
-    """
-
-    features: tuple[str, ...]
-    schedule: dict[str, Any]
-    scenes: dict[str, str]
-    auc: dict[str, Any] = field(default_factory=dict)
+    features: tuple[str, ...]  # names of the model's inputs, in order
+    schedule: dict[str, Any]  # fields of the configurations of the runs that it was fitted on
+    scenes: dict[str, str]  # {"name": fingerprint} of the captures
+    auc: dict[str, Any] = field(default_factory=dict)  # measured figures, see `blitzgs.spawn.fit`
 
 
 def gate_file(name: str) -> Path:
@@ -247,19 +240,12 @@ def veto_lowest(scores: Tensor, candidates: Candidates, rate: float, ranks: Rank
 
 @dataclass(frozen=True)
 class _Trees:
-    """All nodes of all trees, one after the other, as `tree_sums` takes them.
+    """All nodes of all trees, one after the other, as `tree_sums` takes them."""
 
-    Attributes:
-        roots: int32 [T].
-        nodes: int32 [n, 4].
-        leaves: int64 [n], in units of 2^-32.
-        depth: of the deepest tree.
-    """
-
-    roots: Tensor
-    nodes: Tensor
-    leaves: Tensor
-    depth: int
+    roots: Tensor  # int32 [T]
+    nodes: Tensor  # int32 [n, 4]
+    leaves: Tensor  # int64 [n], in units of 2^-32
+    depth: int  # of the deepest tree
 
     @classmethod
     def of(cls, model: dict[str, Any]) -> _Trees:

@@ -59,35 +59,22 @@ class LineageError(RuntimeError):
 
 @dataclass(frozen=True)
 class Births:
-    """Gaussians born on this rank, M of them.
+    """Gaussians born on this rank, M of them."""
 
-    Attributes:
-        ids: int64 [M].
-        parents: int64 [M].
-        means: float32 [M, 3].
-        features: float32 [M, F], features of the candidates.
-    """
-
-    ids: Tensor
-    parents: Tensor
-    means: Tensor
-    features: Tensor
+    ids: Tensor  # int64 [M]
+    parents: Tensor  # int64 [M]
+    means: Tensor  # float32 [M, 3]
+    features: Tensor  # float32 [M, F], features of the candidates
 
 
 @dataclass(frozen=True)
 class Ledger:
-    """Totals of births and deaths so far, over all ranks; part of a checkpoint.
+    """Totals of births and deaths so far, over all ranks; part of a checkpoint."""
 
-    Attributes:
-        births: number of births.
-        deaths: number of deaths.
-        id_sum: sum of the hashed ids of births less that of deaths, modulo 2^64, as a signed integer.
-        parts: number of parts that each rank has written, the largest of all ranks; 0 in old checkpoints.
-    """
-
-    births: int = 0
-    deaths: int = 0
-    id_sum: int = 0
+    births: int = 0  # number of births
+    deaths: int = 0  # number of deaths
+    id_sum: int = 0  # sum of the hashed ids of births less that of deaths, modulo 2^64, as a signed integer
+    # Number of parts that each rank has written, the largest of all ranks; 0 in old checkpoints.
     parts: int = 0
 
 

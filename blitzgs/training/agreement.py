@@ -78,19 +78,12 @@ class SaveClock:
 
 @dataclass(frozen=True)
 class Decision:
-    """What all ranks must do after a step.
+    """What all ranks must do after a step."""
 
-    Attributes:
-        signal: name of the signal that ends the run, or None.
-        save: whether a checkpoint is due.
-        lost: whether a rank could not read a photograph and continues without it.
-        watched: whether those who watch the run want something.
-    """
-
-    signal: str | None
-    save: bool
-    lost: bool = False
-    watched: bool = False
+    signal: str | None  # name of the signal that ends the run, or None
+    save: bool  # whether a checkpoint is due
+    lost: bool = False  # whether a rank could not read a photograph and continues without it
+    watched: bool = False  # whether those who watch the run want something
 
 
 class Agreement:

@@ -26,24 +26,15 @@ from blitzgs.view.views import VIEW_NUMBERS, ViewSet, unpack_views
 
 @dataclass(frozen=True)
 class Batch:
-    """One step's views and photographs on the device.
+    """One step's views and photographs on the device."""
 
-    Attributes:
-        indices: the B cameras of the batch, as indices into the capture.
-        views: the same cameras as the renderer takes them, at the resolution of the step.
-        targets: uint8 [B, H, W, 3]; on several ranks, undefined outside the pixels that this rank's loss
-            reads.
-        masks: uint8 [B, H, W], 0 = excluded pixel; None when no view of the batch has a mask.
-        samples: float32 [B], number of values in a view's mean: 3 x its pixels that count, at least 1.
-        ranges: the tiles of each rank; None on one rank.
-    """
-
-    indices: list[int]
-    views: Views
+    indices: list[int]  # the B cameras of the batch, as indices into the capture
+    views: Views  # the same cameras as the renderer takes them, at the resolution of the step
+    # uint8 [B, H, W, 3]; on several ranks, undefined outside the pixels that this rank's loss reads.
     targets: Tensor
-    masks: Tensor | None
-    samples: Tensor
-    ranges: TileRanges | None
+    masks: Tensor | None  # uint8 [B, H, W], 0 = excluded pixel; None when no view of the batch has a mask
+    samples: Tensor  # float32 [B], number of values in a view's mean: 3 x its pixels that count, at least 1
+    ranges: TileRanges | None  # the tiles of each rank; None on one rank
 
 
 # Photographs are decoded further ahead than batches are uploaded: for every batch that is uploaded ahead,

@@ -43,19 +43,12 @@ SHOWN_CHANGE = 0.1
 
 @dataclass(frozen=True)
 class Plan:
-    """What rank 0 decides after a step.
+    """What rank 0 decides after a step."""
 
-    Attributes:
-        next: step after which the pace is reconsidered.
-        factor: factor of `schedule.scale` (which is 1) from this step on; None: unchanged.
-        images_per_second: the measured speed.
-        seconds: predicted training time of the whole run.
-    """
-
-    next: int
-    factor: float | None = None
-    images_per_second: float = 0.0
-    seconds: float = 0.0
+    next: int  # step after which the pace is reconsidered
+    factor: float | None = None  # factor of `schedule.scale` (which is 1) from this step on; None: unchanged
+    images_per_second: float = 0.0  # the measured speed
+    seconds: float = 0.0  # predicted training time of the whole run
 
 
 class Budget:

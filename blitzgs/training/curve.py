@@ -16,23 +16,14 @@ FALL = 3.0
 
 @dataclass
 class Curve:
-    """Means of the training PSNR in the log records of a run; the same on every rank, and saved.
+    """Means of the training PSNR in the log records of a run; the same on every rank, and saved."""
 
-    Attributes:
-        recent: PSNR of the last `WINDOW` records, dB.
-        best: highest mean of so many records, dB; None before there are so many.
-        best_at: images that the run had seen then.
-        fall: largest fall of the mean below the best one before it, dB.
-        fall_at: images that the run had seen then.
-        warned: whether the present fall has been reported.
-    """
-
-    recent: list[float] = field(default_factory=list)
-    best: float | None = None
-    best_at: int = 0
-    fall: float = 0.0
-    fall_at: int = 0
-    warned: bool = False
+    recent: list[float] = field(default_factory=list)  # PSNR of the last `WINDOW` records, dB
+    best: float | None = None  # highest mean of so many records, dB; None before there are so many
+    best_at: int = 0  # images that the run had seen then
+    fall: float = 0.0  # largest fall of the mean below the best one before it, dB
+    fall_at: int = 0  # images that the run had seen then
+    warned: bool = False  # whether the present fall has been reported
 
     @classmethod
     def of(cls, saved: Mapping[str, Any]) -> Curve:

@@ -21,21 +21,16 @@ if TYPE_CHECKING:
 
 
 class LossTerms(NamedTuple):
-    """A batch's loss and its gradients by the images and by the Gaussians' axes and opacities.
+    """A batch's loss and its gradients by the images and by the Gaussians' axes and opacities."""
 
-    Attributes:
-        parts: sums of |render - photograph| and of the SSIM map over this rank's pixels and the channels,
-            float64 [B, K, 2], in K parts; see `photometric`.
-        v_renders: gradient of the batch's mean loss by the images, [B, H, W, 3].
-        scale_reg: gradient of the loss by the smallest axis of each visible Gaussian, per view [B]; None if
-            `loss.scale` is 0.
-        opacity_reg: gradient of the loss by the opacity of each visible Gaussian, per view [B]; None if
-            `loss.opacity` is 0.
-    """
-
+    # Sums of |render - photograph| and of the SSIM map over this rank's pixels and the channels, float64 [B,
+    # K, 2], in K parts; see `photometric`.
     parts: Tensor
-    v_renders: Tensor
+    v_renders: Tensor  # gradient of the batch's mean loss by the images, [B, H, W, 3]
+    # Gradient of the loss by the smallest axis of each visible Gaussian, per view [B]; None if `loss.scale`
+    # is 0.
     scale_reg: Tensor | None
+    # Gradient of the loss by the opacity of each visible Gaussian, per view [B]; None if `loss.opacity` is 0.
     opacity_reg: Tensor | None
 
 

@@ -98,18 +98,14 @@ def _logged(path: Path, run_id: str) -> list[tuple[int, int]]:
 
 
 class StepRecord(NamedTuple):
-    """The figures of a step, which the host reads later, so that it does not wait for the device.
+    """The figures of a step, which the host reads later, so that it does not wait for the device."""
 
-    Attributes:
-        figures: float64 as int64 [7 + B]. Of all ranks: the number of ranks with parameters that are not
-            finite, the Gaussians that the step projected, those of them that are visible in a view, and all
-            Gaussians. Of the batch: L_scale and L_opacity (0 if their weights are), PSNR (nan if all
-            pixels are masked), and `Batch.samples` [B].
-        sums: `LossTerms.parts` over all ranks.
-    """
-
+    # float64 as int64 [7 + B]. Of all ranks: the number of ranks with parameters that are not finite, the
+    # Gaussians that the step projected, those of them that are visible in a view, and all Gaussians. Of the
+    # batch: L_scale and L_opacity (0 if their weights are), PSNR (nan if all pixels are masked), and
+    # `Batch.samples` [B].
     figures: HostCopy
-    sums: HostSum
+    sums: HostSum  # `LossTerms.parts` over all ranks
 
 
 def measure_step(state: TrainingState, frame: Frame, batch: Batch, sums: HostSum) -> StepRecord:
