@@ -247,11 +247,7 @@ def load_capture(
 
 
 def _root_of(path: Path, images: str) -> tuple[Path, FoundProject | None]:
-    """Return the folder of a capture, and the project that was named instead of it.
-
-    Raises:
-        FileNotFoundError: the file is no project.
-    """
+    """Return the folder of a capture, and the project that was named instead of it."""
     if not path.is_file():
         return path, None
     project = project_at(path)

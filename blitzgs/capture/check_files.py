@@ -63,7 +63,6 @@ class FileCheck:
         """Start to check.
 
         Args:
-            cameras: all views.
             order: those to check, in this order.
             counted: decodes a view's mask, and tells whether some pixel counts.
         """

@@ -188,7 +188,6 @@ def _intersect(cameras: Sequence[Camera], rays: Float64) -> Float64:
     """Return the point [3] in the re-centred world that is nearest to rays, by the distances in the images.
 
     Args:
-        cameras: M cameras.
         rays: [M, 2] normalised coordinates.
     """
     poses = np.stack([camera.world_to_camera for camera in cameras])

@@ -208,7 +208,6 @@ def decode_rgb(data: bytes, name: str, background: tuple[float, float, float] | 
     """Decode to RGB uint8 [H, W, 3] as stored (EXIF orientation not applied).
 
     Args:
-        data: the file, from `read_whole`.
         name: names the file in errors.
         background: colour (0 to 1) over which the colours are composited if the file says that it has alpha;
             None: use the colours as they are stored.

@@ -109,7 +109,6 @@ def decoded_shapes(capture: Capture, factors: Iterable[int] = ()) -> dict[Hashab
     """Return the shapes of all decoded images and masks of a capture, by the keys of `ImageStore`.
 
     Args:
-        capture: the capture.
         factors: by which images are reduced in addition.
     """
     shapes: dict[Hashable, tuple[int, ...]] = {}
@@ -143,7 +142,6 @@ class ImageStore:
         """Read nothing yet.
 
         Args:
-            capture: the capture that has the images.
             budget_bytes: limit of the compressed images in memory.
             threads: number of threads that decode ahead.
             decoded_bytes: limit of the decoded images in memory; None: a quarter of `budget_bytes`, and
@@ -286,7 +284,6 @@ class ImageStore:
 
         Args:
             kind: "image" or "mask".
-            index: the camera.
             spare: it is not what training reads now; see `BoundedCache.put`.
         """
         key = (kind, index, 1)

@@ -54,8 +54,6 @@ def read_layout(
     """Read the views and points of a folder in any of the layouts of docs/captures.md.
 
     Args:
-        root: folder of the capture.
-        images: folder of the images, relative to `root`.
         downscale: see `load_capture`; decides which folder of images is used.
         sparse: see `load_capture`.
         project: file of another program's project to read; None: whatever the folder has.
@@ -139,11 +137,7 @@ def _model_in(root: Path) -> Path:
 
 
 def _models(root: Path, sparse: str) -> tuple[list[Path], list[str]]:
-    """Return the COLMAP models to read, the largest first, and a line if others are left out.
-
-    Raises:
-        FileNotFoundError: the folder that `sparse` names has no model.
-    """
+    """Return the COLMAP models to read, the largest first, and a line if others are left out."""
     if sparse not in ("largest", "all"):
         named = root / sparse
         if colmap.find_models(named) and (model := _model_in(named)).is_relative_to(root):

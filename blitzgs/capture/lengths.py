@@ -178,7 +178,6 @@ class Sight:
 
         Args:
             views: the views that decide.
-            extent: of the scene.
         """
         most = NEAR_OF_EXTENT * extent
         depths = np.sort(self.nearest[list(views)])

@@ -30,7 +30,6 @@ def find_masks(
     """Return the mask of each image, or None.
 
     Args:
-        root: folder of the capture.
         masks: folder of masks relative to it; None: `masks/` if it exists; True: `masks/`; False: no masks.
         names: of the images, relative to their folder or to the capture.
         given: the masks that the capture's file names.
@@ -80,9 +79,6 @@ def _owners(folder: Path, files: Sequence[str], names: Sequence[str | None]) -> 
 
     Every place that a mask of an image may have is a claim on the file there. A file belongs to the image
     with the best claim; of two equally good ones neither may be right.
-
-    Raises:
-        ValueError: two images have equally good claims.
     """
     by_path: dict[str, list[str]] = defaultdict(list)
     for file in files:

@@ -158,7 +158,6 @@ def check_inside(paths: Iterable[Path], root: Path, allowed: Sequence[Path], ref
 
     Args:
         paths: files that the capture names.
-        root: folder of the capture.
         allowed: further folders that the caller chose.
         refuse: refuse them, also those to which links lead.
 
@@ -286,10 +285,6 @@ def existing(names: Sequence[str], paths: Sequence[Path], root: Path, images: st
     """Return the indices of the views whose image is on disk.
 
     Args:
-        names: of the views.
-        paths: of their images.
-        root: folder of the capture.
-        images: folder of the images, relative to `root`.
         allow: warn of missing images instead of failing.
 
     Raises:

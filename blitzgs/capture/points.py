@@ -166,8 +166,6 @@ def transforms_points(root: Path, content: Transforms, model: Path | None) -> So
     """Return the points of transforms.json: those that it names, else those beside it in the same world.
 
     Args:
-        root: folder of the capture.
-        content: of its transforms.json.
         model: the COLMAP model beside it, if there is one.
     """
     if content.points_path is not None:

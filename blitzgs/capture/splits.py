@@ -59,9 +59,6 @@ def split_views(
     """Return train and test views, both ascending.
 
     Args:
-        names: of all views, in their order.
-        paths: of their image files.
-        root: folder of the capture.
         spec: n (every n-th), "val" (Mega-NeRF's layout), a list file (relative to `root` or as it is), or
             "auto": "val" if such a folder has views, else every 8th.
 

@@ -55,8 +55,6 @@ def read_lens(root: Fields, frame: Fields, path: Path, notes: dict[str, None]) -
     """Return the lens of a frame.
 
     Args:
-        root: fields of the file.
-        frame: fields of the frame.
         path: the frame's image, whose size is used if the fields have none.
         notes: gets what was decided between fields that say different things, as its keys.
 

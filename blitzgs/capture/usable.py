@@ -123,7 +123,6 @@ def read_cameras(path: Path, offset: Float64) -> list[Camera]:
     Lenses with distortion become pinhole cameras, as in a capture.
 
     Args:
-        path: the file or the folder.
         offset: float64 [3], subtracted from the positions.
 
     Raises:

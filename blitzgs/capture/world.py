@@ -100,8 +100,6 @@ def fit_similarity(capture: Float64, world: Float64, crs: str = "", source: str 
     Args:
         capture: [N, 3], N >= 3.
         world: [N, 3], the same points.
-        crs: see `WorldFrame`.
-        source: see `WorldFrame`.
 
     Raises:
         ValueError: there are fewer than three points, or they lie on a line: a turn around it is free.
@@ -200,7 +198,6 @@ def enu_frame(latitude: float, longitude: float, altitude: float, source: str) -
         latitude: degrees.
         longitude: degrees.
         altitude: metres above the ellipsoid.
-        source: see `WorldFrame`.
     """
     if not (abs(latitude) <= 90 and abs(longitude) <= 360 and abs(altitude) < 1e6):  # NaN too
         raise ValueError(f"{source}: no place on earth: {latitude}, {longitude}, {altitude}")
@@ -263,7 +260,6 @@ def frame_in(frame: WorldFrame, crs: str, places: Float64) -> tuple[WorldFrame, 
     scale make of the difference at the places.
 
     Args:
-        frame: of the capture.
         crs: wanted, as "EPSG:32633"; its axes must be lengths.
         places: positions of the capture where the frame must be right, [N, 3].
 

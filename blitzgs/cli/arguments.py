@@ -165,10 +165,6 @@ def split_fields(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> t
     A field is a flag with a dot, or one that the command does not have and that has a value after "=". Its
     value follows after "=" or as the next argument.
 
-    Args:
-        parser: the command, which has the method `error`.
-        arguments: what follows the command's name.
-
     Returns:
         The other arguments, and the fields as "--section.field=value".
     """

@@ -143,11 +143,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _film(args: argparse.Namespace) -> Film | None:
-    """Return what --path asks for; None: the command has no --path.
-
-    Raises:
-        ValueError: flags contradict each other; names them.
-    """
+    """Return what --path asks for; None: the command has no --path."""
     is_film = args.out.suffix.lower() == SUFFIX
     if args.path is None:
         for name in ("size", "fps", "seconds", "dataparser"):
@@ -172,7 +168,6 @@ def _renders(
     """Render the views, and yield the index of each and its colours, float32 [H, W, 3], on one rank.
 
     Args:
-        opened: model and views.
         ranks: the job; every rank goes through all views.
         destination: returns the rank that gets a view, by its position; the others get None.
     """

@@ -47,11 +47,6 @@ class Rendered:
 def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> Rendered:
     """Open the model, and choose the cameras. Collective.
 
-    Args:
-        args: of the command.
-        film: what --path asks for; None: there is none.
-        ranks: the job.
-
     Raises:
         ValueError, OSError: a file is missing or damaged, or flags do not fit the model.
     """
@@ -102,11 +97,7 @@ def _shared_box(table: GaussianTable, ranks: Ranks) -> npt.NDArray[np.float64]:
 
 
 def _exposures(found: Tensor | None, stored: RunCameras) -> dict[int, Tensor]:
-    """Return gain and bias, float32 [2, 3], of each training view, by its index among the cameras.
-
-    Raises:
-        ValueError: the run has no exposures, or those of other cameras.
-    """
+    """Return gain and bias, float32 [2, 3], of each training view, by its index among the cameras."""
     if found is None:
         raise ValueError("--exposure: the run was trained without model.exposure")
     if len(found) != len(stored.train):

@@ -74,12 +74,7 @@ def kept_warnings() -> Iterator[list[str]]:
 
 
 def write_final_report(folder: Path, summary: Mapping[str, object] | None) -> None:
-    """Write the report of a run that ends; a failure is a warning.
-
-    Args:
-        folder: the run.
-        summary: its summary; None: it was stopped.
-    """
+    """Write the report of a run that ends; a failure is a warning."""
     from blitzgs.report.report import look_of, write_report
 
     count = 0 if summary is None else summary["gaussians"]

@@ -90,7 +90,6 @@ def with_poses(config: Config, folder: Path) -> Config:
     rank 0 fails, torchrun ends them.
 
     Args:
-        config: of the training.
         folder: the capture to write, or to use if it is finished.
     """
     root = Path(config.data.path)

@@ -327,7 +327,6 @@ def base_file(given: str, file: Path) -> Path:
     Args:
         given: path relative to `file`, or a name of `recipe_names`, with or without ".yaml": a copy of a
             recipe's file names its base so.
-        file: the configuration file.
 
     Raises:
         ConfigError: there is neither such a file nor such a recipe.

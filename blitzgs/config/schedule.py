@@ -78,10 +78,6 @@ def stretched(config: ScheduleConfig, views: int) -> ScheduleConfig:
 
     The factor is between 1 and `MAX_STRETCH`. The result has `images_per_view` 0, so that a second call
     changes nothing.
-
-    Args:
-        config: the schedule as configured.
-        views: number of training views.
     """
     factor = min(max(config.images_per_view * views / config.iterations, 1.0), MAX_STRETCH)
     if config.minutes > 0:

@@ -40,7 +40,6 @@ def page(
     """Return a page.
 
     Args:
-        title: of the browser's tab.
         scripts: names of files in `assets`, in their order.
         data: what the scripts read; numbers that JSON lacks become null.
         look: "html", a page with the model in 3D, and "note", a sentence about it; None: there is none.
@@ -215,9 +214,6 @@ _MAX_PICTURED = 12
 
 def compare(folders: Sequence[Path]) -> str:
     """Return a page that compares runs, as HTML of at most `blitzgs.report.report.MAX_BYTES`.
-
-    Args:
-        folders: the runs, the one that the others are compared with first.
 
     Raises:
         FileNotFoundError: a folder is not a run.

@@ -83,11 +83,7 @@ def checked_camera(
 
 
 def _check(sizes: Float64, Ks: Float64, poses: Float64) -> None:  # noqa: N803
-    """Refuse impossible values of cameras: sizes [N, 2], Ks [N, 3, 3] and poses [N, 4, 4].
-
-    Raises:
-        ValueError: the message names the first one.
-    """
+    """Refuse impossible values of cameras: sizes [N, 2], Ks [N, 3, 3] and poses [N, 4, 4]."""
     rotations = poses[:, :3, :3]
     with np.errstate(invalid="ignore"):
         turned = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) < 1e-3

@@ -74,7 +74,6 @@ def save(
         directory: folder of checkpoints, made if missing.
         columns: name -> [N_rank, ...], this rank's shard; the same names, dtypes and widths on every rank.
         state: the rest of what a resumed run needs, as JSON values; rank 0's is stored.
-        ranks: the job.
         keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
         shared: tensors that are the same on all ranks; rank 0's are stored, in a separate file.
         reached: called at each point at which the save may be interrupted, with the point's name; the tests
@@ -171,9 +170,7 @@ def load_latest(
     the reasons, and the checkpoint that is used.
 
     Args:
-        directory: folder given to `save`.
         ranks: the job, of any world size.
-        device: where the columns go.
         problem: returns what is wrong with a shard's columns, or None.
         only: name of the one checkpoint to load; None: the newest.
 
@@ -212,9 +209,7 @@ def load(
     (`sharding.global_positions`), and opens only the files that hold some of these rows.
 
     Args:
-        path: folder returned by `save`.
         ranks: the job, of any world size.
-        device: where the columns go.
 
     Returns:
         The columns of this rank's shard, name -> [N_rank, ...]; the state; and the tensors that are the same

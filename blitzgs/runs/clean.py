@@ -80,8 +80,6 @@ def cleaned(
     """Find the Gaussians of a run that at most so many training views count, far from the rest or large.
 
     Args:
-        model: the model.
-        cameras: of the run.
         most_views: see `floaters`.
         ranks: the device of the model.
         photograph: returns the photograph of a camera; None: there are none.

@@ -118,11 +118,6 @@ def render_view(
     """Render camera `index` with the Gaussians of all ranks; every rank calls this.
 
     Args:
-        finder: finds this rank's Gaussians in the view.
-        views: all cameras.
-        index: the camera to render.
-        options: how to render.
-        owners: divides the tiles among the ranks.
         destination: rank that gets the image.
 
     Returns:
@@ -175,19 +170,10 @@ def evaluate(
     """Render views and compare them with their photographs; the ranks take turns at comparing.
 
     Args:
-        scene: this rank's Gaussians, without pending optimiser steps.
-        views: all cameras, on the device.
-        cameras: the same cameras, for their names.
-        images: the photographs.
-        indices: cameras to evaluate.
-        options: how to render.
         folder: folder for `metrics.json` and the pictures; None: nothing is written.
-        owners: divides the tiles among the ranks; every rank calls this function.
         pictures: number of evenly spaced views for which render | photograph | error are written side by
             side; if not 0, the previews of the report are written too.
-        lpips: from `load_lpips`.
         report: called with (views rendered, number of views) after each view.
-        inputs: files that must not be overwritten.
         optional_files: if a file cannot be written, warn instead of raising an error; used during training.
         lod: leaves out Gaussians whose octree level is too fine for their distance; None: no gate.
         stops: asked after each round in which every rank compares one view; if it returns True, the
@@ -257,10 +243,6 @@ def _over_all_ranks(
         per_view: the metrics of the views that this rank compared.
         lost: why this rank could not read a photograph; None: it has read all.
         names: names of all views, in the order of the result.
-        ranks: the job.
-
-    Raises:
-        PhotographError: a rank could not read a photograph.
     """
     parts = ranks.all_gather_object((per_view, lost))
     if reasons := [reason for _, reason in parts if reason is not None]:

@@ -57,9 +57,6 @@ def export(
 
     Args:
         source: the Gaussians, in the capture's unit around the model's origin.
-        space: of the model.
-        kind: format of the file.
-        path: file to write.
         coordinates: "capture" writes the capture's coordinates, "centred" the re-centred ones; "auto" writes
             the capture's if the format resolves them finely enough.
         crs: reference system of the capture's coordinates, for the file of the offset; empty: unknown.

@@ -170,8 +170,6 @@ def restore(
     """Read the newest undamaged checkpoint of a run; return None if the run has no checkpoint.
 
     Args:
-        folder: folder of the run.
-        ranks: the job.
         device: device of the Gaussians; None: the ranks' device.
         only: name of the one checkpoint to read; None: the newest.
 
@@ -250,8 +248,6 @@ def open_model(
     """Open the newest model of a run for rendering, with the configuration that was saved with it.
 
     Args:
-        folder: folder of the run.
-        ranks: the job.
         data: present folder of the capture; None: unchanged.
         resident_gb: gigabytes of each device for Gaussians; 0: no limit; None: as the run.
         only: name of the one checkpoint to open; None: the newest.

@@ -130,7 +130,6 @@ def check_unclaimed(checkpoints: Path, files: Sequence[str], ranks: Ranks) -> No
     Args:
         checkpoints: that folder; it may be missing.
         files: names of the files and folders beside it that a run writes.
-        ranks: the job.
 
     Raises:
         FileExistsError: on every rank; it is missing, and one of the files exists.
@@ -149,9 +148,6 @@ def check_room(folder: Path, table: GaussianTable, ranks: Ranks, most_gaussians:
     """Check that a checkpoint fits on the disk, and warn if one of the largest population will not fit.
 
     Args:
-        folder: folder of the run.
-        table: this rank's Gaussians.
-        ranks: the job.
         most_gaussians: limit of the population; 0: none is known.
 
     Raises:
@@ -189,10 +185,8 @@ def check_own(folder: Path, checkpoint: Path, run_id: str, ranks: Ranks) -> None
     """Check that a checkpoint was written by the run whose cameras and log are in `folder`. Collective.
 
     Args:
-        folder: folder of the run.
         checkpoint: the checkpoint, for the message.
         run_id: id of the run that wrote it; empty in old checkpoints, which are not checked.
-        ranks: the job.
 
     Raises:
         CheckpointError: on every rank; it was written by another run.

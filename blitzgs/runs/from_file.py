@@ -65,8 +65,6 @@ def model_of_file(found: Gaussians, config: Config, space: Space, near: float, r
 
     Args:
         found: from `read_gaussians`.
-        config: how it is rendered.
-        space: of the capture.
         near: near plane in the capture's unit.
         ranks: the job; each rank gets its share on its device.
     """

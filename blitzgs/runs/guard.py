@@ -36,11 +36,7 @@ class LossGuard:
         """Check the losses of the B views `names` in step `step` (from 1).
 
         Args:
-            step: number of the step.
-            names: names of its views.
             sums: their `LossTerms.parts` over all ranks, [2 B]; further values are ignored.
-            table: this rank's Gaussians.
-            frame: the rendered frame.
 
         Raises:
             NonFiniteError: this loss (or, on CUDA, the previous step's) is not finite.

@@ -47,10 +47,7 @@ def scene_gate(config: Config, progress: Progress, table: GaussianTable, ranks: 
     """Return the LOD gate of a model for any camera; None if it is not open. Collective.
 
     Args:
-        config: configuration of the run.
-        progress: progress of the run.
         table: this rank's Gaussians, without pending optimiser steps.
-        ranks: the job.
     """
     gate = lod_gate(config, progress)
     if gate is None:

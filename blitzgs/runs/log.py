@@ -71,10 +71,8 @@ class RunLog:
 
         Args:
             folder: folder of the run, to whose `log.jsonl` records are appended. None: log nothing.
-            total: images of the whole run.
             done: images that a resumed run has seen before.
             tensorboard: also write events to `folder/tensorboard`, if the package is installed.
-            run_id: identifies the run in every record.
         """
         self._failures = _Failures()
         self._file: _JsonLines | None = None

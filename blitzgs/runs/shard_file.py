@@ -48,7 +48,6 @@ def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[st
     """Write `columns` to `path` and sync it.
 
     Args:
-        path: file to create.
         columns: name -> tensor on any device.
         reached: called at labelled points of the write.
 

@@ -80,7 +80,6 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
     """Open the newest undamaged checkpoint of a run without reading its Gaussians into memory.
 
     Args:
-        folder: folder of the run.
         only: name of the one checkpoint to open; None: the newest.
 
     Raises:

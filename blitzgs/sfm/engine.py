@@ -123,11 +123,7 @@ def run_stage(stage: str, job: Job, log: Path, lock: int, report: Report) -> Non
     """Do a stage; what COLMAP says is added to the file `log`.
 
     Args:
-        stage: a key of `STAGES`.
-        job: what to do.
-        log: file to append to.
         lock: descriptor of a locked file, which the processes hold until they end.
-        report: called with what is done, and the total.
 
     Raises:
         StageError: COLMAP failed; has its last words.
@@ -233,7 +229,6 @@ def decided(job: Job, gps: bool, use_altitude: bool) -> Job:
     """Return the job with what "auto" means for its photographs.
 
     Args:
-        job: as the user wants it.
         gps: whether the photographs' positions tell neighbours apart; pycolmap also uses them for poses.
         use_altitude: whether their altitudes can be used.
 

@@ -63,7 +63,6 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
     are added to what is there; after any other change the work begins anew.
 
     Args:
-        photographs: what to find the poses of.
         capture: folder to write. Nothing in it that another program wrote is replaced.
         settings: what not to leave to the photographs.
 

@@ -28,11 +28,8 @@ def evaluate(
     """Evaluate a gate on runs, and draw survival.svg and regions_NAME.svg.
 
     Args:
-        gate: the gate.
-        runs: the runs; their schedules may differ.
         gate_from: for each run, the time in images from which on a gate judges spawns; only later spawns are
             in the maps.
-        output: folder for the pictures.
 
     Returns:
         For each run: `gate_fit.judge`, whether the gate was fitted on its scene, the share of initial

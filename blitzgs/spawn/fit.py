@@ -75,7 +75,6 @@ def read_spawns(folder: Path, gaussians: int | None = None) -> Spawns:
     """Read the spawns of a finished run from its lineage.
 
     Args:
-        folder: folder of the lineage.
         gaussians: number of Gaussians of the finished model, which the lineage must have; None: unknown.
 
     Raises:
@@ -159,7 +158,6 @@ def auc(scores: NDArray[Any], positive: NDArray[np.bool_]) -> float:
     It is the probability that a positive scores higher than a negative; ties count half.
 
     Args:
-        scores: [K].
         positive: bool [K], some true and some false.
     """
     _, inverse, counts = np.unique(scores, return_inverse=True, return_counts=True)
@@ -186,7 +184,6 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0, seed: int = 
         runs: at least one run.
         path: path of the model, `NAME.json`; its metadata are written beside it.
         gate_from: time in images from which on a gate is going to judge spawns; see `judge`.
-        seed: seed of the draws of rows.
 
     Returns:
         The figures that go into the metadata: `judge` for each run held out.
@@ -226,7 +223,6 @@ def judge(run: Spawns, scores: NDArray[Any], gate_from: float = 0.0) -> dict[str
     """Return how scores separate the spawns of a run that survived from the others.
 
     Args:
-        run: the spawns, some of which survived and some did not.
         scores: [K], the gate's.
         gate_from: time in images from which on a gate judges spawns.
 

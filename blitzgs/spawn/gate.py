@@ -293,11 +293,7 @@ class _Trees:
 
 
 def _depth(left: list[int], right: list[int]) -> int:
-    """Return how many comparisons the longest path through a tree has.
-
-    Raises:
-        ValueError: a child of a node is outside the tree, or the nodes do not form a tree.
-    """
+    """Return how many comparisons the longest path through a tree has."""
     depth, level, met = 0, [0], 1
     while level := [child for node in level for child in (left[node], right[node]) if left[node] >= 0]:
         depth, met = depth + 1, met + len(level)

@@ -88,7 +88,6 @@ class Lineage:
 
         Args:
             folder: folder of the parts of all ranks, made if missing.
-            ranks: the job.
             step: optimiser step of the checkpoint; parts that were written later are deleted.
             ledger: ledger of the checkpoint. One without births begins a log: all parts are deleted.
             about: description of the run, for the file `ABOUT`.
@@ -130,7 +129,6 @@ class Lineage:
             ids: int64 [M]; kept, so it must not change any more.
             causes: [M], values of `Cause`; the same holds.
             time: time of the event, in images.
-            step: optimiser step.
         """
         times = torch.full_like(ids, time, dtype=torch.int32)
         self._log("deaths", (ids[None], times[None], causes.to(torch.uint8)[None]), step)
@@ -142,7 +140,6 @@ class Lineage:
 
         Args:
             ids: int64 [N], ids of this rank's live Gaussians.
-            step: optimiser step.
 
         Returns:
             The present ledger.

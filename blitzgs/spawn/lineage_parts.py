@@ -44,7 +44,6 @@ class PartWriter:
         """Start the threads, which wait for parts.
 
         Args:
-            folder: folder of the parts.
             device: device of the rows; rows on the CPU are possible in any case.
 
         Raises:
@@ -62,8 +61,6 @@ class PartWriter:
         """Have a part written; it is on disk when `finish` has returned without messages.
 
         Args:
-            name: name of the file.
-            table: name of the table.
             groups: its columns as in `TABLES`, contiguous; they must not change any more.
         """
         ready = None
@@ -145,9 +142,6 @@ class _HostArrays:
 
 def read_lineage(folder: Path) -> dict[str, dict[str, Any]]:
     """Read the log of a run.
-
-    Args:
-        folder: that of the parts.
 
     Returns:
         {"births": columns, "deaths": columns}, numpy arrays by name.

@@ -61,9 +61,6 @@ def open_spawn_gate(config: Config, capture: Capture, ranks: Ranks, known: str) 
     """Open the gate that a configuration names, and warn if it does not suit the run. Collective.
 
     Args:
-        config: configuration of the run.
-        capture: capture of the run.
-        ranks: the job.
         known: digest of the gate that the run has used so far; empty: not known.
 
     Returns:

@@ -31,7 +31,6 @@ def write_sample(run: Spawns, path: Path, most: int = MAX_ROWS) -> float:
 
     Args:
         run: the spawns of a run.
-        path: path of the file, `NAME.parquet`.
         most: expected number of rows; if there are fewer spawns, all are written.
 
     Returns:

@@ -169,11 +169,6 @@ class BatchLoader:
         """Prepare the loader.
 
         Args:
-            images: the photographs.
-            views: all cameras.
-            train: for each of the sampler's views, its camera in the capture.
-            sampler: chooses the views of each step.
-            device: device of the batches.
             ahead: number of batches to prepare beyond the requested one; 0: each batch is prepared when it is
                 requested. The photographs of further batches are decoded.
             owners: divides the tiles of each batch; this rank then decodes and uploads only the pixel rows

@@ -143,7 +143,6 @@ def extended(config: Config, step: int, by: float) -> Config:
     Learning rates stay at their final values.
 
     Args:
-        config: the run's own configuration.
         step: number of steps that the run has taken.
         by: number of images to add, if at least `LEAST_IMAGES`; else the factor of the run's length.
 

@@ -35,12 +35,7 @@ class Curve:
         return dataclasses.asdict(self)
 
     def add(self, images: int, psnr: float) -> str | None:
-        """Add a record; return a warning when the mean has fallen by `FALL` for the first time.
-
-        Args:
-            images: images that the run has seen.
-            psnr: of the record's batch, dB.
-        """
+        """Add a record; return a warning when the mean has fallen by `FALL` for the first time."""
         self.recent = [*self.recent[1 - WINDOW :], psnr]
         if len(self.recent) < WINDOW:
             return None

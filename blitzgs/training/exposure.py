@@ -45,7 +45,6 @@ class Exposures:
 
         Args:
             train: the training views, as indices into the capture.
-            ranks: the job.
         """
         self._ranks = ranks
         self._rows = {index: row for row, index in enumerate(train)}
@@ -74,9 +73,7 @@ class Exposures:
         """Measure the photographs of a batch in one step of `_EVERY`. Collective.
 
         Args:
-            step: number of the step, from 1.
             renders: [B, H, W, 3] as the model shows the views, valid at this rank's pixels.
-            batch: the views' photographs.
         """
         if step % _EVERY:
             return

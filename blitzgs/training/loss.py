@@ -39,10 +39,6 @@ def weighted(config: LossConfig, views: int) -> LossConfig:
 
     This share, `opacity_total` / `views`, is kept between `LEAST_OPACITY` and `MAX_OPACITY`. The result has
     `opacity_total` 0, so that a second call changes nothing.
-
-    Args:
-        config: weights as configured.
-        views: number of training views.
     """
     if config.opacity_total == 0:
         return config
@@ -58,9 +54,6 @@ def loss_terms(
     On several ranks each compares its own tiles.
 
     Args:
-        frame: rendered batch of B views.
-        batch: their photographs.
-        config: weights.
         extent: size of the scene in the unit of the means; L_scale is relative to it.
         shown: the images to compare, [B, H, W, 3], instead of the frame's; `v_renders` is then their
             gradient.
@@ -105,7 +98,6 @@ def photometric(sums: Tensor, samples: Tensor, config: LossConfig) -> Tensor:
     Args:
         sums: `LossTerms.parts` added up over all ranks, [2 B]; see `HostSum.read`.
         samples: `Batch.samples`, on the device of the sums.
-        config: weights.
     """
     l1, ssim = sums.view(2, -1)
     return ((1.0 - config.ssim) * l1 - config.ssim * ssim) / samples + config.ssim

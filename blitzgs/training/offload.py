@@ -35,13 +35,7 @@ class UpcomingCameras:
     """
 
     def __init__(self, sampler: BatchSampler, train: Sequence[int], views: ViewSet) -> None:
-        """Prepare to look ahead.
-
-        Args:
-            sampler: chooses the views of each step.
-            train: for each of the sampler's views, its camera in the capture.
-            views: all cameras.
-        """
+        """Prepare to look ahead."""
         self.batch_size = sampler.batch_size
         self._sampler, self._train, self._views = sampler, list(train), views
 
@@ -88,12 +82,7 @@ class OffloadingStepper(Stepper):
 
         Args:
             pool: this rank's Gaussians, some of which it holds on the device.
-            upcoming: the cameras of the next steps.
-            optimiser: as for `Stepper`, like the following arguments.
-            owners: records what the tiles cost.
-            loss: weights of the loss.
             extent: size of the scene in the unit of the means.
-            noise: noise on the means after each step; None: none.
         """
         self._pool, self._upcoming = pool, upcoming
         self._reported = pool.moved

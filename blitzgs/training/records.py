@@ -130,10 +130,6 @@ def measure_step(state: TrainingState, frame: Frame, batch: Batch, sums: HostSum
 def log_step(state: TrainingState, record: StepRecord) -> None:
     """Write the log record of the last step; wait for its figures, and check the parameters.
 
-    Args:
-        state: state of the run after the step.
-        record: of the step.
-
     Raises:
         NonFiniteError: a parameter is not finite.
     """

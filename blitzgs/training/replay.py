@@ -182,13 +182,6 @@ def replay(
 
     Args:
         config: of the run that is branched, with `population.lineage`.
-        capture: of the run.
-        images: of the capture.
-        source: folder of the run.
-        out: gets a folder for each arm.
-        gate: the learned ranking.
-        rate: share that is vetoed.
-        ranks: the job.
 
     Yields:
         For each arm, when it is trained: its name, psnr, ssim, peak and final Gaussians, the seconds of
@@ -258,12 +251,7 @@ def replay(
 
 
 def _check_unclaimed(out: Path, ranks: Ranks) -> None:
-    """Check that a replay will not replace anything in its folder, except a reference that was not trained.
-
-    Raises:
-        FileExistsError: on every rank; a replay has trained an arm there, or the folder has another file or
-            folder with the name of one that the replay writes.
-    """
+    """Refuse to replace anything in the folder of a replay, except a reference that was not trained."""
     found = None
     # Rank 0 checks for all, because another rank might check after rank 0 has begun to write.
     if ranks.rank == 0:
@@ -292,12 +280,7 @@ def _branch(point: Path, folder: Path) -> None:
 
 
 def _check_comparable(config: Config, capture: Capture, images: Images, source: Path) -> None:
-    """Check that arms can be branched from a run and that their results can be compared.
-
-    Raises:
-        ValueError: the run logged no lineage, has no candidates, was trained by the clock, or all pixels of
-            the views that are measured are masked.
-    """
+    """Check that arms can be branched from a run and that their results can be compared."""
     if not config.population.lineage:
         raise ValueError(
             f"{source} was trained without --population.lineage=true: there is nothing to branch"

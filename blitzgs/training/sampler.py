@@ -50,8 +50,6 @@ class BatchSampler:
         Args:
             sizes: image size of each view, any hashable value.
             batch_size: views per batch, B.
-            seed: of the shuffles.
-            schedule: see above.
             tour: all views, so ordered that neighbours see the same places; None: no place matters.
 
         Raises:
@@ -149,7 +147,6 @@ def tour_of(cameras: Sequence[Camera], points: Float64) -> list[int]:
     place if it sees none. Points behind others count, as they do where Gaussians are loaded for a view.
 
     Args:
-        cameras: the views.
         points: [M, 3], in the world of the cameras; may be empty.
     """
     sample = sampled(points, len(cameras))

@@ -67,11 +67,7 @@ def set_up(
     """Make the state of a new run, or restore the state of the run in `folder`.
 
     Args:
-        config: what to compute.
-        capture: cameras and points.
-        images: its photographs.
         folder: folder of the run, for configuration, log, checkpoints, evaluation and summary.
-        ranks: the job.
         resume: continue from the newest checkpoint in `folder`, if there is one.
         extend: with `resume`, train a finished run longer, see `extension.extended`.
         lap: called with the name of each part of this work at its end (`Laps.lap`).
@@ -165,11 +161,7 @@ def set_up(
 
 
 def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
-    """Check that a run may write to its folder, and that it replaces nothing there.
-
-    Raises:
-        FileExistsError, FolderError: as for `set_up`.
-    """
+    """Check that a run may write to its folder, and that it replaces nothing there."""
     written = (
         run_files.CONFIG, CAMERAS, LOG, run_files.SUMMARY, PICTURE, run_files.LINEAGE, run_files.REPORT,
         exposure.FILE,
@@ -209,11 +201,7 @@ def _resolved(config: Config, capture: Capture, restored: run_files.Restored | N
 
 
 def _continued(config: Config, restored: run_files.Restored, extend: float | None) -> Config:
-    """Return the configuration to continue a run with: `config`, or one with a longer schedule.
-
-    Raises:
-        ConfigError: it differs from that of the run, or the run to extend is not finished.
-    """
+    """Return the configuration to continue a run with: `config`, or one with a longer schedule."""
     if extend is not None:
         # An interrupted extension may have left its schedule in the folder's configuration.
         config = replace(config, schedule=restored.config.schedule)

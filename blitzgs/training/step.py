@@ -56,11 +56,7 @@ class Stepper:
 
         Args:
             table: this rank's Gaussians; neighbours in space should be neighbours in the table.
-            optimiser: optimiser of the table.
-            owners: records what the tiles cost.
-            loss: weights of the loss.
             extent: size of the scene in the unit of the means.
-            noise: noise on the means after each step; None: none.
         """
         self.table = self.scene = table
         self._optimiser, self._owners = optimiser, owners
@@ -100,10 +96,6 @@ class Stepper:
         """Apply pending steps of the rows that the views may see, render, and compare with the photographs.
 
         Args:
-            step: number of the step, from 1.
-            options: how to render.
-            batch: B views, their photographs, and the tiles of each rank.
-            mark: called at the end of each stage with the stage's name.
             view_filter: what the views leave out; None: nothing.
 
         Returns:
@@ -163,10 +155,6 @@ class Stepper:
         """Propagate the gradients of `forward`'s loss to the Gaussians, and take an optimiser step.
 
         Args:
-            step: as for `forward`.
-            frame: from `forward`.
-            terms: from `forward`.
-            mark: called at the end of each stage with the stage's name.
             keep_means2d: whether to return the gradient of the splats' means2d.
 
         Returns:

@@ -40,8 +40,6 @@ def track_gains(capture: Capture, images: Images, ranks: Ranks) -> Tensor | None
     it shows against the mean over the point's photographs, each divided by its own gain.
 
     Args:
-        capture: the capture.
-        images: its photographs.
         ranks: the job; each rank reads its share of the photographs.
 
     Returns:

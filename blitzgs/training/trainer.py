@@ -208,7 +208,6 @@ class Trainer:
         """Save the model and raise the error that the Gaussians of a step or event do not fit into the pool.
 
         Args:
-            error: says so.
             what: what needs the Gaussians, as text.
             is_saved: whether the newest checkpoint already has all steps.
         """

@@ -104,7 +104,6 @@ def batch_gate(state: TrainingState, indices: list[int]) -> ViewGate | None:
     """Return LOD gate and cull mask of a batch of training views; None if it has neither.
 
     Args:
-        state: state of the run.
         indices: training cameras, as indices into the capture.
     """
     columns = [state.columns[index] for index in indices]

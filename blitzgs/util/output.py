@@ -83,7 +83,6 @@ def check_replaceable(path: Path, ours: tuple[bytes, ...] = (), otherwise: str =
     """Check that `path` does not exist, or is a regular file that may be replaced.
 
     Args:
-        path: the file.
         ours: if there are any, a file that is not empty must have one of these in its first 2000 bytes, or
             at its start if they have 8 bytes or fewer.
         otherwise: what else it is, as it follows in the error after "FILE exists".
@@ -115,12 +114,7 @@ class OutputFolder:
     """
 
     def __init__(self, root: Path, inputs: Iterable[Path] = ()) -> None:
-        """Prepare the folder; the first write creates it.
-
-        Args:
-            root: the folder.
-            inputs: files that must not be overwritten.
-        """
+        """Prepare the folder; the first write creates it."""
         self.root = root
         self._inputs: dict[tuple[int, int], Path] = {}
         self._input_folders: dict[str, Path] = {}

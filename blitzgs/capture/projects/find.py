@@ -189,7 +189,6 @@ def points_beside(
     one of the two: the coordinates in which the views see the points are taken.
 
     Args:
-        root: folder of the capture.
         own: points that the project itself brings; None: a file of points is searched.
         frame: where the cameras lie in the world.
         cameras: lenses and poses [4, 4] of the views.

@@ -71,8 +71,6 @@ def _keep_sorted(state: TrainingState, event: Event, counts: dict[str, int], is_
     After the last event the order stays for the rest of the run, so that sorting always pays.
 
     Args:
-        state: state of the run.
-        event: the event.
         counts: of the event over all ranks; "spread" goes, and "sorted" comes if this sorts the table.
         is_sorted: whether the event has sorted it.
     """

@@ -52,10 +52,7 @@ def measure(
     """Compare the model with the photographs of some cameras; see `blitzgs.runs.evaluation.evaluate`.
 
     Args:
-        state: state of the run; every rank calls this.
-        indices: cameras of the capture.
         folder: folder for the metrics and the pictures; None: nothing is written.
-        lpips: the perceptual metric, or None.
     """
     state.catch_up()
     with state.log.work("views measured") as report:

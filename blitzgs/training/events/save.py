@@ -51,7 +51,6 @@ def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[
     If it cannot be written for another reason, which waiting does not change, the model is saved elsewhere.
 
     Args:
-        state: state of the run.
         patience_seconds: longest time to wait.
         gives_up: asked before each wait whether to stop trying; it must return the same on every rank.
 
