@@ -29,11 +29,7 @@ def _is_usable(coordinates: Float64) -> npt.NDArray[np.bool_]:
 
 
 def with_finite_poses(views: list[SourceView]) -> list[SourceView]:
-    """Return the views whose pose is finite; warn of the others.
-
-    Raises:
-        ValueError: there is none.
-    """
+    """Return the views whose pose is finite; warn of the others (ValueError: there is none)."""
     finite = [view for view in views if _is_usable(view.world_to_camera).all()]
     if not finite:
         raise ValueError(f"none of the {len(views)} views has a pose (a finite rotation and translation)")

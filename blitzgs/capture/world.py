@@ -123,11 +123,7 @@ def fit_similarity(capture: Float64, world: Float64, crs: str = "", source: str 
 
 
 def read_frame(path: Path) -> WorldFrame:
-    """Read `geo.json`.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
+    """Read `geo.json` (ValueError: the file is damaged)."""
     try:
         content = json.loads(read_small(path))
         crs, scale = content.get("crs", ""), content.get("scale", 1.0)
@@ -223,11 +219,7 @@ def geodetic(position: Float64) -> tuple[float, float, float]:
 
 
 def pyproj_module() -> Any:
-    """Return the package pyproj, which knows the reference systems.
-
-    Raises:
-        ImportError: it is not installed.
-    """
+    """Return the package pyproj, which knows the reference systems (ImportError: it is not installed)."""
     try:
         import pyproj
     except ImportError as error:

@@ -107,11 +107,7 @@ class StageError(ValueError):
 
 
 def backend() -> str:
-    """Return "pycolmap", or the path of the program `colmap`.
-
-    Raises:
-        ImportError: neither is installed.
-    """
+    """Return "pycolmap", or the path of the program `colmap` (ImportError: neither is installed)."""
     if importlib.util.find_spec("pycolmap") is not None:
         return "pycolmap"
     if (program := shutil.which("colmap")) is None:

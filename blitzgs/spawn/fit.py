@@ -120,11 +120,7 @@ def read_about(text: bytes | str, file: Path) -> dict[str, Any]:
 
 
 def check_outcomes(survived: NDArray[np.bool_], source: object) -> None:
-    """Check that some spawns survived and some did not.
-
-    Raises:
-        ValueError: this is not so; names `source`.
-    """
+    """Check that some spawns survived and some did not (ValueError: this is not so; names `source`)."""
     if not 0 < survived.sum() < len(survived):
         raise ValueError(
             f"{source}: {int(survived.sum()):,} of {len(survived):,} spawns survived; a gate needs a "

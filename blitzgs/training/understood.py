@@ -38,11 +38,7 @@ class Pictures:
 
 
 def check_worlds(capture: Capture) -> None:
-    """Refuse a capture of which no view sees a point.
-
-    Raises:
-        HopelessCaptureError: see above.
-    """
+    """Refuse a capture of which no view sees a point (HopelessCaptureError: see above)."""
     views = len(capture.cameras)
     if capture.about.blind == views and capture.about.random_points:
         raise HopelessCaptureError(

@@ -164,11 +164,7 @@ class OutputFolder:
         return found
 
     def check(self, path: Path) -> None:
-        """Check that a path below the folder may be written.
-
-        Raises:
-            OSError: see `paths`.
-        """
+        """Check that a path below the folder may be written (OSError: see `paths`)."""
         root, folder = os.path.realpath(self.root), os.path.realpath(path.parent)
         if os.path.commonpath([root, folder]) != root:
             raise OSError(
