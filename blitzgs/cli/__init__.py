@@ -45,10 +45,7 @@ COMMANDS = {
     "view": ("blitzgs.cli.view", "look at a model in the browser"),
     "report": ("blitzgs.cli.report", "write the report of a run"),
     "compare": ("blitzgs.cli.report:add_compare", "put runs side by side"),
-    "export": (
-        "blitzgs.cli.export",
-        "write a model as PLY, SOG, SPZ, GLB ..., or as one HTML file to send",
-    ),
+    "export": ("blitzgs.cli.export", "write a model as PLY, SOG, SPZ, GLB ..., or as one HTML file to send"),
     "align": ("blitzgs.cli.align", "find out where a model lies in the world: control points, GPS, a CRS"),
     "gate": ("blitzgs.cli.gate", "fit and evaluate spawn gates, which make smaller models"),
     "doctor": ("blitzgs.cli.doctor", "check this installation"),

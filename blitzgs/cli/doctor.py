@@ -104,12 +104,7 @@ def run(args: argparse.Namespace) -> int:
 
 def examine(folder: Path | None = None, timeout: float = 120.0) -> list[Line]:
     """Return the lines of the report."""
-    lines = [
-        Line("blitzgs", "ok", f"{__version__} in {_PACKAGE}"),
-        _system(),
-        _memory(),
-        *_packages(),
-    ]
+    lines = [Line("blitzgs", "ok", f"{__version__} in {_PACKAGE}"), _system(), _memory(), *_packages()]
     torch_line = _torch(timeout)
     gpus = torch_line.values.get("gpus", [])
     lines += [

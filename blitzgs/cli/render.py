@@ -100,11 +100,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         help="with --path: dataparser_transforms.json of the nerfstudio training that the path was made for",
     )
     parser.add_argument(
-        "--out",
-        type=named_path,
-        required=True,
-        metavar="OUT",
-        help=f"folder for pictures, or FILE{SUFFIX}",
+        "--out", type=named_path, required=True, metavar="OUT", help=f"folder for pictures, or FILE{SUFFIX}"
     )
     parser.add_argument(
         "--exposure",

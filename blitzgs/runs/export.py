@@ -42,12 +42,7 @@ def export_ply(model: Model, path: Path, coordinates: str = "auto", crs: str = "
 
 
 def export(
-    source: GaussianSource,
-    space: Space,
-    kind: Format,
-    path: Path,
-    coordinates: str = "auto",
-    crs: str = "",
+    source: GaussianSource, space: Space, kind: Format, path: Path, coordinates: str = "auto", crs: str = ""
 ) -> Exported:
     """Write a model as a file.
 

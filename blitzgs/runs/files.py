@@ -193,13 +193,7 @@ def restore(
         sort_rows(table)
         progress.sorted_spread = 0
     return Restored(
-        table,
-        progress,
-        space,
-        config,
-        state.get("run", ""),
-        f"{loaded.name} ({why}{skipped})",
-        loaded.shared,
+        table, progress, space, config, state.get("run", ""), f"{loaded.name} ({why}{skipped})", loaded.shared
     )
 
 

@@ -46,12 +46,7 @@ Veto = Callable[[Candidates, Ranks], Tensor]
 
 
 def spawn_features(
-    table: GaussianTable,
-    rows: Tensor,
-    is_split: Tensor,
-    time: int,
-    extent: float,
-    level_count: int,
+    table: GaussianTable, rows: Tensor, is_split: Tensor, time: int, extent: float, level_count: int
 ) -> Tensor:
     """Return the features of candidates at a density event, before its statistics are reset.
 

@@ -77,10 +77,7 @@ def loss_terms(
         opacity_weight=config.opacity,
     )
     return LossTerms(
-        parts,
-        v_renders,
-        scale_reg if config.scale > 0 else None,
-        opacity_reg if config.opacity > 0 else None,
+        parts, v_renders, scale_reg if config.scale > 0 else None, opacity_reg if config.opacity > 0 else None
     )
 
 

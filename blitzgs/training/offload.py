@@ -139,12 +139,7 @@ class OffloadingStepper(Stepper):
         return rendered
 
     def backward(
-        self,
-        step: int,
-        frame: Frame,
-        terms: LossTerms,
-        mark: Mark = unmarked,
-        keep_means2d: bool = False,
+        self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked, keep_means2d: bool = False
     ) -> Tensor | None:
         """See `Stepper.backward`."""
         v_means2d = super().backward(step, frame, terms, mark, keep_means2d)

@@ -145,12 +145,7 @@ class Stepper:
         return frame, terms, sums
 
     def backward(
-        self,
-        step: int,
-        frame: Frame,
-        terms: LossTerms,
-        mark: Mark = unmarked,
-        keep_means2d: bool = False,
+        self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked, keep_means2d: bool = False
     ) -> Tensor | None:
         """Propagate the gradients of `forward`'s loss to the Gaussians, and take an optimiser step.
 

@@ -273,10 +273,7 @@ class Trainer:
         if is_logged:
             self._unwritten = measure_step(state, frame, batch, sums)
         v_means2d = state.stepper.backward(
-            step,
-            frame,
-            terms,
-            keep_means2d=schedule.gathers_statistics(begin),
+            step, frame, terms, keep_means2d=schedule.gathers_statistics(begin)
         )
         if v_means2d is not None:
             self._add_statistics(frame, v_means2d, reduction)

@@ -119,14 +119,7 @@ def _save(state: TrainingState, folder: Path) -> None:
     if state.stepper.exposures is not None:
         shared |= state.stepper.exposures.columns()
     run_files.save(
-        folder,
-        state.table,
-        state.progress,
-        state.space,
-        state.config,
-        state.ranks,
-        state.run_id,
-        shared,
+        folder, state.table, state.progress, state.space, state.config, state.ranks, state.run_id, shared
     )
 
 
