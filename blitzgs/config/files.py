@@ -86,7 +86,7 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
         except _UNREADABLE as error:
             raise ConfigError(f"{name}: cannot read the value '{value}': {error}") from error
         _merge(values, _nest(name.split("."), parsed), name)
-    config: Config = _build(Config, values, "")
+    config = from_dict(values)
     for problem in problems(config):
         raise ConfigError(problem)
     return config
@@ -94,14 +94,17 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
 
 def from_dict(values: dict[str, Any]) -> Config:
     """Rebuild a configuration from `to_dict`'s nested dictionary; raises ConfigError like `load_config`."""
-    config: Config = _build(Config, values, "")
-    return config
+    return typing.cast(Config, _build(Config, values, ""))
 
 
 def to_dict(config: Config) -> dict[str, Any]:
     """Return the configuration as nested dictionaries of JSON-able values."""
-    result: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
-    return result
+    return typing.cast(dict[str, Any], json.loads(json.dumps(dataclasses.asdict(config))))
+
+
+def changed(config: Config, section: str, **fields: Any) -> Config:
+    """Return a configuration with other values of some fields of a section."""
+    return dataclasses.replace(config, **{section: dataclasses.replace(getattr(config, section), **fields)})
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -280,12 +283,9 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
     if hint is int and isinstance(value, float) and value.is_integer():
         return int(value)
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
-        raise ConfigError(f"{path}: must be {_kind(hint)}, got {value!r} ({type(value).__name__})")
+        kinds = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
+        raise ConfigError(f"{path}: must be {kinds[hint]}, got {value!r} ({type(value).__name__})")
     return value
-
-
-def _kind(hint: type) -> str:
-    return {int: "an integer", float: "a number", bool: "true or false", str: "text"}.get(hint, hint.__name__)
 
 
 # The name that stands for the default of every field, without a file.
@@ -301,17 +301,7 @@ def recipe_names() -> list[str]:
 
 
 def recipe_path(given: str) -> Path | None:
-    """Return the file of a configuration.
-
-    Args:
-        given: path of a YAML file, or a name of `recipe_names`, or `DEFAULTS`.
-
-    Returns:
-        The file; None for `DEFAULTS`.
-
-    Raises:
-        ConfigError: there is neither such a file nor such a recipe.
-    """
+    """Return the YAML file of a path or of a name of `recipe_names`; None for `DEFAULTS`."""
     if Path(given).is_file():
         return Path(given)
     if given == DEFAULTS:
@@ -322,14 +312,9 @@ def recipe_path(given: str) -> Path | None:
 
 
 def base_file(given: str, file: Path) -> Path:
-    """Return the file that `base` names in a configuration file.
+    """Return the file that `base` names in a configuration file: a path relative to it, or a recipe.
 
-    Args:
-        given: path relative to `file`, or a name of `recipe_names`, with or without ".yaml": a copy of a
-            recipe's file names its base so.
-
-    Raises:
-        ConfigError: there is neither such a file nor such a recipe.
+    The name may end in ".yaml": a copy of a recipe's file names its base so.
     """
     beside = file.parent / given
     if beside.is_file():

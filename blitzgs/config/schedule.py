@@ -22,12 +22,9 @@ class Pace:
     """
 
     def __init__(self, scale: float, changes: Sequence[tuple[int, float]]) -> None:
-        """Make the map.
+        """Make a map of `scale` images of the run per image of the configuration.
 
-        Args:
-            scale: images of the run per image of the configuration, before the first change.
-            changes: pairs (image of the run, factor) with increasing images above 0: from that image on, the
-                ratio is `scale` times the factor.
+        `changes`, (image of the run, factor) with increasing images above 0: from there, times the factor.
         """
         self._images = [0.0, *(float(image) for image, _ in changes)]
         self._scales = [scale, *(scale * factor for _, factor in changes)]
@@ -90,20 +87,14 @@ class Schedule:
 
     `pace` maps every time of the configuration to an image of the run (without changes of pace: multiplied by
     `scale`), rounded down. The schedule therefore has the same shape at any length.
-
-    Attributes:
-        pace: maps times of the configuration to images of the run.
-        batch_size: views per step, B.
-        steps: optimiser steps of the whole run.
-        iterations: images of the whole run, steps x B.
     """
 
     def __init__(self, config: ScheduleConfig) -> None:
         self._config = config
         self.pace = Pace(config.scale, config.pace)
-        self.batch_size = config.batch_size
-        self.steps = max(1, math.ceil(self._scaled(config.iterations) / self.batch_size))
-        self.iterations = self.steps * self.batch_size
+        self.batch_size = config.batch_size  # views per step, B
+        self.steps = max(1, math.ceil(self._scaled(config.iterations) / self.batch_size))  # of the whole run
+        self.iterations = self.steps * self.batch_size  # images of the whole run
         self._found: tuple[int, int, list[Event]] = (0, 0, [])  # the events of [first, last) images
         self._reductions = [(factor, self._scaled(until)) for factor, until in config.resolution]
 
@@ -180,14 +171,6 @@ class Schedule:
         # `time` is rounded down, so the next event is the first at `time + 1` or later.
         following = math.ceil((self.pace.time(time + 1) - first) / every)
         return first + following * every >= self._config.densify_until
-
-    def has_lod_gate(self, begin: int) -> bool:
-        """Tell whether the step at [begin, begin + B) may leave out Gaussians by their octree levels.
-
-        It may not while statistics for density control are gathered, because a Gaussian that is left out
-        would gather no gradients.
-        """
-        return not self.gathers_statistics(begin)
 
     def has_new_levels(self, begin: int) -> bool:
         """Tell whether levels follow footprints again before the step at [begin, begin + B)."""

@@ -27,7 +27,8 @@ def follow_schedule(state: TrainingState, begin: int) -> None:
     Collective: every rank calls this before every step.
     """
     view = state.config.view
-    if not (view.lod and state.schedule.has_lod_gate(begin)):
+    # A Gaussian that is left out gathers no gradients for density control.
+    if not view.lod or state.schedule.gathers_statistics(begin):
         return
     opens = state.progress.finest_level is None
     if view.footprint > 0 and (opens or state.schedule.has_new_levels(begin)):

@@ -212,7 +212,6 @@ def phases_of(schedule, begin):
         schedule.sh_degree(begin, 3),
         schedule.reduction(begin),
         schedule.gathers_statistics(begin),
-        schedule.has_lod_gate(begin),
         schedule.has_spawn_gate(begin),
         schedule.prunes_by_size(begin),
     )
