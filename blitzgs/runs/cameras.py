@@ -67,9 +67,7 @@ def checked_camera(
 ) -> RunCamera:
     """Return a camera with these values, in arrays of its own.
 
-    Raises:
-        TypeError: a size is no number, or a matrix not made of numbers; the message names it.
-        ValueError: a value is impossible; the message names it.
+    A size or matrix that is none is a TypeError, an impossible value a ValueError; the message names it.
     """
     for argument, size in (("width", width), ("height", height)):
         if isinstance(size, bool) or not isinstance(size, (int, float, np.integer, np.floating)):
@@ -146,12 +144,7 @@ def save_cameras(folder: Path, capture: Capture, run_id: str = "") -> None:
 
 
 def load_cameras(folder: Path) -> RunCameras:
-    """Read the cameras of a run.
-
-    Raises:
-        FileNotFoundError: the run is older than this file.
-        ValueError: the file is damaged.
-    """
+    """Read a run's cameras (FileNotFoundError: it is older than this file; ValueError: it is damaged)."""
     path = folder / CAMERAS
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -35,6 +35,8 @@ MANIFEST = "manifest.json"
 SHARED = "shared.safetensors"
 _NAME = re.compile(r"checkpoint_(\d{6,})")
 _UNFINISHED = ".unfinished_"
+# What reading a damaged checkpoint may raise.
+DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
 
 
 class CheckpointError(RuntimeError):
@@ -224,7 +226,7 @@ def load(
         # Each rank checks some of the files, so that every file is read for its digest once.
         with ranks.watchdog.working("reading a checkpoint"):
             manifest = verified(path, ranks.rank, ranks.world_size)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except DAMAGE as error:
         problem = str(error) or type(error).__name__
     problems = [text for text in ranks.all_gather_object(problem) if text]
     if problems or manifest is None:
@@ -279,11 +281,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def verified(path: Path, part: int = 0, parts: int = 1) -> Manifest:
-    """Read the manifest of a checkpoint, and compare part of the files with their digests.
-
-    Raises:
-        OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError: it is damaged.
-    """
+    """Read the manifest of a checkpoint, and compare part of the files with their digests; see `DAMAGE`."""
     manifest = _read_manifest(path)
     for shard in [*manifest.shards, *([manifest.shared] if manifest.shared else [])][part::parts]:
         _verify(path, shard)

@@ -79,10 +79,7 @@ def cleaned(
 ) -> Cleaned:
     """Find the Gaussians of a run that at most so many training views count, far from the rest or large.
 
-    Args:
-        most_views: see `floaters`.
-        ranks: the device of the model.
-        photograph: returns the photograph of a camera; None: there are none.
+    `photograph` returns the photograph of a camera; None: there are none.
     """
     table = table_of_parameters({name: getattr(model, name) for name in (*PARAMETERS, "level")})
     gate = None if model.lod is None else model.lod.gate

@@ -117,11 +117,7 @@ def render_view(
 ) -> Tensor | None:
     """Render camera `index` with the Gaussians of all ranks; every rank calls this.
 
-    Args:
-        destination: rank that gets the image.
-
-    Returns:
-        float32 [H, W, 3] on rank `destination`, the same bits at any number of ranks; None elsewhere.
+    Returns float32 [H, W, 3] on rank `destination`, the same bits at any number of ranks; None elsewhere.
     """
     picked, ranks = views.pick([index]), owners.ranks
     table, active, _ = finder.find(*picked.as_arguments(), options.limits)
@@ -239,10 +235,7 @@ def _over_all_ranks(
 ) -> dict[str, Any]:
     """Collect the metrics of all ranks, and return what `evaluate` returns. Collective.
 
-    Args:
-        per_view: the metrics of the views that this rank compared.
-        lost: why this rank could not read a photograph; None: it has read all.
-        names: names of all views, in the order of the result.
+    `lost` says why this rank could not read a photograph; None: it has read all.
     """
     parts = ranks.all_gather_object((per_view, lost))
     if reasons := [reason for _, reason in parts if reason is not None]:
@@ -333,12 +326,7 @@ class Previews:
         return {index for _, index in (*self._best, *self._worst)} | self._fixed
 
     def files(self, psnr: Mapping[int, float], lists: bool) -> Iterator[tuple[Path, bytes]]:
-        """Return the files of this rank.
-
-        Args:
-            psnr: of all measured views of all ranks, by their cameras.
-            lists: whether this rank writes the list.
-        """
+        """Return this rank's files, given the PSNR of all ranks' views; one rank also `lists` the cameras."""
         ordered = sorted(psnr, key=lambda index: (psnr[index], index))
         chosen = {*ordered[:_EXTREMES], *ordered[-_EXTREMES:]} | (self._fixed & psnr.keys())
         for index in sorted(chosen & self._kept.keys()):

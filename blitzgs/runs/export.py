@@ -147,12 +147,9 @@ def without_antialiasing(model: Model, cameras: Sequence[CameraLike]) -> Model:
     """Return a model for viewers without antialiasing: its opacities contain the compensation.
 
     The antialiased mode scales a splat's opacity by rho = sqrt(det(cov) / det(cov + eps2d I)), which depends
-    on the view. This function multiplies each opacity by the mean of rho over the given views, weighted with
-    the splat's area in pixels. Nearer and farther views keep errors of opposite sign.
-
-    Args:
-        model: trained with `model.antialiased`.
-        cameras: views from which the model should look right, for example the training views.
+    on the view. This function multiplies each opacity by the mean of rho over the given views (the training
+    views, for example), weighted with the splat's area in pixels. Nearer and farther views keep errors of
+    opposite sign.
     """
     opacities = model.opacities.sigmoid()
     areas = torch.zeros_like(opacities, dtype=torch.float64)

@@ -78,7 +78,7 @@ class Progress:
     least_kept: float = 0.0
     # Digest of the names of the training views, in their order; empty in old checkpoints.
     train_views: str = ""
-    # Result of `blitzgs.training.curve.Curve.saved`; empty in old checkpoints.
+    # Fields of `blitzgs.training.curve.Curve`; empty in old checkpoints.
     curve: dict[str, Any] = dataclasses.field(default_factory=dict)
     gate: str = ""  # digest of the spawn gate's files; empty without a gate, and in old checkpoints
     # Seconds of each kind of work besides the optimiser steps; see `TrainingState.stage`.
@@ -106,10 +106,8 @@ class TrainedModel:
     def scene(self, device: torch.device) -> Scene:
         """Return the scene that views are rendered from on a device.
 
-        With a pool, the first call moves the table into memory that the pool can reach.
-
-        Raises:
-            PoolError: the pool has room for fewer than two blocks.
+        With a pool, the first call moves the table into memory that the pool can reach. PoolError: the pool
+        has room for fewer than two blocks.
         """
         if self.pool_bytes == 0:
             return self.table
@@ -131,12 +129,8 @@ def save(
 ) -> Path:
     """Write a checkpoint of a run; pending optimiser steps stay pending, so that saving changes nothing.
 
-    Returns:
-        The checkpoint's folder.
-
-    Raises:
-        NonFiniteError: a value is not finite; nothing is written, and earlier checkpoints are kept.
-        CheckpointError: a rank could not write; earlier checkpoints are kept.
+    Earlier checkpoints are kept if a value is not finite (NonFiniteError) or a rank could not write
+    (CheckpointError).
     """
     check_before_saving(table, progress.step, ranks)
     state = {
@@ -167,15 +161,10 @@ class Restored:
 def restore(
     folder: Path, ranks: Ranks, device: torch.device | None = None, only: str | None = None
 ) -> Restored | None:
-    """Read the newest undamaged checkpoint of a run; return None if the run has no checkpoint.
+    """Read a run's newest undamaged checkpoint, or the one named `only`; None: the run has no checkpoint.
 
-    Args:
-        device: device of the Gaussians; None: the ranks' device.
-        only: name of the one checkpoint to read; None: the newest.
-
-    Raises:
-        CheckpointError: there are checkpoints, but all are damaged, or the newest is of another version or
-            of another run.
+    The Gaussians go to `device`, else to the ranks' device. CheckpointError: all checkpoints are damaged, or
+    the newest is of another version or of another run.
     """
     loaded = checkpoint.load_latest(
         folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns, only
@@ -198,11 +187,7 @@ def restore(
 
 
 def parsed(state: Mapping[str, Any], path: Path) -> tuple[Progress, Space, Config]:
-    """Return what the state of a checkpoint says.
-
-    Raises:
-        CheckpointError: it is that of another version of the program.
-    """
+    """Return what the state of a checkpoint says (CheckpointError: it is that of another version)."""
     try:
         known = {field.name for field in dataclasses.fields(Progress)}
         progress = Progress(**{name: value for name, value in state["progress"].items() if name in known})
@@ -223,11 +208,7 @@ def run_and_checkpoint(path: Path) -> tuple[Path, str | None]:
 
 
 def check_is_run(folder: Path) -> None:
-    """Check that a folder looks like a run.
-
-    Raises:
-        FileNotFoundError: it has neither a configuration nor checkpoints.
-    """
+    """Refuse a folder that has neither a configuration nor checkpoints (FileNotFoundError)."""
     if not (folder / CONFIG).exists() and not (folder / CHECKPOINTS).exists():
         raise FileNotFoundError(f"{folder} is not a run: it has no {CONFIG} and no {CHECKPOINTS}")
 
@@ -241,13 +222,9 @@ def open_model(
 ) -> TrainedModel:
     """Open the newest model of a run for rendering, with the configuration that was saved with it.
 
-    Args:
-        data: present folder of the capture; None: unchanged.
-        resident_gb: gigabytes of each device for Gaussians; 0: no limit; None: as the run.
-        only: name of the one checkpoint to open; None: the newest.
-
-    Raises:
-        FileNotFoundError: the folder is not a run, or holds no checkpoint.
+    `data` is the present folder of the capture, `resident_gb` the gigabytes of each device for Gaussians (0:
+    no limit, None: as the run), `only` the name of a checkpoint. FileNotFoundError: the folder is no run, or
+    holds no checkpoint.
     """
     check_is_run(folder)
     pool_bytes = int((_resident_gb(folder / CONFIG) if resident_gb is None else resident_gb) * 1e9)
@@ -286,11 +263,7 @@ def compare_with_file(config: Config, path: Path) -> None:
 
 
 def check_resumable(saved: Config, wanted: Config) -> None:
-    """Check that a configuration gives the same result as the one that a checkpoint was trained with.
-
-    Raises:
-        ConfigError: a field differs; the message names the first one.
-    """
+    """Refuse a configuration that gives another result than the checkpoint's (ConfigError names a field)."""
     for name, old, new in _differences(saved, wanted):
         # The number of minutes may change: the rest of the run is then fitted into the rest of the new time.
         is_budget = name == "schedule.minutes" and old > 0 and new > 0

@@ -36,10 +36,8 @@ class FolderError(RuntimeError):
 def locked(folder: Path, ranks: Ranks) -> Iterator[None]:
     """Lock a folder against other runs while the context lasts; every rank calls this.
 
-    The operating system releases the lock when the process ends, also after a crash.
-
-    Raises:
-        FolderError: on every rank, when another process is training in the folder.
+    The operating system releases the lock when the process ends, also after a crash. FolderError, on every
+    rank: another process is training in the folder.
     """
     descriptor, problem = None, None
     if ranks.rank == 0:
@@ -88,11 +86,7 @@ def _lock(path: Path) -> tuple[int | None, str | None]:
 
 
 def check_writable(folder: Path, ranks: Ranks) -> None:
-    """Check that every rank can write to the folder and that all of them see the same one.
-
-    Raises:
-        FolderError: on every rank, naming those that cannot.
-    """
+    """Check that all ranks can write to the folder, and see the same one (FolderError names the others)."""
     token = ranks.broadcast_object(f".probe_{secrets.token_hex(6)}")
     problem = None
     own = folder / f"{token}_{ranks.rank}"
@@ -127,12 +121,8 @@ def check_writable(folder: Path, ranks: Ranks) -> None:
 def check_unclaimed(checkpoints: Path, files: Sequence[str], ranks: Ranks) -> None:
     """Check that a run will not replace files of another program: every run has a folder of checkpoints.
 
-    Args:
-        checkpoints: that folder; it may be missing.
-        files: names of the files and folders beside it that a run writes.
-
-    Raises:
-        FileExistsError: on every rank; it is missing, and one of the files exists.
+    FileExistsError, on every rank: it is missing, and one of the `files`, which a run writes beside it,
+    exists.
     """
     found = None
     if ranks.rank == 0 and not os.path.lexists(checkpoints):
@@ -145,14 +135,7 @@ def check_unclaimed(checkpoints: Path, files: Sequence[str], ranks: Ranks) -> No
 
 
 def check_room(folder: Path, table: GaussianTable, ranks: Ranks, most_gaussians: int) -> None:
-    """Check that a checkpoint fits on the disk, and warn if one of the largest population will not fit.
-
-    Args:
-        most_gaussians: limit of the population; 0: none is known.
-
-    Raises:
-        FolderError: on every rank, if not even a checkpoint of the present population fits.
-    """
+    """Check that a checkpoint fits on the disk (else FolderError); warn if `most_gaussians` will not fit."""
     row = sum(table.row_bytes.values())
     parts = ranks.all_gather_object((len(table), row))
     rows, row = sum(count for count, _ in parts), max(size for _, size in parts)
@@ -184,12 +167,8 @@ _TAIL_BYTES = 1 << 16
 def check_own(folder: Path, checkpoint: Path, run_id: str, ranks: Ranks) -> None:
     """Check that a checkpoint was written by the run whose cameras and log are in `folder`. Collective.
 
-    Args:
-        checkpoint: the checkpoint, for the message.
-        run_id: id of the run that wrote it; empty in old checkpoints, which are not checked.
-
-    Raises:
-        CheckpointError: on every rank; it was written by another run.
+    CheckpointError, on every rank: it was written by another run. Old checkpoints have no id and are not
+    checked.
     """
     known = ranks.broadcast_object(known_id(folder) if ranks.rank == 0 else "")
     if known and run_id and known != run_id:

@@ -77,14 +77,10 @@ def source_of(model: Model) -> RunSource:
 
 
 def open_source(folder: Path, only: str | None = None) -> RunSource:
-    """Open the newest undamaged checkpoint of a run without reading its Gaussians into memory.
+    """Open the newest undamaged checkpoint of a run, or the one named `only`, without reading its Gaussians.
 
-    Args:
-        only: name of the one checkpoint to open; None: the newest.
-
-    Raises:
-        FileNotFoundError: the folder is not a run, or holds no checkpoint.
-        CheckpointError: all checkpoints are damaged, or the newest is of another version or of another run.
+    FileNotFoundError: the folder is no run, or holds no checkpoint. CheckpointError: all checkpoints are
+    damaged, or the newest is of another version or of another run.
     """
     run_files.check_is_run(folder)
     refused = []
@@ -93,7 +89,7 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
         path = folder / run_files.CHECKPOINTS / name
         try:
             manifest = checkpoint.verified(path)
-        except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        except checkpoint.DAMAGE as error:
             refused.append(f"checkpoint {path} is damaged: {error}")
             continue
         if refused:

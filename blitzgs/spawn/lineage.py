@@ -17,7 +17,6 @@ An event only queues work on the device that makes its rows. Other threads copy 
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import json
 import re
@@ -217,16 +216,6 @@ def initial_births(ids: Tensor, parents: Tensor, means: Tensor) -> Births:
     features = torch.full((len(ids), len(FEATURES)), torch.nan, device=ids.device)
     features[:, FEATURES.index("time")] = 0
     return Births(ids, parents, means, features)
-
-
-def ledger_of(state: dict[str, int] | None) -> Ledger:
-    """Read a ledger back from a checkpoint."""
-    return Ledger(**(state or {}))
-
-
-def ledger_state(ledger: Ledger) -> dict[str, int]:
-    """Return a ledger for a checkpoint."""
-    return dataclasses.asdict(ledger)
 
 
 def _is_later(name: re.Match[str], step: int, ledger: Ledger) -> bool:

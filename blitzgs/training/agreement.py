@@ -62,7 +62,7 @@ class SaveClock:
     """Tells when the next checkpoint by wall time is due."""
 
     def __init__(self, seconds: float) -> None:
-        """Start the clock; `seconds` is the time between two checkpoints, 0: none by wall time."""
+        """Start the clock; `seconds` is the time between two checkpoints; 0: none by wall time."""
         self._seconds = seconds or math.inf
         self.restart()
 
@@ -95,10 +95,7 @@ class Agreement:
     def __init__(
         self, ranks: Ranks, stop: StopRequest, clock: SaveClock, wants: Callable[[], bool] = lambda: False
     ) -> None:
-        """Prepare to collect the requests that `stop`, `clock` and `wants` note on each of `ranks`.
-
-        `wants` returns whether those who watch the run want something of all ranks.
-        """
+        """Prepare; `wants` returns whether those who watch the run want something of all ranks."""
         self._ranks, self._stop, self._clock, self._wants = ranks, stop, clock, wants
         self._next = 0
         self._last: tuple[int, float] | None = None

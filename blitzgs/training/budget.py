@@ -52,18 +52,14 @@ class Plan:
 
 
 class Budget:
-    """Keeps a run within `schedule.minutes`; does nothing if that is 0.
-
-    Attributes:
-        next_step: step after which the pace is reconsidered.
-    """
+    """Keeps a run within `schedule.minutes`; does nothing if that is 0."""
 
     def __init__(self, state: TrainingState) -> None:
         """Begin; the next few steps are not measured."""
         self._state = state
         self._seconds = 60 * state.config.schedule.minutes
         self._interval = WARM_UP_STEPS
-        self.next_step = state.progress.step + WARM_UP_STEPS
+        self.next_step = state.progress.step + WARM_UP_STEPS  # after which the pace is reconsidered
         self._mark: tuple[int, float] | None = None
         self._shown = 0
 
@@ -115,12 +111,10 @@ class Budget:
         text = None
         if abs(total - self._shown) > SHOWN_CHANGE * total:
             self._shown = total
-            end = (
-                f"will end after about {plan.seconds / 60:.3g} minutes (--minutes: {self._seconds / 60:.3g})"
-            )
             text = (
                 f"{plan.images_per_second:.1f} images/s: {total:,} images in all, a scale of "
-                f"{values['scale']:.3g}; {end}"
+                f"{values['scale']:.3g}; will end after about {plan.seconds / 60:.3g} minutes (--minutes: "
+                f"{self._seconds / 60:.3g})"
             )
         state.log.event(state.images_seen, "pace", values, text)
 

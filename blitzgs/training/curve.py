@@ -3,10 +3,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 # Log records whose mean is compared: the views of one batch differ by more than a fall.
 WINDOW = 16
@@ -24,15 +21,6 @@ class Curve:
     fall: float = 0.0  # largest fall of the mean below the best one before it, dB
     fall_at: int = 0  # images that the run had seen then
     warned: bool = False  # whether the present fall has been reported
-
-    @classmethod
-    def of(cls, saved: Mapping[str, Any]) -> Curve:
-        """Restore a curve from `saved`; an empty mapping gives a new one."""
-        return cls(**saved)
-
-    def saved(self) -> dict[str, Any]:
-        """Return the curve as JSON values."""
-        return dataclasses.asdict(self)
 
     def add(self, images: int, psnr: float) -> str | None:
         """Add a record; return a warning when the mean has fallen by `FALL` for the first time."""

@@ -49,9 +49,7 @@ def weighted(config: LossConfig, views: int) -> LossConfig:
 def loss_terms(
     frame: Frame, batch: Batch, config: LossConfig, extent: float, shown: Tensor | None = None
 ) -> LossTerms:
-    """Compare rendered views with their photographs.
-
-    On several ranks each compares its own tiles.
+    """Compare rendered views with their photographs; on several ranks each compares its own tiles.
 
     Args:
         extent: size of the scene in the unit of the means; L_scale is relative to it.
@@ -92,9 +90,8 @@ def _weights(ssim: float, count: int, device: torch.device) -> tuple[Tensor, Ten
 def photometric(sums: Tensor, samples: Tensor, config: LossConfig) -> Tensor:
     """Return (1 - lambda) L1 + lambda (1 - SSIM) of each view, float32 [B].
 
-    Args:
-        sums: `LossTerms.parts` added up over all ranks, [2 B]; see `HostSum.read`.
-        samples: `Batch.samples`, on the device of the sums.
+    `sums` are `LossTerms.parts` added up over all ranks, [2 B] (`HostSum.read`); `samples` those of the
+    batch, on their device.
     """
     l1, ssim = sums.view(2, -1)
     return ((1.0 - config.ssim) * l1 - config.ssim * ssim) / samples + config.ssim

@@ -49,10 +49,9 @@ class MemoryMeter:
 def population_report(state: TrainingState, meter: MemoryMeter) -> dict[str, Any]:
     """Return the population at its stages and the memory of each rank; every rank calls this.
 
-    Returns:
-        "initial", "before_pass_1", "after_pass_1", "peak", "before_pass_2", "after_pass_2" (only passes that
-        happened) and "final": numbers of Gaussians of all ranks. "peak_memory_bytes" and, on CUDA,
-        "mean_memory_bytes" since the run began or was resumed: lists with a value for each rank.
+    "initial", "before_pass_1" and so on (only passes that happened), "peak" and "final" are numbers of
+    Gaussians of all ranks. "peak_memory_bytes" and, on CUDA, "mean_memory_bytes" since the run began or was
+    resumed are lists with a value for each rank.
     """
     progress = state.progress
     counts = progress.milestones | {"peak": progress.peak_gaussians, "final": state.population()}
@@ -128,11 +127,7 @@ def measure_step(state: TrainingState, frame: Frame, batch: Batch, sums: HostSum
 
 
 def log_step(state: TrainingState, record: StepRecord) -> None:
-    """Write the log record of the last step; wait for its figures, and check the parameters.
-
-    Raises:
-        NonFiniteError: a parameter is not finite.
-    """
+    """Write the record of the last step; wait for its figures, and check the parameters (NonFiniteError)."""
     with state.ranks.watchdog.waiting("read_figures"):
         figures = record.figures.read().view(torch.float64)
     bad, active, visible, population, scale, opacity, psnr = figures[:7].tolist()

@@ -72,24 +72,15 @@ class CandidateRecord:
 
 
 class OracleVeto:
-    """Vetoes candidates whose children did not survive in a reference run.
-
-    Attributes:
-        seen: number of candidates so far, on this rank.
-        matched: number of those that the reference run had too.
-    """
+    """Vetoes candidates whose children did not survive in a reference run."""
 
     def __init__(self, known: Tensor, dead: Tensor, rate: float | None, seed: int) -> None:
-        """Store the reference run's candidates and events.
+        """Take the `event_keys` of the reference's candidates and of its non-surviving events, int64 [K].
 
-        Args:
-            known: int64 [K], `event_keys` of its candidates.
-            dead: int64 [D], `event_keys` of its non-surviving spawn events.
-            rate: veto at most this share of the clones and of the splits; None: no limit.
-            seed: seed of the draw among non-surviving candidates if there are more.
+        With a `rate`, at most this share of the clones and of the splits is vetoed, drawn by `seed`.
         """
         self._known, self._dead, self._rate, self._seed = known, dead, rate, seed
-        self.seen = self.matched = 0
+        self.seen = self.matched = 0  # this rank's candidates, and those that the reference had too
 
     def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
         """Tell which candidates are vetoed, bool [M]. Collective."""
@@ -179,9 +170,6 @@ def replay(
     ranks: Ranks,
 ) -> Iterator[dict[str, Any]]:
     """Train every arm to the end, one after the other. Collective.
-
-    Args:
-        config: of the run that is branched, with `population.lineage`.
 
     Yields:
         For each arm, when it is trained: its name, psnr, ssim, peak and final Gaussians, the seconds of

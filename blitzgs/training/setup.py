@@ -31,7 +31,7 @@ from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writab
 from blitzgs.runs.from_file import trained_columns
 from blitzgs.runs.log import LOG, RunLog
 from blitzgs.runs.world import save_frame
-from blitzgs.spawn.lineage import Lineage, initial_births, ledger_of
+from blitzgs.spawn.lineage import Ledger, Lineage, initial_births
 from blitzgs.spawn.rules import lineage_subject, open_spawn_gate
 from blitzgs.table.blocks import sort_rows
 from blitzgs.table.host_table import HostTable
@@ -155,7 +155,7 @@ def set_up(
         save_clock=SaveClock(config.log.checkpoint_seconds),
         veto=veto,
         lineage=lineage,
-        curve=Curve.of(progress.curve),
+        curve=Curve(**progress.curve),
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )
 
@@ -280,7 +280,7 @@ def _start_lineage(
     """Open the log of births and deaths, for a new run or at the checkpoint's state; None if it is off."""
     if not config.population.lineage:
         return None
-    about, ledger = lineage_subject(config, capture), ledger_of(progress.ledger)
+    about, ledger = lineage_subject(config, capture), Ledger(**progress.ledger)
     lineage = Lineage(folder / run_files.LINEAGE, ranks, progress.step, ledger, about)
     if not progress.ledger:
         lineage.born(initial_births(table["id"], table["parent"], table["means"]), progress.step)

@@ -102,11 +102,7 @@ def keep_to_views(table: GaussianTable, progress: Progress, capture: Capture, ra
 
 
 def batch_gate(state: TrainingState, indices: list[int]) -> ViewGate | None:
-    """Return LOD gate and cull mask of a batch of training views; None if it has neither.
-
-    Args:
-        indices: training cameras, as indices into the capture.
-    """
+    """Return LOD gate and cull mask of training views (indices into the capture); None: there is neither."""
     columns = [state.columns[index] for index in indices]
     lod, flags = lod_gate(state.config, state.progress), state.progress.gated_views
     lod_views = 0 if lod is None else lod_bits([flags[column] == "1" for column in columns])

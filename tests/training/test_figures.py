@@ -2,7 +2,7 @@
 """Figures of views: masked ones, some now and then, and falls of the training PSNR."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
@@ -153,5 +153,5 @@ def test_a_reset_begins_the_curve_anew():
 
 def test_a_curve_survives_a_resume():
     curve, _ = followed([25.0] * 20)
-    again = Curve.of(curve.saved())
+    again = Curve(**asdict(curve))
     assert again == curve and followed([19.0] * 30, again)[1]

@@ -27,12 +27,7 @@ MOST_SPREAD = 4.0
 
 
 def run(state: TrainingState, event: Event) -> None:
-    """Run one density event and log what it did.
-
-    Raises:
-        NonFiniteError: a parameter is not finite.
-        ModelLostError: no Gaussian is left.
-    """
+    """Run one density event and log what it did (errors: NonFiniteError, ModelLostError)."""
     state.stepper.write_back()
     # The largest column, sh, does not decide anything; it is checked with each record of the log.
     check_table(state.table, state.progress.step, PARAMETERS[:-1])
@@ -68,11 +63,9 @@ def _spread(state: TrainingState) -> Tensor:
 def _keep_sorted(state: TrainingState, event: Event, counts: dict[str, int], is_sorted: bool) -> None:
     """Sort the table if its blocks have become too large; no result depends on it. Every rank calls this.
 
-    After the last event the order stays for the rest of the run, so that sorting always pays.
-
-    Args:
-        counts: of the event over all ranks; "spread" goes, and "sorted" comes if this sorts the table.
-        is_sorted: whether the event has sorted it.
+    After the last event the order stays for the rest of the run, so that sorting always pays. Of the counts
+    over all ranks, "spread" goes, and "sorted" comes if this sorts the table; `is_sorted`: the event has
+    sorted it.
     """
     spread_now = counts.pop("spread")
     if not is_sorted:

@@ -20,9 +20,8 @@ from blitzgs.training.state import TrainingState
 def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
     """Measure the held-out views, or the training views if none are held out; the training clock pauses.
 
-    Returns:
-        The mean of each metric, and under "split" which views were measured; an empty dictionary if the run
-        has to stop meanwhile.
+    Returns the mean of each metric, and under "split" which views were measured; nothing if the run has to
+    stop meanwhile.
     """
     with state.paused_clock():
         folder = state.folder / run_files.EVALUATION / f"{state.images_seen:06d}"
@@ -49,11 +48,7 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
 def measure(
     state: TrainingState, indices: Sequence[int], folder: Path | None, lpips: Lpips | None = None
 ) -> dict[str, Any]:
-    """Compare the model with the photographs of some cameras; see `blitzgs.runs.evaluation.evaluate`.
-
-    Args:
-        folder: folder for the metrics and the pictures; None: nothing is written.
-    """
+    """Compare the model with photographs; see `evaluate`. Without a folder nothing is written."""
     state.catch_up()
     with state.log.work("views measured") as report:
         return evaluate(
