@@ -56,12 +56,7 @@ class FileCheck:
     def __init__(
         self, cameras: Sequence[Camera], order: Sequence[int], counted: Callable[[Camera], bool]
     ) -> None:
-        """Start to check.
-
-        Args:
-            order: those to check, in this order.
-            counted: decodes a view's mask, and tells whether some pixel counts.
-        """
+        """Start to check files; `counted` decodes a view's mask, and tells whether some pixel counts."""
         self.damage: str | None = None
         self._cameras, self._order, self._counted = cameras, order, counted
         self._stop = threading.Event()

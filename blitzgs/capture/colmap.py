@@ -155,16 +155,11 @@ def count_images(folder: Path) -> int:
 
 
 def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = False) -> ColmapModel:
-    """Read a sparse model; binary files are preferred where both kinds are complete.
+    """Read a sparse model of .bin or .txt files; binary files are preferred where both kinds are complete.
 
-    Args:
-        folder: holds cameras, images and points3D as .bin or .txt (rigs and frames files are not needed).
-        points2d: read the observations of the images too (most of the file's size).
-        tracks: read the tracks of the points too (their lengths are always read).
-
-    Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: a file is damaged; names the file, the byte offset or line, and the reason.
+    Observations of images (`points2d`, most of the file's size) and tracks are read if asked for; the tracks'
+    lengths always are. FileNotFoundError: a file is missing. ValueError: a file is damaged; names the file,
+    the byte offset or line, and the reason.
     """
     folder = Path(folder)
     binary, text = ({name: _file(folder, name, suffix) for name in FILES} for suffix in _SUFFIXES)
@@ -187,9 +182,8 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
 def write_model(folder: Path | str, model: ColmapModel, *, text: bool = False) -> None:
     """Write a sparse model as .bin (or .txt) files, creating the folder.
 
-    Raises:
-        ValueError: columns disagree in length, a camera's parameters do not fit its model, or a name cannot
-            stand in the file.
+    ValueError: columns disagree in length, a camera's parameters do not fit its model, or a name cannot stand
+    in the file.
     """
     folder = Path(folder)
     _check(model, text)

@@ -39,11 +39,8 @@ class ControlPoint:
 def read_control_points(path: Path) -> tuple[list[ControlPoint], str]:
     """Read points from CSV (name, E, N, h, image, x, y; a row a mark) or OpenDroneMap's gcp_list.txt.
 
-    Returns:
-        The points, and the reference system that gcp_list.txt names (empty: none).
-
-    Raises:
-        ValueError: the file is damaged, or a point has two places; names the line.
+    Returns the points, and the reference system that gcp_list.txt names (empty: none). ValueError: the file
+    is damaged, or a point has two places; names the line.
     """
     lines = read_small(path).splitlines()
     head = next((line for line in lines if line.strip()), "")
@@ -113,12 +110,9 @@ class Placed:
 
 
 def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Float64) -> list[Placed]:
-    """Find the points in the capture by the rays through their marks.
+    """Find the points in the capture, by the rays through their marks in pixels of the photographs.
 
-    Args:
-        points: with marks in pixels of the photographs.
-        cameras: of a capture that was loaded without downscaling.
-        origin: `Capture.offset`.
+    The cameras are those of a capture that was loaded without downscaling, `origin` is its `Capture.offset`.
     """
     by_name = _by_name(cameras)
     found = []
@@ -155,8 +149,7 @@ def _by_name(cameras: Sequence[Camera]) -> Mapping[str, Camera]:
 def normalised(lens: Lens, x: float, y: float) -> Float64:
     """Return the normalised coordinates (u, v) that a lens maps to a pixel, by Newton's method.
 
-    Raises:
-        ValueError: the pixel is outside the photograph, or outside what the lens maps.
+    ValueError: the pixel is outside the photograph, or outside what the lens maps.
     """
     if not (0 <= x <= lens.width and 0 <= y <= lens.height):
         raise ValueError(f"the mark {x:g}, {y:g} is outside a photograph of {lens.width} x {lens.height}")
@@ -187,8 +180,7 @@ def _before_fold(lens: Lens, at: Float64) -> bool:
 def _intersect(cameras: Sequence[Camera], rays: Float64) -> Float64:
     """Return the point [3] in the re-centred world that is nearest to rays, by the distances in the images.
 
-    Args:
-        rays: [M, 2] normalised coordinates.
+    The rays are [M, 2], normalised coordinates.
     """
     poses = np.stack([camera.world_to_camera for camera in cameras])
     focal = np.array([camera.rectification.lens.intrinsics[0] for camera in cameras])
@@ -224,10 +216,8 @@ def align(placed: Sequence[Placed], origin: Float64, crs: str, source: str) -> W
     """Fit the similarity to the points that agree, and write residuals into all that were found.
 
     Of five points or more, those that contradict the others are left out (least median of squares over
-    triples: P. J. Rousseeuw, JASA 1984); `Placed.problem` says so.
-
-    Raises:
-        ValueError: fewer than three points can be used, or they lie on a line.
+    triples: P. J. Rousseeuw, JASA 1984); `Placed.problem` says so. ValueError: fewer than three points can be
+    used, or they lie on a line.
     """
     used = [point for point in placed if point.position is not None]
     if len(used) < 3:

@@ -106,11 +106,7 @@ def has_mask(camera: Camera) -> bool:
 
 
 def decoded_shapes(capture: Capture, factors: Iterable[int] = ()) -> dict[Hashable, tuple[int, ...]]:
-    """Return the shapes of all decoded images and masks of a capture, by the keys of `ImageStore`.
-
-    Args:
-        factors: by which images are reduced in addition.
-    """
+    """Return the shapes of all decoded images and masks, also reduced ones, by the keys of `ImageStore`."""
     shapes: dict[Hashable, tuple[int, ...]] = {}
     for factor in (1, *factors):
         for index, camera in enumerate(capture.cameras):
@@ -280,12 +276,7 @@ class ImageStore:
                 del self._pending[key]
 
     def _whole(self, kind: str, index: int, spare: bool = False) -> UInt8:
-        """Return an image or mask of the full size from memory, or decode it here and keep it.
-
-        Args:
-            kind: "image" or "mask".
-            spare: it is not what training reads now; see `BoundedCache.put`.
-        """
+        """Return an "image" or "mask" of the full size from memory, or decode it here and keep it."""
         key = (kind, index, 1)
         found = self._found(key)  # another process may have decoded it since the look-up
         if found is not None:

@@ -51,16 +51,10 @@ class Source:
 def read_layout(
     root: Path, images: str, downscale: float, sparse: str = "largest", project: FoundProject | None = None
 ) -> tuple[list[SourceView], SourcePoints, Source]:
-    """Read the views and points of a folder in any of the layouts of docs/captures.md.
+    """Read the views and points of a folder in any of the layouts of docs/captures.md, or of a `project`.
 
-    Args:
-        downscale: see `load_capture`; decides which folder of images is used.
-        sparse: see `load_capture`.
-        project: file of another program's project to read; None: whatever the folder has.
-
-    Raises:
-        FileNotFoundError: the folder has no capture.
-        ValueError: a file is damaged.
+    `downscale` (which decides on the folder of images) and `sparse` are those of `load_capture`.
+    FileNotFoundError: the folder has no capture. ValueError: a file is damaged.
     """
     if not root.is_dir():
         raise FileNotFoundError(

@@ -76,12 +76,8 @@ def find_apart(
 ) -> tuple[npt.NDArray[np.bool_], list[StrayCamera]]:
     """Find the cameras that must not decide on lengths, and those of them whose pose is wrong.
 
-    Args:
-        views: all views, with finite poses.
-        points: [M, 3] in the same world; may be empty.
-
-    Returns:
-        Whether each view must not decide on lengths [V], and the cameras whose pose is wrong.
+    Poses are finite, and points [M, 3] are in the same world. Returns whether each view must not decide on
+    lengths [V], and the cameras whose pose is wrong.
     """
     centres = camera_centres(np.stack([view.world_to_camera for view in views]))
     middle = np.median(centres, axis=0)
@@ -174,11 +170,7 @@ class Sight:
         return len(blind)
 
     def near(self, views: Sequence[int], extent: float) -> float:
-        """Return the near plane: less than the depth of what the views see, and at most 0.01 x the extent.
-
-        Args:
-            views: the views that decide.
-        """
+        """Return the near plane: less than the depth of what views see, and at most 0.01 x the extent."""
         most = NEAR_OF_EXTENT * extent
         depths = np.sort(self.nearest[list(views)])
         depths = depths[np.isfinite(depths)]
@@ -197,12 +189,7 @@ class Sight:
 
 
 def measured_extent(centres: Float64, points: Float64) -> float:
-    """Return the extent of a scene: see `Capture.extent`.
-
-    Args:
-        centres: of the training cameras that decide on lengths, [V, 3].
-        points: [M, 3] in the same world.
-    """
+    """Return a scene's extent (`Capture.extent`) by its training cameras [V, 3] and points [M, 3]."""
     extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     distance = float(np.median(np.linalg.norm(points - centres[0], axis=1)))
     if extent > _LEAST_SPREAD * distance:
@@ -218,10 +205,9 @@ def measured_extent(centres: Float64, points: Float64) -> float:
 def random_points(
     cameras: Sequence[Camera], offset: Float64, count: int
 ) -> tuple[Float64, npt.NDArray[np.uint8]]:
-    """Return uniform points of random colours in the region that cameras look at, in the capture's own world.
+    """Return uniform points of random colours in the region that cameras look at, in the capture's world.
 
-    Raises:
-        ValueError: all cameras are in one place.
+    ValueError: all cameras are in one place.
     """
     poses = np.stack([camera.world_to_camera for camera in cameras])
     centres, axes = camera_centres(poses), poses[:, 2, :3]

@@ -29,14 +29,10 @@ def find_masks(
 ) -> list[Path | None]:
     """Return the mask of each image, or None.
 
-    Args:
-        masks: folder of masks relative to it; None: `masks/` if it exists; True: `masks/`; False: no masks.
-        names: of the images, relative to their folder or to the capture.
-        given: the masks that the capture's file names.
-
-    Raises:
-        FileNotFoundError: there is no such folder, or a mask that the file names is missing.
-        ValueError: no file of the folder belongs to an image, or a file belongs to several.
+    Names are relative to the images' folder or to the capture; `given` are the masks that the capture's file
+    names. `masks` is a folder relative to `root`; None: `masks/` if it exists; True: `masks/`; False: no
+    masks. FileNotFoundError: there is no such folder, or a mask that the file names is missing. ValueError:
+    no file of the folder belongs to an image, or a file belongs to several.
     """
     if masks is False:
         return [None] * len(names)

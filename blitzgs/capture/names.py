@@ -62,12 +62,9 @@ _RULES: tuple[_Rule, ...] = (
 
 
 def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dict[str, Path]:
-    """Return the file of each of the names for which exactly one file of a folder fits.
+    """Return the file below `folder` of each of the names for which exactly one fits; these do not exist.
 
-    Args:
-        names: relative to `folder`; no such files exist.
-        found: further names, whose files exist; these are not taken for other names.
-        folder: with its subfolders.
+    Further names, `found`, have files, which are not taken for others.
     """
     wanted = list(dict.fromkeys(names))
     if not wanted or not folder.is_dir():
@@ -154,15 +151,9 @@ def what_is_at(path: Path) -> str | None:
 
 
 def check_inside(paths: Iterable[Path], root: Path, allowed: Sequence[Path], refuse: bool) -> None:
-    """Warn of files that names lead to outside the capture, or refuse them.
+    """Warn of paths that lead outside the capture and the `allowed` folders, or refuse them (ValueError).
 
-    Args:
-        paths: files that the capture names.
-        allowed: further folders that the caller chose.
-        refuse: refuse them, also those to which links lead.
-
-    Raises:
-        ValueError: a file is outside, and `refuse` is set.
+    Links that lead outside are refused too.
     """
     bases = [os.path.normpath(folder.absolute()) for folder in (root, *allowed)]
     outside = [path for path in paths if not _is_below(os.path.normpath(path.absolute()), bases)]
@@ -282,15 +273,10 @@ def read_lines(path: Path) -> list[str]:
 
 
 def existing(names: Sequence[str], paths: Sequence[Path], root: Path, images: str, allow: bool) -> list[int]:
-    """Return the indices of the views whose image is on disk.
+    """Return the indices of the views whose image is on disk; with `allow`, warn of the others.
 
-    Args:
-        allow: warn of missing images instead of failing.
-
-    Raises:
-        MissingImagesError: images are missing.
-        FileNotFoundError: all are missing.
-        ValueError: two views have one image.
+    MissingImagesError, FileNotFoundError: images are missing, or all are. ValueError: two views have one
+    image.
     """
     exists = [path.is_file() for path in paths]
     owners = defaultdict(list)

@@ -26,11 +26,10 @@ _GREY = 128
 
 
 def read_points(path: Path) -> tuple[Float64, npt.NDArray[np.uint8] | None, Any]:
-    """Return positions [M, 3], colours [M, 3] (None: the file has none), and the reference system or None.
+    """Return positions and colours [M, 3] (None: the file has none), and the reference system or None.
 
-    Raises:
-        ImportError: the package that reads the format is not installed.
-        ValueError: the file is damaged; names it.
+    ImportError: the package that reads the format is not installed. ValueError: the file is damaged; names
+    it.
     """
     try:
         return _read_e57(path) if path.suffix.lower() == ".e57" else _read_las(path)
@@ -136,13 +135,7 @@ class SourcePoints:
 
 
 def file_points(path: Path) -> SourcePoints:
-    """Read the points of a PLY, LAS, LAZ or E57 file; warn if they have no colours.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ImportError: the package that reads the format is not installed.
-        ValueError: the file is damaged, or has no points.
-    """
+    """Read the points of a PLY, LAS, LAZ or E57 file; warn if they have no colours; errors: `read_points`."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} is missing: put the file of points there, or correct its name")
     if path.suffix.lower() in SUFFIXES:
@@ -163,11 +156,7 @@ def file_points(path: Path) -> SourcePoints:
 
 
 def transforms_points(root: Path, content: Transforms, model: Path | None) -> SourcePoints:
-    """Return the points of transforms.json: those that it names, else those beside it in the same world.
-
-    Args:
-        model: the COLMAP model beside it, if there is one.
-    """
+    """Return the points that transforms.json names, else those beside it or of `model` in the same world."""
     if content.points_path is not None:
         return file_points(content.points_path)
     plys = sorted(path for path in root.iterdir() if path.suffix.lower() == ".ply" and path.is_file())

@@ -107,11 +107,7 @@ class SharedImages:
 
     @classmethod
     def create(cls, shapes: Mapping[Hashable, tuple[int, ...]]) -> tuple[SharedImages, SharedMemoryOffer]:
-        """Make memory for uint8 images of these shapes; it takes up memory only as images are put there.
-
-        Raises:
-            OSError: the system has no such memory.
-        """
+        """Make memory for uint8 images of these shapes (OSError: the system has none); images fill it up."""
         file = os.memfd_create("blitzgs-images")
         os.ftruncate(file, size_of(shapes))
         images = cls(file, shapes)
@@ -121,11 +117,7 @@ class SharedImages:
 
     @classmethod
     def join(cls, offer: SharedMemoryOffer, shapes: Mapping[Hashable, tuple[int, ...]]) -> SharedImages:
-        """Map the memory that another process of the host has made for the same shapes.
-
-        Raises:
-            OSError: this process has no access to it.
-        """
+        """Map the memory that another process of the host made for the same shapes (OSError: no access)."""
         file = os.open(offer.path, os.O_RDWR)
         if os.fstat(file).st_size != size_of(shapes):
             os.close(file)

@@ -78,8 +78,7 @@ def find_transforms(root: Path) -> list[Path]:
 def read_transforms(root: Path, files: Sequence[Path] | None = None) -> Transforms:
     """Read every frame of a capture, or of the given files, whose images are relative to `root`.
 
-    Raises:
-        ValueError: a field is missing or makes no sense; names the file, the frame and the field.
+    ValueError: a field is missing or makes no sense; names the file, the frame and the field.
     """
     frames: list[Frame] = []
     points_path, applied = None, None

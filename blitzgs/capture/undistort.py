@@ -76,8 +76,7 @@ class Rectification:
 def rectify(lens: Lens, policy: str = "crop") -> Rectification:
     """Choose the pinhole image for a lens; `policy` is "crop" or "mask".
 
-    Raises:
-        ValueError: hardly anything of the image can be kept (damaged distortion parameters).
+    ValueError: hardly anything of the image can be kept (damaged distortion parameters).
     """
     if lens.is_pinhole:
         return Rectification(lens, lens.width, lens.height, 0, 0, has_invalid=False)

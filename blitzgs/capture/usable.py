@@ -116,14 +116,9 @@ def points_at_random(root: Path, cameras: Sequence[Camera], offset: Float64) -> 
 def read_cameras(path: Path, offset: Float64) -> list[Camera]:
     """Read the cameras of a transforms file of any name, or of a folder with one or with a COLMAP model.
 
-    Lenses with distortion become pinhole cameras, as in a capture.
-
-    Args:
-        offset: float64 [3], subtracted from the positions.
-
-    Raises:
-        FileNotFoundError: there is no such file, or no camera in the folder.
-        ValueError: a file is damaged, or has no camera; the message names it.
+    Lenses with distortion become pinhole cameras, as in a capture; `offset` [3] is subtracted from the
+    positions. FileNotFoundError: there is no such file, or no camera in the folder. ValueError: a file is
+    damaged, or has no camera.
     """
     if path.is_file():
         read = transforms.read_transforms(path.parent, [path])

@@ -122,11 +122,7 @@ def add_split(parser: argparse.ArgumentParser, verb: str) -> None:
 
 
 def chosen_views(split: str, cameras: Capture | RunCameras, folder: Path) -> Sequence[int]:
-    """Return the cameras that --split names, as indices.
-
-    Raises:
-        ValueError: there are none; names the run's folder.
-    """
+    """Return the cameras that --split names, as indices (ValueError: the run in `folder` has none)."""
     indices: Sequence[int] = range(len(cameras.cameras)) if split == "all" else getattr(cameras, split)
     if not indices:
         raise ValueError(f"{folder} has no {split} views: choose another --split")
@@ -160,13 +156,10 @@ class Parser(argparse.ArgumentParser):
 
 
 def split_fields(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Separate the fields of a configuration from a command's other arguments.
+    """Return a command's arguments without configuration fields, and these as "--section.field=value".
 
     A field is a flag with a dot, or one that the command does not have and that has a value after "=". Its
     value follows after "=" or as the next argument.
-
-    Returns:
-        The other arguments, and the fields as "--section.field=value".
     """
     others: list[str] = []
     fields: list[str] = []

@@ -132,11 +132,7 @@ def examine(folder: Path | None = None, timeout: float = 120.0) -> list[Line]:
 
 
 def probe(name: str, *arguments: str, timeout: float) -> dict[str, Any]:
-    """Run a probe in a process of its own and return what it found.
-
-    Raises:
-        ProbeError: it failed, crashed or took longer than `timeout` seconds.
-    """
+    """Run a probe in a process of its own and return what it found; raises ProbeError as `run_command`."""
     command = [sys.executable, "-m", "blitzgs.cli.doctor_probes", name, *arguments]
     output = run_command(command, timeout)
     try:
@@ -149,8 +145,7 @@ def probe(name: str, *arguments: str, timeout: float) -> dict[str, Any]:
 def run_command(command: Sequence[str], timeout: float) -> str:
     """Run a command, with all processes that it starts, and return its standard output.
 
-    Raises:
-        ProbeError: it cannot be started, failed, was killed or took longer than `timeout` seconds.
+    ProbeError: it cannot be started, failed, was killed or took longer than `timeout` seconds.
     """
     path = os.pathsep.join(filter(None, [str(_PACKAGE.parent), os.environ.get("PYTHONPATH")]))
     try:

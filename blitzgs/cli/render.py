@@ -161,11 +161,9 @@ def _film(args: argparse.Namespace) -> Film | None:
 def _renders(
     opened: Rendered, ranks: Ranks, destination: Callable[[int], int]
 ) -> Iterator[tuple[int, Tensor | None]]:
-    """Render the views, and yield the index of each and its colours, float32 [H, W, 3], on one rank.
+    """Render the views, and yield each index and its colours, float32 [H, W, 3], on the rank `destination`.
 
-    Args:
-        ranks: the job; every rank goes through all views.
-        destination: returns the rank that gets a view, by its position; the others get None.
+    Every rank goes through all views; `destination` depends on the position, and other ranks get None.
     """
     views, subject = ViewSet(list(opened.cameras), opened.space, ranks.device), opened.subject
     finder, owners = VisibleFinder(subject.scene, subject.lod), TileOwners(ranks)

@@ -45,11 +45,7 @@ class Rendered:
 
 
 def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> Rendered:
-    """Open the model, and choose the cameras. Collective.
-
-    Raises:
-        ValueError, OSError: a file is missing or damaged, or flags do not fit the model.
-    """
+    """Open the model, and choose the cameras. Collective."""
     if args.model.is_file():
         opened = _open_ply(args, ranks)
         subject, space, box = opened.subject, opened.exhibit.space, opened.exhibit.box

@@ -32,11 +32,8 @@ _KINDS = {int: "integer", float: "number", bool: "true or false", str: "text", t
 def describe(wanted: str) -> str:
     """Describe fields: meaning, kind, default and allowed values.
 
-    Args:
-        wanted: "section.field", a field's name without its section, or a section; leading dashes are allowed.
-
-    Raises:
-        ConfigError: there is no such field.
+    `wanted` is "section.field", a field's name without its section, or a section; leading dashes are allowed.
+    ConfigError: there is no such field.
     """
     name = wanted.lstrip("-").partition("=")[0]
     sections = _sections()

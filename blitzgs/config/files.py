@@ -60,15 +60,11 @@ REMOVED: Mapping[str, Any] = {
 
 
 def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -> Config:
-    """Build a configuration from the defaults, then a YAML file, then overrides.
+    """Build a configuration from the defaults, then a YAML file, then overrides, "section.field=value".
 
-    Args:
-        path: YAML file with sections as in `Config`, or None. A file may name another one under `base`
-            (relative to itself, or the name of a recipe); it then changes the values of that file.
-        overrides: "section.field=value" with a YAML value; leading dashes are allowed.
-
-    Raises:
-        ConfigError: unknown field, ill-typed or impossible value, unreadable file.
+    A file may name another one under `base` (relative to itself, or the name of a recipe); it then changes
+    the values of that file. Values of overrides are YAML; leading dashes are allowed. ConfigError: an unknown
+    field, an ill-typed or impossible value, or an unreadable file.
     """
     values: dict[str, Any] = {}
     if path is not None:

@@ -54,11 +54,7 @@ class RunData:
 
 
 def read_run(path: Path) -> RunData:
-    """Read a run; damaged files are left out, and named in `problems`.
-
-    Raises:
-        FileNotFoundError: the folder is not a run.
-    """
+    """Read a run (FileNotFoundError: it is none); damaged files are left out, and named in `problems`."""
     folder = open_run(path)
     data = RunData(folder, {}, [], None, None, {})
     try:

@@ -37,12 +37,9 @@ _ROOM_FOR_NOTES = 1000
 def page(
     title: str, scripts: tuple[str, ...], data: Mapping[str, Any], look: Mapping[str, str] | None = None
 ) -> str:
-    """Return a page.
+    """Return a page of some scripts of `assets` and their data; numbers that JSON lacks become null.
 
-    Args:
-        scripts: names of files in `assets`, in their order.
-        data: what the scripts read; numbers that JSON lacks become null.
-        look: "html", a page with the model in 3D, and "note", a sentence about it; None: there is none.
+    `look` has "html", a page with the model in 3D, and "note", a sentence about it; None: there is none.
     """
     assets = files("blitzgs.report") / "assets"
     values = {
@@ -60,11 +57,7 @@ def page(
 def fitted(
     title: str, scripts: tuple[str, ...], data: dict[str, Any], look: Mapping[str, str] | None = None
 ) -> str:
-    """Return a page of at most `MAX_BYTES`: the look in 3D is left out first, then pictures, and it says so.
-
-    Raises:
-        ValueError: the page is larger without either.
-    """
+    """Return a page of at most `MAX_BYTES`: the look in 3D is left out first, then pictures; it says so."""
     pictures, notes = data["pictures"], list(data["left_out"])
     room = MAX_BYTES - _ROOM_FOR_NOTES - len(page(title, scripts, data | {"pictures": []}).encode())
     if room < 0:
@@ -80,12 +73,7 @@ def fitted(
 
 
 def write_page(path: Path, text: str) -> None:
-    """Write a page.
-
-    Raises:
-        FileExistsError: the file exists and is no page of ours.
-        OSError: it cannot be written.
-    """
+    """Write a page (FileExistsError: the file exists and is no page of ours)."""
     check_replaces_page(path)
     write_file(path, text, sync=False)
 
@@ -110,15 +98,7 @@ _SHOWN_EXTREMES = 4
 
 
 def report(folder: Path, look: Mapping[str, str] | None = None) -> str:
-    """Return the report of a run as HTML of at most `blitzgs.report.report.MAX_BYTES`.
-
-    Args:
-        folder: the run; it may be unfinished.
-        look: the model in 3D; see `blitzgs.report.report.page`.
-
-    Raises:
-        FileNotFoundError: the folder is not a run.
-    """
+    """Return the report of a run, which may be unfinished, as HTML of at most `MAX_BYTES`; see `page`."""
     data = read_run(folder)
     metrics = gather.metrics_of(data.views)
     content = {
@@ -142,12 +122,7 @@ def report(folder: Path, look: Mapping[str, str] | None = None) -> str:
 
 
 def write_report(folder: Path, look: Mapping[str, str] | None = None, out: Path | None = None) -> Path:
-    """Write the report of a run, into its folder if `out` is None; return the file.
-
-    Raises:
-        FileNotFoundError: the folder is not a run.
-        OSError: the file cannot be written, or exists and is no such page.
-    """
+    """Write the report of a run, into its folder if `out` is None; return the file."""
     path = out or folder / run_files.REPORT
     write_page(path, report(folder, look))
     return path
@@ -194,12 +169,8 @@ LOOK_BYTES = 4_000_000
 def look_of(folder: Path) -> dict[str, str]:
     """Return the newest model of a run as a page with its viewer ("html"), and what it lacks ("note").
 
-    The checkpoint is read into host memory, with the optimiser's moments.
-
-    Raises:
-        FileNotFoundError: there is no checkpoint.
-        CheckpointError: all checkpoints are damaged.
-        ValueError: the model has no visible Gaussian.
+    The checkpoint is read into host memory, with the optimiser's moments. FileNotFoundError and
+    CheckpointError: there is no sound checkpoint. ValueError: the model has no visible Gaussian.
     """
     found = web_file(open_model(folder, Ranks()), LOOK_BYTES)
     note = f"{found.gaussians:,} of {found.of:,} Gaussians. {found.left_out}"
@@ -213,12 +184,7 @@ _MAX_PICTURED = 12
 
 
 def compare(folders: Sequence[Path]) -> str:
-    """Return a page that compares runs, as HTML of at most `blitzgs.report.report.MAX_BYTES`.
-
-    Raises:
-        FileNotFoundError: a folder is not a run.
-        ValueError: there are fewer than two, or a configuration cannot be read.
-    """
+    """Return a page that compares runs with the first, as HTML of at most `MAX_BYTES`."""
     if len(folders) < 2:
         raise ValueError("a comparison needs two runs or more")
     runs = [read_run(folder) for folder in folders]

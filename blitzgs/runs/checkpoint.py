@@ -166,21 +166,11 @@ def load_latest(
     problem: Callable[[dict[str, Tensor]], str | None] = lambda columns: None,
     only: str | None = None,
 ) -> Loaded | None:
-    """Load this rank's share of the newest sound checkpoint.
+    """Load this rank's share of the newest sound checkpoint, or of the one named `only`; None: there is none.
 
     A damaged checkpoint is refused, and the one before it is tried. A warning names the refused checkpoints,
-    the reasons, and the checkpoint that is used.
-
-    Args:
-        ranks: the job, of any world size.
-        problem: returns what is wrong with a shard's columns, or None.
-        only: name of the one checkpoint to load; None: the newest.
-
-    Returns:
-        The checkpoint; None if the folder has none.
-
-    Raises:
-        CheckpointError: checkpoints exist, but none is sound.
+    the reasons (those of `problem` too, which looks at a shard's columns), and the checkpoint that is used.
+    CheckpointError: checkpoints exist, but none is sound.
     """
     found = ranks.broadcast_object(names_of(Path(directory)) if ranks.rank == 0 else [])
     refused = []
@@ -204,21 +194,12 @@ def load_latest(
 def load(
     path: str | os.PathLike[str], ranks: Ranks, device: torch.device | str
 ) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Tensor]]:
-    """Load this rank's share of one checkpoint.
+    """Load this rank's share of one checkpoint: its shard's columns, the state, and tensors for all ranks.
 
     With the world size that it was saved with, each rank gets its own shard unchanged. With another one the
     rows are redistributed: rank m gets the positions = m (mod M) of the global order
-    (`sharding.global_positions`), and opens only the files that hold some of these rows.
-
-    Args:
-        ranks: the job, of any world size.
-
-    Returns:
-        The columns of this rank's shard, name -> [N_rank, ...]; the state; and the tensors that are the same
-        on all ranks, on the CPU.
-
-    Raises:
-        CheckpointError: on every rank, when a file is missing, torn or altered.
+    (`sharding.global_positions`), and opens only the files that hold some of these rows. CheckpointError, on
+    every rank: a file is missing, torn or altered.
     """
     path = Path(path)
     manifest, problem = None, None

@@ -66,17 +66,10 @@ def image_metrics(render: Tensor, target: Tensor, mask: Tensor | None) -> dict[s
 
 
 def correct_colours(pixels: Tensor, wanted: Tensor) -> Tensor:
-    """Apply the affine colour map (a 3 x 4 matrix) that brings `pixels` closest to `wanted`.
+    """Apply the affine colour map (3 x 4) that brings `pixels` closest to `wanted`, float64 [P, 3]; clamped.
 
     The map is fitted by least squares over the pixels of one view. It removes differences of exposure and
     white balance, which are properties of the photograph and not of the scene.
-
-    Args:
-        pixels: float64 [P, 3].
-        wanted: float64 [P, 3].
-
-    Returns:
-        float64 [P, 3], clamped to [0, 1].
     """
     known = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
     # The pseudo-inverse also handles a view of a single colour, for which many maps are equally good.

@@ -116,13 +116,9 @@ def backend() -> str:
 
 
 def run_stage(stage: str, job: Job, log: Path, lock: int, report: Report) -> None:
-    """Do a stage; what COLMAP says is added to the file `log`.
+    """Do a stage of `STAGES`; what COLMAP says is added to the file `log`, its last words are a StageError.
 
-    Args:
-        lock: descriptor of a locked file, which the processes hold until they end.
-
-    Raises:
-        StageError: COLMAP failed; has its last words.
+    Its processes hold the locked file `lock`, a descriptor, until they end.
     """
     program = backend()
     Path(job.models).mkdir(parents=True, exist_ok=True)
@@ -224,12 +220,8 @@ def _gpu_flags(program: str, command: str) -> list[str]:
 def decided(job: Job, gps: bool, use_altitude: bool) -> Job:
     """Return the job with what "auto" means for its photographs.
 
-    Args:
-        gps: whether the photographs' positions tell neighbours apart; pycolmap also uses them for poses.
-        use_altitude: whether their altitudes can be used.
-
-    Raises:
-        ValueError: the user wants neighbours by GPS, and there are none.
+    `gps`: their positions tell neighbours apart; pycolmap also uses them for poses, with altitudes if these
+    can be used. ValueError: the user wants neighbours by GPS, and there are none.
     """
     if job.pairs == "gps" and not gps:
         raise ValueError(

@@ -65,9 +65,8 @@ class Photographs:
     def of(cls, folder: Path) -> Photographs:
         """Read the photographs of a folder; masks are searched in `masks/` in it and beside it.
 
-        Raises:
-            FileNotFoundError: the folder has no photographs.
-            ValueError: fewer than three can be used, or masks belong to none of them.
+        FileNotFoundError: there are none. ValueError: fewer than three can be used, or masks belong to none
+        of them.
         """
         names = find_photographs(folder) if folder.is_dir() else []
         if not names:

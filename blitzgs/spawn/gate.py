@@ -71,12 +71,7 @@ def write_info(path: Path, info: GateInfo) -> None:
 
 
 def check_no_other(path: Path) -> None:
-    """Check that a new gate would replace only the files of a gate, which its metadata show.
-
-    Raises:
-        FileExistsError: there is a model file without metadata, or another file at the path of the metadata.
-        OSError: one of the two is no regular file.
-    """
+    """Refuse to replace files that are not a gate's, as its metadata show (FileExistsError, OSError)."""
     metadata = info_path(path)
     for file in (path, metadata):
         check_replaceable(file)
@@ -95,11 +90,7 @@ def check_no_other(path: Path) -> None:
 
 
 def read_info(path: Path) -> GateInfo:
-    """Read the metadata of a model file.
-
-    Raises:
-        GateError: they are missing, damaged, of another format, or of other features.
-    """
+    """Read a model file's metadata (GateError: missing, damaged, of another format or other features)."""
     if not path.name:
         raise GateError(f"{path}: no such gate; `blitzgs gate fit` makes one")
     beside = info_path(path)
@@ -133,13 +124,9 @@ class SpawnGate:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read a model and its metadata.
+        """Read a model in XGBoost's JSON and its metadata.
 
-        Args:
-            path: a model in XGBoost's JSON.
-
-        Raises:
-            GateError: a file is missing, damaged or of another kind; for UBJSON it says how to convert it.
+        GateError: a file is missing, damaged or of another kind; for UBJSON it says how to convert it.
         """
         self.info = read_info(path)
         if path.suffix == ".ubj":
@@ -155,13 +142,9 @@ class SpawnGate:
             raise GateError(f"{path} is not a binary classifier in XGBoost's JSON: {error!r}") from error
 
     def scores(self, features: Tensor) -> Tensor:
-        """Score candidates by their chance to survive.
+        """Score candidates by their chance to survive, from features float32 [M, F]; NaN: unknown.
 
-        Args:
-            features: float32 [M, F], see `FEATURES`; NaN: unknown.
-
-        Returns:
-            int64 [M], the sum of the trees' leaves in units of 2^-32: log odds up to a constant.
+        Returns int64 [M], the sum of the trees' leaves in units of 2^-32: log odds up to a constant.
         """
         self._trees = self._trees.to(features.device)
         trees = self._trees
@@ -218,16 +201,10 @@ def veto_draws(candidates: Candidates, seed: int) -> Tensor:
 
 
 def veto_lowest(scores: Tensor, candidates: Candidates, rate: float, ranks: Ranks) -> Tensor:
-    """Mark the ceil(rate n) lowest of all ranks' n clones, and likewise of their splits.
+    """Mark the ceil(rate n) lowest of all ranks' n clones, and likewise of their splits. Collective.
 
-    Args:
-        scores: float32 [M].
-        candidates: candidates of this rank.
-        rate: vetoed share in [0, 1]; its decimal value counts.
-        ranks: the job; every rank calls this.
-
-    Returns:
-        bool [M], the same candidates at every world size; ties go to the smaller parent id.
+    Scores are float32 [M]; of the rate, in [0, 1], the decimal value counts. Returns bool [M], the same
+    candidates at every world size; ties go to the smaller parent id.
     """
     vetoed = torch.zeros_like(candidates.is_split)
     for group in (~candidates.is_split, candidates.is_split):

@@ -83,16 +83,11 @@ class Lineage:
     def __init__(
         self, folder: Path, ranks: Ranks, step: int, ledger: Ledger, about: dict[str, Any] | None = None
     ) -> None:
-        """Begin a log, or continue one from a checkpoint. Collective.
+        """Begin a log, or continue one from the checkpoint of `step` and `ledger`. Collective.
 
-        Args:
-            folder: folder of the parts of all ranks, made if missing.
-            step: optimiser step of the checkpoint; parts that were written later are deleted.
-            ledger: ledger of the checkpoint. One without births begins a log: all parts are deleted.
-            about: description of the run, for the file `ABOUT`.
-
-        Raises:
-            ImportError: pyarrow is not installed.
+        The folder is that of all ranks' parts; those that were written after the checkpoint are deleted, and
+        all if the ledger has no births. `about` describes the run, for the file `ABOUT`. ImportError: pyarrow
+        is not installed.
         """
         self._writer = PartWriter(folder, ranks.device)
         self._folder, self._ranks, self.ledger = folder, ranks, ledger
@@ -122,30 +117,15 @@ class Lineage:
         self._log("births", (torch.stack((births.ids, births.parents)), floats), step)
 
     def died(self, ids: Tensor, causes: Tensor, time: int, step: int) -> None:
-        """Log deaths.
-
-        Args:
-            ids: int64 [M]; kept, so it must not change any more.
-            causes: [M], values of `Cause`; the same holds.
-            time: time of the event, in images.
-        """
+        """Log deaths: ids, int64 [M], and values of `Cause` [M], which must not change any more."""
         times = torch.full_like(ids, time, dtype=torch.int32)
         self._log("deaths", (ids[None], times[None], causes.to(torch.uint8)[None]), step)
 
     def flush_and_check(self, ids: Tensor, step: int) -> Ledger:
-        """Write all pending rows and check that births - deaths is the population. Collective.
+        """Write pending rows, before a checkpoint, and check that births less deaths are the population.
 
-        Call this before a checkpoint is written.
-
-        Args:
-            ids: int64 [N], ids of this rank's live Gaussians.
-
-        Returns:
-            The present ledger.
-
-        Raises:
-            LineageError: on every rank, when births - deaths is not the live population.
-            OSError: on every rank, when one could not write a part; a later call tries that part again.
+        Returns the present ledger. LineageError, on every rank: births - deaths is not the live population.
+        OSError, on every rank: one could not write a part; a later call tries that part again.
         """
         self.flush(step)
         failed = [(error.errno, str(error)) for error in self._writer.finish()]

@@ -131,17 +131,11 @@ LEAST_IMAGES = 100
 
 
 def extended(config: Config, step: int, by: float) -> Config:
-    """Return the configuration of a finished run with a longer schedule.
+    """Return the configuration of a finished run with a longer schedule: `by` images, or `by` times as long.
 
-    The times of all events stay, so the new part of the run has no density events and no importance passes.
-    Learning rates stay at their final values.
-
-    Args:
-        step: number of steps that the run has taken.
-        by: number of images to add, if at least `LEAST_IMAGES`; else the factor of the run's length.
-
-    Raises:
-        ConfigError: the run is not finished, or would become too long.
+    It is a number of images from `LEAST_IMAGES` on. The times of all events stay, so the new part of the run
+    has no density events and no importance passes. Learning rates stay at their final values. ConfigError:
+    the run is not finished, or would become too long.
     """
     schedule = Schedule(config.schedule)
     if step < schedule.steps:

@@ -171,19 +171,14 @@ def replay(
 ) -> Iterator[dict[str, Any]]:
     """Train every arm to the end, one after the other. Collective.
 
-    Yields:
-        For each arm, when it is trained: its name, psnr, ssim, peak and final Gaussians, the seconds of
-        training since the branch, the reference's share of non-surviving events (`dead`) and of candidates
-        that the limit of the population held back (`held_back`), and of an oracle the share of the candidates
-        that it knew (`matched`).
+    Yields, for each arm: its name, psnr, ssim, peak and final Gaussians, the seconds of training since the
+    branch, the reference's share of non-surviving events (`dead`) and of candidates that the limit of the
+    population held back (`held_back`), and of an oracle the share of the candidates that it knew (`matched`).
 
-    Raises:
-        ValueError: the run logged no lineage, has no candidates from the gate's onset on, was trained by the
-            clock, ends before the onset, or all pixels of the views that are measured are masked.
-        FileNotFoundError: it has no checkpoint from before the onset.
-        FileExistsError: `out` holds a replay already, or another folder with the name of an arm. A replay
-            that ended before its first arm was trained is begun again.
-        FolderError: another process is training in the folder of an arm.
+    ValueError, FileNotFoundError: the run cannot be branched, or its arms could not be compared.
+    FileExistsError: `out` holds a replay already, or another folder with the name of an arm; a replay that
+    ended before its first arm was trained is begun again. FolderError: another process is training in the
+    folder of an arm.
     """
     _check_comparable(config, capture, images, source)
     _check_unclaimed(out, ranks)

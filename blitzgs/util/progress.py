@@ -18,8 +18,7 @@ Report = Callable[[int, int], None]
 def image_progress(what: str, shown: bool = True) -> Iterator[Report]:
     """Show a bar on standard error while the context lasts, if standard error is a terminal.
 
-    Yields:
-        A function to call with (images done, number of images).
+    Yields a function to call with (images done, number of images).
     """
     console = Console(stderr=True)
     columns = (

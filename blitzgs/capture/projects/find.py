@@ -67,9 +67,7 @@ def find_project(root: Path) -> FoundProject | None:
     """Return the project in a folder; None: there is none.
 
     A reconstruction of Bundler beside another project has its points, and is not a project of its own.
-
-    Raises:
-        ValueError: there are several.
+    ValueError: there are several.
     """
     found = [
         FoundProject(kind, file)
@@ -97,9 +95,8 @@ def read_project(
 ) -> tuple[list[str], list[Path], list[Lens], Project, SourcePoints]:
     """Read a project: names, files, lenses, the project itself, and its points.
 
-    Raises:
-        FileNotFoundError: no photograph is there, so that the size of none is known.
-        ValueError: the project is damaged.
+    FileNotFoundError: no photograph is there, so that the size of none is known. ValueError: the project is
+    damaged.
     """
     project = found.kind.read(found.file)
     if not project.views:
@@ -183,18 +180,10 @@ _SAMPLE, _VIEWS = 2000, 100
 def points_beside(
     root: Path, own: SourcePoints | None, frame: WorldFrame | None, cameras: Sequence[tuple[Lens, Float64]]
 ) -> SourcePoints:
-    """Return the points in the folder of a project, in the world of its cameras.
+    """Return the project's own points, or those of a file beside it, in the world of its cameras.
 
     Programs export cameras in coordinates of their own and points in those of a reference system, or both in
-    one of the two: the coordinates in which the views see the points are taken.
-
-    Args:
-        own: points that the project itself brings; None: a file of points is searched.
-        frame: where the cameras lie in the world.
-        cameras: lenses and poses [4, 4] of the views.
-
-    Raises:
-        ImportError, ValueError: see `file_points`.
+    one of the two: the coordinates in which the views (lenses and poses [4, 4]) see the points are taken.
     """
     points = own
     if points is None:

@@ -48,11 +48,7 @@ _LINES = 10
 
 
 def read_pix4d(path: Path) -> Project:
-    """Read the cameras of a parameter file, with the offset and reference system beside it.
-
-    Raises:
-        ValueError: the file is damaged; names the line.
-    """
+    """Read the cameras of a parameter file, with the offset and reference system beside it."""
     lines = [line.strip() for line in read_text(path).splitlines()]
     begin = next((i for i, line in enumerate(lines) if line.startswith("camera model")), None)
     if begin is None:
@@ -91,12 +87,7 @@ def _frame(path: Path) -> WorldFrame | None:
 
 
 def read_opf(path: Path) -> Project:
-    """Read the calibrated cameras of a project.
-
-    Raises:
-        ValueError: a file or field is missing or makes no sense; names it.
-        FileNotFoundError: a file that the project names is missing.
-    """
+    """Read the calibrated cameras of a project."""
     files = _resources(path)
     content = {
         kind: _content(path, files, kind) for kind in ("calibrated-cameras", "input-cameras", "camera-list")

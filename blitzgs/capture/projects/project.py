@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the readers of projects have in common: their result, and safe parsing of XML, JSON and numbers."""
+"""What the readers of projects have in common: their result, and safe parsing of XML, JSON and numbers.
+
+All raise ValueError for what is damaged, missing or not supported; it names the file and the place in it.
+"""
 
 from __future__ import annotations
 
@@ -49,11 +52,7 @@ class Project:
 
 
 def pose_of(camera_to_world: Float64, centre: Sequence[float] | Float64, where: str) -> Float64:
-    """Return world to camera [4, 4] of a camera's axes in the world [3, 3] (as columns) and its centre.
-
-    Raises:
-        ValueError: the axes are no rotation.
-    """
+    """Return world to camera [4, 4] of a camera's axes in the world [3, 3] (as columns) and its centre."""
     check_rotation(camera_to_world, where)
     pose = np.eye(4)
     pose[:3, :3] = camera_to_world.T
@@ -140,9 +139,6 @@ def read_xml(path: Path) -> ElementTree.Element:
     """Return the root of an XML file.
 
     Entities are refused: a few lines of them expand to gigabytes or name other files, and no project has one.
-
-    Raises:
-        ValueError: the file is no XML, or defines entities; names the file and the line.
     """
     check_size(path)
     builder = ElementTree.TreeBuilder()

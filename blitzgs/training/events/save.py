@@ -45,16 +45,9 @@ def run(state: TrainingState, event: Event | None = None) -> None:
 def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[], bool]) -> None:
     """Write the checkpoint at the end of a run; if there is no space for it, wait and try again.
 
-    If it cannot be written for another reason, which waiting does not change, the model is saved elsewhere.
-
-    Args:
-        patience_seconds: longest time to wait.
-        gives_up: asked before each wait whether to stop trying; it must return the same on every rank.
-
-    Raises:
-        NonFiniteError: as for `run`.
-        CheckpointError: it could not be written in time, or not at all; the message says whether and where
-            the model was saved instead.
+    `gives_up`, the same on every rank, is asked before each wait. If it cannot be written for another reason,
+    which waiting does not change, the model is saved elsewhere. CheckpointError: it could not be written in
+    time, or not at all; the message says whether and where the model was saved instead.
     """
     waited, pause = 0.0, FIRST_WAIT_SECONDS
     while True:
