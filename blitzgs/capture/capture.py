@@ -32,7 +32,7 @@ from blitzgs.capture.image_files import ImageHeader, read_header
 from blitzgs.capture.layouts import Source, SourceView, read_layout
 from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_extent
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.masks import excluded_share, find_masks
+from blitzgs.capture.masks import check_masks, find_masks
 from blitzgs.capture.names import MissingImagesError as MissingImagesError
 from blitzgs.capture.names import check_inside, existing
 from blitzgs.capture.points import SourcePoints
@@ -101,8 +101,6 @@ class About:
     colors_from: str = ""  # what in it gives their colours; empty: nothing
     with_alpha: int = 0  # number of photographs that have alpha
     extra_bands: int = 0  # number of photographs with a band that is neither colour nor alpha; it is not used
-    with_mask: int = 0  # number of photographs that have a mask
-    mask_share: float | None = None  # mean share of the pixels that masks exclude, of a few masks
     damaged: int = 0  # number of views that `allow_missing` left out because their image or mask is damaged
 
 
@@ -194,6 +192,7 @@ def load_capture(
     with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # the files may be on a slow network disk
         headers = list(pool.map(lambda view: read_header(view.path), views))
     extra_bands = [view for view, header in zip(views, headers, strict=True) if header.extra_bands]
+    check_masks([view.mask_path for view in views])
     if extra_bands:
         warnings.warn(
             f"{len(extra_bands)} of {len(views)} photographs have a further band that their file does not "
@@ -239,8 +238,6 @@ def load_capture(
             colors_from=points.colors_from,
             with_alpha=sum(header.has_alpha for header in headers),
             extra_bands=len(extra_bands),
-            with_mask=sum(view.mask_path is not None for view in views),
-            mask_share=excluded_share([view.mask_path for view in views]),
             damaged=len(damage),
         ),
     )

@@ -10,13 +10,15 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture.cameras import Camera, Float64, camera_centres
-from blitzgs.capture.lens import Lens
+
+if TYPE_CHECKING:
+    from blitzgs.capture.layouts import SourceView
 
 # Cameras whose distance is below this share of the points' distance count as being in one place: the parallax
 # between them is far below a pixel.
@@ -40,22 +42,6 @@ _SKIPPED_POINTS, _SKIPPED_VIEWS = 0.02, 0.01
 _PAIRS, _LEAST_POINTS = 10_000_000, 2000
 
 
-class PosedView(Protocol):
-    """What the search for stray cameras reads of a view."""
-
-    @property
-    def name(self) -> str:
-        """Name of the image."""
-
-    @property
-    def lens(self) -> Lens:
-        """Lens at the size that the capture's file states."""
-
-    @property
-    def world_to_camera(self) -> Float64:
-        """Pose, [4, 4]."""
-
-
 @dataclass(frozen=True)
 class StrayCamera:
     """A camera that lies apart from all others and hardly shows a point: its pose is wrong."""
@@ -72,7 +58,7 @@ def sampled(points: Float64, views: int) -> Float64:
 
 
 def find_apart(
-    views: Sequence[PosedView], points: Float64
+    views: Sequence[SourceView], points: Float64
 ) -> tuple[npt.NDArray[np.bool_], list[StrayCamera]]:
     """Find the cameras that must not decide on lengths, and those of them whose pose is wrong.
 
@@ -107,7 +93,7 @@ def find_apart(
     return apart, strays
 
 
-def _shown(view: PosedView, points: Float64) -> float:
+def _shown(view: SourceView, points: Float64) -> float:
     """Return the share of an image's sides on which a view shows the inner 90 % of what it sees."""
     x, y, depth = view.world_to_camera[:3, :3] @ points.T + view.world_to_camera[:3, 3:]
     front = depth > 0

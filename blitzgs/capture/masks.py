@@ -131,19 +131,14 @@ def _places(name: str) -> Iterator[str]:
             yield "/".join((*parts[begin:-1], form.format(name=path.name, stem=path.stem) + suffix))
 
 
-def excluded_share(masks: Sequence[Path | None]) -> float | None:
-    """Return the mean share of the pixels that masks exclude, of a few of them; None: there are no masks.
-
-    Warns if these exclude nothing, or everything. Damaged masks are left to whoever needs them.
-    """
+def check_masks(masks: Sequence[Path | None]) -> None:
+    """Warn if a few of the masks exclude nothing, or everything; damaged ones are left to who needs them."""
     paths = [path for path in dict.fromkeys(masks) if path is not None]
-    if not paths:
-        return None
     sample = [paths[i * len(paths) // min(_SAMPLED, len(paths))] for i in range(min(_SAMPLED, len(paths)))]
     with ThreadPoolExecutor(_SAMPLED) as pool:
         shares = [share for share in pool.map(_share, sample) if share is not None]
     if not shares:
-        return None
+        return
     if max(shares) == 0:
         warnings.warn(
             f"the masks exclude nothing ({len(shares)} of {len(paths)} were looked at; first: {sample[0]}): "
@@ -157,7 +152,6 @@ def excluded_share(masks: Sequence[Path | None]) -> float | None:
             "too; write masks as PNG with white where pixels count, or use --data.masks=false",
             stacklevel=3,
         )
-    return sum(shares) / len(shares)
 
 
 def _share(path: Path) -> float | None:
