@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import math
 import sys
@@ -22,6 +21,7 @@ from blitzgs.cli.arguments import (
     named_path,
 )
 from blitzgs.config.fields import Config, DataConfig, ModelConfig
+from blitzgs.config.files import changed
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians, is_antialiased
 from blitzgs.formats.models import read_gaussians
@@ -93,8 +93,7 @@ def run(args: argparse.Namespace) -> int:
             model = run_files.open_model(run_folder, ranks, args.data, args.resident_gb, checkpoint)
             config = model.config
         if args.allow_missing:
-            data = dataclasses.replace(config.data, allow_missing=True)
-            config = dataclasses.replace(config, data=data)
+            config = changed(config, "data", allow_missing=True)
         capture, images = open_capture(config, ranks, "--allow-missing")
         if path.is_file():
             model = model_of_file(

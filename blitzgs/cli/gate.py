@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 
 from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, named_path
 from blitzgs.config.fields import ScheduleConfig
-from blitzgs.config.files import ConfigError, load_config
+from blitzgs.config.files import ConfigError, changed, load_config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
@@ -154,7 +153,7 @@ def run_replay(args: argparse.Namespace) -> int:
         raise ConfigError(f"{args.folder} is not a run: it has no {run_files.CONFIG}")
     config = load_config(args.folder / run_files.CONFIG)
     if args.data is not None:
-        config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(args.data)))
+        config = changed(config, "data", path=str(args.data))
     results: list[dict[str, Any]] = []
     with Ranks.from_environment(
         args.device,

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import os
 import shlex
 import sys
@@ -14,6 +13,7 @@ from pathlib import Path
 from blitzgs.capture.colmap import camera_models
 from blitzgs.cli.arguments import Commands, add_command, named_path
 from blitzgs.config.fields import Config
+from blitzgs.config.files import changed
 from blitzgs.sfm.photographs import Photographs, estimate, has_photographs_alone, photograph_folder
 from blitzgs.sfm.reconstruct import MAPPERS, PAIRS, WORK, Settings, is_finished, reconstruct
 from blitzgs.util.terminal import printable
@@ -101,8 +101,7 @@ def with_poses(config: Config, folder: Path) -> Config:
         find_poses(photograph_folder(root, config.data.images), folder, Settings())
     while not is_finished(folder):
         time.sleep(1.0)
-    data = dataclasses.replace(config.data, path=os.path.realpath(folder), images="images")
-    return dataclasses.replace(config, data=data)
+    return changed(config, "data", path=os.path.realpath(folder), images="images")
 
 
 def understood_alone(config: Config) -> str | None:

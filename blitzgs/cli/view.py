@@ -87,14 +87,12 @@ def run(args: argparse.Namespace) -> int:
 
 def photographs(folder: Path, data: Path | None) -> Callable[[int], npt.NDArray[np.uint8]] | None:
     """Return a function that reads the photographs of a run's cameras; None if the capture is not there."""
-    import dataclasses
-
-    from blitzgs.config.files import load_config
+    from blitzgs.config.files import changed, load_config
 
     try:
         config = load_config(folder / run_files.CONFIG)
         if data is not None:
-            config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
+            config = changed(config, "data", path=str(data))
         _, images = open_capture(config, Ranks(), "--data DIR")
     except (OSError, ValueError) as error:
         print(f"no photographs to compare with: {error}")

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from blitzgs.config.files import changed
 from blitzgs.formats.gaussians import GaussianSource
 from blitzgs.formats.models import FORMATS, Format, check_replaces
 from blitzgs.runs.folder import Model
@@ -143,5 +144,5 @@ def without_antialiasing(model: Model, cameras: Sequence[CameraLike]) -> Model:
     # A Gaussian that no view sees stays as it is.
     factor = torch.where(areas > 0, compensated / areas.clamp_min(1e-300), 1.0)
     baked = (opacities.double() * factor).clamp(1e-6, 1 - 1e-6)
-    config = replace(model.config, model=replace(model.config.model, antialiased=False))
+    config = changed(model.config, "model", antialiased=False)
     return replace(model, opacities=baked.logit().float(), config=config)

@@ -17,7 +17,7 @@ import torch
 
 import blitzgs
 from blitzgs.config.fields import Config
-from blitzgs.config.files import ConfigError, flat, from_dict, load_config, to_dict
+from blitzgs.config.files import ConfigError, changed, flat, from_dict, load_config, to_dict
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.optim.table_adam import TableAdam
@@ -236,7 +236,7 @@ def open_model(
     if ranks.rank == 0:
         compare_with_file(config, folder / CONFIG)
     if data is not None:
-        config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
+        config = changed(config, "data", path=str(data))
     optimiser = TableAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
     optimiser.catch_up(table, None, progress.step)
     return TrainedModel(config, progress, restored.space, table, pool_bytes, exposure.stored(restored.shared))

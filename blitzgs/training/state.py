@@ -15,6 +15,7 @@ import torch
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.images import Images
 from blitzgs.config.fields import Config
+from blitzgs.config.files import changed
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.frame import RenderOptions
@@ -136,7 +137,7 @@ class TrainingState:
         """Multiply `schedule.scale` by `factor` from now on; every rank calls this."""
         schedule = self.config.schedule
         pace = (*schedule.pace, (self.images_seen, factor))
-        self.config = replace(self.config, schedule=replace(schedule, pace=pace))
+        self.config = changed(self.config, "schedule", pace=pace)
         self.schedule = Schedule(self.config.schedule)
         self.optimiser.follow(self.schedule)
         self.sampler.schedule = self.schedule
