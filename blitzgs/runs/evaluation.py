@@ -22,7 +22,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.capture.images import Images, PhotographError
+from blitzgs.capture.images import ImageStore, PhotographError
 from blitzgs.capture.pictures import comparison, encode_image, error_map, to_uint8
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
@@ -142,7 +142,7 @@ def evaluate(
     scene: Scene,
     views: ViewSet,
     cameras: Sequence[CameraLike],
-    images: Images,
+    images: ImageStore,
     indices: Sequence[int],
     options: RenderOptions,
     folder: Path | None,

@@ -21,7 +21,8 @@ from blitzgs.config.files import ConfigError, changed, flat, from_dict, load_con
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs import checkpoint, exposure
+from blitzgs.runs import checkpoint
+from blitzgs.runs.cameras import stored_exposures
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.folder_checks import check_own
 from blitzgs.runs.guard import bad_column, check_before_saving
@@ -239,7 +240,9 @@ def open_model(
         config = changed(config, "data", path=str(data))
     optimiser = TableAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
     optimiser.catch_up(table, None, progress.step)
-    return TrainedModel(config, progress, restored.space, table, pool_bytes, exposure.stored(restored.shared))
+    return TrainedModel(
+        config, progress, restored.space, table, pool_bytes, stored_exposures(restored.shared)
+    )
 
 
 def _resident_gb(path: Path) -> float:

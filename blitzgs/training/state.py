@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from blitzgs.capture.capture import Capture
-from blitzgs.capture.images import Images
+from blitzgs.capture.images import ImageStore
 from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
 from blitzgs.config.schedule import Schedule
@@ -50,7 +50,7 @@ class TrainingState:
 
     config: Config
     capture: Capture  # cameras and points
-    images: Images  # the capture's photographs
+    images: ImageStore  # the capture's photographs
     folder: Path  # folder of the run; rank 0 writes most of its files
     ranks: Ranks
     schedule: Schedule  # tells which events happen at which step

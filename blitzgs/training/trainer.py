@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.capture.capture import Capture
-from blitzgs.capture.images import Images, PhotographError
+from blitzgs.capture.images import ImageStore, PhotographError
 from blitzgs.config.fields import Config
 from blitzgs.config.files import config_hash, save_config
 from blitzgs.config.schedule import Event
@@ -60,7 +60,7 @@ class Trainer:
         self,
         config: Config,
         capture: Capture,
-        images: Images,
+        images: ImageStore,
         folder: Path,
         ranks: Ranks,
         resume: bool = False,

@@ -11,7 +11,7 @@ import torch
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs.exposure import LEAST_SPREAD, stored
+from blitzgs.runs.cameras import LEAST_SPREAD, stored_exposures
 from blitzgs.training.exposure import Exposures
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.track_gains import _log_gains, differ, track_gains
@@ -71,7 +71,7 @@ def test_saved_exposures_are_restored():
     second = Exposures(TRAIN, Ranks())
     second.restore(first.columns())
     assert torch.equal(first.effective(), second.effective()) and torch.equal(first.counts, second.counts)
-    assert torch.equal(stored(first.columns()), first.effective()) and stored({}) is None
+    assert torch.equal(stored_exposures(first.columns()), first.effective()) and stored_exposures({}) is None
     other = Exposures(TRAIN[1:], Ranks())
     other.restore(first.columns())
     assert other.counts.sum() == 0
