@@ -48,7 +48,7 @@ from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.runs.guard import LossGuard
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.training.step import Stepper
 from blitzgs.view.levels import measure_levels
 from blitzgs.view.views import Space, ViewSet, render_options, trained_centres

@@ -37,7 +37,7 @@ from blitzgs.runs.log import LOG
 from blitzgs.training.agreement import Agreement
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture
-from blitzgs.training.population_report import population_report
+from blitzgs.training.records import population_report
 from blitzgs.training.trainer import Trainer
 
 # A training stops so long before its process ends itself, in seconds; it is then evaluated.

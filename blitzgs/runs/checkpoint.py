@@ -35,6 +35,8 @@ MANIFEST = "manifest.json"
 SHARED = "shared.safetensors"
 _NAME = re.compile(r"checkpoint_(\d{6,})")
 _UNFINISHED = ".unfinished_"
+# What reading a damaged checkpoint may raise.
+DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
 
 
 class CheckpointError(RuntimeError):
@@ -74,7 +76,6 @@ def save(
         directory: folder of checkpoints, made if missing.
         columns: name -> [N_rank, ...], this rank's shard; the same names, dtypes and widths on every rank.
         state: the rest of what a resumed run needs, as JSON values; rank 0's is stored.
-        ranks: the job.
         keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
         shared: tensors that are the same on all ranks; rank 0's are stored, in a separate file.
         reached: called at each point at which the save may be interrupted, with the point's name; the tests
@@ -149,21 +150,13 @@ def save(
 
 @dataclass
 class Loaded:
-    """A checkpoint in memory.
+    """A checkpoint in memory."""
 
-    Attributes:
-        columns: columns of this rank's shard.
-        state: the state that was saved with them.
-        shared: tensors that are the same on all ranks; empty if none were stored.
-        name: name of the checkpoint.
-        refused: for each newer checkpoint, why it was not used.
-    """
-
-    columns: dict[str, Tensor]
-    state: dict[str, Any]
-    shared: dict[str, Tensor]
-    name: str
-    refused: list[str]
+    columns: dict[str, Tensor]  # columns of this rank's shard
+    state: dict[str, Any]  # the state that was saved with them
+    shared: dict[str, Tensor]  # tensors that are the same on all ranks; empty if none were stored
+    name: str  # name of the checkpoint
+    refused: list[str]  # for each newer checkpoint, why it was not used
 
 
 def load_latest(
@@ -173,23 +166,11 @@ def load_latest(
     problem: Callable[[dict[str, Tensor]], str | None] = lambda columns: None,
     only: str | None = None,
 ) -> Loaded | None:
-    """Load this rank's share of the newest sound checkpoint.
+    """Load this rank's share of the newest sound checkpoint, or of the one named `only`; None: there is none.
 
     A damaged checkpoint is refused, and the one before it is tried. A warning names the refused checkpoints,
-    the reasons, and the checkpoint that is used.
-
-    Args:
-        directory: folder given to `save`.
-        ranks: the job, of any world size.
-        device: where the columns go.
-        problem: returns what is wrong with a shard's columns, or None.
-        only: name of the one checkpoint to load; None: the newest.
-
-    Returns:
-        The checkpoint; None if the folder has none.
-
-    Raises:
-        CheckpointError: checkpoints exist, but none is sound.
+    the reasons (those of `problem` too, which looks at a shard's columns), and the checkpoint that is used.
+    CheckpointError: checkpoints exist, but none is sound.
     """
     found = ranks.broadcast_object(names_of(Path(directory)) if ranks.rank == 0 else [])
     refused = []
@@ -213,23 +194,12 @@ def load_latest(
 def load(
     path: str | os.PathLike[str], ranks: Ranks, device: torch.device | str
 ) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Tensor]]:
-    """Load this rank's share of one checkpoint.
+    """Load this rank's share of one checkpoint: its shard's columns, the state, and tensors for all ranks.
 
     With the world size that it was saved with, each rank gets its own shard unchanged. With another one the
     rows are redistributed: rank m gets the positions = m (mod M) of the global order
-    (`sharding.global_positions`), and opens only the files that hold some of these rows.
-
-    Args:
-        path: folder returned by `save`.
-        ranks: the job, of any world size.
-        device: where the columns go.
-
-    Returns:
-        The columns of this rank's shard, name -> [N_rank, ...]; the state; and the tensors that are the same
-        on all ranks, on the CPU.
-
-    Raises:
-        CheckpointError: on every rank, when a file is missing, torn or altered.
+    (`sharding.global_positions`), and opens only the files that hold some of these rows. CheckpointError, on
+    every rank: a file is missing, torn or altered.
     """
     path = Path(path)
     manifest, problem = None, None
@@ -237,7 +207,7 @@ def load(
         # Each rank checks some of the files, so that every file is read for its digest once.
         with ranks.watchdog.working("reading a checkpoint"):
             manifest = verified(path, ranks.rank, ranks.world_size)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except DAMAGE as error:
         problem = str(error) or type(error).__name__
     problems = [text for text in ranks.all_gather_object(problem) if text]
     if problems or manifest is None:
@@ -292,11 +262,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def verified(path: Path, part: int = 0, parts: int = 1) -> Manifest:
-    """Read the manifest of a checkpoint, and compare part of the files with their digests.
-
-    Raises:
-        OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError: it is damaged.
-    """
+    """Read the manifest of a checkpoint, and compare part of the files with their digests; see `DAMAGE`."""
     manifest = _read_manifest(path)
     for shard in [*manifest.shards, *([manifest.shared] if manifest.shared else [])][part::parts]:
         _verify(path, shard)

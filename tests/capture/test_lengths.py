@@ -12,7 +12,7 @@ from blitzgs.capture import colmap
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.lengths import NEAR_OF_EXTENT
-from tests.capture.helpers import look_at, smooth_image, write_image
+from tests.capture.helpers import as_text, look_at, smooth_image, write_image
 
 COUNT, W, H = 12, 64, 48
 NAMES = [f"{i:02d}.png" for i in range(COUNT)]
@@ -65,7 +65,9 @@ def write(root, form, rotations, centres, points):
             track_offsets=np.zeros(len(points) + 1, dtype=np.uint64),
         ),
     )
-    colmap.write_model(root / "sparse" / "0", model, text=form == "text")
+    colmap.write_model(root / "sparse" / "0", model)
+    if form == "text":
+        as_text(root / "sparse" / "0")
 
 
 def quiet_load(root, **options):

@@ -17,7 +17,7 @@ from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.training.loss import loss_terms, opacity_term, photometric, scale_term, weighted
 from blitzgs.training.step import Stepper
 from blitzgs.training.trainer import Trainer
