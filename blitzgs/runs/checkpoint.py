@@ -9,8 +9,6 @@ compares the files with the digests. The folder must be on a file system that ev
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import re
 import shutil
@@ -18,7 +16,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -29,11 +27,10 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.sharding import global_positions
-from blitzgs.runs.shard_file import file_digest, header_of, write_shard
-from blitzgs.util.output import check_space, explain, is_lack_of_space, sync_to_disk
+from blitzgs.runs.manifest import Shard, finish, verified
+from blitzgs.runs.shard_file import header_of, write_shard
+from blitzgs.util.output import check_space, explain, is_lack_of_space
 
-FORMAT = 2
-MANIFEST = "manifest.json"
 SHARED = "shared.safetensors"
 _NAME = re.compile(r"checkpoint_(\d{6,})")
 _UNFINISHED = ".unfinished_"
@@ -49,16 +46,6 @@ class CheckpointError(RuntimeError):
     def __init__(self, message: str, lacks_space: bool = False) -> None:
         super().__init__(message)
         self.lacks_space = lacks_space
-
-
-@dataclass
-class Shard:
-    """One file of a checkpoint: name, rows of the table in it, size and SHA-256."""
-
-    file: str
-    rows: int
-    bytes: int
-    sha256: str
 
 
 def save(
@@ -195,7 +182,7 @@ class Saving:
             try:
                 with ranks.watchdog.working("finishing a checkpoint"):
                     shards = [shard for shard, _, _ in results if shard]
-                    _finish(self._folder, path, shards, common, self._state, ranks.world_size, self._reached)
+                    finish(self._folder, path, shards, common, self._state, ranks.world_size, self._reached)
             except OSError as error:
                 problems.append(f"rank 0 could not write: {explain(error)}")
                 lacks_space = is_lack_of_space(error)
@@ -318,15 +305,6 @@ def load(
     return read_share(path, manifest.shards, ranks, torch.device(device)), manifest.state, shared
 
 
-@dataclass
-class Manifest:
-    """The files of a checkpoint, and its state."""
-
-    shards: list[Shard]
-    shared: Shard | None
-    state: dict[str, Any]
-
-
 def read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.device) -> dict[str, Tensor]:
     """Read this rank's share of the columns in a folder's shards, as `load` does, without verifying files."""
     sizes = [shard.rows for shard in shards]
@@ -358,85 +336,6 @@ def _opened(path: Path) -> Iterator[Any]:
         # The package accepts only UTF-8 paths.
         with safe_open(path if is_text else f"/proc/self/fd/{file.fileno()}", "pt") as shard:
             yield shard
-
-
-def verified(path: Path, part: int = 0, parts: int = 1) -> Manifest:
-    """Read the manifest of a checkpoint, and compare part of the files with their digests.
-
-    Raises:
-        OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError: it is damaged.
-    """
-    manifest = _read_manifest(path)
-    for shard in [*manifest.shards, *([manifest.shared] if manifest.shared else [])][part::parts]:
-        _verify(path, shard)
-    return manifest
-
-
-def _read_manifest(path: Path) -> Manifest:
-    try:
-        content = json.loads((path / MANIFEST).read_text())
-    except FileNotFoundError:
-        raise ValueError(f"{MANIFEST} is missing") from None
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{MANIFEST} is not valid JSON ({error})") from error
-    if content["format"] not in (1, FORMAT):
-        raise ValueError(f"{MANIFEST} has format {content['format']}, this version reads 1 and {FORMAT}")
-    # Format 1 had no digest of the manifest.
-    if content["format"] != 1 and content.pop("sha256") != _digest(content):
-        raise ValueError(f"{MANIFEST} does not match its own SHA-256")
-    shared = content.get("shared")
-    shards = [Shard(**shard) for shard in content["shards"]]
-    if not shards:
-        raise ValueError(f"{MANIFEST} names no files")
-    return Manifest(shards, None if shared is None else Shard(**shared), content["state"])
-
-
-def _digest(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def _verify(path: Path, shard: Shard) -> None:
-    file = path / shard.file
-    if not file.exists():
-        raise ValueError(f"{shard.file} is missing")
-    if file.stat().st_size != shard.bytes:
-        raise ValueError(f"{shard.file} has {file.stat().st_size} bytes, the manifest says {shard.bytes}")
-    if file_digest(file) != shard.sha256:
-        raise ValueError(f"{shard.file} does not match its SHA-256")
-
-
-def _finish(
-    unfinished: Path,
-    path: Path,
-    shards: list[Shard],
-    shared: Shard | None,
-    state: Mapping[str, Any],
-    world_size: int,
-    reached: Callable[[str], None],
-) -> None:
-    """Write the manifest beside the shards and give the folder its final name, each step synced."""
-    missing = [shard.file for shard in shards if not (unfinished / shard.file).exists()]
-    if missing:
-        raise OSError(f"{', '.join(missing)} not in {unfinished}: every rank must see the same file system")
-    content = {
-        "format": FORMAT,
-        "world_size": world_size,
-        "shards": [asdict(shard) for shard in shards],
-        "shared": None if shared is None else asdict(shared),
-        "state": dict(state),
-    }
-    content = json.loads(json.dumps(content))  # tuples become lists: what is read back has the same digest
-    with open(unfinished / MANIFEST, "w") as file:
-        json.dump(content | {"sha256": _digest(content)}, file, indent=1)
-        reached("manifest written")
-        file.flush()
-        os.fsync(file.fileno())
-    sync_to_disk(unfinished)
-    reached("manifest synced")
-    unfinished.rename(path)
-    reached("renamed")
-    sync_to_disk(path.parent)
-    reached("finished")
 
 
 def _delete_old(directory: Path, keep: int, reached: Callable[[str], None]) -> Thread:
