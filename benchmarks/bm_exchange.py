@@ -106,13 +106,13 @@ def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
     """Return the octree of a capture's points and evenly spaced training views."""
     capture, lod = load_capture(args.data, downscale=args.downscale), Config().lod
     space = Space.of(capture.offset, capture.extent)
-    points = torch.from_numpy(capture.points) / space.unit
+    points = torch.from_numpy(capture.points).to(device) / space.unit
     centres = trained_centres([capture.cameras[i] for i in capture.train], space).to(device)
     table = octree_gaussians(
         points,
-        torch.from_numpy(capture.colors),
+        torch.from_numpy(capture.colors).to(device),
         centres,
-        measure_levels(points.to(device), centres, lod.fork),
+        measure_levels(points, centres, lod.fork),
         args.visible_threshold,
     ).table(sh_degree=3, opacity=0.5)
     views = ViewSet(list(capture.cameras), space, device)
