@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from blitzgs.capture.images import PhotographError
-from blitzgs.runs.evaluation import EvaluationStoppedError
+from blitzgs.runs.evaluation import EvaluationStoppedError, spread
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.state import TrainingState
 
@@ -74,9 +74,3 @@ class Glances:
         left = MAX_SHARE * (progress.seconds - self._begin) - self._spent
         count = min(MAX_VIEWS, len(self._order), math.floor(left / max(cost, 1e-9)))
         return count if count >= min(LEAST_VIEWS, len(self._order)) else 0
-
-
-def spread(indices: list[int]) -> list[int]:
-    """Order indices such that the first few of them are spread evenly, however many are taken."""
-    share = (math.sqrt(5) - 1) / 2
-    return [index for _, index in sorted((k * share % 1, index) for k, index in enumerate(indices))]
