@@ -37,6 +37,8 @@ CHECKPOINTS = "checkpoints"
 SUMMARY = "summary.json"
 REPORT = "report.html"
 EVALUATION = "evaluation"
+# In the folder of a run's last evaluation: metrics of some training views.
+TRAINED_VIEWS = "trained.json"
 LINEAGE = "lineage"
 # Sections and fields that a resumed run may change, because they do not change the result beyond rounding.
 # The exception is `data.allow_missing`: a run whose photograph is lost could not be resumed without it.
