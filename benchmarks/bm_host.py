@@ -31,9 +31,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import make_parser, report, write_json
+from harness import Parts, make_parser, report, trace, write_json
 from scenes import aerial
-from step_parts import Parts, trace
 
 from blitzgs import l1_ssim, rasterization, raw_rasterization
 from blitzgs.distributed.group import Ranks

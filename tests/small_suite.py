@@ -26,17 +26,17 @@ TESTS = [
     )),
     *(PROJECT + test for test in (
         "splats_match_the_cpu[0-False]", "splats_match_the_cpu[1-True]", "splats_match_the_cpu[2-False]",
-        "splats_match_the_cpu[3-True]", "active_rows_and_views", "gradients_match_float64_of_project[0-True]",
-        "gradients_match_float64_of_project[3-False]", "nothing_visible[behind]", "ranks_of_splats_match_the_cpu",
+        "splats_match_the_cpu[3-True]", "active_rows_and_views", "splat_gradients_match_float64[0-True]",
+        "splat_gradients_match_float64[3-False]", "nothing_visible[behind]", "ranks_of_splats_match_the_cpu",
         "splats_with_nan_vanish_and_spread_nowhere",
     )),
     # Gradients: absolute ones too, deterministic, channels.
     *(PROJECT + test for test in (
         "image_matches_float64[3]", "image_matches_float64[4]", "image_matches_float64[9]",
-        "gradients_match_float64_of_rasterize[False-False-3]", "gradients_match_float64_of_rasterize[False-False-4]",
-        "gradients_match_float64_of_rasterize[False-True-3]", "gradients_match_float64_of_rasterize[False-True-9]",
-        "gradients_match_float64_of_rasterize[True-False-3]", "gradients_match_float64_of_rasterize[True-False-9]",
-        "gradients_match_float64_of_rasterize[True-True-9]", "packed_gradients_are_the_same[3-False]",
+        "gradients_match_float64[False-False-3]", "gradients_match_float64[False-False-4]",
+        "gradients_match_float64[False-True-3]", "gradients_match_float64[False-True-9]",
+        "gradients_match_float64[True-False-3]", "gradients_match_float64[True-False-9]",
+        "gradients_match_float64[True-True-9]", "packed_gradients_are_the_same[3-False]",
         "packed_gradients_are_the_same[3-True]",
         "gradients_of_some_of_the_composited_tiles[False]", "empty_lists_give_the_background",
         "entries_of_no_tile_name_any_splat[True]",

@@ -50,7 +50,7 @@ def test_a_splat_does_not_depend_on_other_gaussians(scene):
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("degree", [0, 3])
-def test_gradients_match_float64_of_project(scene, degree, antialiased):
+def test_splat_gradients_match_float64(scene, degree, antialiased):
     scene.degree = degree
     splats = scene.project("cpu", antialiased=antialiased)
     g = torch.Generator().manual_seed(2)
@@ -233,7 +233,7 @@ def test_image_matches_float64(scene, channels):
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 9])
 @pytest.mark.parametrize("deterministic", [False, True])
 @pytest.mark.parametrize("absgrad", [False, True])
-def test_gradients_match_float64_of_rasterize(scene, channels, deterministic, absgrad):
+def test_gradients_match_float64(scene, channels, deterministic, absgrad):
     job = Job(scene, channels)
     exact, ours, decided = close_images(job)
     g = torch.Generator().manual_seed(6)
