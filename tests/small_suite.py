@@ -13,8 +13,8 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-INTERSECT, PROJECT, TRANSPORT = (
-    f"tests/cuda/test_{name}_cuda.py::test_" for name in ("intersect", "project", "transport")
+INTERSECT, PROJECT, LAUNCH = (
+    f"tests/cuda/test_{name}_cuda.py::test_" for name in ("intersect", "project", "launch")
 )
 OPS, BLOCKS = "tests/ops/test_", "tests/table/test_blocks.py::test_"
 TESTS = [
@@ -44,7 +44,7 @@ TESTS = [
     *(INTERSECT + test for test in (
         "close_to_float64", "entries_after_the_last_splat_are_not_read",
     )),
-    *(TRANSPORT + test for test in (
+    *(LAUNCH + test for test in (
         "splats_arrive_and_their_gradients_are_found",
         "a_barrier_exchanges_values_when_all_ranks_have_arrived", "copies_to_the_host_need_pinned_memory",
     )),
