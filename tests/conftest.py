@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
+import signal
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: it says how OpenMP threads wait
 
@@ -25,6 +26,14 @@ LINEAGE = (
     "log.keep_checkpoints=9",
     "log.pictures=0",
 )
+
+
+@pytest.fixture(scope="session", autouse=True)
+def signals_as_in_a_terminal():
+    """The tests may have been started with ignored signals, as by nohup or as a shell's background job."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in (signal.SIGHUP, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="module", autouse=True)

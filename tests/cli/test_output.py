@@ -112,8 +112,6 @@ def test_ctrl_c_at_the_start_has_no_traceback(capture, tmp_path, moment):
     module, _, name = moment.rpartition(".")
     program = (
         f"import os, signal, sys, {module} as module\nfrom blitzgs.cli import main\n"
-        # Children of a shell's background jobs ignore Ctrl-C; these tests may be such a job.
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"real = module.{name}\n"
         "def interrupted(*arguments):\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n    return real(*arguments)\n"
