@@ -45,13 +45,9 @@ from tests.training.tiny import tiny_config, tiny_scene
 
 GAUSSIANS, WIDTH, HEIGHT = 50, 32, 32
 CALLS: dict[str, dict[str, Any]] = {
-    "dense": {},
-    "sparse": {"sparse_grad": True},
-    "not packed": {"packed": False},
-    "2 views": {"views": 2},
-    "values": {"sh_degree": None},
-    "sparse, meta": {"sparse_grad": True, "read_meta": True},
-}
+    "dense": {}, "sparse": {"sparse_grad": True}, "not packed": {"packed": False}, "2 views": {"views": 2},
+    "values": {"sh_degree": None}, "sparse, meta": {"sparse_grad": True, "read_meta": True},
+}  # fmt: skip
 
 
 def measure(

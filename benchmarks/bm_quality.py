@@ -254,12 +254,9 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--minutes", type=float, metavar="M", help="start no run later than this")
     parser.add_argument(
-        "--collect",
-        type=Path,
-        nargs="*",
-        metavar="SOURCE",
+        "--collect", type=Path, nargs="*", metavar="SOURCE",
         help="add these runs; without recipes, report alone",
-    )
+    )  # fmt: skip
     return parser
 
 

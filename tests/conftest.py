@@ -16,16 +16,10 @@ _TRAININGS = ("config", "report", "runs", "spawn", "training")
 
 # Of `lineage_run`: density events at 20, 40, 60 and 80; the gate judges from 60 on, a checkpoint lies at 50.
 LINEAGE = (
-    "population.lineage=true",
-    "population.grad_threshold=1e-4",
-    "population.importance=true",
-    "schedule.t1=40",
-    "schedule.t2=90",
-    "schedule.gate_from=60",
-    "schedule.checkpoint_every=50",
-    "log.keep_checkpoints=9",
-    "log.pictures=0",
-)
+    "population.lineage=true", "population.grad_threshold=1e-4", "population.importance=true",
+    "schedule.t1=40", "schedule.t2=90", "schedule.gate_from=60", "schedule.checkpoint_every=50",
+    "log.keep_checkpoints=9", "log.pictures=0",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -89,12 +89,8 @@ def test_nearer_frames_load_more_and_small_errors_show_everything(tmp_path, caps
 
 
 FLAGS = (
-    "schedule.iterations=60",
-    "view.lod=true",
-    "schedule.densify_until=40",
-    "lod.fork=1.3",
-    "log.pictures=0",
-)
+    "schedule.iterations=60", "view.lod=true", "schedule.densify_until=40", "lod.fork=1.3", "log.pictures=0",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

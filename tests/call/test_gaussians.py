@@ -141,17 +141,9 @@ def test_the_image_is_the_sum_over_all_contributors(backend, packed):
     scene = random_scene(cameras=3).to(backend[1], backend[0])
     values = torch.rand(60, 3, generator=torch.Generator().manual_seed(2)).to(scene.means)
     image, alphas, meta = blitzgs.rasterization(
-        scene.means,
-        scene.quats,
-        scene.scales,
-        scene.opacities,
-        values,
-        scene.viewmats,
-        scene.Ks,
-        40,
-        32,
+        scene.means, scene.quats, scene.scales, scene.opacities, values, scene.viewmats, scene.Ks, 40, 32,
         packed=packed,
-    )
+    )  # fmt: skip
     counts, also = blitzgs.rasterize_num_contributing_gaussians(*arguments(meta))
     assert torch.equal(also, alphas[..., 0]) and counts.shape == (3, 32, 40)
     ids, weights = blitzgs.rasterize_contributing_gaussian_ids(*arguments(meta), counts)

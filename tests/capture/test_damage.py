@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of kinds that are not supported, and damage that is found before a file is needed."""
 
-
 import cv2
 import numpy as np
 import pytest

@@ -30,11 +30,8 @@ class Calls:
         projected = [r.cuda() if torch.is_tensor(r) else r for r in scene.project("cpu")]
         self.grid = scene.grid()
         self.splats = (
-            projected[4],
-            projected[5],
-            projected[7],
-            torch.rand(len(projected[0]), 3, generator=g).cuda(),
-        )
+            projected[4], projected[5], projected[7], torch.rand(len(projected[0]), 3, generator=g).cuda(),
+        )  # fmt: skip
         self.depths, self.cameras = projected[6], projected[1]
         means2d, conics, opacities, _ = self.splats
         listed, _ = ops.intersect(means2d, conics, opacities, self.depths, self.cameras, None, *self.grid, -1)

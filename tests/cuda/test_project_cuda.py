@@ -157,12 +157,8 @@ def test_splats_do_not_depend_on_the_capacity_that_was_guessed(scene, splats_see
     assert len(expected.gaussian_ids) == splats and len(expected.visible_ids) == visible
     assert torch.equal(expected_ids, ids[expected.gaussian_ids.long()])
     sizes = [
-        (visible, splats),
-        (visible - 1, splats),
-        (visible, splats - 1),
-        (1, 1),
-        (visible + 1, splats + 200),
-    ]
+        (visible, splats), (visible - 1, splats), (visible, splats - 1), (1, 1), (visible + 1, splats + 200),
+    ]  # fmt: skip
     for size in [*sizes, (2 * visible + 3, 3 * splats + 1000)]:
         if min(size) < 1:
             with pytest.raises(RuntimeError, match="how many visible Gaussians and splats there is room for"):
@@ -270,11 +266,8 @@ def test_forward_zeroes_the_gradient_table(n_splats, begin, end):
     """The table is zeroed for few and many splats, and for some tiles and none."""
     job = Job(Scene(4, views=1, width=90, height=50), 3, 16, begin, end)
     job.splats = [
-        torch.zeros(n_splats, 2),
-        torch.ones(n_splats, 3),
-        torch.ones(n_splats),
-        torch.ones(n_splats, 3),
-    ]
+        torch.zeros(n_splats, 2), torch.ones(n_splats, 3), torch.ones(n_splats), torch.ones(n_splats, 3),
+    ]  # fmt: skip
     job.lists = [torch.zeros(0, dtype=torch.int32), torch.zeros(25, dtype=torch.int64)]
     torch.full((n_splats, 12), float("nan"), device="cuda")  # what the table would hold otherwise
     assert len(job.forward("cuda")[6]) == 0

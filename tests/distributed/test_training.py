@@ -34,19 +34,11 @@ from tests.training.tiny import (
 ROOT = Path(__file__).parents[2]
 # 10 + 20 steps of 2 images; density events (after 28, 36, 44 and 52 images) fall into the 20 steps.
 SETTINGS = (
-    "schedule.iterations=60",
-    "schedule.batch_size=2",
-    "schedule.densify_from=28",
-    "schedule.densify_until=60",
-    "schedule.densify_every=8",
-    "schedule.size_prune_after=0",
-    "population.grad_threshold=4e-3",
-    "population.clone_scale=0.02",
-    "population.max_gaussians=490",
-    "schedule.checkpoint_every=19",
-    "log.every=2",
-    "log.keep_checkpoints=9",
-)
+    "schedule.iterations=60", "schedule.batch_size=2", "schedule.densify_from=28",
+    "schedule.densify_until=60", "schedule.densify_every=8", "schedule.size_prune_after=0",
+    "population.grad_threshold=4e-3", "population.clone_scale=0.02", "population.max_gaussians=490",
+    "schedule.checkpoint_every=19", "log.every=2", "log.keep_checkpoints=9",
+)  # fmt: skip
 
 
 def _train(ranks, folder, *overrides):

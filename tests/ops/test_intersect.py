@@ -368,14 +368,9 @@ def test_errors_name_the_value_of_splat_count(device):
             intersect(*columns.padded.geometry(), **view, n_splats=columns.count.cpu())
         with pytest.raises(RuntimeError, match="gradients must have 150 splats or more, got 149"):
             ops.rasterize_fwd_(
-                *columns.padded.values(),
-                None,
-                *lists,
-                *VIEW,
-                0,
-                -1,
+                *columns.padded.values(), None, *lists, *VIEW, 0, -1,
                 torch.zeros(149, SPLAT_GRADIENT, device=device),
-            )
+            )  # fmt: skip
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -107,12 +107,9 @@ def test_a_stray_point_does_not_spoil_the_grid():
 def test_one_point():
     levels = Levels(1, 2.0, 1.0, 0.1)
     one = octree_gaussians(
-        torch.zeros(1, 3, dtype=torch.float64),
-        torch.zeros(1, 3, dtype=torch.uint8),
-        torch.ones(2, 3, dtype=torch.float64),
-        levels,
-        0.9,
-    ).table(sh_degree=0, opacity=0.1)
+        torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.uint8),
+        torch.ones(2, 3, dtype=torch.float64), levels, 0.9,
+    ).table(sh_degree=0, opacity=0.1)  # fmt: skip
     assert len(one) == 1 and bool(one["scales"].isfinite().all())
 
 
