@@ -231,15 +231,8 @@ def main() -> None:
                 write_json(args.json, args.device, **found)
     print(f"{found['scene']}, B = {args.batch_size}, table {found['table_gb']:.2f} GB")
     columns = (
-        "arm",
-        "order",
-        "step_ms",
-        "cost",
-        "resident_hits",
-        "moved_mb_per_step",
-        "in_gb_per_s",
-        "sweep_s",
-    )
+        "arm", "order", "step_ms", "cost", "resident_hits", "moved_mb_per_step", "in_gb_per_s", "sweep_s",
+    )  # fmt: skip
     print(markdown_table([{name: row.get(name, "") for name in columns} for row in found["results"]]))
     for row in found["results"]:
         if "failed" in row:

@@ -139,12 +139,9 @@ class RecordedTrainer(Trainer):
         seconds = state.progress.seconds + time.monotonic() - begin
         with state.paused_clock():
             self.recorder.record(
-                state.images_seen,
-                seconds,
-                state.population(),
-                end,
+                state.images_seen, seconds, state.population(), end,
                 lambda indices: measure(state, indices, None),
-            )
+            )  # fmt: skip
 
 
 def train_ours(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:

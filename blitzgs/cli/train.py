@@ -8,6 +8,7 @@ import json
 import os
 import shlex
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -27,7 +28,7 @@ from blitzgs.runs import files as run_files
 from blitzgs.runs.folder_checks import locked
 from blitzgs.training.budget import LEAST_IMAGES
 from blitzgs.training.estimate import estimate
-from blitzgs.training.inputs import open_capture
+from blitzgs.training.inputs import open_capture, read_ahead
 from blitzgs.training.state import TrainingState
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import check_worlds, understood
@@ -193,17 +194,18 @@ def run(args: argparse.Namespace) -> int:
     laps.lap("imports")
     with (
         kept_warnings() as warned,
+        nullcontext(read_ahead(config.data)) as reading,  # while the ranks join
         Ranks.from_environment(
             args.device,
             job.timeout_seconds,
             cast(Transport, job.transport),
             job.share_gpus,
             tables_on_host=config.memory.resident_gb > 0,
+            lap=laps.lap,
         ) as ranks,
     ):
-        laps.lap("processes")
         # A capture that cannot be read leaves no empty folder behind.
-        capture, images = open_capture(config, ranks)
+        capture, images = open_capture(config, ranks, reading=reading)
         check_worlds(capture)
         laps.lap("capture")
         # Otherwise a damaged photograph would be found when its turn comes, a held-out one at the end.

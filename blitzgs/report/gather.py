@@ -177,10 +177,13 @@ def plan(data: RunData) -> dict[str, Any] | None:
 
 
 def _other_views(data: RunData) -> dict[str, dict[str, float]]:
-    """Return the metrics of training views that `blitzgs eval --split train` or `all` has measured."""
+    """Return the metrics of training views, of the run's end and of `blitzgs eval --split train` or `all`."""
     found: dict[str, dict[str, float]] = {}
-    for split in ("all", "train"):
-        file = data.folder.path / run_files.EVALUATION / split / "metrics.json"
+    folder = data.folder.path / run_files.EVALUATION
+    for file in (
+        *sorted(folder.glob(f"*/{run_files.TRAINED_VIEWS}")),
+        *(folder / split / "metrics.json" for split in ("all", "train")),
+    ):
         if file.exists():
             found |= _views_of(file, data.problems)
     return found

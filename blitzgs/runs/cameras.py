@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stores a run's cameras in its folder, so that rendering needs no capture, and its photographs' exposures."""
+"""Stores a run's cameras in its folder, so that rendering needs no capture, and photographs' exposures."""
 
 from __future__ import annotations
 

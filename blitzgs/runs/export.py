@@ -69,8 +69,7 @@ def export(
     reach, middle = _measured(source, offset)
     rounding = _spacing(reach[1])
     centred = coordinates == "centred" or (coordinates == "auto" and rounding > _MAX_ROUNDING * middle)
-    if coordinates == "auto" and not kind.streams:
-        # Quantised positions are fine only near the origin.
+    if coordinates == "auto" and kind.quantised:
         centred |= float(np.linalg.norm(offset)) > 2 * space.extent * space.unit
     sidecar = path.with_name(path.name + ".offset.json")
     if centred:

@@ -27,7 +27,7 @@ from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.folder_checks import check_own
 from blitzgs.runs.guard import bad_column, check_before_saving
 from blitzgs.table.blocks import sort_rows
-from blitzgs.table.host_table import HostTable
+from blitzgs.table.host_table import HostTable, available_bytes
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.views import Space
@@ -38,6 +38,8 @@ CHECKPOINTS = "checkpoints"
 SUMMARY = "summary.json"
 REPORT = "report.html"
 EVALUATION = "evaluation"
+# In the folder of a run's last evaluation: metrics of some training views.
+TRAINED_VIEWS = "trained.json"
 LINEAGE = "lineage"
 # Sections and fields that a resumed run may change, because they do not change the result beyond rounding.
 # The exception is `data.allow_missing`: a run whose photograph is lost could not be resumed without it.
@@ -127,11 +129,13 @@ def save(
     ranks: Ranks,
     run_id: str = "",
     shared: Mapping[str, torch.Tensor] | None = None,
-) -> Path:
-    """Write a checkpoint of a run; pending optimiser steps stay pending, so that saving changes nothing.
+    in_background: bool = False,
+) -> checkpoint.Saving:
+    """Begin to write a checkpoint of a run; pending optimiser steps stay pending: saving changes nothing.
 
-    Earlier checkpoints are kept if a value is not finite (NonFiniteError) or a rank could not write
-    (CheckpointError).
+    With `in_background`, the table may change before `Saving.finish`: a copy of it is written, or, if memory
+    lacks for that, the call returns when the files are written. Earlier checkpoints are kept if a value is
+    not finite (NonFiniteError: nothing is written) or a rank could not write (CheckpointError).
     """
     check_before_saving(table, progress.step, ranks)
     state = {
@@ -142,7 +146,18 @@ def save(
     }
     keep = config.log.keep_checkpoints
     columns = {name: table[name] for name in table}
-    return checkpoint.save(folder / CHECKPOINTS, columns, state, ranks, keep, shared)
+    has_room = in_background and 2 * table.memory_bytes < _memory_left(table.device)
+    if has_room:
+        columns = {name: column.clone() for name, column in columns.items()}
+    saving = checkpoint.Saving(folder / CHECKPOINTS, columns, state, ranks, keep, shared)
+    if in_background and not has_room:
+        with ranks.watchdog.working("writing a checkpoint"):
+            saving.wait()
+    return saving
+
+
+def _memory_left(device: torch.device) -> int:
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else available_bytes() or 0
 
 
 @dataclass

@@ -20,10 +20,11 @@ from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint
 from blitzgs.runs import files as run_files
-from blitzgs.runs.checkpoint import CheckpointError, Shard
+from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.folder import Model
 from blitzgs.runs.folder_checks import check_own
 from blitzgs.runs.lod import lod_gate
+from blitzgs.runs.manifest import DAMAGE, Shard, verified
 from blitzgs.runs.shard_file import header_of, read_rows
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import LodGate
@@ -87,8 +88,8 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
     for name in reversed(names) if only is None else [only]:
         path = folder / run_files.CHECKPOINTS / name
         try:
-            manifest = checkpoint.verified(path)
-        except checkpoint.DAMAGE as error:
+            manifest = verified(path)
+        except DAMAGE as error:
             refused.append(f"checkpoint {path} is damaged: {error}")
             continue
         if refused:

@@ -299,12 +299,12 @@ def first_gaussians(
 ) -> tuple[GaussianTable, Progress]:
     """Make the first Gaussians; each rank keeps its share of them at `home`."""
     lod, device = config.lod, ranks.device
-    points = torch.from_numpy(capture.points) / space.unit
+    points = torch.from_numpy(capture.points).to(device) / space.unit
     # Cameras that are far from the others would stretch the octree over distances that no photograph covers.
     together = [i for i in capture.train if i not in capture.apart] or capture.train
     centres = trained_centres([capture.cameras[i] for i in together], space).to(device)
-    levels = measure_levels(points.to(device), centres, lod.fork)
-    colors, most = torch.from_numpy(capture.colors), config.population.max_gaussians
+    levels = measure_levels(points, centres, lod.fork)
+    colors, most = torch.from_numpy(capture.colors).to(device), config.population.max_gaussians
     if config.model.start:
         return _of_file(config, space, levels, ranks, home)
     first = octree_gaussians(

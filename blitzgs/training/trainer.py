@@ -180,6 +180,9 @@ class Trainer:
                     if decision.save:
                         with state.stage("checkpoint"):
                             save.run(state)
+                    if decision.written:
+                        with state.stage("checkpoint"):
+                            save.finish(state)
                     if decision.watched and watching is not None:
                         self._write_record()
                         watching.serve(state.stops)

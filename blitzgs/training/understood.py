@@ -122,7 +122,7 @@ def _warn_of_pictures(capture: Capture, pictures: Pictures, near: float) -> None
                 stacklevel=3,
             )
     views = capture.train[:_PROJECTED]
-    points = sampled(capture.points, len(views))
+    points = sampled(capture.points, len(capture.cameras))
     depths = [depths_seen(capture.cameras[i], points) for i in views]
     cut = sum(len(d) > 0 and bool(d.max() <= near) for d in depths)
     if 2 * cut > len(views):

@@ -70,6 +70,8 @@ def test_a_training_writes_its_report(trained):
     assert data["curves"]["held_out"][-1][2] == pytest.approx(measured["psnr"], rel=1e-4)
     cameras = run.cameras()
     assert [p[2] for p in data["cameras"]["points"]] == [int(k in cameras.test) for k in range(8)]
+    assert all(isinstance(p[3], float) for p in data["cameras"]["points"])
+    assert data["cameras"]["trained_known"]
     assert data["config"] == (folder / "config.yaml").read_text()
     assert data["environment"]["torch"] == torch.__version__
     assert data["pictures"] and all(len(view["layers"]) == 3 for view in data["pictures"])
@@ -104,6 +106,8 @@ def test_the_plan_is_seen_from_above(trained):
 
 def test_measured_training_views_are_coloured_too(trained, tmp_path):
     folder = copied(trained, tmp_path / "run")
+    (at_the_end,) = folder.glob("evaluation/*/trained.json")
+    at_the_end.unlink()  # which colours them, too
     before = data_of(report(folder))["cameras"]
     assert [p[3] is not None for p in before["points"]] == [bool(p[2]) for p in before["points"]]
     arguments = ["eval", str(folder), "--data", str(trained[0]), "--split", "train", "--pictures", "0"]

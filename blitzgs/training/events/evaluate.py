@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,9 +14,13 @@ from blitzgs.capture.images import PhotographError
 from blitzgs.config.schedule import Event
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import files as run_files
-from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, worst_views
+from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, spread, worst_views
 from blitzgs.runs.lod import scene_gate
 from blitzgs.training.state import TrainingState
+from blitzgs.util.output import write_file
+
+# At the end of a run, as many training views as held-out ones are measured, but at least and at most:
+LEAST_TRAINED, MOST_TRAINED = 8, 64
 
 
 def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
@@ -28,6 +34,9 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
         capture = state.capture
         try:
             metrics = measure(state, capture.test or capture.train, folder, state.lpips)
+            if event is None and capture.test:
+                count = min(MOST_TRAINED, max(LEAST_TRAINED, len(capture.test)))
+                _write_trained(state, spread(capture.train)[:count], folder)
         except EvaluationStoppedError:
             text = "evaluation given up: the run has to stop"
             state.log.event(state.images_seen, "evaluation stopped", {}, text)
@@ -43,6 +52,18 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
             names = ", ".join(f"{name} {psnr:.2f} dB" for name, psnr in worst)
             state.log.event(state.images_seen, "worst views", {"worst": dict(worst)}, f"worst views: {names}")
     return means
+
+
+def _write_trained(state: TrainingState, indices: Sequence[int], folder: Path) -> None:
+    """Measure some training views, which the report's plan of the cameras shows beside the held-out ones."""
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".* as they are masked")  # the run has warned of its masks
+            metrics = measure(state, sorted(indices), None)
+        if state.ranks.rank == 0:
+            write_file(folder / run_files.TRAINED_VIEWS, json.dumps(metrics, indent=1) + "\n")
+    except (OSError, PhotographError) as error:
+        warnings.warn(f"the metrics of training views are not written: {error}", stacklevel=3)
 
 
 def measure(
@@ -129,9 +150,3 @@ class Glances:
         left = MAX_SHARE * (progress.seconds - self._begin) - self._spent
         count = min(MAX_VIEWS, len(self._order), math.floor(left / max(cost, 1e-9)))
         return count if count >= min(LEAST_VIEWS, len(self._order)) else 0
-
-
-def spread(indices: list[int]) -> list[int]:
-    """Order indices such that the first few of them are spread evenly, however many are taken."""
-    share = (math.sqrt(5) - 1) / 2
-    return [index for _, index in sorted((k * share % 1, index) for k, index in enumerate(indices))]
