@@ -197,17 +197,7 @@ def _message(error: BaseException) -> str:
 
 
 # Commands whose result is what they print.
-_PRINTING = (
-    "eval",
-    "completion",
-    "--json",
-    "--show-config",
-    "--check",
-    "--help",
-    "--help-fields",
-    "-h",
-    "--version",
-)
+_PRINTING = "eval completion --json --show-config --check --help --help-fields -h --version".split()
 
 
 def _report_lost(given: list[str], outputs: dict[str, Output]) -> int:

@@ -46,23 +46,28 @@ class EvaluationStoppedError(Exception):
     """An evaluation was given up because the run has to stop."""
 
 
-def image_metrics(render: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, float]:
-    """Return PSNR in dB, SSIM, and the PSNR after `correct_colours` ("psnr_corrected") of one view.
+def image_metrics(
+    render: Tensor, target: Tensor, mask: Tensor | None, lpips: Lpips | None = None
+) -> dict[str, float]:
+    """Return PSNR in dB, SSIM, the PSNR after `correct_colours` ("psnr_corrected"), and LPIPS of one view.
 
-    Args:
-        render: float [H, W, 3]; clamped to [0, 1] and not quantised.
-        target: uint8 [H, W, 3].
-        mask: uint8 [H, W]; pixels with 0 are left out of all metrics; None: no mask.
+    The render, float [H, W, 3], is clamped to [0, 1] and not quantised; the target is uint8 [H, W, 3]. Pixels
+    with 0 in the mask, uint8 [H, W], are left out of all metrics but LPIPS.
     """
     render = render.clamp(0.0, 1.0)
+    mask = None if mask is None else mask.to(target.device)
     counted = torch.ones_like(target[..., 0]) if mask is None else mask
     pixels, wanted = render[counted != 0].double(), target[counted != 0].double() / 255.0
     similarity = ssim(render[None], target[None], None if mask is None else mask[None])
-    return {
+    metrics = {
         "psnr": _psnr(pixels, wanted),
         "ssim": similarity.item(),
         "psnr_corrected": _psnr(correct_colours(pixels, wanted), wanted),
     }
+    if lpips is not None:
+        pair = (image.permute(2, 0, 1)[None].cpu() * 2 - 1 for image in (render, target.float() / 255))
+        metrics["lpips"] = float(lpips(*pair))
+    return metrics
 
 
 def correct_colours(pixels: Tensor, wanted: Tensor) -> Tensor:
@@ -125,17 +130,6 @@ def render_view(
     owners.record([index], frame.tile_work, ranges)
     collect_images(frame.renders, ranges, ranks, destination)
     return frame.renders[0] if ranks.rank == destination else None
-
-
-def _compare(render: Tensor, target: Tensor, mask: Tensor | None, lpips: Lpips | None) -> dict[str, float]:
-    """Return all metrics of one view; arguments as for `image_metrics`."""
-    metrics = image_metrics(render, target, None if mask is None else mask.to(target.device))
-    if lpips is not None:
-        pair = [
-            image.permute(2, 0, 1)[None].cpu() * 2 - 1 for image in (render.clamp(0, 1), target.float() / 255)
-        ]
-        metrics["lpips"] = float(lpips(pair[0], pair[1]))
-    return metrics
 
 
 def evaluate(
@@ -205,7 +199,7 @@ def evaluate(
                 continue
             if mask is not None and not bool(mask.any()):
                 continue  # nothing to compare
-            per_view[cameras[index].name] = _compare(render, target, mask, lpips)
+            per_view[cameras[index].name] = image_metrics(render, target, mask, lpips)
             if files is not None and index in chosen:
                 picture = comparison(render, target, mask)
                 files.write(chosen[index], encode_image(picture, ".jpg"))

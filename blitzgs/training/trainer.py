@@ -36,7 +36,6 @@ from blitzgs.training.budget import Budget
 from blitzgs.training.events import evaluate, handle_all, save
 from blitzgs.training.events.evaluate import Glances
 from blitzgs.training.records import (
-    MemoryMeter,
     StepRecord,
     describe,
     log_step,
@@ -89,7 +88,7 @@ class Trainer:
         self._warned_of_masks = False
         self._watching: Watching | None = None
         self._watched_on = False
-        self.memory = MemoryMeter()
+        self._memory: list[int] = []  # samples of what this rank's GPU has allocated
 
     def watch(self, watcher: Watcher | None, stays: bool = False) -> None:
         """Let somebody watch the training; every rank calls this before `train`, rank 0 with a watcher.
@@ -269,7 +268,8 @@ class Trainer:
         state.stepped(step, degree)
         state.log.advance(end)
         if is_logged:
-            self.memory.sample(state.ranks.device)
+            if state.ranks.device.type == "cuda":
+                self._memory.append(run_files.memory_bytes(state.ranks.device))
             if not self._writes_late:
                 self._write_record()
         if is_logged or step == schedule.steps:
@@ -366,7 +366,7 @@ class Trainer:
             raise ModelLostError("no Gaussian is left: do the poses and the points belong together?")
         with state.stage("final_checkpoint"):
             save.run_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
-        population = population_report(state, self.memory)
+        population = population_report(state, self._memory)
         state.log.event(state.images_seen, "population", population, describe(population))
         images = state.images.memory()
         state.log.event(state.images_seen, "image_memory", dataclasses.asdict(images), str(images))
