@@ -197,7 +197,9 @@ def _message(error: BaseException) -> str:
 
 
 # Commands whose result is what they print.
-_PRINTING = "eval completion --json --show-config --check --help --help-fields -h --version".split()
+_PRINTING = (
+    "eval", "completion", "--json", "--show-config", "--check", "--help", "--help-fields", "-h", "--version"
+)  # fmt: skip
 
 
 def _report_lost(given: list[str], outputs: dict[str, Output]) -> int:
