@@ -14,15 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from blitzgs.cli.arguments import (
-    Commands,
-    add_capture,
-    add_command,
-    add_device,
-    add_model,
-    named_path,
-    number,
-)
+from blitzgs.cli import arguments
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import GaussianSource, is_antialiased
@@ -78,27 +70,29 @@ A city that no browser holds at once is written as a folder that viewers load pi
 Memory does not grow with the model; the disk needs twice the size of the model. See docs/guide/tiles.md.
 """
 _TILES = "--tiles and --streamed-sog"
-_COUNT = number(int, lambda value: value >= 1, "a whole number from 1 on")
+_COUNT = arguments.number(int, lambda value: value >= 1, "a whole number from 1 on")
 
 
-def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
+def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "export", run, summary, HELP)
-    add_model(parser)
-    add_device(parser)
-    add_capture(parser)
+    parser = arguments.add_command(commands, "export", run, summary, HELP)
+    arguments.add_model(parser)
+    arguments.add_device(parser)
+    arguments.add_capture(parser)
     kind = parser.add_mutually_exclusive_group(required=True)
     for name, found in FORMATS.items():
-        kind.add_argument(f"--{name}", type=named_path, metavar="FILE", help=f"{found.title} file to write")
-    kind.add_argument("--html", type=named_path, metavar="FILE", help="HTML file to write")
+        arguments.add_path(kind, f"--{name}", "FILE", f"{found.title} file to write")
+    arguments.add_path(kind, "--html", "FILE", "HTML file to write")
     for name, title in (
         ("tiles", "3D Tiles (tileset.json)"),
         ("streamed-sog", "streamed SOG (lod-meta.json)"),
     ):
-        kind.add_argument(f"--{name}", type=named_path, metavar="DIR", help=f"folder to make for {title}")
+        arguments.add_path(kind, f"--{name}", "DIR", f"folder to make for {title}")
     parser.add_argument(
         "--max-mb",
-        type=number(float, lambda mb: 0 < mb <= LARGEST_MB, f"a number of megabytes up to {LARGEST_MB}"),
+        type=arguments.number(
+            float, lambda mb: 0 < mb <= LARGEST_MB, f"a number of megabytes up to {LARGEST_MB}"
+        ),
         metavar="MB",
         help=f"with --html: largest size of the file in megabytes (default: {MAX_MB})",
     )
@@ -129,11 +123,11 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         metavar=tuple("xyzXYZ"),
         help="keep this box of the capture's coordinates",
     )
-    parser.add_argument(
+    arguments.add_path(
+        parser,
         "--crop-polygon",
-        type=named_path,
-        metavar="FILE",
-        help='keep this region: a GeoJSON polygon, or lines "x y", in the capture\'s coordinates',
+        "FILE",
+        'keep this region: a GeoJSON polygon, or lines "x y", in the capture\'s coordinates',
     )
     parser.add_argument(
         "--crop-axes", choices=("xy", "xz", "yz"), help="axes of the polygon's corners (default: xy)"

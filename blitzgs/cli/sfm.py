@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from blitzgs.capture.colmap import camera_models
-from blitzgs.cli.arguments import Commands, add_command, named_path
+from blitzgs.cli.arguments import Commands, add_command, add_path
 from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
 from blitzgs.sfm.photographs import Photographs, estimate, has_photographs_alone, photograph_folder
@@ -41,8 +41,8 @@ photographs without a pose and why), and COLMAP's database and messages.
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "sfm", run, summary, HELP)
-    parser.add_argument("photos", type=named_path, metavar="PHOTOS", help="folder of the photographs")
-    parser.add_argument("capture", type=named_path, metavar="CAPTURE", help="folder to write")
+    add_path(parser, "photos", "PHOTOS", "folder of the photographs")
+    add_path(parser, "capture", "CAPTURE", "folder to write")
     parser.add_argument(
         "--pairs", choices=PAIRS, default="auto", help="which photographs are compared (default: see above)"
     )

@@ -17,7 +17,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from blitzgs.cli.arguments import Commands, add_command, add_device, named_path, number
+from blitzgs.cli.arguments import Commands, add_command, add_device, add_path, number
 from blitzgs.cli.report import kept_warnings, write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
 from blitzgs.config.describe import describe, describe_all, describe_page
@@ -98,15 +98,13 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         metavar="RECIPE",
         help="name of a recipe, or a YAML file (default: aerial on a GPU, aerial_cpu on a CPU)",
     )
-    parser.add_argument(
-        "--data", type=named_path, metavar="DIR", help="folder of the capture, or another program's project"
-    )
-    parser.add_argument("--out", type=named_path, metavar="RUN", help="folder for the results")
-    parser.add_argument(
+    add_path(parser, "--data", "DIR", "folder of the capture, or another program's project")
+    add_path(parser, "--out", "RUN", "folder for the results")
+    add_path(
+        parser,
         "--start",
-        type=named_path,
-        metavar="FILE",
-        help="begin with the Gaussians of a file (PLY, SPZ, SOG, .splat) in the capture's coordinates",
+        "FILE",
+        "begin with the Gaussians of a file (PLY, SPZ, SOG, .splat) in the capture's coordinates",
     )
     parser.add_argument(
         "--resume", action="store_true", help="continue from the newest checkpoint in RUN, if any"
@@ -133,11 +131,11 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         help="read the capture, print what was understood and roughly what the training will take, and stop; "
         "needs no GPU and no --out",
     )
-    parser.add_argument(
+    add_path(
+        parser,
         "--sfm",
-        type=named_path,
-        metavar="DIR",
-        help="folder for the capture that is made of photographs without poses (default: RUN_capture)",
+        "DIR",
+        "folder for the capture that is made of photographs without poses (default: RUN_capture)",
     )
     parser.add_argument("--no-sfm", action="store_true", help="refuse photographs without poses")
     add_live_page(parser)
