@@ -8,7 +8,6 @@ the camera among all of the run, and `views.json`, the list of these numbers.
 
 from __future__ import annotations
 
-import heapq
 import json
 import math
 import warnings
@@ -300,28 +299,23 @@ class Previews:
         """Begin; `fixed` are cameras whose pictures are kept whatever their PSNR."""
         self._folder, self._fixed = folder / FOLDER, fixed
         self._kept: dict[int, dict[str, bytes]] = {}
-        # The smallest entry of each is the next to be dropped: (PSNR, camera) and (-PSNR, camera).
-        self._best: list[tuple[float, int]] = []
-        self._worst: list[tuple[float, int]] = []
+        self._psnr: dict[int, float] = {}  # of this rank's views so far
 
     def add(self, index: int, psnr: float, render: Tensor, target: Tensor, mask: Tensor | None) -> None:
         """Take a measured view; arguments are those of `blitzgs.capture.pictures.comparison`."""
-        dropped = _push(self._best, (psnr, index)) | _push(self._worst, (-psnr, index))
-        if index in self._needed():
+        self._psnr[index] = psnr
+        needed = _extremes(self._psnr) | self._fixed
+        if index in needed:
             pictures = (to_uint8(render), to_uint8(target), to_uint8(error_map(render, target, mask)))
             self._kept[index] = {
                 part: _encoded(picture) for part, picture in zip(PARTS, pictures, strict=True)
             }
-        for other in dropped - self._needed():
-            self._kept.pop(other, None)
-
-    def _needed(self) -> set[int]:
-        return {index for _, index in (*self._best, *self._worst)} | self._fixed
+        for other in self._kept.keys() - needed:
+            del self._kept[other]
 
     def files(self, psnr: Mapping[int, float], lists: bool) -> Iterator[tuple[Path, bytes]]:
         """Return this rank's files, given the PSNR of all ranks' views; one rank also `lists` the cameras."""
-        ordered = sorted(psnr, key=lambda index: (psnr[index], index))
-        chosen = {*ordered[:_EXTREMES], *ordered[-_EXTREMES:]} | (self._fixed & psnr.keys())
+        chosen = _extremes(psnr) | (self._fixed & psnr.keys())
         for index in sorted(chosen & self._kept.keys()):
             for part, content in self._kept[index].items():
                 yield preview_file(self._folder, index, part), content
@@ -334,12 +328,10 @@ def preview_file(folder: Path, index: int, part: str) -> Path:
     return folder / f"{index:06d}_{part}.webp"
 
 
-def _push(heap: list[tuple[float, int]], entry: tuple[float, int]) -> set[int]:
-    """Add an entry; return the camera of the one that no longer fits, if any."""
-    if len(heap) < _EXTREMES:
-        heapq.heappush(heap, entry)
-        return set()
-    return {heapq.heappushpop(heap, entry)[1]}
+def _extremes(psnr: Mapping[int, float]) -> set[int]:
+    """Return the cameras of the best and the worst views."""
+    ordered = sorted(psnr, key=lambda index: (psnr[index], index))
+    return {*ordered[:_EXTREMES], *ordered[-_EXTREMES:]}
 
 
 def _encoded(picture: npt.NDArray[np.uint8]) -> bytes:

@@ -272,7 +272,8 @@ def compare_with_file(config: Config, path: Path) -> None:
     """Warn if a run's configuration file differs from the configuration in its checkpoint."""
     try:
         # The file has the pace of the run's beginning or, after its end, the final one.
-        fields = _changed_fields(config, with_pace_of(load_config(path), config))
+        found = with_pace_of(load_config(path), config)
+        fields = [name for name, *_ in _differences(config, found) if not _is_free(name)]
         what = f"differs in {', '.join(fields)}" if fields else ""
     except ConfigError as error:
         what = f"cannot be read ({error})"
@@ -310,10 +311,6 @@ def with_pace_of(config: Config, saved: Config | None) -> Config:
 
 def _is_free(name: str) -> bool:
     return any(name == free or name.startswith(free + ".") for free in FREE_FIELDS)
-
-
-def _changed_fields(saved: Config, found: Config) -> list[str]:
-    return [name for name, *_ in _differences(saved, found) if not _is_free(name)]
 
 
 def _differences(saved: Config, found: Config) -> list[tuple[str, Any, Any]]:

@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 
 import torch
 
+from blitzgs.config.files import config_hash
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.frame import Frame
 from blitzgs.ops.host import HostCopy
-from blitzgs.runs.files import memory_bytes, peak_memory_bytes
+from blitzgs.runs.files import memory_bytes, peak_memory_bytes, versions
 from blitzgs.runs.guard import check_table, find_bad
 from blitzgs.runs.log import LOG, records
 from blitzgs.training.batches import Batch
@@ -51,6 +52,33 @@ def describe(report: dict[str, Any]) -> str:
     """Return the report in one line of text."""
     stages = [f"{name.replace('_', ' ')} {report[name]:,}" for name in _STAGES if name in report]
     return "population: " + ", ".join(stages)
+
+
+def run_figures(state: TrainingState, population: dict[str, Any]) -> dict[str, Any]:
+    """Return the figures of a run for its summary, besides its metrics. Collective."""
+    figures = {
+        "images": state.images_seen,
+        "seconds": state.progress.seconds,
+        "stages": state.stages(),
+        "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
+        "gaussians": state.population(),
+        "peak_gaussians": state.progress.peak_gaussians,
+        "population": population,
+        "peak_memory_bytes": peak_memory_bytes(state.ranks.device),
+        "config_hash": config_hash(state.config),
+        "run": state.run_id,
+        "versions": versions(state.ranks.device),
+        "largest_fall": state.curve.fall,
+        "warnings": state.curve.warnings(),
+    }
+    if state.config.schedule.minutes > 0:
+        figures |= {
+            "budget_seconds": 60 * state.config.schedule.minutes,
+            "scale": state.images_seen / state.config.schedule.iterations,
+        }
+    if state.stepper.exposures is not None:
+        figures["exposure"] = state.stepper.exposures.describe()
+    return figures
 
 
 def write_picture(state: TrainingState, report: dict[str, Any]) -> None:
