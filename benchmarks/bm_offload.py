@@ -36,7 +36,7 @@ from blitzgs.table.blocks import morton_order
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Pool, PoolError
 from blitzgs.table.table import GaussianTable
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.step import Stepper

@@ -32,7 +32,7 @@ from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, GaussianTable
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.training.step import Stepper
 
 LOSS = LossConfig(ssim=0.2, scale=0)

@@ -13,6 +13,7 @@ from blitzgs.capture.capture import MissingImagesError, load_capture
 from blitzgs.capture.names import match_names, unified
 from blitzgs.formats import native
 from tests.capture.helpers import (
+    as_text,
     edit_model,
     reconstruction,
     shared_data,
@@ -80,9 +81,9 @@ def test_reads_what_colmap_writes_and_colmap_reads_what_we_write(tmp_path, model
     assert_same(ours, rec)
 
     again = tmp_path / "again"
-    colmap.write_model(again, ours, text=text)
+    colmap.write_model(again, ours)
     back = pycolmap.Reconstruction()
-    (back.read_text if text else back.read_binary)(str(again))
+    back.read_binary(str(again))
     assert_same(ours, back)
     assert_same(colmap.read_model(again, points2d=True, tracks=True), rec)
 
@@ -100,9 +101,10 @@ def test_observations_and_tracks_are_left_out_unless_asked_for(tmp_path):
 
 
 def test_an_empty_model_round_trips(tmp_path):
-    for text in (False, True):
-        colmap.write_model(tmp_path / str(text), colmap.ColmapModel(), text=text)
-        model = colmap.read_model(tmp_path / str(text), points2d=True, tracks=True)
+    colmap.write_model(tmp_path, colmap.ColmapModel())
+    for change in (lambda _: None, as_text):
+        change(tmp_path)
+        model = colmap.read_model(tmp_path, points2d=True, tracks=True)
         assert model.cameras == [] and len(model.images.ids) == 0 and model.points.positions.shape == (0, 3)
 
 
@@ -133,7 +135,9 @@ def test_text_tolerates_blank_lines_carriage_returns_and_a_missing_last_line(tmp
     ],
 )
 def test_damage_is_named_with_file_place_and_reason(tmp_path, file, content, message):
-    colmap.write_model(tmp_path, colmap.ColmapModel(), text=file.endswith(".txt"))
+    colmap.write_model(tmp_path, colmap.ColmapModel())
+    if file.endswith(".txt"):
+        as_text(tmp_path)
     (tmp_path / file).write_bytes(content)
     with pytest.raises(ValueError, match=message):
         colmap.read_model(tmp_path, points2d=True, tracks=True)
@@ -170,13 +174,10 @@ def test_columns_that_disagree_are_not_written(tmp_path):
 
 
 @pytest.mark.parametrize("name", [" a.jpg", "a.jpg ", "\ta.jpg", "a.jpg\r", "\va.jpg", "a.jpg\f", " "])
-def test_names_that_text_would_change_are_written_only_as_binary(tmp_path, name):
+def test_blanks_of_names_are_kept(tmp_path, name):
     reconstruction(NAMES, 64, 48).write_binary(str(tmp_path))
     model = colmap.read_model(tmp_path, tracks=True)
     model.images.names[0] = name
-    with pytest.raises(ValueError, match=f"the name '{name}' begins or ends with a blank"):
-        colmap.write_model(tmp_path / "text", model, text=True)
-    assert not (tmp_path / "text" / "images.txt").exists()
     colmap.write_model(tmp_path / "binary", model)
     assert colmap.read_model(tmp_path / "binary").images.names == model.images.names
 

@@ -16,7 +16,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.capture.lengths import NEAR_OF_EXTENT
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.undistort import rectify
-from tests.capture.helpers import look_at, smooth_image, write_image
+from tests.capture.helpers import as_text, look_at, smooth_image, write_image
 
 COUNT, W, H = 12, 64, 48
 NAMES = [f"{i:02d}.png" for i in range(COUNT)]
@@ -69,7 +69,9 @@ def write(root, form, rotations, centres, points):
             track_offsets=np.zeros(len(points) + 1, dtype=np.uint64),
         ),
     )
-    colmap.write_model(root / "sparse" / "0", model, text=form == "text")
+    colmap.write_model(root / "sparse" / "0", model)
+    if form == "text":
+        as_text(root / "sparse" / "0")
 
 
 def quiet_load(root, **options):

@@ -15,7 +15,7 @@ from blitzgs.capture.layouts import read_layout
 from blitzgs.capture.points import file_points
 from blitzgs.formats.ply import read_point_cloud
 from tests.capture import helpers as files
-from tests.capture.helpers import smooth_image, write_capture, write_image
+from tests.capture.helpers import as_text, smooth_image, write_capture, write_image
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 COUNT = 50
@@ -183,11 +183,8 @@ def test_a_file_of_points_that_is_missing_is_named(tmp_path):
 def test_a_colmap_model_with_its_points_in_a_ply(tmp_path, suffix):
     root = write_capture(tmp_path, [f"{i}.png" for i in range(4)])
     folder = root / "sparse" / "0"
-    model = colmap.read_model(folder, points2d=True, tracks=True)
     if suffix == ".txt":
-        colmap.write_model(folder, model, text=True)
-        for path in folder.glob("*.bin"):
-            path.unlink()
+        as_text(folder)
     (folder / f"points3D{suffix}").unlink()
     write_ply(folder / "points3D.ply", ("red", "green", "blue"), COLORS, "u1")
     capture = load_capture(root)

@@ -12,8 +12,7 @@ import torch
 
 from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
 from blitzgs.config.files import ConfigError, from_dict, load_config, save_config, to_dict
-from blitzgs.config.pace import Pace
-from blitzgs.config.schedule import Schedule, stretched
+from blitzgs.config.schedule import Pace, Schedule, stretched
 from blitzgs.optim.table_adam import BETA1, BETA2, EPS, TableAdam
 from tests.training.tiny import random_gaussians
 
@@ -199,7 +198,7 @@ def phases_of(schedule, begin):
     """Return all properties of the step that begins with an image, except for events and rates."""
     return (
         schedule.sh_degree(begin, 3), schedule.reduction(begin), schedule.gathers_statistics(begin),
-        schedule.has_lod_gate(begin), schedule.has_spawn_gate(begin), schedule.prunes_by_size(begin),
+        schedule.has_spawn_gate(begin), schedule.prunes_by_size(begin),
     )  # fmt: skip
 
 

@@ -169,7 +169,7 @@ def test_the_log_tells_the_resolution_and_the_measurements_have_all_of_it(whole_
     _, other = train(tmp_path, "schedule.iterations=60")
     assert not events_of(tmp_path, "resolution")
     assert summary["psnr"] == pytest.approx(other["psnr"], abs=1.5) and summary["psnr"] != other["psnr"]
-    assert list(steps_of(folder)) and trainer.loader.views_read == 7
+    assert list(steps_of(folder)) and trainer.loader.views_masked[1] == 7
 
 
 def test_a_step_renders_the_camera_of_the_reduced_photograph(tmp_path):

@@ -20,7 +20,7 @@ from blitzgs.population.initialisation import INITIAL_OPACITY
 from blitzgs.runs.exposure import LEAST_SPREAD, stored
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.training.exposure import Exposures
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.loss import loss_terms, opacity_term, photometric, scale_term, weighted

@@ -4,7 +4,7 @@
 import json
 import os
 import signal
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -14,9 +14,9 @@ from blitzgs.capture.images import PhotographError
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.guard import ModelLostError
 from blitzgs.runs.watch import Wish
-from blitzgs.training import glances
 from blitzgs.training.curve import FALL, WINDOW, Curve
-from blitzgs.training.glances import Glances, spread
+from blitzgs.training.events import evaluate as glances
+from blitzgs.training.events.evaluate import Glances, spread
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Look
@@ -289,8 +289,12 @@ def test_the_share_of_the_time_is_small(tmp_path, monkeypatch, cost):
 def test_a_lost_held_out_photograph_ends_the_glances_alone(tmp_path, monkeypatch):
     glance_at_once(monkeypatch)
 
-    def measure(*_, **__):
-        raise PhotographError("03.png is gone")
+    found = glances.measure
+
+    def measure(state, views, folder, lpips):
+        if folder is None:
+            raise PhotographError("03.png is gone")
+        return found(state, views, folder, lpips)
 
     monkeypatch.setattr(glances, "measure", measure)
     _, summary = train(tmp_path)
@@ -324,5 +328,5 @@ def test_a_reset_begins_the_curve_anew():
 
 def test_a_curve_survives_a_resume():
     curve, _ = followed([25.0] * 20)
-    again = Curve.of(curve.saved())
+    again = Curve(**asdict(curve))
     assert again == curve and followed([19.0] * 30, again)[1]
