@@ -106,8 +106,8 @@ def test_ctrl_c_at_the_start_has_no_traceback(capture, tmp_path, moment):
     program = (
         f"import os, signal, sys, {module} as module\nfrom blitzgs.cli import main\n"
         f"real = module.{name}\n"
-        "def interrupted(*arguments):\n"
-        "    os.kill(os.getpid(), signal.SIGINT)\n    return real(*arguments)\n"
+        "def interrupted(*arguments, **options):\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n    return real(*arguments, **options)\n"
         f"module.{name} = interrupted\n"
         f"sys.exit(main(['train', '--data', {str(capture)!r}, '--out', {str(tmp_path / 'r')!r}]))"
     )
