@@ -271,7 +271,7 @@ def test_the_share_of_the_time_is_small(tmp_path, monkeypatch, cost):
     state.start_clock()
     spent = []
 
-    def measure(state, views, folder, lpips):
+    def measure(state, views, folder, lpips=None):
         now[0] += cost * len(views)
         spent.append(cost * len(views))
         return {"psnr": 20.0}
