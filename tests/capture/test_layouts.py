@@ -31,6 +31,7 @@ def test_nothing_to_load_is_said_clearly(tmp_path):
         load_capture(tmp_path / "nowhere")
     (tmp_path / "photographs").mkdir()
     (tmp_path / "photographs" / "DJI_0001.JPG").touch()
+    (tmp_path / "photographs" / "cameras.json").touch()  # a run has such a file, and it is no model
     with pytest.raises(FileNotFoundError, match="has images but not their cameras: blitzgs sfm"):
         load_capture(tmp_path)
     (tmp_path / "sparse" / "1").mkdir(parents=True)
