@@ -202,6 +202,7 @@ NOTATIONS = [
     ({DECOMPOSED: E_ACUTE}, [], []),
     ({"a.jpg": "a.png", "b.jpg": "b.png"}, [], []),
     ({"a.tif": "a.JPEG"}, [], []),
+    ({"a.HEIC": "a.jpg", "b.ARW": "b.jpg"}, [], ["b.dng"]),
     ({"day/a.jpg": "a.jpg"}, [], []),
     ({"a.jpg": "day/a.jpg"}, [], []),
     ({"day/a.jpg": "day_a.jpg", "night/a.jpg": "night_a.jpg"}, [], []),
