@@ -118,14 +118,21 @@ def _say(new: dict[str, str], count: int, folder: Path, ignored: str) -> None:
 
 
 def files_below(folder: Path) -> list[str]:
-    """Return the files of a folder and its subfolders, sorted, as paths relative to it with slashes."""
+    """Return the files of a folder and its subfolders, sorted, as paths relative to it with slashes.
+
+    Hidden ones are left out, as macOS writes them beside photographs. Links are followed, but none to a
+    folder that has the link inside, which would repeat all.
+    """
     out = []
     for place, folders, files in os.walk(folder, followlinks=True):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        if len(Path(place).relative_to(folder).parts) > _DEEPEST:  # a link to a folder above itself
+        inside = f"{os.path.realpath(place)}/"
+        shown = (name for name in folders if not name.startswith("."))
+        folders[:] = sorted(n for n in shown if not inside.startswith(f"{os.path.realpath(f'{place}/{n}')}/"))
+        if len(Path(place).relative_to(folder).parts) > _DEEPEST:  # links that lead to each other
             folders.clear()
         base = Path(place).relative_to(folder).as_posix()
-        out += [name if base == "." else f"{base}/{name}" for name in files]
+        visible = (name for name in files if not name.startswith("."))
+        out += [name if base == "." else f"{base}/{name}" for name in visible]
     return sorted(out)
 
 
