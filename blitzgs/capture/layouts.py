@@ -188,7 +188,10 @@ def _with_photographs(root: Path, source: Source, views: Sequence[SourceView]) -
         file
         for folder in folders
         for file in (folder.iterdir() if folder.is_dir() else ())
-        if file.suffix.lower() in suffixes and file not in known and not _BY_PRODUCT.search(file.stem)
+        if file.suffix.lower() in suffixes
+        and file not in known
+        and not file.name.startswith(".")
+        and not _BY_PRODUCT.search(file.stem)
     )
     if without:
         warnings.warn(

@@ -31,6 +31,7 @@ from blitzgs.formats.glb import write_glb
 from blitzgs.formats.partition import BITS, Counts, Partition, Parts, extents
 from blitzgs.formats.web_page import WebScene, tiles_page
 from blitzgs.util.output import sync_to_disk, write_file
+from blitzgs.util.processes import follow_parent
 
 TILESET, PAGE = "tileset.json", "index.html"
 # Gaussians of a tile: 8 MB at SH degree 3.
@@ -209,11 +210,16 @@ def each_part(
             yield work(parts, folder, number)
         return
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, initializer=torch.set_num_threads, initargs=(1,))
+    pool = ProcessPoolExecutor(processes, context, _prepare)
     try:
         yield from pool.map(work, [parts] * len(chosen), [folder] * len(chosen), chosen)
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _prepare() -> None:
+    follow_parent()
+    torch.set_num_threads(1)
 
 
 def _encode(parts: Parts, folder: Path, part: int) -> tuple[Array, int, int]:
