@@ -281,7 +281,11 @@ def test_a_killed_export_leaves_no_tileset(tmp_path):
         assert process.stdout.readline() == "ready\n"
         process.kill()
     assert not (tmp_path / "t").exists() and not list(tmp_path.rglob("tileset.json"))
+    left = list(tmp_path.iterdir())
     with new_folder(tmp_path / "t") as folder:
+        assert len(left) == 1 and not left[0].exists()
+        with pytest.raises(KeyError), new_folder(tmp_path / "t"):
+            raise KeyError(folder.stat())  # a folder in use is not removed
         (folder / "x").write_text("x")
     assert (tmp_path / "t" / "x").exists()
 
