@@ -189,7 +189,7 @@ def load_capture(
     train, test = ([place[index] for index in part if index in place] for part in (train, test))
     apart_left = [place[index] for index in kept if apart[index]]
     if not train:
-        raise MissingImagesError(f"{root}: no image of a training view is on disk")
+        raise MissingImagesError(f"{root}: no image of a training view is on disk and whole")
     with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # the files may be on a slow network disk
         headers = list(pool.map(lambda view: read_header(view.path), views))
     extra_bands = [view for view, header in zip(views, headers, strict=True) if header.extra_bands]

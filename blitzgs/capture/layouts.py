@@ -101,7 +101,8 @@ def _no_capture(root: Path) -> FileNotFoundError:
 
 def _hint(root: Path) -> str:
     """Return what a folder without a capture has instead, and what to do."""
-    models = [path.parent for depth in ("*", "*/*", "*/*/*") for path in root.glob(f"{depth}/cameras.*")]
+    files = [path for depth in ("*", "*/*", "*/*/*") for path in root.glob(f"{depth}/cameras.*")]
+    models = [path.parent for path in files if path.suffix in (".bin", ".txt")]
     if models:
         return (
             f"; there is a COLMAP model in {min(models)}: name the folder above its sparse/0 with --data, or "
@@ -175,7 +176,10 @@ def _with_photographs(root: Path, source: Source, views: Sequence[SourceView]) -
         file
         for folder in folders
         for file in (folder.iterdir() if folder.is_dir() else ())
-        if file.suffix.lower() in suffixes and file not in known and not _BY_PRODUCT.search(file.stem)
+        if file.suffix.lower() in suffixes
+        and file not in known
+        and not file.name.startswith(".")
+        and not _BY_PRODUCT.search(file.stem)
     )
     if without:
         warnings.warn(

@@ -74,8 +74,8 @@ def read_transforms(root: Path, files: Sequence[Path] | None = None) -> Transfor
     for path in files:
         content, entries = _read_file(path)
         if "ply_file_path" in content:
-            if not isinstance(content["ply_file_path"], str):
-                raise ValueError(f"{path}: ply_file_path must be text, got {content['ply_file_path']!r}")
+            if not _names_file(content, "ply_file_path"):
+                raise ValueError(f"{path}: ply_file_path must name a file, got {content['ply_file_path']!r}")
             points_path = _found(root, [content["ply_file_path"]]).popitem()[1]
         applied = _applied(path, content) if applied is None else applied
         lists = _lists(path, content)

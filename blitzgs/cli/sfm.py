@@ -10,10 +10,12 @@ import sys
 import time
 from pathlib import Path
 
-from blitzgs.capture.colmap import camera_models
+from blitzgs.capture.colmap import camera_models, find_models
+from blitzgs.capture.transforms import find_transforms
 from blitzgs.cli.arguments import Commands, add_command, add_path
 from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
+from blitzgs.runs.files import CONFIG
 from blitzgs.sfm.photographs import Photographs, estimate, has_photographs_alone, photograph_folder
 from blitzgs.sfm.reconstruct import MAPPERS, PAIRS, WORK, Settings, is_finished, reconstruct
 from blitzgs.util.terminal import printable
@@ -89,16 +91,19 @@ def with_poses(config: Config, folder: Path) -> Config:
     They go into `folder`, which is used as it is if it is finished. Under torchrun rank 0 finds them and the
     others, which have not joined yet, wait for its report; where rank 0 fails, torchrun ends them.
     """
-    root = Path(config.data.path)
-    if not config.data.path or not has_photographs_alone(root, config.data.images):
+    photographs = _photographs_alone(config)
+    if photographs is None:
         return config
     first = os.environ.get("RANK", "0") == "0"
     if is_finished(folder):
         if first:
             print(f"poses: those of {folder}, found before (blitzgs sfm adds photographs)", file=sys.stderr)
     elif first:
-        print(f"{root} has photographs without poses: they are found first, into {folder}", file=sys.stderr)
-        find_poses(photograph_folder(root, config.data.images), folder, Settings())
+        print(
+            f"{config.data.path} has photographs without poses: they are found first, into {folder}",
+            file=sys.stderr,
+        )
+        find_poses(photographs, folder, Settings())
     while not is_finished(folder):
         time.sleep(1.0)
     return changed(config, "data", path=os.path.realpath(folder), images="images")
@@ -106,11 +111,32 @@ def with_poses(config: Config, folder: Path) -> Config:
 
 def understood_alone(config: Config) -> str | None:
     """Return what a training would do first with photographs that have no poses; None: they have."""
-    root = Path(config.data.path)
-    if not config.data.path or not has_photographs_alone(root, config.data.images):
+    folder = _photographs_alone(config)
+    if folder is None:
         return None
-    photographs = Photographs.of(photograph_folder(root, config.data.images))
+    photographs = Photographs.of(folder)
     return (
         f"{len(photographs.names):,} photographs without poses: a training finds them first, in about "
         f"{estimate(photographs.sizes)}; then this command says more (blitzgs sfm finds poses alone)"
     )
+
+
+def _photographs_alone(config: Config) -> Path | None:
+    """Return the folder of photographs that have no poses; None: they have.
+
+    Raises:
+        FileNotFoundError: the folder is a run or a part of a capture, whose pictures need no poses.
+    """
+    root = Path(config.data.path)
+    if not config.data.path or not has_photographs_alone(root, config.data.images):
+        return None
+    if (root / CONFIG).is_file():
+        raise FileNotFoundError(
+            f"{root} is a run and no capture: name the capture that its {CONFIG} has as data.path"
+        )
+    if find_models(root.parent) or find_transforms(root.parent):
+        raise FileNotFoundError(
+            f"{root} lies in a capture that has its cameras: --data={shlex.quote(str(root.parent))} (or find "
+            "others with blitzgs sfm)"
+        )
+    return photograph_folder(root, config.data.images)

@@ -80,7 +80,11 @@ def run(args: argparse.Namespace) -> int:
     device, _ = resolve_device(args.device, local_rank=0, local_world_size=1, share_gpus=False)
     ranks = Ranks(device=device)
     model: Path = args.model
-    photograph = None if model.is_file() else photographs(run_files.run_and_checkpoint(model)[0], args.data)
+    photograph = None
+    if not model.is_file():
+        folder, _ = run_files.run_and_checkpoint(model)
+        run_files.check_is_run(folder)
+        photograph = photographs(folder, args.data)
     studio = Studio(open_model(model, ranks, photograph, args.paths), args.host, args.port)
     print(f"{model}: open {studio.page.url} (Ctrl-C ends)", flush=True)
     try:

@@ -67,7 +67,7 @@ def set_up(
     Args:
         folder: folder of the run, for configuration, log, checkpoints, evaluation and summary.
         resume: continue from the newest checkpoint in `folder`, if there is one.
-        extend: with `resume`, train a finished run longer, see `extension.extended`.
+        extend: with `resume`, train a finished run longer, see `budget.extended`.
         lap: called with the name of each part of this work at its end (`Laps.lap`).
 
     Raises:
