@@ -58,14 +58,12 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor rank_masks, Tensor splat_ids, Tensor totals)");
   // scale_reg, opacity_reg: for each view, weights of the Gaussians' smallest axes and opacities. v_splats:
   // (v_means2d, v_conics, v_opacities[, v_colors]) or, on CUDA, one table of splat gradients.
-  // dense: gradients of all Gaussians, or of `count` rows, in which rows, int64 [U], are the visible ones.
   m.def(
       "project_bwd(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor? scale_reg, Tensor? opacity_reg, "
       "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor? level, "
       "int width, int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, "
       "float radius_clip, bool antialiased, bool raw, float[] fade, "
-      "Tensor[] v_splats, Tensor? v_depths, bool need_viewmats, bool dense=False, "
-      "Tensor? rows=None, int count=0) -> ("
+      "Tensor[] v_splats, Tensor? v_depths, bool need_viewmats, bool dense=False) -> ("
       "Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, Tensor v_sh, "
       "Tensor v_viewmats)");
   // project_bwd, then lazy_adam_step_ of the visible Gaussians. With places, v_splats are the tables of the

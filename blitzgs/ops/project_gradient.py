@@ -114,22 +114,17 @@ def _first_gradients(
     """Compute what `_gradients` returns; `saved` has the tensors of `ctx`."""
     _, visible_ids, _ = saved.splats
     gathered = ctx.tables is not None
-    all_dense = not any(sparse)
+    all_dense = not gathered and not any(sparse)
     # If all Gaussians are visible, the rows of these are all rows. While torch traces the backward pass, the
     # number of rows is unknown, and tensors are of another type.
     complete = (
-        all_dense
-        and not gathered
-        and type(visible_ids) is Tensor
-        and visible_ids.shape[0] == saved.gaussians[0].shape[0]
+        all_dense and type(visible_ids) is Tensor and visible_ids.shape[0] == saved.gaussians[0].shape[0]
     )
-    # The kernel writes dense gradients, also those of tables, only if all are needed; an unneeded one would
-    # cost memory.
+    # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
     dense = all_dense and not complete and all(needed)
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
         saved.gaussians, *saved.cameras, None, None, *saved.splats, saved.level, *ctx.options,
         _splat_gradients(saved, v), v.depths, need_viewmats, dense,
-        saved.ids if dense else None, len(ctx.tables[0]) if gathered else 0,
     )  # fmt: skip
     found: list[Tensor | None] = gradients[: len(saved.gaussians)]
     if len(ctx.parts) > 1:
@@ -234,13 +229,11 @@ def _(
     level: Tensor | None,
     *options: Any,
     dense: bool = False,
-    rows: Tensor | None = None,
-    count: int = 0,
+    **_gradients: Any,
 ) -> tuple[Tensor, ...]:
     means, (need_viewmats, *given) = gaussians[0], options[N_OPTIONS + 2 :]
-    defaults: tuple[Any, ...] = (dense, rows, count)
-    dense, rows, count = (*given, *defaults[len(given) :])
-    length = visible_ids.shape[0] if not dense else means.shape[0] if rows is None else count
+    dense = given[0] if given else dense
+    length = (means if dense else visible_ids).shape[0]
     return (
         means.new_empty(length, 3),
         means.new_empty(length, 4),

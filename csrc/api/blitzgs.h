@@ -172,7 +172,7 @@ inline GaussianGradients project_backward(const Gaussians& g, const Cameras& cam
       "blitzgs::project_bwd", gaussians, cameras.viewmats, cameras.Ks, /*scale_reg=*/none,
       /*opacity_reg=*/none, s.camera_ids, s.visible_ids, s.splat_offsets, /*level=*/none, o.width, o.height,
       o.tile_size, o.sh_degree, o.near_plane, o.far_plane, o.eps2d, o.radius_clip, o.antialiased, o.raw,
-      o.fade, v_splats, /*v_depths=*/none, of_viewmats, of_all, /*rows=*/none, /*count=*/std::int64_t{0});
+      o.fade, v_splats, /*v_depths=*/none, of_viewmats, of_all);
   return {r[0], r[1], r[2], r[3], r[4], r[5]};
 }
 

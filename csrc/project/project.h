@@ -234,18 +234,11 @@ class SplatMemory {
 
 // The outputs of the backward pass. By default there is one row for each visible Gaussian, [U, ...] (sh
 // [U, K, 3], null without sh). With `dense` there is one row for each Gaussian, [N, ...]; the caller fills
-// them with zeros, and the backward pass writes the rows of visible Gaussians: `rows` [U], or null:
-// visible_ids. viewmats [B, 4, 4] or null.
+// them with zeros, and the backward pass writes the rows of visible Gaussians. viewmats [B, 4, 4] or null.
 template <class T>
 struct ProjectGradients {
   T *means, *quats, *scales, *opacities, *sh, *viewmats;
   bool dense = false;
-  const std::int64_t* rows = nullptr;
-
-  // The row of visible Gaussian u, which is Gaussian `id`.
-  BLITZGS_HD std::int64_t row(std::int64_t u, std::int64_t id) const {
-    return !dense ? u : rows ? rows[u] : id;
-  }
 };
 
 // Arrays that are set to zero together; on CUDA by one launch, because each launch takes the host

@@ -25,8 +25,8 @@ struct StoreGradients {
       reinterpret_cast<float4*>(out.quats)[row(warp)] = v_quat;
     }
     if (out.dense) {
-      triple.scatter(v_mean, out.means, target(warp), warp.lane);
-      triple.scatter(v_scale, out.scales, target(warp), warp.lane);
+      triple.scatter(v_mean, out.means, warp.id, warp.lane);
+      triple.scatter(v_scale, out.scales, warp.id, warp.lane);
     } else {
       triple.store(v_mean, out.means + 3 * warp.first, warp.count, warp.lane);
       triple.store(v_scale, out.scales + 3 * warp.first, warp.count, warp.lane);
@@ -36,7 +36,7 @@ struct StoreGradients {
   __device__ void take_sh(Shared&, Own&, const WarpRows& warp, const ShStage<DEGREE>& stage) const {
     if (!out.sh) return;
     if (out.dense) {
-      stage.scatter(out.sh, stride, target(warp), warp.lane);
+      stage.scatter(out.sh, stride, warp.id, warp.lane);
     } else {
       stage.store(out.sh + stride * warp.first, stride, warp.count, warp.lane);
     }
@@ -51,11 +51,9 @@ struct StoreGradients {
   }
 
  private:
-  // The row of the outputs that belongs to this lane's Gaussian, which exists.
-  __device__ std::int64_t row(const WarpRows& warp) const { return out.row(warp.first + warp.lane, warp.id); }
-  // The same of any lane; negative: it has no Gaussian.
-  __device__ std::int32_t target(const WarpRows& warp) const {
-    return warp.id < 0 ? warp.id : static_cast<std::int32_t>(row(warp));
+  // The row of the outputs that belongs to this lane's Gaussian.
+  __device__ std::int64_t row(const WarpRows& warp) const {
+    return out.dense ? warp.id : warp.first + warp.lane;
   }
 };
 

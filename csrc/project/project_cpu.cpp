@@ -131,7 +131,7 @@ void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& came
   const ActivatedGaussian<T> gaussian = load_gaussian(in, id);
   GaussianGradient<T> gradient{};
   T axis_weight = T(0);
-  const std::int64_t at = out.row(u, id);
+  const std::int64_t at = out.dense ? id : u;
   if (out.sh) std::fill_n(out.sh + stride * at, stride, T(0));
   for (std::int64_t r = splats.splat_offsets[u]; r < splats.splat_offsets[u + 1]; ++r) {
     const int view = splats.camera_ids[r];

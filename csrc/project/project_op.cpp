@@ -271,7 +271,7 @@ BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats,
                             std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
                             double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
                             const FloatList& fade, const TensorList& v_splats, const OptionalTensor& v_depths,
-                            bool need_viewmats, bool dense, const OptionalTensor& rows, std::int64_t count) {
+                            bool need_viewmats, bool dense) {
   constexpr const char* kOp = "project_bwd";
   const ProjectArguments p(kOp, gaussians, viewmats, Ks,
                            checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
@@ -280,8 +280,7 @@ BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats,
   const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
                              std::nullopt);
-  if (rows) check_in_place(kOp, "rows", *rows, ScalarType::Long, {b.visible()});
-  const std::int64_t length = !dense ? b.visible() : rows ? count : p.count;
+  const std::int64_t length = dense ? p.count : b.visible();
   Tensor v_means = make_empty(p.means, {length, 3}), v_quats = make_empty(p.means, {length, 4}),
          v_scales = make_empty(p.means, {length, 3}), v_opacities = make_empty(p.means, {length}),
          v_sh = make_empty(p.means, {length, p.sh_stride, 3}),
@@ -300,8 +299,7 @@ BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats,
         p.inputs<T>(), b.pointers(), v.source<T>(), b.regularisers<T>(),
         ProjectGradients<T>{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),
                             mutable_data<T>(v_opacities), p.sh ? mutable_data<T>(v_sh) : nullptr,
-                            need_viewmats ? mutable_data<T>(v_viewmats) : nullptr, dense,
-                            data_or_null<std::int64_t>(rows)},
+                            need_viewmats ? mutable_data<T>(v_viewmats) : nullptr, dense},
         scope.workspace, scope.stream);
   });
   return {v_means, v_quats, v_scales, v_opacities, v_sh, v_viewmats};
