@@ -102,8 +102,6 @@ class OneImport(GsplatTrainer):
 
 # Refinements from one sorting of the rows to the next: each appends few rows, so the order stays good.
 SORT_EVERY = 5
-# Gaussians from which gradients are sparse: the host's work for six sparse tensors pays from some on.
-SPARSE_FROM = 500_000
 
 
 class FourSwaps(OneImport):
@@ -130,7 +128,6 @@ class FourSwaps(OneImport):
         image, _, info = blitzgs.raw_rasterization(
             p["means"], p["quats"], p["scales"], p["opacities"], p["sh0"], p["shN"], views.viewmats, views.Ks,
             views.width, views.height, sh_degree=self.sh_degree, optimizers=self._optimisers,
-            sparse_grad=len(p["means"]) >= SPARSE_FROM,
         )  # fmt: skip
         return image, info
 
