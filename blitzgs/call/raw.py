@@ -96,8 +96,7 @@ def raw_rasterization(
         backgrounds: [C, D] behind everything; None for zero. Depth channels have none.
         render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
         sparse_grad: False: dense gradients, for parameters that are not leaves (`means + offsets`), and for
-            optimisers, gradient clipping and torch's DistributedDataParallel, which take no others. With
-            fewer than some 500,000 Gaussians they are faster.
+            optimisers, gradient clipping and torch's DistributedDataParallel, which take no others.
         absgrad: as in `blitzgs.rasterization`.
         rasterize_mode: "classic" or "antialiased".
         optimizers: the parameters' optimisers: one, a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
