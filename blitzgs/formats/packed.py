@@ -25,10 +25,17 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
-import psutil
 import torch
 
-from blitzgs.formats.gaussians import BLOCK, MIP, Gaussians, GaussianSource, is_antialiased, unit_quats
+from blitzgs.formats.gaussians import (
+    BLOCK,
+    MIP,
+    Gaussians,
+    GaussianSource,
+    check_memory,
+    is_antialiased,
+    unit_quats,
+)
 from blitzgs.formats.ply import read_ply
 from blitzgs.util.output import new_file
 
@@ -56,17 +63,6 @@ def _package(name: str) -> ModuleType:
         raise ImportError(
             f'this format needs the package {name} ({error}): pip install "blitzgs[formats]"'
         ) from error
-
-
-def _check_room(path: Path, count: int, degree: int) -> None:
-    """Refuse a number of Gaussians that memory cannot hold, twice, as the packages and torch do."""
-    needed = 2 * 4 * count * (14 + 3 * _COEFFICIENTS[degree])
-    free = psutil.virtual_memory().available
-    if needed > free:
-        raise ValueError(
-            f"{path} says that it holds {count:,} Gaussians: reading them takes {needed / 1e9:,.1f} GB of "
-            f"memory, and {free / 1e9:,.1f} GB are free"
-        )
 
 
 def unit_blocks(source: GaussianSource) -> Iterator[Gaussians]:
@@ -204,7 +200,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
     size = len(header) + len(found) + chunks * columns * 4 + count * (16 + rest)
     if path.stat().st_size < size:
         raise ValueError(f"{path} is cut off: {path.stat().st_size:,} of {size:,} bytes")
-    _check_room(path, count, degree)
+    check_memory(f"{path} says that it holds", count, degree)
     comments = [line for line in text.splitlines() if line.startswith(("comment ", "obj_info "))]
     return replace(_unforged(path, "compressed.ply"), comments=comments)
 
@@ -235,7 +231,7 @@ def read_splat(path: Path) -> Gaussians:
     size = path.stat().st_size
     if size % _SPLAT.itemsize:
         raise ValueError(f"{path} is cut off: {size:,} bytes are no multiple of {_SPLAT.itemsize}")
-    _check_room(path, size // _SPLAT.itemsize, 0)
+    check_memory(f"{path} says that it holds", size // _SPLAT.itemsize, 0)
     rows = np.fromfile(path, dtype=_SPLAT)
     if not (rows["scale"] >= 0).all():
         first = int(np.argmin((rows["scale"] >= 0).all(axis=1)))
@@ -305,7 +301,7 @@ def read_spz(path: Path) -> Gaussians:
     if degree not in _COEFFICIENTS:
         raise ValueError(f"{path}: SH degree {degree} is not supported, 0 to 3 are")
     size = 16 + count * (16 + (4 if version >= 3 else 3) + 3 * (_COEFFICIENTS[degree] - 1))
-    _check_room(path, count, degree)
+    check_memory(f"{path} says that it holds", count, degree)
     if deflated:
         if size > _DEFLATE * path.stat().st_size:
             raise ValueError(f"{path}: {path.stat().st_size:,} bytes cannot hold {count:,} Gaussians")
@@ -392,7 +388,7 @@ def _check_sog(path: Path) -> bool:
         count = meta["count"] if "version" in meta else meta["means"]["shape"][0]
         if type(count) is not int or count < 1:
             raise ValueError(f"{path}: meta.json names {count!r} Gaussians")
-        _check_room(path, count, 3)
+        check_memory(f"{path} says that it holds", count, 3)
         for part in ("means", "scales", "quats", "sh0", "shN"):
             if part not in meta and part == "shN":
                 continue

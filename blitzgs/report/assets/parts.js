@@ -196,7 +196,8 @@ function curveCharts(runs) {
       chart("Loss", lines(["loss"], [""]), { ...options, zero: true }),
       chart("PSNR, dB", lines(["psnr", "held_out"], ["training", "held out"]), { ...options, text: (v) => v.toFixed(1) }),
       chart("Gaussians", lines(["gaussians"], [""]), { ...options, zero: true }),
-      chart("Memory, bytes", lines(["memory_bytes"], [""]), { ...options, zero: true }),
+      chart("Memory, GB", lines(["memory_bytes"], [""]).map((line) => ({ ...line,
+        points: line.points.map(([x, y]) => [x, y / 1e9]) })), { ...options, zero: true, text: (v) => number(v, v < 10 ? 2 : 0) }),
       chart("Images per second", lines(["images_per_second"], [""]), { ...options, zero: true }),
     ].filter(Boolean));
   }
