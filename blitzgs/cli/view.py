@@ -117,9 +117,7 @@ class _Handler(SimpleHTTPRequestHandler):
 def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
     """Return a server of a tileset's folder, not running yet; port 0: any free one.
 
-    Raises:
-        ValueError: the tileset is damaged, or another program wrote it.
-        OSError: the address is not this machine's, or the port is in use.
+    ValueError: the tileset is damaged, or another program's. OSError: it cannot listen at the address.
     """
     try:
         tileset = json.loads((folder / TILESET).read_text(encoding="utf-8"))

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import re
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import timedelta
 from types import TracebackType
@@ -70,6 +70,7 @@ class Ranks:
         transport: Transport = "auto",
         share_gpus: bool = False,
         tables_on_host: bool = False,
+        lap: Callable[[str], None] = lambda _: None,
     ) -> Ranks:
         """Join the job that torchrun's environment describes: Gloo on the CPU, NCCL on CUDA.
 
@@ -85,6 +86,7 @@ class Ranks:
                 for development.
             tables_on_host: whether collectives will carry tensors that are on the CPU although the ranks
                 compute on CUDA.
+            lap: called with the name of each part of this work at its end (`Laps.lap`).
 
         Returns:
             The ranks; without torchrun, or with a single process, an object with `world_size` 1.
@@ -120,11 +122,13 @@ class Ranks:
         )
         if chosen.type == "cuda":
             torch.cuda.set_device(chosen)
+            torch.cuda.synchronize()
+        lap("device")
         if world_size > 1:
-            ranks._join(transport, tables_on_host)
+            ranks._join(transport, tables_on_host, lap)
         return ranks
 
-    def _join(self, transport: Transport, tables_on_host: bool) -> None:
+    def _join(self, transport: Transport, tables_on_host: bool, lap: Callable[[str], None]) -> None:
         if self.shares_gpu:
             # Torch reads this variable whenever it maps shared memory.
             os.environ["TORCH_SYMM_MEM_ALLOW_OVERLAPPING_DEVICES"] = "1"
@@ -145,7 +149,9 @@ class Ranks:
             timedelta(seconds=max(self.timeout_seconds, BUSY_SECONDS) + margin), dist.group.WORLD
         )
         self.watchdog = Watchdog(self.rank, self.world_size, self.timeout_seconds)
+        lap("processes")
         self._choose_transport(transport, self.timeout_seconds + margin)
+        lap("shared memory")
 
     def _choose_transport(self, transport: Transport, timeout_seconds: float) -> None:
         memory: SharedMemory | str = "not asked for"

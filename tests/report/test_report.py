@@ -13,12 +13,10 @@ import torch
 
 from blitzgs.cli import main
 from blitzgs.cli.report import kept_warnings
-from blitzgs.report.compare import compare, differences, labels
 from blitzgs.report.gather import MAX_POINTS
-from blitzgs.report.page import MAX_BYTES
-from blitzgs.report.report import report
+from blitzgs.report.report import MAX_BYTES, compare, differences, labels, report
+from blitzgs.runs.evaluation import PARTS, Previews, preview_file
 from blitzgs.runs.folder import open_run
-from blitzgs.runs.previews import PARTS, Previews, preview_file
 from tests.browser import Browser, needs_chromium, wait_for
 from tests.training.tiny import OVERRIDES, as_flags, at_step, events_of, train, write_tiny_capture
 

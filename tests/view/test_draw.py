@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is drawn of a table, and which of its blocks and rows are visible."""
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -195,9 +196,9 @@ def test_every_point_is_between_the_bounds_of_its_block(count):
         for block, own in enumerate(distances.split(BLOCK_POINTS, dim=1)):
             edge = tightest(own, dim=1)
             assert (bound[:, block] <= edge).all() if bounds == 1 else (bound[:, block] >= edge).all()
-    chosen = torch.arange(len(blocks)) % 2 == 0
-    expected = [points[rows] for rows in blocks.order.split(BLOCK_POINTS)[::2]]
-    assert torch.equal(blocks.points_of(chosen), torch.cat(expected))
+    chosen = torch.arange(len(blocks)).expand(len(centres), -1)
+    own = blocks.distances_of(centres, chosen, math.inf).flatten(1)
+    assert torch.equal(own[:, :count], distances) and own[:, count:].isinf().all()
 
 
 @pytest.mark.parametrize("pairs", [1, 200, 1 << 20])
