@@ -27,7 +27,7 @@ from blitzgs.util.output import new_file
 Bytes = npt.NDArray[np.uint8]
 
 _BOOK = 256
-_META_BYTES = 64 << 20
+_META_BYTES = 1 << 20
 # Entries of the palette of SH coefficients: at most, and one for so many Gaussians.
 # A model of fewer Gaussians than `_EXACT` has an entry for each.
 _PALETTE, _SHARED, _EXACT = 65536, 16, 4096
