@@ -17,7 +17,7 @@ import torch
 from blitzgs.cli import arguments
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.gaussians import GaussianSource, is_antialiased
+from blitzgs.formats.gaussians import GaussianSource, check_memory, is_antialiased
 from blitzgs.formats.models import FORMATS, Format, check_replaces, offset_of, open_gaussians
 from blitzgs.formats.selection import Selected, Selection, read_polygon
 from blitzgs.formats.web_page import check_replaces_page
@@ -250,12 +250,14 @@ def _export_run(
     run_folder, checkpoint = run_and_checkpoint(args.model)
     coordinates = args.coordinates or "auto"
     in_memory = args.classic or args.clean is not None or args.most is not None or coordinates == "world"
+    opened = open_source(run_folder, checkpoint)
     if not in_memory:
-        opened = open_source(run_folder, checkpoint)
         source: GaussianSource = (
             opened if selection is None else Selected(opened, selection, opened.space.offset)
         )
         return source, export(source, opened.space, kind, path, coordinates)
+    flags = "--classic, --clean, --most and --coordinates world need the model in memory"
+    check_memory(f"{flags}; {run_folder} holds", len(opened), opened.degree)
     from blitzgs.viewer.studio import open_model
     from blitzgs.viewer.web import contributions
 
