@@ -37,7 +37,7 @@ from blitzgs.runs.log import LOG
 from blitzgs.training.agreement import Agreement
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture, read_ahead
-from blitzgs.training.population_report import population_report
+from blitzgs.training.records import population_report
 from blitzgs.training.trainer import Trainer
 from blitzgs.util.progress import Laps
 
@@ -196,16 +196,13 @@ def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float)
         images_seen, seconds = state.images_seen, state.progress.seconds
         host_peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
         result |= {
-            "images": images_seen,
-            "planned_images": state.schedule.iterations,
-            "batch_size": config.schedule.batch_size,
-            "seconds": seconds,
-            "images_per_second": images_seen / max(seconds, 1e-9),
-            "gaussians": state.population(),
+            "images": images_seen, "planned_images": state.schedule.iterations,
+            "batch_size": config.schedule.batch_size, "seconds": seconds,
+            "images_per_second": images_seen / max(seconds, 1e-9), "gaussians": state.population(),
             "population": population_report(state, trainer.memory),
             "image_memory": dataclasses.asdict(images.memory()),
             "host_peak_bytes": ranks.all_gather_object(host_peak),
-        }
+        }  # fmt: skip
         if ranks.rank == 0:
             records = [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
             result["phases"] = phases_of(state.config, records, images_seen, seconds)

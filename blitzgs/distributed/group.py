@@ -111,7 +111,7 @@ class Ranks:
         _share_cores(local_world_size)
         chosen, shared = resolve_device(device, local_rank, local_world_size, share_gpus)
         if chosen.type == "cuda":
-            _extend_memory_in_place()
+            extend_memory_in_place()
         ranks = cls(
             rank=rank,
             world_size=world_size,
@@ -305,11 +305,12 @@ def _share_cores(local_world_size: int) -> None:
         torch.set_num_threads(max(1, len(os.sched_getaffinity(0)) // local_world_size))
 
 
-def _extend_memory_in_place() -> None:
+def extend_memory_in_place() -> None:
     """Let torch's CUDA allocator extend its memory, unless the user has configured it; before its first use.
 
     A table that grows by some percent in each density event does not fit into the memory that its last copy
-    has left. By default, torch then asks CUDA for new memory for every column.
+    has left, nor a frame of a viewer into that of a smaller one. By default, torch then asks CUDA for new
+    memory for every column.
     """
     if not any(name in os.environ for name in ALLOCATOR_VARIABLES):
         os.environ[ALLOCATOR_VARIABLES[0]] = "expandable_segments:True"

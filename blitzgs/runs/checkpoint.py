@@ -27,7 +27,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.sharding import global_positions
-from blitzgs.runs.manifest import Shard, finish, verified
+from blitzgs.runs.manifest import DAMAGE, Shard, finish, verified
 from blitzgs.runs.shard_file import header_of, write_shard
 from blitzgs.util.output import check_space, explain, is_lack_of_space
 
@@ -293,7 +293,7 @@ def load(
         # Each rank checks some of the files, so that every file is read for its digest once.
         with ranks.watchdog.working("reading a checkpoint"):
             manifest = verified(path, ranks.rank, ranks.world_size)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except DAMAGE as error:
         problem = str(error) or type(error).__name__
     problems = [text for text in ranks.all_gather_object(problem) if text]
     if problems or manifest is None:

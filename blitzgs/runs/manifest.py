@@ -16,6 +16,8 @@ from blitzgs.util.output import sync_to_disk
 
 FORMAT = 2
 MANIFEST = "manifest.json"
+# What reading a damaged checkpoint may raise.
+DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
 
 
 @dataclass
@@ -38,11 +40,7 @@ class Manifest:
 
 
 def verified(path: Path, part: int = 0, parts: int = 1) -> Manifest:
-    """Read the manifest of a checkpoint, and compare part of the files with their digests.
-
-    Raises:
-        OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError: it is damaged.
-    """
+    """Read the manifest of a checkpoint, and compare part of the files with their digests; see `DAMAGE`."""
     manifest = _read_manifest(path)
     for shard in [*manifest.shards, *([manifest.shared] if manifest.shared else [])][part::parts]:
         _verify(path, shard)

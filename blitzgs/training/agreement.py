@@ -67,7 +67,7 @@ class SaveClock:
     """
 
     def __init__(self, seconds: float) -> None:
-        """Start the clock; `seconds` is the time between two checkpoints, 0: none by wall time."""
+        """Start the clock; `seconds` is the time between two checkpoints; 0: none by wall time."""
         self.saving: Saving | None = None
         self._seconds = seconds or math.inf
         self.restart()
@@ -89,21 +89,13 @@ class SaveClock:
 
 @dataclass(frozen=True)
 class Decision:
-    """What all ranks must do after a step.
+    """What all ranks must do after a step."""
 
-    Attributes:
-        signal: name of the signal that ends the run, or None.
-        save: whether a checkpoint is due.
-        written: whether all ranks have written their parts of the checkpoint that has begun.
-        lost: whether a rank could not read a photograph and continues without it.
-        watched: whether those who watch the run want something.
-    """
-
-    signal: str | None
-    save: bool
-    written: bool = False
-    lost: bool = False
-    watched: bool = False
+    signal: str | None  # name of the signal that ends the run, or None
+    save: bool  # whether a checkpoint is due
+    written: bool = False  # whether all ranks have written their parts of the checkpoint that has begun
+    lost: bool = False  # whether a rank could not read a photograph and continues without it
+    watched: bool = False  # whether those who watch the run want something
 
 
 class Agreement:
@@ -115,10 +107,7 @@ class Agreement:
     def __init__(
         self, ranks: Ranks, stop: StopRequest, clock: SaveClock, wants: Callable[[], bool] = lambda: False
     ) -> None:
-        """Prepare to collect the requests that `stop`, `clock` and `wants` note on each of `ranks`.
-
-        `wants` returns whether those who watch the run want something of all ranks.
-        """
+        """Prepare; `wants` returns whether those who watch the run want something of all ranks."""
         self._ranks, self._stop, self._clock, self._wants = ranks, stop, clock, wants
         self._next = 0
         self._last: tuple[int, float] | None = None

@@ -52,8 +52,6 @@ def open_capture(
     the decoded images if they all fit into half of that. Collective.
 
     Args:
-        config: configuration of the run.
-        ranks: the job.
         remedy: the flag of the caller's command that leaves out views without a photograph, for the error
             message.
         reading: of `read_ahead`.
@@ -145,7 +143,6 @@ def sharing_hint(
     """Return what to do if the decoded images are too many to be shared by the ranks of a host.
 
     Args:
-        capture: the images.
         cache_bytes: `DataConfig.cache_bytes`.
         local_ranks: number of ranks of the host.
         factors: by which images are reduced in addition.

@@ -14,7 +14,7 @@ from blitzgs.distributed.group import (
     ALLOCATOR_VARIABLES,
     MismatchError,
     Ranks,
-    _extend_memory_in_place,
+    extend_memory_in_place,
     resolve_device,
 )
 from blitzgs.distributed.host_sum import HostSum
@@ -196,11 +196,11 @@ def test_memory_is_extended_in_place_unless_the_user_has_configured_it(monkeypat
     for name in ALLOCATOR_VARIABLES:
         monkeypatch.setenv(name, "max_split_size_mb:128")  # so that the test's end restores both
         monkeypatch.delenv(name)
-    _extend_memory_in_place()
+    extend_memory_in_place()
     assert os.environ[present] == "expandable_segments:True"
     monkeypatch.delenv(present)
     monkeypatch.setenv(former, "max_split_size_mb:128")
-    _extend_memory_in_place()
+    extend_memory_in_place()
     assert present not in os.environ
 
 

@@ -16,17 +16,9 @@ from tests.distributed.rank_harness import CONTEXT, RankError, run_ranks
 
 ALONE = Ranks()
 POINTS = [
-    "begin",
-    "folder made",
-    "shard half written",
-    "shard written",
-    "shard synced",
-    "manifest written",
-    "manifest synced",
-    "renamed",
-    "finished",
-    "old one renamed",
-]
+    "begin", "folder made", "shard half written", "shard written", "shard synced", "manifest written",
+    "manifest synced", "renamed", "finished", "old one renamed",
+]  # fmt: skip
 
 
 def table(rows, seed=0):

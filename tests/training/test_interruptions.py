@@ -32,19 +32,6 @@ from tests.training.tiny import at_step, read_log, steps_of, tiny_config, tiny_s
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(autouse=True)
-def signals_as_in_a_terminal():
-    # The tests may have been started with ignored signals, as by nohup or as a shell's background job.
-    numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
-    before = [
-        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
-        for number in numbers
-    ]
-    yield
-    for number, handler in zip(numbers, before, strict=True):
-        signal.signal(number, handler)
-
-
 def trainer(folder, *overrides, images=None, resume=False):
     capture, own = tiny_scene()
     return Trainer(tiny_config(*overrides), capture, images or own, folder, Ranks(), resume)

@@ -7,7 +7,7 @@ import contextlib
 import shlex
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from blitzgs.config.files import save_config
@@ -15,7 +15,6 @@ from blitzgs.config.schedule import Event
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import save_cameras
 from blitzgs.runs.checkpoint import CheckpointError, Saving
-from blitzgs.spawn.lineage import ledger_state
 from blitzgs.training.state import TrainingState
 from blitzgs.util.output import is_lack_of_space
 
@@ -33,10 +32,8 @@ STOPPING_PATIENCE_SECONDS = 15.0
 def run(state: TrainingState, event: Event | None = None) -> None:
     """Begin to write a checkpoint while training goes on; all ranks `finish` it.
 
-    If it cannot be written, the run continues and tries again a minute later.
-
-    Raises:
-        NonFiniteError: a value is not finite; nothing is written, and earlier checkpoints are kept.
+    If it cannot be written, the run continues and tries again a minute later. If a value is not finite,
+    NonFiniteError is raised, and earlier checkpoints are kept.
     """
     finish(state)
     with _reported(state):
@@ -64,17 +61,9 @@ def _reported(state: TrainingState) -> Iterator[None]:
 def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[], bool]) -> None:
     """Write the checkpoint at the end of a run; if there is no space for it, wait and try again.
 
-    If it cannot be written for another reason, which waiting does not change, the model is saved elsewhere.
-
-    Args:
-        state: state of the run.
-        patience_seconds: longest time to wait.
-        gives_up: asked before each wait whether to stop trying; it must return the same on every rank.
-
-    Raises:
-        NonFiniteError: as for `run`.
-        CheckpointError: it could not be written in time, or not at all; the message says whether and where
-            the model was saved instead.
+    `gives_up`, the same on every rank, is asked before each wait. If it cannot be written for another reason,
+    which waiting does not change, the model is saved elsewhere. CheckpointError: it could not be written in
+    time, or not at all; the message says whether and where the model was saved instead.
     """
     finish(state)
     waited, pause = 0.0, FIRST_WAIT_SECONDS
@@ -124,7 +113,7 @@ def _write(state: TrainingState, in_background: bool = False) -> Saving:
             raise CheckpointError(
                 f"no checkpoint was written, because {error}.", is_lack_of_space(error)
             ) from error
-        state.progress = replace(state.progress, ledger=ledger_state(ledger))
+        state.progress = replace(state.progress, ledger=asdict(ledger))
     saving = _save(state, state.folder, in_background)
     state.save_clock.restart()
     return saving
@@ -132,7 +121,7 @@ def _write(state: TrainingState, in_background: bool = False) -> Saving:
 
 def _save(state: TrainingState, folder: Path, in_background: bool = False) -> Saving:
     """Begin to write a checkpoint into the folder of a run."""
-    state.progress = replace(state.progress, curve=state.curve.saved())
+    state.progress = replace(state.progress, curve=asdict(state.curve))
     # The division of tiles decides the order of sums, and therefore their last bits.
     shared = state.owners.columns() if state.ranks.world_size > 1 else {}
     if state.stepper.exposures is not None:
