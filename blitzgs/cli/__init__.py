@@ -117,14 +117,15 @@ def _run(given: list[str]) -> int:
 
 
 def _wake_gpu(local_rank: int, given: Sequence[str]) -> None:
-    """Make this process's CUDA context while torch is imported: on a host of several GPUs, both take seconds.
+    """Make this process's CUDA context and initialise NVML while torch is imported.
 
-    It is the context that torch uses. Without a GPU, or with another one named, nothing happens.
+    Torch uses both. On a host of several GPUs they take seconds, NVML within the first allocation of shared
+    memory, where no other thread of Python could run. Without a GPU, or with a device named, nothing happens.
     """
     if any(text.startswith(("--device", "--check", "--show-config")) for text in given):
         return
     try:
-        driver = ctypes.CDLL("libcuda.so.1")
+        driver, management = ctypes.CDLL("libcuda.so.1"), ctypes.CDLL("libnvidia-ml.so.1")
     except OSError:
         return
     count, device, context = ctypes.c_int(), ctypes.c_int(), ctypes.c_void_p()
@@ -132,6 +133,7 @@ def _wake_gpu(local_rank: int, given: Sequence[str]) -> None:
         return
     if not driver.cuDeviceGet(ctypes.byref(device), local_rank % count.value):
         driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)
+        management.nvmlInit_v2()
 
 
 def _arguments(parser: Parser, command: Parser | None, chosen: str, given: list[str]) -> argparse.Namespace:
