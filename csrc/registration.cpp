@@ -268,7 +268,6 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def("find_non_finite(Tensor[] columns, Tensor[] nonzero) -> Tensor");
 
   // Scene initialisation.
-  m.def("voxel_keys(Tensor points, float[] origin, float voxel_size) -> Tensor");
   m.def("knn_distances(Tensor points, int k) -> Tensor");
 }
 

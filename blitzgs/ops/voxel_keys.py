@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
+CELL_BITS = 21
 
 
 def voxel_keys(points: Tensor, origin: Sequence[float], voxel_size: float) -> Tensor:
@@ -17,19 +17,15 @@ def voxel_keys(points: Tensor, origin: Sequence[float], voxel_size: float) -> Te
     Cells are clamped to [0, 2^21); equal keys mean the same voxel.
 
     Args:
-        points: positions [N, 3], float32 or float64, any unit.
+        points: positions [N, 3], any floating dtype and unit; the cells are computed in float64.
         origin: lower corner of the grid, 3 values in the same unit.
         voxel_size: edge of a voxel in the same unit, > 0.
 
     Returns:
         int64 [N]; -1 for a point that is not finite.
-
-    Raises:
-        RuntimeError: wrong shape or dtype, or a voxel size that is not positive.
     """
-    return torch.ops.blitzgs.voxel_keys(points, list(origin), voxel_size)
-
-
-@torch.library.register_fake("blitzgs::voxel_keys")
-def _(points: Tensor, origin: Sequence[float], voxel_size: float) -> Tensor:
-    return points.new_empty(points.shape[0], dtype=torch.int64)
+    corner = torch.tensor(origin, dtype=torch.float64, device=points.device)
+    cells = ((points.double() - corner) / voxel_size).floor().clamp(0, (1 << CELL_BITS) - 1)
+    x, y, z = cells.long().unbind(1)
+    keys = x | y << CELL_BITS | z << 2 * CELL_BITS
+    return keys.where(points.isfinite().all(dim=1), -1)

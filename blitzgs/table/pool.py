@@ -166,6 +166,7 @@ class Pool:
         self._last_use = np.zeros(slots, dtype=np.int64)
         self._clock = 0
         self._ready_for: int | None = None
+        self._loading: int | None = None  # blocks that are being loaded for the next step, if that is all
 
     @staticmethod
     def _held_of(columns: Mapping[str, Tensor], rows: int) -> GaussianTable:
@@ -193,7 +194,8 @@ class Pool:
             self.table[name][-self._rest :].copy_(self.held[name][-self._rest :])
         if self._stream is not None:
             self._stream.synchronize()
-        self._is_open, self._rest_changed, self._ready_for = False, False, None
+        self._is_open = self._rest_changed = False
+        self._ready_for = self._loading = None
 
     def catch_up(self, function: Callable[[GaussianTable], None]) -> None:
         """Load every block of the table into the pool, one part after the other, and change its rows there.
@@ -235,7 +237,7 @@ class Pool:
         if self._ready_for != step:
             # `prefetch` has not loaded all of them.
             self._load(self._visibility.blocks_of_batch(0), self._begun, required=True)
-        self._ready_for = None
+        self._ready_for = self._loading = None
         self._wait()
         return self._index()
 
@@ -262,16 +264,21 @@ class Pool:
             before = self.moved.loaded
             if self._load(following, self._begun, kept=now):
                 self._ready_for = step
-                self._load_ahead(self.moved.loaded - before)
+                self._loading = self.moved.loaded - before
 
     def store_bounds(self, index: BlockIndex) -> None:
-        """Store the bounds of the index that `load_for_step` returned, after a step has moved rows."""
+        """Store the bounds of the index that `load_for_step` returned, after a step has moved rows.
+
+        All work of the step is queued then, so the host has time to choose blocks of later steps.
+        """
         self._bounds[self._table_blocks] = index.bounds
+        if self._loading is not None:
+            self._load_ahead(self._loading)
 
     def load_for_views(self, cameras: Cameras) -> BlockIndex:
         """Load the blocks that views see, to render without a training step; else as `load_for_step`."""
         self._open()
-        self._ready_for = None
+        self._ready_for = self._loading = None
         self._visibility = BlockVisibility(self._bounds[: self._blocks], cameras, len(cameras.viewmats))
         wanted = self._visibility.blocks_of_batch(0)
         self._count(needed=int(wanted.sum()))

@@ -9,7 +9,6 @@
 #include "population/sampling.h"
 #include "population/spawn_features.h"
 #include "population/tree_sums.h"
-#include "population/voxel_keys.h"
 
 namespace blitzgs {
 namespace {
@@ -265,23 +264,6 @@ Tensor knn_distances(const Tensor& points, std::int64_t k) {
   return distances;
 }
 
-Tensor voxel_keys(const Tensor& points, const std::vector<double>& origin, double voxel_size) {
-  check_floating("voxel_keys", "points", points);
-  check_shape("voxel_keys", "points", points, {-1, 3});
-  STD_TORCH_CHECK(origin.size() == 3, "blitzgs::voxel_keys: origin must have 3 values, got ", origin.size());
-  STD_TORCH_CHECK(voxel_size > 0, "blitzgs::voxel_keys: voxel_size must be positive, got ", voxel_size);
-  const Tensor rows = as_contiguous(points);
-  Tensor keys = make_empty(rows, {rows.size(0)}, ScalarType::Long);
-  DeviceScope scope(rows);
-  const VoxelGrid grid{{origin[0], origin[1], origin[2]}, voxel_size};
-  dispatch_floating(rows, [&](auto zero) {
-    using T = decltype(zero);
-    backend::for_each_row(VoxelKeys<T>{data<T>(rows), grid, mutable_data<std::int64_t>(keys), rows.size(0)},
-                          scope.stream);
-  });
-  return keys;
-}
-
 }  // namespace
 }  // namespace blitzgs
 
@@ -295,5 +277,4 @@ BLITZGS_REGISTER(m) {
   m.impl("tree_sums", TORCH_BOX(&blitzgs::tree_sums));
   m.impl("spawn_features", TORCH_BOX(&blitzgs::spawn_features));
   m.impl("knn_distances", TORCH_BOX(&blitzgs::knn_distances));
-  m.impl("voxel_keys", TORCH_BOX(&blitzgs::voxel_keys));
 }

@@ -141,8 +141,9 @@ def loads(pool, views):
     counts = []
     for step in range(len(views.viewmats)):
         before = pool.moved.loaded
-        pool.load_for_step(step, first(views, step), 1)
+        index = pool.load_for_step(step, first(views, step), 1)
         pool.prefetch(step + 1)
+        pool.store_bounds(index)
         counts.append(pool.moved.loaded - before)
     return counts
 
