@@ -145,11 +145,6 @@ def _warn(function: str, where: str, ending: str, stacklevel: int) -> None:
     )
 
 
-@torch.library.register_fake("blitzgs::find_non_finite")
-def _(columns: Sequence[Tensor], nonzero: Sequence[Tensor]) -> Tensor:
-    return columns[0].new_empty((), dtype=torch.int32)
-
-
 @lru_cache(maxsize=64)
 def _calls(_device: torch.device, _gaussians: int) -> count[int]:
     """Return the counter of calls with this number of Gaussians."""

@@ -106,15 +106,3 @@ def _gradients_of_arranged(
     if needed[0] and v_last is not None and v_of_splats is not None:
         v_under = (v_last - places.arrange([v_of_splats])[0]).sum(dim=-2)
     return [v_under, *v_columns]
-
-
-@torch.library.register_fake("blitzgs::arrange_splats")
-def _(
-    columns: Sequence[Tensor], places: Sequence[Tensor], shape: Sequence[int], under: Tensor | None = None
-) -> list[Tensor]:
-    return [column.new_empty(*shape, *column.shape[1:]) for column in columns]
-
-
-@torch.library.register_fake("blitzgs::splats_of_arranged")
-def _(arranged: Sequence[Tensor], places: Sequence[Tensor], shape: Sequence[int]) -> list[Tensor]:
-    return [t.new_empty(len(places[0]), *t.shape[len(shape) :]) for t in arranged]

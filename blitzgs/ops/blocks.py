@@ -211,33 +211,6 @@ def _rows(means: Tensor, scales: Tensor, pending: PendingSteps | None) -> list[T
     return [means, scales, *(pending or ())]
 
 
-@torch.library.register_fake("blitzgs::morton_keys")
-def _(points: Tensor) -> Tensor:
-    return points.new_empty(points.shape[0], dtype=torch.int64)
-
-
-@torch.library.register_fake("blitzgs::update_block_bounds_")
-def _(*_args: object) -> None:
-    return None
-
-
-@torch.library.register_fake("blitzgs::cull_blocks")
-def _(bounds: Tensor, *_args: object, capacity_blocks: int | None = None) -> tuple[Tensor, ...]:
-    blocks = (
-        torch.library.get_ctx().new_dynamic_size()
-        if capacity_blocks is None
-        else min(capacity_blocks, len(bounds))
-    )
-    return tuple(
-        bounds.new_empty(n, dtype=torch.int32) for n in (blocks * BLOCK_ROWS, blocks * BLOCK_ROWS, 1, 1)
-    )
-
-
-@torch.library.register_fake("blitzgs::gate_views_")
-def _(*_args: object) -> None:
-    return None
-
-
 # Bits of a word of a mask. In the layout by row, each bit is of one column.
 WORD_BITS = 32
 SECTOR_WORDS = BLOCK_ROWS // WORD_BITS
@@ -268,13 +241,3 @@ def rows_of_sectors(sectors: Tensor, n: int) -> Tensor:
         RuntimeError: a wrong shape or dtype.
     """
     return torch.ops.blitzgs.rows_of_sectors(sectors, n)
-
-
-@torch.library.register_fake("blitzgs::sectors_of_rows")
-def _(rows: Tensor) -> Tensor:
-    return rows.new_empty(-(-rows.shape[0] // BLOCK_ROWS), WORD_BITS * rows.shape[1], SECTOR_WORDS)
-
-
-@torch.library.register_fake("blitzgs::rows_of_sectors")
-def _(sectors: Tensor, n: int) -> Tensor:
-    return sectors.new_empty(n, sectors.shape[1] // WORD_BITS)

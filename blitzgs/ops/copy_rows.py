@@ -44,13 +44,3 @@ def put_rows_(column: Tensor, rows: Tensor, fresh: Tensor | None = None) -> None
         RuntimeError: shapes or dtypes do not fit.
     """
     torch.ops.blitzgs.put_rows_(column, rows, fresh)
-
-
-@torch.library.register_fake("blitzgs::take_rows_")
-def _(*_args: object) -> None:
-    return None
-
-
-@torch.library.register_fake("blitzgs::put_rows_")
-def _(*_args: object) -> None:
-    return None

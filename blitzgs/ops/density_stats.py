@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -60,8 +58,3 @@ def density_stats_(
             height,
             weight,
         )
-
-
-@torch.library.register_fake("blitzgs::density_stats_")
-def _(*_args: Any) -> None:
-    return None

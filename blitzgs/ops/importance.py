@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -67,30 +67,6 @@ def splat_contributions(
     return sums
 
 
-@torch.library.register_fake("blitzgs::contributions")
-def _(
-    means2d: Tensor,
-    conics: Tensor,
-    splat_opacities: Tensor,
-    isect_splats: Tensor,
-    tile_offsets: Tensor,
-    n_cameras: int,
-    width: int,
-    height: int,
-    tile_size: int,
-    tile_begin: int,
-    tile_end: int,
-    n_splats: Tensor | None = None,
-    squares: bool = False,
-) -> tuple[Tensor, Tensor, Tensor]:
-    count = means2d.shape[0]
-    return (
-        means2d.new_empty(count, dtype=torch.int64),
-        means2d.new_empty(count, dtype=torch.int32),
-        means2d.new_empty(count if squares else 0, dtype=torch.int64),
-    )
-
-
 # How many times a weight is divided by the square root of its number of pixels, for each score rule.
 DIVISIONS = {"weight": 0, "root": 1, "density": 2}
 
@@ -147,8 +123,3 @@ def view_sums_(
     torch.ops.blitzgs.view_sums_(
         list(sums), list(splats), weights, pixels, counts, list(columns), DIVISIONS[rule], eps, unit
     )
-
-
-@torch.library.register_fake("blitzgs::view_sums_")
-def _(*_args: Any) -> None:
-    return None

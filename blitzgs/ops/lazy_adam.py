@@ -6,7 +6,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -305,19 +305,3 @@ def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
     for step in range(steps - 2, -1, -1):
         tails[step] = ratios * (terms[step] + tails[step + 1])
     return table.to(lr_table.device)
-
-
-@torch.library.register_fake("blitzgs::lazy_adam_final_rules")
-def _(table: Tensor, like: Tensor, explicit_steps: int, eps: float) -> Tensor:
-    # Six rules of four numbers, two steps and a number, to a multiple of four numbers.
-    return table.new_empty(max(0, len(table) - explicit_steps), 28 * like.dtype.itemsize, dtype=torch.uint8)
-
-
-@torch.library.register_fake("blitzgs::lazy_adam_step_")
-def _(*args: Any) -> None:
-    return None
-
-
-@torch.library.register_fake("blitzgs::lazy_adam_catch_up_")
-def _(*args: Any) -> None:
-    return None

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -66,8 +66,3 @@ class MassCut(NamedTuple):
     def has_ties(self) -> bool:
         """Tell, at `TIES_STEP`, whether ids must decide between equal weights; waits for the device."""
         return bool(self.searches[:, _MISSING_ID].any())
-
-
-@torch.library.register_fake("blitzgs::mass_cut_")
-def _(*_args: Any) -> None:
-    return None

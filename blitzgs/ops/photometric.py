@@ -148,46 +148,6 @@ def _as_bytes(masks: Tensor | None) -> Tensor | None:
     return masks.view(torch.uint8) if masks is not None and masks.dtype == torch.bool else masks
 
 
-@torch.library.register_fake("blitzgs::photometric_fwd")
-def _(renders: Tensor, targets: Tensor, masks: Tensor | None, *_tiles: int) -> tuple[Tensor, Tensor]:
-    return renders.new_empty(renders.shape[0]), renders.new_empty(renders.shape[0])
-
-
-@torch.library.register_fake("blitzgs::photometric_bwd")
-def _(renders: Tensor, *_others: Any) -> Tensor:
-    return torch.empty_like(renders, memory_format=torch.contiguous_format)
-
-
-@torch.library.register_fake("blitzgs::photometric_fwd_bwd")
-def _(
-    renders: Tensor,
-    targets: Tensor,
-    masks: Tensor | None,
-    l1_weights: Tensor,
-    ssim_weights: Tensor,
-    tile_size: int,
-    tile_begin: int,
-    tile_end: int,
-    samples: Tensor | None = None,
-    visible: Tensor | None = None,
-    scale_weight: float = 0.0,
-    opacity_weight: float = 0.0,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    views, n_parts = renders.shape[0], torch.library.get_ctx().new_dynamic_size()
-    n_regs = 0 if visible is None else views
-    return (
-        renders.new_empty(views, n_parts, 2, dtype=torch.float64),
-        torch.empty_like(renders, memory_format=torch.contiguous_format),
-        renders.new_empty(n_regs),
-        renders.new_empty(n_regs),
-    )
-
-
-@torch.library.register_fake("blitzgs::l1_ssim_fwd_bwd")
-def _(renders: Tensor, *_others: Any) -> tuple[Tensor, Tensor]:
-    return renders.new_empty(()), torch.empty_like(renders, memory_format=torch.contiguous_format)
-
-
 def _save_inputs(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     renders, targets, masks, *tiles = inputs
     ctx.save_for_backward(renders, targets, masks)

@@ -78,27 +78,3 @@ def pixel_splats(
         n_cameras, width, height, tile_size, strongest,
     )  # fmt: skip
     return PixelSplats(*(column if rows is None else column.index_select(0, rows) for column in found))
-
-
-@torch.library.register_fake("blitzgs::pixel_splats")
-def _(
-    means2d: Tensor,
-    conics: Tensor,
-    splat_opacities: Tensor,
-    isect_splats: Tensor,
-    tile_offsets: Tensor,
-    slots: Tensor | None,
-    n_rows: int,
-    n_cameras: int,
-    width: int,
-    height: int,
-    tile_size: int,
-    strongest: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    return (
-        means2d.new_empty(n_rows),
-        means2d.new_empty(n_rows, dtype=torch.int32),
-        means2d.new_empty(n_rows, dtype=torch.int32),
-        means2d.new_empty(n_rows, strongest, dtype=torch.int32),
-        means2d.new_empty(n_rows, strongest),
-    )

@@ -70,13 +70,3 @@ def swap_blocks_(
             or a table that is not in (pinned) memory of the host.
     """
     torch.ops.blitzgs.swap_blocks_(list(pool), list(table), n_written, slots, leaving, coming)
-
-
-@torch.library.register_fake("blitzgs::seen_blocks")
-def _(bounds: Tensor, *_args: object) -> Tensor:
-    return bounds.new_empty(len(bounds), dtype=torch.int32)
-
-
-@torch.library.register_fake("blitzgs::swap_blocks_")
-def _(*_args: object) -> None:
-    return None

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -49,8 +47,3 @@ def position_noise_(
         torch.ops.blitzgs.position_noise_(
             means, quats, scales, opacities, ids, visible_ids, seed, step, threshold, strength
         )
-
-
-@torch.library.register_fake("blitzgs::position_noise_")
-def _(*_args: Any) -> None:
-    return None

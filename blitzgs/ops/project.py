@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -13,8 +10,6 @@ from blitzgs._library import below_autograd
 from blitzgs.ops.host import to_host
 from blitzgs.ops.project_gradient import Project, ProjectCall, TableRows
 from blitzgs.ops.projection_types import (
-    N_OPTIONS,
-    VIEW_TOTALS,
     ProjectedSplats,
     ProjectionInputs,
     ProjectionOptions,
@@ -150,41 +145,3 @@ def differentiable_splats(
         [], None, None,
     )  # fmt: skip
     return ProjectedSplats._make((*columns, totals.cpu()[:3]))
-
-
-@torch.library.register_fake("blitzgs::project_fwd")
-def _(
-    gaussians: Sequence[Tensor],
-    viewmats: Tensor,
-    Ks: Tensor,
-    active_ids: Tensor | None,
-    active_views: Tensor | None,
-    n_active: Tensor | None,
-    n_blocks: Tensor | None,
-    ids: Tensor | None,
-    level: Tensor | None,
-    *others: Any,
-) -> tuple[Tensor, ...]:
-    context, means = torch.library.get_ctx(), gaussians[0]
-    rank_tiles: Sequence[int] = others[N_OPTIONS]
-    U, P = context.new_dynamic_size(), context.new_dynamic_size()
-
-    def ints_of(*shape: Any) -> Tensor:
-        return means.new_empty(shape, dtype=torch.int32)
-
-    return (
-        ints_of(P),
-        ints_of(P),
-        ints_of(U),
-        ints_of(U + 1),
-        means.new_empty(P, 2),
-        means.new_empty(P, 3),
-        means.new_empty(P),
-        means.new_empty(P),
-        means.new_empty(P if len(gaussians) > 4 else 0, 3),
-        ints_of(P, 2),
-        ints_of(P),
-        means.new_empty(P if rank_tiles else 0, dtype=torch.int64),
-        means.new_empty(0 if ids is None else P, dtype=torch.int64),
-        means.new_empty(VIEW_TOTALS + viewmats.shape[0] + len(rank_tiles), dtype=torch.int64),
-    )

@@ -214,31 +214,3 @@ def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
 
 
 torch.library.register_autograd("blitzgs::project_fwd", _backward, setup_context=_setup_context)
-
-
-@torch.library.register_fake("blitzgs::project_bwd")
-def _(
-    gaussians: Sequence[Tensor],
-    viewmats: Tensor,
-    Ks: Tensor,
-    scale_reg: Tensor | None,
-    opacity_reg: Tensor | None,
-    camera_ids: Tensor,
-    visible_ids: Tensor,
-    splat_offsets: Tensor,
-    level: Tensor | None,
-    *options: Any,
-    dense: bool = False,
-    **_gradients: Any,
-) -> tuple[Tensor, ...]:
-    means, (need_viewmats, *given) = gaussians[0], options[N_OPTIONS + 2 :]
-    dense = given[0] if given else dense
-    length = (means if dense else visible_ids).shape[0]
-    return (
-        means.new_empty(length, 3),
-        means.new_empty(length, 4),
-        means.new_empty(length, 3),
-        means.new_empty(length),
-        means.new_empty(length, gaussians[4].shape[1] if len(gaussians) > 4 else 0, 3),
-        means.new_empty(viewmats.shape[0] if need_viewmats else 0, 4, 4),
-    )

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -62,8 +60,3 @@ def project_bwd_step_(
             gradients.places,
             means2d_sums,
         )
-
-
-@torch.library.register_fake("blitzgs::project_bwd_step_")
-def _(*args: Any) -> None:
-    return None

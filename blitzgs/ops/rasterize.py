@@ -13,7 +13,7 @@ from torch import Tensor
 from blitzgs._library import without_autograd
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.intersect import TileGrid, pixels_of_tiles
-from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, GradientBuffer, gradient_columns
+from blitzgs.ops.splat_gradients import GradientBuffer, gradient_columns
 
 if TYPE_CHECKING:
     from blitzgs.ops.arrange_splats import Places
@@ -141,69 +141,6 @@ def rasterize(
         end = sys.maxsize if tile_end < 0 else tile_end
         alphas = alphas * pixels_of_tiles(n_cameras, width, height, tile_size, tile_begin, end, alphas.device)
     return renders, alphas
-
-
-@torch.library.register_fake("blitzgs::rasterize_fwd")
-def _(
-    means2d: Tensor,
-    conics: Tensor,
-    splat_opacities: Tensor,
-    colors: Tensor,
-    backgrounds: Tensor | None,
-    isect_splats: Tensor,
-    tile_offsets: Tensor,
-    n_cameras: int,
-    width: int,
-    height: int,
-    tile_size: int,
-    tile_begin: int,
-    tile_end: int,
-    clear_rest: bool = True,
-    backward_follows: bool = False,
-    n_splats: Tensor | None = None,
-) -> tuple[Tensor, ...]:
-    pixels, context = (n_cameras, height, width), torch.library.get_ctx()
-    # The layout of packed splats differs between backends.
-    splat_bytes, n_ordered = context.new_dynamic_size(), context.new_dynamic_size()
-    n_ready = context.new_dynamic_size() if backward_follows else 0
-    return (
-        means2d.new_empty(*pixels, colors.shape[1]),
-        means2d.new_empty(pixels),
-        means2d.new_empty(pixels, dtype=torch.int32),
-        means2d.new_empty(tile_offsets.shape[0] - 1, dtype=torch.int32),
-        means2d.new_empty(means2d.shape[0], splat_bytes, dtype=torch.uint8),
-        means2d.new_empty(n_ordered, 16, dtype=torch.int32),
-        means2d.new_empty(n_ready, SPLAT_GRADIENT),
-    )
-
-
-@torch.library.register_fake("blitzgs::rasterize_bwd")
-def _(
-    splats: Sequence[Tensor],
-    backgrounds: Tensor | None,
-    lists: Sequence[Tensor],
-    composited: Sequence[Tensor],
-    v_renders: Tensor,
-    v_alphas: Tensor | None,
-    n_cameras: int,
-    width: int,
-    height: int,
-    tile_size: int,
-    tile_begin: int,
-    tile_end: int,
-    absgrad: bool,
-    deterministic: bool,
-    gradients: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    means2d, _, _, colors = splats
-    n_splats = means2d.shape[0] if gradients is None else 0
-    return (
-        means2d.new_empty(n_splats, 2),
-        means2d.new_empty(n_splats, 3),
-        means2d.new_empty(n_splats),
-        means2d.new_empty(n_splats, colors.shape[1]),
-        means2d.new_empty(n_splats if absgrad else 0, 2),
-    )
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:

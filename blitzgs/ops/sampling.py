@@ -58,13 +58,3 @@ def key_of_bits(bits: Tensor) -> Tensor:
     """Return the keys, float32, with the given ordered bits (int64)."""
     bits = bits ^ torch.where(bits >> (KEY_BITS - 1) > 0, 1 << (KEY_BITS - 1), (1 << KEY_BITS) - 1)
     return bits.to(torch.int32).view(torch.float32)
-
-
-@torch.library.register_fake("blitzgs::sampling_keys")
-def _(weights: Tensor, ids: Tensor, seed: int, event: int) -> Tensor:
-    return torch.empty_like(weights)
-
-
-@torch.library.register_fake("blitzgs::key_histogram")
-def _(keys: Tensor, prefix: Tensor, shift: int, width: int) -> Tensor:
-    return keys.new_empty(1 << width, dtype=torch.int64)

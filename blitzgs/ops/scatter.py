@@ -85,16 +85,3 @@ def as_column(words: Tensor, like: Tensor) -> Tensor:
     """Undo `words_of`: int32 [R, words] as [R, ...] with the dtype and splat shape of `like`."""
     values = words.view(like.dtype)[:, : math.prod(like.shape[1:])]
     return values.reshape(-1, *like.shape[1:])
-
-
-@torch.library.register_fake("blitzgs::scatter_splats")
-def _(columns: Sequence[Tensor], masks: Tensor, group_sizes: Sequence[int]) -> tuple[Tensor, Tensor]:
-    words = sum(column.shape[1] for column in columns) * sum(group_sizes)
-    runs = runs_of(masks.shape[0])
-    packed = masks.new_empty(words, dtype=torch.int32)
-    return packed, masks.new_empty((runs, len(group_sizes)))
-
-
-@torch.library.register_fake("blitzgs::gather_splats")
-def _(packed: Tensor, widths: Sequence[int], group_sizes: Sequence[int]) -> list[Tensor]:
-    return [packed.new_empty((sum(group_sizes), width)) for width in widths]

@@ -161,19 +161,3 @@ class GradientBuffer:
             return zeros if zeros.shape[0] == count else zeros[:count]
         others = None if self.others is None else self.others()
         return means2d.new_zeros(count, SPLAT_GRADIENT) if others is None else others
-
-
-@torch.library.register_fake("blitzgs::splat_gradient_layout")
-def _() -> list[int]:
-    return [_MEAN2D, _CONIC, _OPACITY, _COLOR, _MEAN2D_ABS, SPLAT_GRADIENT]
-
-
-@torch.library.register_fake("blitzgs::sum_splats")
-def _(
-    values: Tensor,
-    places: Tensor,
-    group_sizes: Sequence[int],
-    splats: int,
-    widths: Sequence[int],
-) -> list[Tensor]:
-    return [values.new_empty((splats, width)) for width in widths]

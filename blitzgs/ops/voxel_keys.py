@@ -28,8 +28,3 @@ def voxel_keys(points: Tensor, origin: Sequence[float], voxel_size: float) -> Te
         RuntimeError: wrong shape or dtype, or a voxel size that is not positive.
     """
     return torch.ops.blitzgs.voxel_keys(points, list(origin), voxel_size)
-
-
-@torch.library.register_fake("blitzgs::voxel_keys")
-def _(points: Tensor, origin: Sequence[float], voxel_size: float) -> Tensor:
-    return points.new_empty(points.shape[0], dtype=torch.int64)
