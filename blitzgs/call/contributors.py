@@ -8,7 +8,7 @@ from torch import Tensor
 
 from blitzgs.call.arguments import check_tensors
 from blitzgs.call.pixels import checked_pixels
-from blitzgs.ops.pixel_splats import PixelSplats, pixel_splats
+from blitzgs.ops.importance import PixelSplats, pixel_splats
 
 
 def rasterize_num_contributing_gaussians(

@@ -12,8 +12,7 @@ from torch import Tensor
 from blitzgs.call.arguments import Gaussians, Scene
 from blitzgs.call.covariances import Decomposed, shaped_by
 from blitzgs.call.queued import ShTables
-from blitzgs.ops.project import differentiable_splats, project_splats
-from blitzgs.ops.project_gradient import TableRows
+from blitzgs.ops.project import TableRows, differentiable_splats, project_splats
 from blitzgs.ops.projection_types import MAX_VIEWS, ProjectedSplats, ProjectionInputs, ProjectionOptions
 
 # The tile size of the CUDA kernels. If the caller asks for another one, only meta's lists have it.

@@ -23,7 +23,7 @@ from blitzgs.call.pixels import Pixels
 from blitzgs.call.queued import ShTables, render_queued
 from blitzgs.call.ranks import Job, send_splats
 from blitzgs.call.signals import Signals
-from blitzgs.ops.pixel_splats import pixel_splats
+from blitzgs.ops.importance import pixel_splats
 from blitzgs.ops.project import differentiable_splats
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import Through, rasterize

@@ -16,7 +16,7 @@ from blitzgs.call.channels import ImageOptions, channels_of
 from blitzgs.frame.run import run
 from blitzgs.frame.transport.local import LocalExchange, LocalTransport
 from blitzgs.frame.transport.protocol import Exchange
-from blitzgs.ops.project_gradient import TableRows
+from blitzgs.ops.project import TableRows
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, first_rows
 
 _EXACT = LocalTransport(exact=True)

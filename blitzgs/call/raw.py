@@ -27,7 +27,7 @@ from blitzgs.call.images import render
 from blitzgs.call.intrinsics import warn_of_gradient
 from blitzgs.call.queued import ShTables
 from blitzgs.ops.projection_types import ProjectionOptions
-from blitzgs.ops.sparse_rows import of_shape
+from blitzgs.ops.rows import of_shape
 
 
 class CatchesUp(Protocol):

@@ -18,8 +18,8 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.tiles import TileRanges
+from blitzgs.ops.exchange import divide_tiles, tile_costs
 from blitzgs.ops.intersect import tile_counts
-from blitzgs.ops.tile_costs import divide_tiles, tile_costs
 
 # Fixed cost of a tile, in units of one list entry: its pixels are written and compared with the photograph.
 # The sums of `divide_tiles` are exact from 8 on.

@@ -100,7 +100,7 @@ class SplatGradients(NamedTuple):
 
         Args:
             values: [sum(group_sizes), F], the rows of each rank's `side_by_side` for this rank's splats.
-            places: from `blitzgs.ops.scatter.scatter_splats`.
+            places: from `blitzgs.ops.exchange.scatter_splats`.
             group_sizes: number of splats that this rank sent to each rank.
             splats: number P of this rank's own splats.
         """
@@ -124,7 +124,7 @@ def sum_splats(
     Args:
         values: [sum(group_sizes), F], float32 (CPU also float64), in the order in which `scatter_splats`
             packed them.
-        places: from `blitzgs.ops.scatter.scatter_splats`.
+        places: from `blitzgs.ops.exchange.scatter_splats`.
         group_sizes: as for `scatter_splats`.
         splats: P.
         widths: widths of the columns that the F values consist of; they add up to F.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import decimal_share, mass_prefix, smallest
-from blitzgs.ops.sampling import sampling_keys
+from blitzgs.ops.counter_random import sampling_keys
 
 
 def sample_by_score(score: Tensor, ids: Tensor, keep: float, seed: int, event: int, ranks: Ranks) -> Tensor:

@@ -11,9 +11,9 @@ from torch.nn.functional import softplus
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
-from blitzgs.ops.copy_rows import put_rows_, take_rows
-from blitzgs.ops.relocation import MAX_COPIES, overlap
-from blitzgs.ops.sampling import sampling_keys
+from blitzgs.ops.counter_random import sampling_keys
+from blitzgs.ops.population import MAX_COPIES, overlap
+from blitzgs.ops.rows import put_rows_, take_rows
 from blitzgs.optim.table_adam import Pending
 from blitzgs.population.density import (
     CHILDREN_OF_A_SPLIT,
@@ -114,7 +114,7 @@ def shared(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, T
         o' = 1 - (1 - o)^(1/N),
         s' = s o / overlap(o', N)
 
-    (Kheradmand et al. 2024, eq. 9; `blitzgs.ops.relocation.overlap`).
+    (Kheradmand et al. 2024, eq. 9; `blitzgs.ops.population.overlap`).
 
     Args:
         opacities: logits, [M].

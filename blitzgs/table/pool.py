@@ -24,9 +24,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.ops.blocks import BLOCK_ROWS
+from blitzgs.ops.blocks import BLOCK_ROWS, swap_blocks_
 from blitzgs.ops.host import to_device
-from blitzgs.ops.pool import swap_blocks_
 from blitzgs.table.block_visibility import UNSEEN, BlockVisibility, Cameras, culled_blocks
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.host_table import HostTable

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from blitzgs.ops.copy_rows import put_rows_, take_rows
+from blitzgs.ops.rows import put_rows_, take_rows
 from blitzgs.table.layouts import LAYOUTS
 
 # A column that has to be moved to become longer gets memory for this many times its rows.

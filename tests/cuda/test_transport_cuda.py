@@ -8,9 +8,9 @@ import torch
 
 from blitzgs.frame.transport import Traffic
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, PeerBuffers
+from blitzgs.ops.exchange import runs_of
 from blitzgs.ops.host import HostCopy, PinnedNumbers
 from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, splats_of
-from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.cuda.scenes import Scene, ops
 from tests.helpers import sum_of_ranks

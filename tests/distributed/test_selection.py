@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import mass_prefix, smallest
-from blitzgs.ops.sampling import sampling_keys
+from blitzgs.ops.counter_random import sampling_keys
 from tests.distributed.rank_harness import run_ranks
 
 ALONE = Ranks()

@@ -14,10 +14,10 @@ from blitzgs.frame.transport import CollectiveTransport, LocalTransport, PeerTra
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT
 from blitzgs.frame.transport.protocol import CapacityEstimate, Traffic
 from blitzgs.frame.transport.way_back import CollectiveWayBack
+from blitzgs.ops.exchange import scatter_splats
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Sizes
-from blitzgs.ops.scatter import scatter_splats
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.distributed.rank_harness import run_ranks
 from tests.frame.test_sharded_rendering import OPTIONS, cameras

@@ -2,7 +2,7 @@
 import pytest
 import torch
 
-from blitzgs.ops.copy_rows import put_rows_, take_rows
+from blitzgs.ops.rows import put_rows_, take_rows
 from tests.helpers import DEVICES
 
 COLUMNS = [

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from blitzgs.ops import host
-from blitzgs.ops.blocks import BLOCK_ROWS
+from blitzgs.ops.blocks import BLOCK_ROWS, seen_blocks, swap_blocks_
 from blitzgs.ops.host import PinnedNumbers
-from blitzgs.ops.pool import seen_blocks, swap_blocks_
 from blitzgs.table.blocks import BlockIndex
 from tests.helpers import DEVICES
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views

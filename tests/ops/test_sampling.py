@@ -2,8 +2,7 @@
 import pytest
 import torch
 
-from blitzgs.ops.counter_random import uniform
-from blitzgs.ops.sampling import KEY_BITS, key_histogram, key_of_bits, sampling_keys
+from blitzgs.ops.counter_random import KEY_BITS, key_histogram, key_of_bits, sampling_keys, uniform
 from tests.helpers import DEVICES
 
 

@@ -17,9 +17,9 @@ from blitzgs.frame.transport.protocol import (
     unmarked,
 )
 from blitzgs.frame.transport.way_back import CollectiveWayBack
+from blitzgs.ops.exchange import gather_splats, scatter_splats, words_per_splat
 from blitzgs.ops.host import to_host
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats
-from blitzgs.ops.scatter import gather_splats, scatter_splats, words_per_splat
 
 
 class CollectiveTransport:

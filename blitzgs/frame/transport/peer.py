@@ -54,9 +54,9 @@ from blitzgs.frame.transport.protocol import (
     unmarked,
 )
 from blitzgs.frame.transport.way_back import PeerWayBack
+from blitzgs.ops.exchange import runs_of
 from blitzgs.ops.host import current_stream
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of
-from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
 
 # The columns of `Splats` in the order in which ranks write them (kSentColumns of csrc/exchange/transport.h):

@@ -16,7 +16,7 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import SharedMemory
 from blitzgs.frame.transport.protocol import Traffic
-from blitzgs.ops.scatter import RUN
+from blitzgs.ops.exchange import RUN
 from blitzgs.ops.splat_gradients import SplatGradients
 
 
