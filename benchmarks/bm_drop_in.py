@@ -32,9 +32,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from harness import make_parser, report
+from harness import Parts, TracedParts, make_parser, report, trace
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer
-from step_parts import Parts, TracedParts, trace
 from torch import Tensor
 
 import blitzgs

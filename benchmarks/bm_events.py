@@ -27,26 +27,23 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import torch
-from bm_step import LOSS, RATE, random_photographs
+from bm_step import BEHIND, LOSS, OPTIONS, RATE, STEP, make_table, random_photographs
 from harness import make_parser, markdown_table, write_json
 from scenes import BenchmarkScene, aerial
 
 from blitzgs.config.fields import Config, OptimiserConfig
 from blitzgs.config.schedule import Event, Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.frame import RenderOptions
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs.files import Progress
 from blitzgs.runs.log import RunLog
 from blitzgs.table.blocks import morton_order
-from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, GaussianTable
+from blitzgs.table.table import GaussianTable
 from blitzgs.training.events import densify
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
 
-STEP, BEHIND, DRAWN_ROWS = 2000, 40, 1 << 20
-OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e10)
 # Functions that are parts of an event, in this version or in one with which it is compared.
 PARTS = {
     "blitzgs.training.events.densify": (
@@ -103,17 +100,10 @@ def _wait(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def make_table(scene: BenchmarkScene, ranks: Ranks) -> GaussianTable:
-    """Return this rank's share of a scene, with moments."""
+def rows_of(scene: BenchmarkScene, ranks: Ranks) -> torch.Tensor:
+    """Return the rows of this rank's share of a scene."""
     mine = torch.arange(ranks.rank, len(scene.means), ranks.world_size, device=scene.means.device)
-    mine = mine[morton_order(scene.means[mine])]
-    table = GaussianTable.create({name: column[mine] for name, column in scene.raw().items()} | {"id": mine})
-    for names in zip(EXP_AVGS, EXP_AVG_SQS, strict=True):
-        for first, second in zip(*(table[name].split(DRAWN_ROWS) for name in names), strict=True):
-            size = 1e-7 * torch.exp(2 * torch.randn_like(first))
-            first.copy_(torch.randn_like(size)).mul_(size)
-            second.copy_(size).square_()
-    return table
+    return mine[morton_order(scene.means[mine])]
 
 
 def make_state(scene: BenchmarkScene, table: GaussianTable, ranks: Ranks) -> TrainingState:
@@ -224,7 +214,7 @@ def measure(millions: float, ranks: Ranks, args: argparse.Namespace) -> dict[str
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     scene = aerial(int(millions * 1e6), str(ranks.device), views=args.views)
-    table = make_table(scene, ranks)
+    table = make_table(scene, rows_of(scene, ranks))
     state = make_state(scene, table, ranks)
     events = Events(state, scene, args.dead)
     result: dict[str, Any] = {"millions": millions, "ranks": ranks.world_size}
@@ -259,7 +249,7 @@ def measure_parts(millions: float, ranks: Ranks, args: argparse.Namespace) -> li
     From then on all events are slower, because the host waits after each part.
     """
     scene = aerial(int(millions * 1e6), str(ranks.device), views=args.views)
-    state = make_state(scene, make_table(scene, ranks), ranks)
+    state = make_state(scene, make_table(scene, rows_of(scene, ranks)), ranks)
     events = Events(state, scene, args.dead)
     rows: dict[str, dict[str, Any]] = {}
     measured = Measured(ranks.device)

@@ -48,22 +48,14 @@ from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.runs.guard import LossGuard
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.training.step import Stepper
 from blitzgs.view.levels import measure_levels
 from blitzgs.view.views import Space, ViewSet, render_options, trained_centres
 
 STAGES = (
-    "project",
-    "exchange",
-    "sort",
-    "raster",
-    "loss",
-    "raster back",
-    "exchange back",
-    "optimiser",
-    "other",
-)
+    "project", "exchange", "sort", "raster", "loss", "raster back", "exchange back", "optimiser", "other",
+)  # fmt: skip
 
 
 class Clock:
@@ -106,15 +98,12 @@ def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
     """Return the octree of a capture's points and evenly spaced training views."""
     capture, lod = load_capture(args.data, downscale=args.downscale), Config().lod
     space = Space.of(capture.offset, capture.extent)
-    points = torch.from_numpy(capture.points) / space.unit
+    points = torch.from_numpy(capture.points).to(device) / space.unit
     centres = trained_centres([capture.cameras[i] for i in capture.train], space).to(device)
     table = octree_gaussians(
-        points,
-        torch.from_numpy(capture.colors),
-        centres,
-        measure_levels(points.to(device), centres, lod.fork),
-        args.visible_threshold,
-    ).table(sh_degree=3, opacity=0.5)
+        points, torch.from_numpy(capture.colors).to(device), centres,
+        measure_levels(points, centres, lod.fork), args.visible_threshold,
+    ).table(sh_degree=3, opacity=0.5)  # fmt: skip
     views = ViewSet(list(capture.cameras), space, device)
     count = min(args.batch * args.batches, len(capture.train))
     chosen = [capture.train[k * len(capture.train) // count] for k in range(count)]

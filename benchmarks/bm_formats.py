@@ -39,13 +39,10 @@ def read(path: Path) -> Gaussians:
     columns = {name.rpartition(":")[2]: torch.tensor(values) for name, values in found.items()}
     sh = [column for name, column in columns.items() if name.startswith("SH_DEGREE")]
     return Gaussians(
-        means=columns["POSITION"],
-        quats=columns["ROTATION"][:, [3, 0, 1, 2]],
-        scales=columns["SCALE"].log(),
-        opacities=columns["OPACITY"][:, 0].logit(1e-7),
-        sh=torch.stack(sh, dim=1),
+        means=columns["POSITION"], quats=columns["ROTATION"][:, [3, 0, 1, 2]], scales=columns["SCALE"].log(),
+        opacities=columns["OPACITY"][:, 0].logit(1e-7), sh=torch.stack(sh, dim=1),
         comments=content["asset"]["extras"]["comments"],
-    )
+    )  # fmt: skip
 
 
 def main() -> int:

@@ -31,9 +31,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import make_parser, report, write_json
+from harness import Parts, make_parser, report, trace, write_json
 from scenes import aerial
-from step_parts import Parts, trace
 
 from blitzgs import l1_ssim, rasterization, raw_rasterization
 from blitzgs.distributed.group import Ranks
@@ -46,13 +45,9 @@ from tests.training.tiny import tiny_config, tiny_scene
 
 GAUSSIANS, WIDTH, HEIGHT = 50, 32, 32
 CALLS: dict[str, dict[str, Any]] = {
-    "dense": {},
-    "sparse": {"sparse_grad": True},
-    "not packed": {"packed": False},
-    "2 views": {"views": 2},
-    "values": {"sh_degree": None},
-    "sparse, meta": {"sparse_grad": True, "read_meta": True},
-}
+    "dense": {}, "sparse": {"sparse_grad": True}, "not packed": {"packed": False}, "2 views": {"views": 2},
+    "values": {"sh_degree": None}, "sparse, meta": {"sparse_grad": True, "read_meta": True},
+}  # fmt: skip
 
 
 def measure(

@@ -21,8 +21,7 @@ from pathlib import Path
 
 from harness import make_parser, report
 
-from blitzgs.config.files import load_config
-from blitzgs.config.recipes import recipe_path
+from blitzgs.config.files import load_config, recipe_path
 from blitzgs.distributed.group import Ranks, resolve_device
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer

@@ -36,7 +36,7 @@ from blitzgs.table.blocks import morton_order
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Pool, PoolError
 from blitzgs.table.table import GaussianTable
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.step import Stepper
@@ -231,15 +231,8 @@ def main() -> None:
                 write_json(args.json, args.device, **found)
     print(f"{found['scene']}, B = {args.batch_size}, table {found['table_gb']:.2f} GB")
     columns = (
-        "arm",
-        "order",
-        "step_ms",
-        "cost",
-        "resident_hits",
-        "moved_mb_per_step",
-        "in_gb_per_s",
-        "sweep_s",
-    )
+        "arm", "order", "step_ms", "cost", "resident_hits", "moved_mb_per_step", "in_gb_per_s", "sweep_s",
+    )  # fmt: skip
     print(markdown_table([{name: row.get(name, "") for name in columns} for row in found["results"]]))
     for row in found["results"]:
         if "failed" in row:

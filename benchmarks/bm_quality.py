@@ -18,7 +18,7 @@ gsplat-default-reset (with the resets of opacities that 1.5.3 skips by mistake) 
     recipes: {aerial: configs/aerial.yaml, mcmc: gsplat-mcmc --cap_max=2000000}
     seeds: [0, 1, 2]
 
---stress YAML runs the stress grid of a configuration (`benchmarks/quality_stress.py`) instead of recipes, and
+--stress YAML runs the stress grid of a configuration (`benchmarks/quality_plan.py`) instead of recipes, and
 writes stress.md; --part 2/8 runs an eighth of it.
 
 Every run is a process. By default, each GPU has one run at a time. With more (--per-gpu) the models are as
@@ -45,10 +45,19 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import quality_report
-import quality_stress
 import torch
 from harness import commit
-from quality_plan import RunSpec, parse_named, read_plan, runs_of
+from quality_plan import (
+    STRESS_SEEDS,
+    RunSpec,
+    parse_named,
+    parse_part,
+    part_of,
+    read_plan,
+    runs_of,
+    stress_markdown,
+    stress_recipes,
+)
 from quality_run import describe, write
 
 EVALUATE_AT = (1_000, 2_000, 4_000, 7_000, 10_000, 15_000, 20_000)
@@ -223,9 +232,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--seeds", type=int, nargs="+", help="of the trainings (default: the plan's, or 0)")
     parser.add_argument("--plan", type=Path, metavar="YAML", help="captures, recipes and seeds")
     parser.add_argument("--stress", metavar="YAML", help="run the stress grid of this configuration")
-    parser.add_argument(
-        "--part", type=quality_stress.parse_part, metavar="K/N", help="with --stress: this part of the grid"
-    )
+    parser.add_argument("--part", type=parse_part, metavar="K/N", help="with --stress: this part of the grid")
     parser.add_argument(
         "--evaluate-at",
         type=positive,
@@ -247,12 +254,9 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--minutes", type=float, metavar="M", help="start no run later than this")
     parser.add_argument(
-        "--collect",
-        type=Path,
-        nargs="*",
-        metavar="SOURCE",
+        "--collect", type=Path, nargs="*", metavar="SOURCE",
         help="add these runs; without recipes, report alone",
-    )
+    )  # fmt: skip
     return parser
 
 
@@ -268,8 +272,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         seeds = args.seeds or plan.get("seeds") or [0]
         evaluate_at = args.evaluate_at
         if args.stress is not None:
-            recipes |= quality_stress.part_of(quality_stress.recipes(args.stress), args.part or (1, 1))
-            seeds, evaluate_at = args.seeds or quality_stress.SEEDS, []
+            recipes |= part_of(stress_recipes(args.stress), args.part or (1, 1))
+            seeds, evaluate_at = args.seeds or STRESS_SEEDS, []
         quality_report.collect(args.out, args.collect or [])
         specs = []
         if captures or recipes or args.collect is None:
@@ -282,7 +286,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     work(specs, Pool(args.out, args.gpus, args.per_gpu, args.ranks), args.minutes)
     print(quality_report.report(args.out))
     if args.stress is not None:
-        table = quality_stress.markdown(quality_report.read_runs(args.out / quality_report.RUNS))
+        table = stress_markdown(quality_report.read_runs(args.out / quality_report.RUNS))
         (args.out / "stress.md").write_text(table)
         print(table)
     wanted = {spec.name for spec in specs}

@@ -41,12 +41,9 @@ OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e10)
 WARM_UP = 5
 # The stages by their marks in `blitzgs.frame.frame`; the exchange of a single rank does nothing.
 STAGES = {
-    "project": "project",
-    "sort": "intersect",
-    "raster": "rasterize",
-    "raster back": "rasterize_backward",
+    "project": "project", "sort": "intersect", "raster": "rasterize", "raster back": "rasterize_backward",
     "project back": "project_backward",
-}
+}  # fmt: skip
 SCENES: dict[str, Callable[[], BenchmarkScene]] = {
     "aerial1": lambda: aerial(1_000_000, "cuda"),
     "aerial4": lambda: aerial(4_000_000, "cuda"),

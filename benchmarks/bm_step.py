@@ -32,7 +32,7 @@ from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, GaussianTable
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.training.step import Stepper
 
 LOSS = LossConfig(ssim=0.2, scale=0)
@@ -63,9 +63,12 @@ def random_photographs(scene: BenchmarkScene) -> Batch:
     return Batch(list(range(count)), views, targets, None, samples, None)
 
 
-def make_table(scene: BenchmarkScene) -> GaussianTable:
-    """Return the scene as a table in the middle of a training: with moments, at step 0."""
-    table = GaussianTable.create(scene.raw())
+def make_table(scene: BenchmarkScene, rows: torch.Tensor | None = None) -> GaussianTable:
+    """Return the scene, or some of its rows, as a table amidst a training: with moments, at step 0."""
+    columns = scene.raw()
+    if rows is not None:
+        columns = {name: column[rows] for name, column in columns.items()} | {"id": rows}
+    table = GaussianTable.create(columns)
     # Gradients of this loss are around 1e-7; their sizes spread over some orders of magnitude.
     for names in zip(EXP_AVGS, EXP_AVG_SQS, strict=True):
         for first, second in zip(*(table[name].split(DRAWN_ROWS) for name in names), strict=True):

@@ -23,7 +23,7 @@ from harness import make_parser, report
 from scenes import aerial
 
 from blitzgs.config.fields import Config
-from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.group import Ranks, extend_memory_in_place
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.table.blocks import morton_order
 from blitzgs.view.draw import Drawer, Subject, intrinsics, table_of_parameters
@@ -127,6 +127,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--full", action="store_true")
     options = parser.parse_args(arguments)
+    extend_memory_in_place()  # as `blitzgs view`
     width, height = (int(text) for text in options.size.split("x"))
     ranks = Ranks(device=torch.device(options.device))
     opened = (

@@ -14,11 +14,8 @@ Json = dict[str, Any]
 Rows = list[dict[str, str]]
 
 TITLES = {
-    "full": "LOD gate and mask",
-    "no_lod": "mask alone",
-    "no_mask": "LOD gate alone",
-    "all_off": "neither",
-}
+    "full": "LOD gate and mask", "no_lod": "mask alone", "no_mask": "LOD gate alone", "all_off": "neither",
+}  # fmt: skip
 NONE = "–"
 
 
@@ -239,12 +236,7 @@ def _budget(images: Json, kind: str) -> str:
 
 
 TABLES: dict[str, Callable[[Json], Rows]] = {
-    "city": city_rows,
-    "city_arms": arm_rows,
-    "city_costs": cost_rows,
-    "city_phases": phase_rows,
-    "city_popping": popping_rows,
-    "city_curve": curve_rows,
-    "city_ranks": rank_rows,
+    "city": city_rows, "city_arms": arm_rows, "city_costs": cost_rows, "city_phases": phase_rows,
+    "city_popping": popping_rows, "city_curve": curve_rows, "city_ranks": rank_rows,
     "city_memory": memory_rows,
-}
+}  # fmt: skip

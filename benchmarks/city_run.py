@@ -36,9 +36,10 @@ from blitzgs.runs.files import TrainedModel
 from blitzgs.runs.log import LOG
 from blitzgs.training.agreement import Agreement
 from blitzgs.training.events.evaluate import measure
-from blitzgs.training.inputs import open_capture
-from blitzgs.training.population_report import population_report
+from blitzgs.training.inputs import open_capture, read_ahead
+from blitzgs.training.records import population_report
 from blitzgs.training.trainer import Trainer
+from blitzgs.util.progress import Laps
 
 # A training stops so long before its process ends itself, in seconds; it is then evaluated.
 RESERVE = 16.0
@@ -153,8 +154,11 @@ def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float)
         folder: for the run's log.
         since: when the process began, by `time.monotonic`.
     """
-    config = spec.config()
-    with Ranks.from_environment(spec.device, config.ranks.timeout_seconds, config.ranks.transport) as ranks:
+    config, laps = spec.config(), Laps()
+    reading = read_ahead(config.data)
+    with Ranks.from_environment(
+        spec.device, config.ranks.timeout_seconds, config.ranks.transport, lap=laps.lap
+    ) as ranks:
         folder = Path(ranks.broadcast_object(str(folder)))  # all ranks are on one host
         wall: dict[str, float] = result.setdefault("wall", {})
 
@@ -164,8 +168,9 @@ def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float)
             if ranks.rank == 0:
                 write(path, result)
 
-        capture, images = open_capture(config, ranks)
-        trainer = CityTrainer(config, capture, images, folder, ranks)
+        capture, images = open_capture(config, ranks, reading=reading)
+        laps.lap("capture")
+        trainer = CityTrainer(config, capture, images, folder, ranks, laps=laps)
         state = trainer.state
         result["views"] = {"train": len(capture.train), "test": len(capture.test)}
         result["points"] = len(capture.points)
@@ -184,22 +189,20 @@ def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float)
         if ranks.rank == 0:
             timer.start()
         result["finished"] = trainer.train() is not None
+        result["set_up"] = laps.seconds
         timer.cancel()
         is_done = result["finished"] or deadline.is_set()
         synchronize(ranks.device)
         images_seen, seconds = state.images_seen, state.progress.seconds
         host_peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
         result |= {
-            "images": images_seen,
-            "planned_images": state.schedule.iterations,
-            "batch_size": config.schedule.batch_size,
-            "seconds": seconds,
-            "images_per_second": images_seen / max(seconds, 1e-9),
-            "gaussians": state.population(),
+            "images": images_seen, "planned_images": state.schedule.iterations,
+            "batch_size": config.schedule.batch_size, "seconds": seconds,
+            "images_per_second": images_seen / max(seconds, 1e-9), "gaussians": state.population(),
             "population": population_report(state, trainer.memory),
             "image_memory": dataclasses.asdict(images.memory()),
             "host_peak_bytes": ranks.all_gather_object(host_peak),
-        }
+        }  # fmt: skip
         if ranks.rank == 0:
             records = [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
             result["phases"] = phases_of(state.config, records, images_seen, seconds)

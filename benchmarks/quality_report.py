@@ -179,15 +179,8 @@ def write_csv(path: Path, runs: Sequence[Run]) -> None:
     about = ("capture", "recipe", "settings", "seed", "commit", "per_gpu")
     splits = [f"{split}_{metric}" for split in ("test", "train") for metric in METRICS]
     head = [
-        *about,
-        "images",
-        "seconds",
-        "gaussians",
-        *splits,
-        "is_end",
-        "peak_gaussians",
-        "peak_memory_bytes",
-    ]
+        *about, "images", "seconds", "gaussians", *splits, "is_end", "peak_gaussians", "peak_memory_bytes",
+    ]  # fmt: skip
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, head, restval="")
         writer.writeheader()

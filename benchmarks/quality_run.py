@@ -29,7 +29,7 @@ from blitzgs.runs.evaluation import METRICS, evaluate, load_lpips
 from blitzgs.training.agreement import Agreement
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture
-from blitzgs.training.population_report import population_report
+from blitzgs.training.records import population_report
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.views import Space, ViewSet, render_options
 
@@ -139,12 +139,9 @@ class RecordedTrainer(Trainer):
         seconds = state.progress.seconds + time.monotonic() - begin
         with state.paused_clock():
             self.recorder.record(
-                state.images_seen,
-                seconds,
-                state.population(),
-                end,
+                state.images_seen, seconds, state.population(), end,
                 lambda indices: measure(state, indices, None),
-            )
+            )  # fmt: skip
 
 
 def train_ours(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:

@@ -60,13 +60,9 @@ COMMANDS = {
 # trainings take many minutes and depend on the recipe more than on the kernels, and the city has a page of
 # its own.
 GROUPS = (
-    ("quality",),
-    ("compact",),
-    ("town_parts",),
-    ("exchange", "city_ranks", "drop_in_full"),
-    ("city",),
+    ("quality",), ("compact",), ("town_parts",), ("exchange", "city_ranks", "drop_in_full"), ("city",),
     ("gpu_record",),
-)
+)  # fmt: skip
 # After commands that take no --json: gpu_record.py writes its file itself, bm_quality.py collects all of its
 # runs in one file.
 COPIED = {"gpu_record": "python benchmarks/report.py"} | {

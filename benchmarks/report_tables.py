@@ -93,15 +93,11 @@ def stage_lines(render: Json) -> list[str]:
 def call_lines(render: Json) -> list[str]:
     """Tabulate the same work through `blitzgs.rasterization` and autograd."""
     columns = {
-        "blitzgs": "the training step's ops",
-        "rasterization": "the call, dense gradients",
-        "rasterization, 1 thread": "dense, autograd in one thread",
-        "sparse": "sparse gradients",
-        "sparse, 1 thread": "sparse, autograd in one thread",
-        "sparse, meta": "sparse, all of meta read",
-        "gsplat": "gsplat",
-        "gsplat, 1 thread": "gsplat, autograd in one thread",
-    }
+        "blitzgs": "the training step's ops", "rasterization": "the call, dense gradients",
+        "rasterization, 1 thread": "dense, autograd in one thread", "sparse": "sparse gradients",
+        "sparse, 1 thread": "sparse, autograd in one thread", "sparse, meta": "sparse, all of meta read",
+        "gsplat": "gsplat", "gsplat, 1 thread": "gsplat, autograd in one thread",
+    }  # fmt: skip
     measured = [name for name in columns if any(name in result for result in render["results"])]
     rows = [
         [result["scene"], *(ms(result[name]["total"]) if name in result else "–" for name in measured)]

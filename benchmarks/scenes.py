@@ -40,12 +40,9 @@ class BenchmarkScene:
     def raw(self) -> dict[str, Tensor]:
         """Return the parameters before activation: log scales and logit opacities."""
         return {
-            "means": self.means,
-            "quats": self.quats,
-            "scales": self.scales.log(),
-            "opacities": torch.logit(self.opacities),
-            "sh": self.sh,
-        }
+            "means": self.means, "quats": self.quats, "scales": self.scales.log(),
+            "opacities": torch.logit(self.opacities), "sh": self.sh,
+        }  # fmt: skip
 
     def first_views(self, count: int) -> BenchmarkScene:
         """Return the scene seen by its first `count` cameras only."""

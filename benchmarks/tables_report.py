@@ -138,14 +138,10 @@ def cost_rows(scene: str, reports: Sequence[dict[str, Any]], reference: Sequence
     for report in reports:
         ms = report["ms"]
         ours = {
-            "preprocess": ms["project"] + ms["sort"],
-            "communicate": ms["exchange"] + ms["exchange back"],
-            "render": ms["raster"],
-            "loss": ms["loss"],
-            "backward": ms["raster back"],
-            "other": ms["optimiser"] + ms["other"],
-            "total": ms["alone"],
-        }
+            "preprocess": ms["project"] + ms["sort"], "communicate": ms["exchange"] + ms["exchange back"],
+            "render": ms["raster"], "loss": ms["loss"], "backward": ms["raster back"],
+            "other": ms["optimiser"] + ms["other"], "total": ms["alone"],
+        }  # fmt: skip
         paper = papers.get(report["ranks"], {})
         row: Row = {"scene": scene, "GPUs": report["ranks"]}
         row |= {name: round(value, 2) for name, value in ours.items()}

@@ -24,6 +24,7 @@ _HELP = {
     "built": "a city; --no-built: flat farmland",
     "grain": "noise of the photographs, in steps of 8-bit values",
     "exposure": "standard deviation of the logarithm of the photographs' gains",
+    "altitudes": "number of heights flown at, 1 to 8",
 }
 
 

@@ -14,6 +14,7 @@ from blitzgs_synth.options import CityOptions
 FIELD_OF_VIEW = math.radians(62)  # horizontal
 TILT = math.radians(45)  # of the oblique views, from straight down
 OVERLAP = 0.68  # of neighbouring nadir images, along and across the line of flight
+CLIMB = 1.6  # ratio of two neighbouring altitudes
 _MIN_HEIGHT, _MAX_HEIGHT = 75.0, 260.0  # metres above ground
 
 
@@ -52,8 +53,8 @@ class View:
 
 
 def flight_height(options: CityOptions) -> float:
-    """Return the height above ground, in metres, at which nadir images have the wanted overlap."""
-    nadir = max(options.views - _oblique_count(options), 1)
+    """Return the lowest height above ground, in metres, at which nadir images have the wanted overlap."""
+    nadir = max(_shares(options.views - _oblique_count(options), options.altitudes)[0], 1)
     spacing = options.extent / math.sqrt(nadir)
     footprint = spacing / (1 - OVERLAP)
     side = math.sqrt(options.width * options.height) / options.width  # of the image, mean of both edges
@@ -61,36 +62,48 @@ def flight_height(options: CityOptions) -> float:
 
 
 def plan_flight(options: CityOptions) -> list[View]:
-    """Return the views of a capture in flying order: nadir lines, then oblique lines in four headings."""
+    """Return the views of a capture in flying order: nadir lines, then oblique lines in four headings.
+
+    With several altitudes each of these is flown at the lowest first.
+    """
     rng = np.random.default_rng([options.seed, 4])
-    height = flight_height(options)
+    lowest = flight_height(options)
     oblique = _oblique_count(options)
     per_heading = [oblique // 4 + (k < oblique % 4) for k in range(4)]
     passes: list[tuple[str, float, float, int]] = [("nadir", 0.0, 0.0, options.views - oblique)]
     passes += [(f"oblique_{'nesw'[k]}", k * math.pi / 2, TILT, n) for k, n in enumerate(per_heading)]
-    # The outermost images reach half a footprint past their centre: up to the edge of the city.
-    flown = max(options.extent - 0.6 * height, 0.5 * options.extent)
     views: list[View] = []
-    for label, heading, tilt, count in passes:
+    for label, heading, tilt, total in passes:
         forward = np.array([math.sin(heading), math.cos(heading)])
-        # Oblique cameras fly behind the point that they look at.
-        back = height * math.tan(tilt)
-        for position in _lawn_mower(count, flown):
-            ground = position + rng.normal(0, 0.01 * height, 2)
-            centre = np.array([*(ground - back * forward), height * (1 + rng.normal(0, 0.01))])
-            yaw, pitch, roll = np.array([heading, tilt, 0.0]) + rng.normal(0, math.radians(1.2), 3)
-            focal = 0.5 * options.width / math.tan(FIELD_OF_VIEW / 2)
-            views.append(
-                View(
-                    name=f"{len(views):05d}_{label}.jpg",
-                    width=options.width,
-                    height=options.height,
-                    focal=focal,
-                    rotation=_rotation(float(yaw), float(pitch), float(roll)),
-                    centre=centre,
+        for level, count in enumerate(_shares(total, options.altitudes)):
+            height = lowest * CLIMB**level
+            # The outermost images reach half a footprint past their centre: up to the edge of the city.
+            flown = max(options.extent - 0.6 * height, 0.5 * options.extent)
+            # Oblique cameras fly behind the point that they look at.
+            back = height * math.tan(tilt)
+            for position in _lawn_mower(count, flown):
+                ground = position + rng.normal(0, 0.01 * height, 2)
+                centre = np.array([*(ground - back * forward), height * (1 + rng.normal(0, 0.01))])
+                yaw, pitch, roll = np.array([heading, tilt, 0.0]) + rng.normal(0, math.radians(1.2), 3)
+                focal = 0.5 * options.width / math.tan(FIELD_OF_VIEW / 2)
+                views.append(
+                    View(
+                        name=f"{len(views):05d}_{label}.jpg",
+                        width=options.width,
+                        height=options.height,
+                        focal=focal,
+                        rotation=_rotation(float(yaw), float(pitch), float(roll)),
+                        centre=centre,
+                    )
                 )
-            )
     return views
+
+
+def _shares(count: int, altitudes: int) -> list[int]:
+    """Divide `count` views over the altitudes, the lowest first."""
+    weights = CLIMB ** (-2.0 * np.arange(altitudes))
+    ends = np.rint(count * np.cumsum(weights) / weights.sum()).astype(int)
+    return [int(share) for share in np.diff(ends, prepend=0)]
 
 
 def _oblique_count(options: CityOptions) -> int:

@@ -10,6 +10,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from blitzgs.capture.colmap import FILES, read_model, write_model
 from blitzgs.util.output import PARTIAL, write_file
@@ -31,19 +32,10 @@ _FOLDERS = ("images", "sparse")
 def generate_city(
     out: Path | str,
     *,
-    extent: float = CityOptions.extent,
-    views: int = CityOptions.views,
-    width: int = CityOptions.width,
-    height: int = CityOptions.height,
-    points_per_view: int = CityOptions.points_per_view,
-    oblique: float = CityOptions.oblique,
-    seed: int = CityOptions.seed,
-    built: bool = CityOptions.built,
-    grain: float = CityOptions.grain,
-    exposure: float = CityOptions.exposure,
     processes: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
+    **parameters: Any,
 ) -> Path:
     """Generate a city and photograph it from the air, unless `out` already holds the same one.
 
@@ -55,32 +47,21 @@ def generate_city(
 
     Args:
         out: folder to create.
-        extent: edge of the built-up square in metres.
-        views: number of images.
-        width: of the images, pixels.
-        height: of the images, pixels.
-        points_per_view: feature points looked for per image.
-        oblique: fraction of oblique views, 0 to 1.
-        seed: seed of all random numbers.
-        built: whether there is a city; false: flat farmland.
-        grain: standard deviation of the photographs' noise, in steps of 8-bit values.
-        exposure: standard deviation of the logarithm of the photographs' gains.
         processes: number of processes that render; None: one for each core that this process may use.
         overwrite: replace a city with other parameters instead of raising.
         progress: called after each image.
+        **parameters: fields of `CityOptions`; the others have its defaults.
 
     Returns:
         `out`, ready to be trained on.
 
     Raises:
-        ValueError: a parameter is out of range.
+        TypeError, ValueError: a parameter is unknown, or out of range.
         FileExistsError: `out` holds something else, or another process is making it.
         BrokenProcessPool: the system ended one of the processes, for example because memory ran out.
         ModuleNotFoundError: `embreex` is not installed.
     """
-    options = CityOptions(
-        extent, views, width, height, points_per_view, oblique, seed, built, grain, exposure
-    )
+    options = CityOptions(**parameters)
     out = Path(out)
     if out.name in ("", ".."):
         raise ValueError(f"synthetic city: the folder must be given by its name, got '{out}'")

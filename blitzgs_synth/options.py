@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, fields
 # Raised whenever the same parameters would give other files, so that cached cities are made anew.
 FORMAT_VERSION = 3
 # Fields that the first cities of this version did not have.
-_LATER = ("built", "grain", "exposure")
+_LATER = ("built", "grain", "exposure", "altitudes")
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,8 @@ class CityOptions:
         built: whether there is a city; false: flat farmland of finely textured crops.
         grain: standard deviation of the noise of the photographs, in steps of 8-bit values.
         exposure: standard deviation of the logarithm of the photographs' gains.
+        altitudes: number of heights flown at, 1 to 8; each is 1.6 times the one below it and has, for the
+            same overlap, 1 / 1.6² of its views.
     """
 
     extent: float = 150.0
@@ -38,6 +40,7 @@ class CityOptions:
     built: bool = True
     grain: float = 0.0
     exposure: float = 0.0
+    altitudes: int = 1
 
     def __post_init__(self) -> None:
         limits = {
@@ -51,6 +54,7 @@ class CityOptions:
             "built": (False, True),
             "grain": (0.0, 64.0),
             "exposure": (0.0, 1.0),
+            "altitudes": (1, 8),
         }
         for name, (low, high) in limits.items():
             value = getattr(self, name)
@@ -78,6 +82,10 @@ PRESETS = {
     "town": CityOptions(extent=500.0, views=400, width=1368, height=912, points_per_view=1000),
     # More than two square kilometres, with the views and the image size of the usual large captures.
     "city": CityOptions(extent=1600.0, views=2048, width=1368, height=912, points_per_view=1200),
+    # Four square kilometres from three heights.
+    "metropolis": CityOptions(
+        extent=2000.0, views=5120, width=1368, height=912, points_per_view=1200, altitudes=3
+    ),
     # Flat crops from straight above, with grain: a capture on which training can lose what it has learnt
     # (docs/decisions/recipe.md).
     "farmland": CityOptions(

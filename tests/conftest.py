@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
+import signal
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: it says how OpenMP threads wait
 
@@ -15,16 +16,18 @@ _TRAININGS = ("config", "report", "runs", "spawn", "training")
 
 # Of `lineage_run`: density events at 20, 40, 60 and 80; the gate judges from 60 on, a checkpoint lies at 50.
 LINEAGE = (
-    "population.lineage=true",
-    "population.grad_threshold=1e-4",
-    "population.importance=true",
-    "schedule.t1=40",
-    "schedule.t2=90",
-    "schedule.gate_from=60",
-    "schedule.checkpoint_every=50",
-    "log.keep_checkpoints=9",
-    "log.pictures=0",
-)
+    "population.lineage=true", "population.grad_threshold=1e-4", "population.importance=true",
+    "schedule.t1=40", "schedule.t2=90", "schedule.gate_from=60", "schedule.checkpoint_every=50",
+    "log.keep_checkpoints=9", "log.pictures=0",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="session", autouse=True)
+def signals_as_in_a_terminal():
+    """The tests may have been started with ignored signals, as by nohup or as a shell's background job."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in (signal.SIGHUP, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -55,16 +55,9 @@ class Scene:
     def arguments(self) -> tuple:
         """Return the positional arguments of `blitzgs.rasterization`."""
         return (
-            self.means,
-            self.quats,
-            self.scales,
-            self.opacities,
-            self.colors,
-            self.viewmats,
-            self.Ks,
-            self.width,
-            self.height,
-        )
+            self.means, self.quats, self.scales, self.opacities, self.colors, self.viewmats, self.Ks,
+            self.width, self.height,
+        )  # fmt: skip
 
 
 def rasterize_scene(scene: Scene, **options):

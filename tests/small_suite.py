@@ -13,9 +13,8 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-INTERSECT, PROJECT, RASTERIZE, IMPORTANCE, TRANSPORT = (
-    f"tests/cuda/test_{name}_cuda.py::test_"
-    for name in ("intersect", "project", "rasterize", "importance", "transport")
+INTERSECT, PROJECT, LAUNCH = (
+    f"tests/cuda/test_{name}_cuda.py::test_" for name in ("intersect", "project", "launch")
 )
 OPS, BLOCKS = "tests/ops/test_", "tests/table/test_blocks.py::test_"
 TESTS = [
@@ -27,12 +26,12 @@ TESTS = [
     )),
     *(PROJECT + test for test in (
         "splats_match_the_cpu[0-False]", "splats_match_the_cpu[1-True]", "splats_match_the_cpu[2-False]",
-        "splats_match_the_cpu[3-True]", "active_rows_and_views", "gradients_match_float64[0-True]",
-        "gradients_match_float64[3-False]", "nothing_visible[behind]", "ranks_of_splats_match_the_cpu",
+        "splats_match_the_cpu[3-True]", "active_rows_and_views", "splat_gradients_match_float64[0-True]",
+        "splat_gradients_match_float64[3-False]", "nothing_visible[behind]", "ranks_of_splats_match_the_cpu",
         "splats_with_nan_vanish_and_spread_nowhere",
     )),
     # Gradients: absolute ones too, deterministic, channels.
-    *(RASTERIZE + test for test in (
+    *(PROJECT + test for test in (
         "image_matches_float64[3]", "image_matches_float64[4]", "image_matches_float64[9]",
         "gradients_match_float64[False-False-3]", "gradients_match_float64[False-False-4]",
         "gradients_match_float64[False-True-3]", "gradients_match_float64[False-True-9]",
@@ -42,10 +41,10 @@ TESTS = [
         "gradients_of_some_of_the_composited_tiles[False]", "empty_lists_give_the_background",
         "entries_of_no_tile_name_any_splat[True]",
     )),
-    *(IMPORTANCE + test for test in (
+    *(INTERSECT + test for test in (
         "close_to_float64", "entries_after_the_last_splat_are_not_read",
     )),
-    *(TRANSPORT + test for test in (
+    *(LAUNCH + test for test in (
         "splats_arrive_and_their_gradients_are_found",
         "a_barrier_exchanges_values_when_all_ranks_have_arrived", "copies_to_the_host_need_pinned_memory",
     )),
@@ -65,11 +64,11 @@ TESTS = [
         "photometric.py::test_float32_matches_the_definition[shape4-False-cuda]",
         "photometric.py::test_a_partition_of_the_tiles_adds_up_to_the_whole[16-cuda]",
         "photometric.py::test_loss_and_ssim_are_means[cuda]",
-        "splat_count.py::test_lists_ignore_entries_after_the_last_splat[8192-True-cuda]",
-        "splat_count.py::test_a_number_out_of_range_is_no_splat[501-cuda]",
-        "splat_count.py::test_images_and_gradients_ignore_entries_after_the_last_splat[700-3-composited1-owned1-cuda]",
-        "splat_count.py::test_a_table_of_gradients_is_zeroed_for_the_splats[700-1500-tiles0]",
-        "splat_count.py::test_lists_with_too_little_room_are_the_nearest_splats[tiles1-0.5]",
+        "intersect.py::test_lists_ignore_entries_after_the_last_splat[8192-True-cuda]",
+        "intersect.py::test_a_number_out_of_range_is_no_splat[501-cuda]",
+        "intersect.py::test_images_and_gradients_ignore_entries_after_the_last_splat[700-3-composited1-owned1-cuda]",
+        "intersect.py::test_a_table_of_gradients_is_zeroed_for_the_splats[700-1500-tiles0]",
+        "intersect.py::test_lists_with_too_little_room_are_the_nearest_splats[tiles1-0.5]",
         "rows.py::test_splats_reach_their_groups[6000-cuda]",
         "rows.py::test_sums_follow_the_splats_back[5000-cuda]",
         "render.py::test_equal_the_image_bit_for_bit[3-cuda-float32]",
@@ -79,18 +78,18 @@ TESTS = [
         "positions.py::test_position_noise_matches_the_formula[cuda]",
         "positions.py::test_knn_distances_match_a_kd_tree[uniform-3-cuda]",
         "positions.py::test_knn_distances_of_small_clouds[cuda]",
-        "cull_mask.py::test_every_bit_is_at_its_place_and_comes_back[257-3-cuda]",
+        "moved_rows.py::test_every_bit_is_at_its_place_and_comes_back[257-3-cuda]",
         "importance.py::test_mass_cuts_equal_sorting[share2-ties-3-cuda]",
         "importance.py::test_spawn_features_match_the_formulas[1000-cuda]",
         "sums.py::test_tree_sums_equal_a_walk_down_each_tree[700-cuda]",
         "sums.py::test_view_sums_equal_dense_sums[density-cuda]",
         "sums.py::test_each_target_of_a_report_gets_this_ranks_share[3000-cuda]",
-        "pool_ops.py::test_swapped_blocks_have_the_right_contents[cuda]",
-        "pool_ops.py::test_views_have_sizes_of_their_own[cuda]",
+        "moved_rows.py::test_swapped_blocks_have_the_right_contents[cuda]",
+        "moved_rows.py::test_views_have_sizes_of_their_own[cuda]",
         "project.py::test_dense_gradients_equal_scattered_compact_ones[2-9-cuda-float32]",
-        "copy_rows.py::test_bits_and_unaligned_columns[cuda]",
-        "sampling.py::test_keys_match_the_formula[cuda]",
-        "sampling.py::test_digits_of_keys_are_counted_under_a_prefix[700-cuda]",
+        "moved_rows.py::test_bits_and_unaligned_columns[cuda]",
+        "moved_rows.py::test_keys_match_the_formula[cuda]",
+        "moved_rows.py::test_digits_of_keys_are_counted_under_a_prefix[700-cuda]",
         "render.py::test_images_are_those_of_lists_and_compositing[True-cuda-float32]",
         "rows.py::test_columns_are_at_their_places_and_come_back[700-False-cuda]",
         "rows.py::test_entries_without_a_splat_have_the_values_of_their_gaussians[cuda]",

@@ -256,12 +256,8 @@ def test_the_example_of_the_single_ops_renders_the_image_of_the_one_call():
     viewmats[:, 2, 3] = torch.tensor([5.0, 8.0])
     Ks = torch.tensor([[40.0, 0, 25], [0, 40, 20], [0, 0, 1]]).repeat(2, 1, 1)
     names = {
-        "means": means,
-        "quats": quats,
-        "log_scales": scales.log(),
-        "logits": opacities.logit(),
-        "sh": sh,
-    }
+        "means": means, "quats": quats, "log_scales": scales.log(), "logits": opacities.logit(), "sh": sh,
+    }  # fmt: skip
     names |= {"viewmats": viewmats, "Ks": Ks, "width": width, "height": height}
     exec(compile(example, "own-trainer.md", "exec"), names)
     views = (viewmats, Ks, width, height)

@@ -28,14 +28,13 @@ from blitzgs.capture.cameras import (
     scaled_matrix,
 )
 from blitzgs.capture.check_files import FindDamage, damaged
-from blitzgs.capture.files import MissingImagesError as MissingImagesError
-from blitzgs.capture.files import existing
 from blitzgs.capture.image_files import ImageHeader, read_header
 from blitzgs.capture.layouts import Source, SourceView, read_layout
 from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_extent
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.masks import excluded_share, find_masks
-from blitzgs.capture.names import check_inside
+from blitzgs.capture.masks import check_masks, find_masks
+from blitzgs.capture.names import MissingImagesError as MissingImagesError
+from blitzgs.capture.names import check_inside, existing
 from blitzgs.capture.points import SourcePoints
 from blitzgs.capture.projects.find import FoundProject, folder_of, project_at
 from blitzgs.capture.splits import split_capture, without_unused
@@ -91,32 +90,18 @@ class About:
     """What `load_capture` decided, for messages."""
 
     source: Source
-    split: str
-    """What decided on the held-out views."""
+    split: str  # what decided on the held-out views
+    # The cameras whose pose is wrong; they are left out unless `stray_cameras` keeps them.
     strays: list[StrayCamera]
-    """The cameras whose pose is wrong; they are left out unless `stray_cameras` keeps them."""
-    unused: int
-    """Number of frames that are in no list of the file's own split."""
-    missing: int
-    """Number of views whose image is not on disk."""
-    blind: int
-    """Number of views that see none of the points."""
-    random_points: bool
-    """Whether the capture has no points, so that training starts from random ones."""
-    points_from: str = ""
-    """The file of the points, relative to the capture."""
-    colors_from: str = ""
-    """What in it gives their colours; empty: nothing."""
-    with_alpha: int = 0
-    """Number of photographs that have alpha."""
-    extra_bands: int = 0
-    """Number of photographs with a band that is neither colour nor alpha; it is not used."""
-    with_mask: int = 0
-    """Number of photographs that have a mask."""
-    mask_share: float | None = None
-    """Mean share of the pixels that masks exclude, of a few masks."""
-    damaged: int = 0
-    """Number of views that `allow_missing` left out because their image or mask is damaged."""
+    unused: int  # number of frames that are in no list of the file's own split
+    missing: int  # number of views whose image is not on disk
+    blind: int  # number of views that see none of the points
+    random_points: bool  # whether the capture has no points, so that training starts from random ones
+    points_from: str = ""  # the file of the points, relative to the capture
+    colors_from: str = ""  # what in it gives their colours; empty: nothing
+    with_alpha: int = 0  # number of photographs that have alpha
+    extra_bands: int = 0  # number of photographs with a band that is neither colour nor alpha; it is not used
+    damaged: int = 0  # number of views that `allow_missing` left out because their image or mask is damaged
 
 
 def load_capture(
@@ -207,6 +192,7 @@ def load_capture(
     with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # the files may be on a slow network disk
         headers = list(pool.map(lambda view: read_header(view.path), views))
     extra_bands = [view for view, header in zip(views, headers, strict=True) if header.extra_bands]
+    check_masks([view.mask_path for view in views])
     if extra_bands:
         warnings.warn(
             f"{len(extra_bands)} of {len(views)} photographs have a further band that their file does not "
@@ -252,19 +238,13 @@ def load_capture(
             colors_from=points.colors_from,
             with_alpha=sum(header.has_alpha for header in headers),
             extra_bands=len(extra_bands),
-            with_mask=sum(view.mask_path is not None for view in views),
-            mask_share=excluded_share([view.mask_path for view in views]),
             damaged=len(damage),
         ),
     )
 
 
 def _root_of(path: Path, images: str) -> tuple[Path, FoundProject | None]:
-    """Return the folder of a capture, and the project that was named instead of it.
-
-    Raises:
-        FileNotFoundError: the file is no project.
-    """
+    """Return the folder of a capture, and the project that was named instead of it."""
     if not path.is_file():
         return path, None
     project = project_at(path)

@@ -23,11 +23,7 @@ def mask_error(error: Exception) -> ValueError:
 
 
 def read_mask_file(path: Path) -> None:
-    """Decode a mask.
-
-    Raises:
-        ValueError: it is damaged; says that it is a mask.
-    """
+    """Decode a mask (ValueError: it is damaged; says that it is a mask)."""
     try:
         decode_mask(read_whole(path), str(path))
     except ValueError as error:
@@ -60,13 +56,7 @@ class FileCheck:
     def __init__(
         self, cameras: Sequence[Camera], order: Sequence[int], counted: Callable[[Camera], bool]
     ) -> None:
-        """Start to check.
-
-        Args:
-            cameras: all views.
-            order: those to check, in this order.
-            counted: decodes a view's mask, and tells whether some pixel counts.
-        """
+        """Start to check files; `counted` decodes a view's mask, and tells whether some pixel counts."""
         self.damage: str | None = None
         self._cameras, self._order, self._counted = cameras, order, counted
         self._stop = threading.Event()

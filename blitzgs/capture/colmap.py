@@ -48,17 +48,13 @@ class ColmapImages:
 
     ids: npt.NDArray[np.uint32] = _empty("u4", 0)
     camera_ids: npt.NDArray[np.uint32] = _empty("u4", 0)
-    quats: Float64 = _empty("f8", 0, 4)
-    """[N, 4] w, x, y, z."""
-    translations: Float64 = _empty("f8", 0, 3)
-    """[N, 3]."""
+    quats: Float64 = _empty("f8", 0, 4)  # [N, 4] w, x, y, z
+    translations: Float64 = _empty("f8", 0, 3)  # [N, 3]
     names: list[str] = field(default_factory=list)
+    # [N + 1]; all zero when the observations were not read.
     point2d_offsets: npt.NDArray[np.uint64] = _empty("u8", 1)
-    """[N + 1]; all zero when the observations were not read."""
-    points2d: Float64 = _empty("f8", 0, 2)
-    """[O, 2] pixels."""
-    point3d_ids: npt.NDArray[np.int64] = _empty("i8", 0)
-    """[O]; -1 where the observation has no point."""
+    points2d: Float64 = _empty("f8", 0, 2)  # [O, 2] pixels
+    point3d_ids: npt.NDArray[np.int64] = _empty("i8", 0)  # [O]; -1 where the observation has no point
 
 
 @dataclass
@@ -66,14 +62,11 @@ class ColmapPoints:
     """M points. The track of point i is rows track_offsets[i] to track_offsets[i + 1]."""
 
     ids: npt.NDArray[np.int64] = _empty("i8", 0)
-    positions: Float64 = _empty("f8", 0, 3)
-    """[M, 3] world."""
-    colors: npt.NDArray[np.uint8] = _empty("u1", 0, 3)
-    """[M, 3]."""
-    errors: Float64 = _empty("f8", 0)
-    """[M] mean reprojection error in pixels; -1 = unknown."""
+    positions: Float64 = _empty("f8", 0, 3)  # [M, 3] world
+    colors: npt.NDArray[np.uint8] = _empty("u1", 0, 3)  # [M, 3]
+    errors: Float64 = _empty("f8", 0)  # [M] mean reprojection error in pixels; -1 = unknown
+    # [M + 1]; right even when the tracks themselves were not read.
     track_offsets: npt.NDArray[np.uint64] = _empty("u8", 1)
-    """[M + 1]; right even when the tracks themselves were not read."""
     track_image_ids: npt.NDArray[np.uint32] = _empty("u4", 0)
     track_point2d_ids: npt.NDArray[np.uint32] = _empty("u4", 0)
 
@@ -91,8 +84,8 @@ class ColmapModel:
     cameras: list[ColmapCamera] = field(default_factory=list)
     images: ColmapImages = field(default_factory=ColmapImages)
     points: ColmapPoints = field(default_factory=ColmapPoints)
+    # The file of the points. With a suffix of `POINT_SUFFIXES`, `points` is empty: the caller reads it.
     points_path: Path | None = None
-    """The file of the points. With a suffix of `POINT_SUFFIXES`, `points` is empty: the caller reads it."""
 
 
 @cache
@@ -162,16 +155,11 @@ def count_images(folder: Path) -> int:
 
 
 def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = False) -> ColmapModel:
-    """Read a sparse model; binary files are preferred where both kinds are complete.
+    """Read a sparse model of .bin or .txt files; binary files are preferred where both kinds are complete.
 
-    Args:
-        folder: holds cameras, images and points3D as .bin or .txt (rigs and frames files are not needed).
-        points2d: read the observations of the images too (most of the file's size).
-        tracks: read the tracks of the points too (their lengths are always read).
-
-    Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: a file is damaged; names the file, the byte offset or line, and the reason.
+    Observations of images (`points2d`, most of the file's size) and tracks are read if asked for; the tracks'
+    lengths always are. FileNotFoundError: a file is missing. ValueError: a file is damaged; names the file,
+    the byte offset or line, and the reason.
     """
     folder = Path(folder)
     binary, text = ({name: _file(folder, name, suffix) for name in FILES} for suffix in _SUFFIXES)
@@ -191,22 +179,19 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
     )
 
 
-def write_model(folder: Path | str, model: ColmapModel, *, text: bool = False) -> None:
-    """Write a sparse model as .bin (or .txt) files, creating the folder.
+def write_model(folder: Path | str, model: ColmapModel) -> None:
+    """Write a sparse model as .bin files, creating the folder.
 
-    Raises:
-        ValueError: columns disagree in length, a camera's parameters do not fit its model, or a name cannot
-            stand in the file.
+    ValueError: columns disagree in length, a camera's parameters do not fit its model, or a name cannot stand
+    in the file.
     """
-    folder = Path(folder)
-    _check(model, text)
-    folder.mkdir(parents=True, exist_ok=True)
-    files = _texts_of(model) if text else _bytes_of(model)
-    for name, content in zip(FILES, files, strict=True):
-        (folder / (name + (".txt" if text else ".bin"))).write_bytes(content)
+    _check(model)
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    for name, content in zip(FILES, _bytes_of(model), strict=True):
+        Path(folder, f"{name}.bin").write_bytes(content)
 
 
-def _check(model: ColmapModel, text: bool) -> None:
+def _check(model: ColmapModel) -> None:
     """Refuse a model that its files could not hold."""
     for camera in model.cameras:
         if len(camera.params) != len(camera_models()[camera.model]):
@@ -231,11 +216,6 @@ def _check(model: ColmapModel, text: bool) -> None:
     for name in images.names:
         if not name or "\0" in name or "\n" in name:
             raise ValueError(f"images: the name {name!r} is empty or has a NUL or line break in it")
-        if text and name != name.strip(" \t\r\v\f"):
-            raise ValueError(
-                f"images: the name '{name}' begins or ends with a blank, which readers of text strip; rename "
-                "the image or write the model as .bin"
-            )
 
 
 def _bytes_of(model: ColmapModel) -> Iterator[bytes]:
@@ -267,32 +247,6 @@ def _joined(heads: list[bytes], offsets: npt.NDArray[np.uint64], rows: npt.NDArr
     for head, begin, end in zip(heads, ends, ends[1:], strict=False):
         parts += [head, struct.pack("<Q", end - begin), data[begin * size : end * size]]
     return b"".join(parts)
-
-
-def _texts_of(model: ColmapModel) -> Iterator[bytes]:
-    """Yield the text files of a model; numbers are the shortest that are read back as the same bits."""
-
-    def line(*values: Any) -> str:
-        return " ".join(map(str, values)) + "\n"
-
-    images, points = model.images, model.points
-    yield "".join(line(c.id, c.model, c.width, c.height, *c.params) for c in model.cameras).encode()
-    observed = np.column_stack([images.points2d.astype(object), images.point3d_ids.astype(object)])
-    poses = zip(images.ids, images.quats, images.translations, images.camera_ids, images.names, strict=True)
-    ends = images.point2d_offsets.tolist()
-    lines = [
-        line(i, *q, *t, c, name) + line(*observed[begin:end].ravel())
-        for (i, q, t, c, name), begin, end in zip(poses, ends, ends[1:], strict=False)
-    ]
-    yield os.fsencode("".join(lines))
-    tracks = np.column_stack([points.track_image_ids, points.track_point2d_ids])
-    rows = zip(points.ids, points.positions, points.colors, points.errors, strict=True)
-    ends = points.track_offsets.tolist()
-    lines = [
-        line(i, *xyz, *rgb, error, *tracks[begin:end].ravel())
-        for (i, xyz, rgb, error), begin, end in zip(rows, ends, ends[1:], strict=False)
-    ]
-    yield "".join(lines).encode()
 
 
 def quats_to_rotations(quats: Float64) -> Float64:

@@ -28,27 +28,19 @@ _TRIPLES = 500
 
 @dataclass
 class ControlPoint:
-    """A surveyed place and its marks.
+    """A surveyed place and its marks."""
 
-    Attributes:
-        name: of the point.
-        world: east, north, height.
-        marks: photograph's name, x and y in its pixels; the corner of the first pixel is (0, 0).
-    """
-
-    name: str
-    world: Float64
+    name: str  # of the point
+    world: Float64  # east, north, height
+    # photograph's name, x and y in its pixels; the corner of the first pixel is (0, 0).
     marks: list[tuple[str, float, float]] = field(default_factory=list)
 
 
 def read_control_points(path: Path) -> tuple[list[ControlPoint], str]:
     """Read points from CSV (name, E, N, h, image, x, y; a row a mark) or OpenDroneMap's gcp_list.txt.
 
-    Returns:
-        The points, and the reference system that gcp_list.txt names (empty: none).
-
-    Raises:
-        ValueError: the file is damaged, or a point has two places; names the line.
+    Returns the points, and the reference system that gcp_list.txt names (empty: none). ValueError: the file
+    is damaged, or a point has two places; names the line.
     """
     lines = read_small(path).splitlines()
     head = next((line for line in lines if line.strip()), "")
@@ -105,34 +97,22 @@ def _add(points: dict[str, ControlPoint], name: str, image: str, words: Sequence
 
 @dataclass
 class Placed:
-    """A control point in the coordinates of a capture.
+    """A control point in the coordinates of a capture."""
 
-    Attributes:
-        point: surveyed place and marks.
-        position: [3] in the capture's own world; None: `problem` says why there is none.
-        problem: why it is not used; empty: it is.
-        cameras: of its marks.
-        pixels: [M, 2] its marks.
-        offset: [3] in world units, the fitted place minus the surveyed one.
-        reprojection: root mean square distance in pixels of the surveyed place from the marks.
-    """
-
-    point: ControlPoint
-    position: Float64 | None = None
-    problem: str = ""
-    cameras: list[Camera] = field(default_factory=list)
-    pixels: Float64 = field(default_factory=lambda: np.zeros((0, 2)))
+    point: ControlPoint  # surveyed place and marks
+    position: Float64 | None = None  # [3] in the capture's own world; None: `problem` says why there is none
+    problem: str = ""  # why it is not used; empty: it is
+    cameras: list[Camera] = field(default_factory=list)  # of its marks
+    pixels: Float64 = field(default_factory=lambda: np.zeros((0, 2)))  # [M, 2] its marks
+    # [3] in world units, the fitted place minus the surveyed one.
     offset: Float64 = field(default_factory=lambda: np.full(3, math.nan))
-    reprojection: float = math.nan
+    reprojection: float = math.nan  # root mean square distance in pixels of the surveyed place from the marks
 
 
 def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Float64) -> list[Placed]:
-    """Find the points in the capture by the rays through their marks.
+    """Find the points in the capture, by the rays through their marks in pixels of the photographs.
 
-    Args:
-        points: with marks in pixels of the photographs.
-        cameras: of a capture that was loaded without downscaling.
-        origin: `Capture.offset`.
+    The cameras are those of a capture that was loaded without downscaling, `origin` is its `Capture.offset`.
     """
     by_name = _by_name(cameras)
     found = []
@@ -169,8 +149,7 @@ def _by_name(cameras: Sequence[Camera]) -> Mapping[str, Camera]:
 def normalised(lens: Lens, x: float, y: float) -> Float64:
     """Return the normalised coordinates (u, v) that a lens maps to a pixel, by Newton's method.
 
-    Raises:
-        ValueError: the pixel is outside the photograph, or outside what the lens maps.
+    ValueError: the pixel is outside the photograph, or outside what the lens maps.
     """
     if not (0 <= x <= lens.width and 0 <= y <= lens.height):
         raise ValueError(f"the mark {x:g}, {y:g} is outside a photograph of {lens.width} x {lens.height}")
@@ -201,9 +180,7 @@ def _before_fold(lens: Lens, at: Float64) -> bool:
 def _intersect(cameras: Sequence[Camera], rays: Float64) -> Float64:
     """Return the point [3] in the re-centred world that is nearest to rays, by the distances in the images.
 
-    Args:
-        cameras: M cameras.
-        rays: [M, 2] normalised coordinates.
+    The rays are [M, 2], normalised coordinates.
     """
     poses = np.stack([camera.world_to_camera for camera in cameras])
     focal = np.array([camera.rectification.lens.intrinsics[0] for camera in cameras])
@@ -239,10 +216,8 @@ def align(placed: Sequence[Placed], origin: Float64, crs: str, source: str) -> W
     """Fit the similarity to the points that agree, and write residuals into all that were found.
 
     Of five points or more, those that contradict the others are left out (least median of squares over
-    triples: P. J. Rousseeuw, JASA 1984); `Placed.problem` says so.
-
-    Raises:
-        ValueError: fewer than three points can be used, or they lie on a line.
+    triples: P. J. Rousseeuw, JASA 1984); `Placed.problem` says so. ValueError: fewer than three points can be
+    used, or they lie on a line.
     """
     used = [point for point in placed if point.position is not None]
     if len(used) < 3:

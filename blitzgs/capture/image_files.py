@@ -56,8 +56,7 @@ class ImageHeader:
 def read_header(path: Path) -> ImageHeader:
     """Return size, orientation and bands of an image file; JPEG, PNG and TIFF files are not decoded.
 
-    Raises:
-        ValueError: the file is damaged, not an image, or of a kind that is not supported; names it.
+    ValueError: the file is damaged, not an image, or of a kind that is not supported; names it.
     """
     with path.open("rb") as file:
         data = file.read(_HEADER_BYTES)
@@ -168,10 +167,8 @@ def read_whole(path: Path) -> bytes:
 
     Decoders show the lost part of a JPEG as grey, without an error, so this function walks the codes of the
     file. Damage that leaves a valid sequence of codes (most changes of a single bit) cannot be detected. The
-    checksums of a PNG are compared, because decoders complain of them on the terminal.
-
-    Raises:
-        ValueError: the file is truncated or damaged; names it, the byte offset and the reason.
+    checksums of a PNG are compared, because decoders complain of them on the terminal. ValueError names the
+    file, the byte offset and the reason.
     """
     data = path.read_bytes()
     if data[:2] == b"\xff\xd8":
@@ -182,11 +179,7 @@ def read_whole(path: Path) -> bytes:
 
 
 def check_png(data: bytes, name: str) -> None:
-    """Refuse a PNG without all of its chunks, or with a wrong checksum of one that a picture needs.
-
-    Raises:
-        FormatError: names the file, the byte offset and the reason.
-    """
+    """Refuse a PNG without all of its chunks, or with a wrong checksum of one that a picture needs."""
     at, kinds = len(_PNG_START), set()
     while b"IEND" not in kinds:
         end = at + 12 + int.from_bytes(data[at : at + 4], "big")
@@ -207,14 +200,8 @@ def check_png(data: bytes, name: str) -> None:
 def decode_rgb(data: bytes, name: str, background: tuple[float, float, float] | None = None) -> UInt8:
     """Decode to RGB uint8 [H, W, 3] as stored (EXIF orientation not applied).
 
-    Args:
-        data: the file, from `read_whole`.
-        name: names the file in errors.
-        background: colour (0 to 1) over which the colours are composited if the file says that it has alpha;
-            None: use the colours as they are stored.
-
-    Raises:
-        ValueError: the file cannot be decoded, or is of a kind that is not supported.
+    If the file says that it has alpha, colours are composited over `background` (0 to 1); None: they are used
+    as they are stored. ValueError: the file cannot be decoded, or is of a kind that is not supported.
     """
     header = _describe(data, name)
     _check_supported(header, name)
@@ -231,11 +218,8 @@ def decode_rgb(data: bytes, name: str, background: tuple[float, float, float] | 
 def check_photograph(path: Path) -> bool:
     """Check that a photograph can be decoded, and tell whether some pixel is not fully transparent.
 
-    JPEG and PNG files without alpha are not decoded: `read_whole` finds their damage.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: the file is damaged or not supported; names it.
+    JPEG and PNG files without alpha are not decoded: `read_whole` finds their damage. ValueError: the file is
+    damaged or not supported; names it.
     """
     data, name = read_whole(path), str(path)
     header = _describe(data, name)
@@ -284,9 +268,6 @@ def decode_mask(data: bytes, name: str) -> UInt8:
     Numbers and colours may be labels, so of a lossless file only black is black; but a file of nothing else
     than nearly black and nearly white pixels has no labels. In a lossy file all darker than half its
     brightest pixel is black. If all colours are black, the transparent pixels are the excluded ones.
-
-    Raises:
-        ValueError: the file cannot be decoded.
     """
     header = _describe(data, name)
     if not header["supported"]:
@@ -334,16 +315,11 @@ def apply_orientation(pixels: UInt8, orientation: int) -> UInt8:
 
 
 def reduced(pixels: UInt8, mask: UInt8 | None, factor: int) -> UInt8:
-    """Return the mean colours of squares of `factor` x `factor` pixels, rounded.
+    """Return the mean colours of squares of `factor` x `factor` pixels (16 at most), rounded.
 
     The rest of a width or height that does not divide is cut off on the right and below, so that the pinhole
-    of the result has the same intrinsics divided by `factor`.
-
-    Args:
-        pixels: [H, W, 3], or [H, W].
-        mask: [H, W], 0 = excluded; None: all pixels count. A mean is that of the pixels that count, or 0
-            where none does.
-        factor: at most 16.
+    of the result has the same intrinsics divided by `factor`. A mean is that of the pixels that count (`mask`
+    is not 0), or 0 where none does. Pixels are [H, W, 3], or [H, W] without a mask.
     """
     width, height = pixels.shape[1] // factor, pixels.shape[0] // factor
     pixels = pixels[: height * factor, : width * factor]

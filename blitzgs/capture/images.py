@@ -29,7 +29,6 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.capture.bounded_cache import BoundedCache as BoundedCache
 from blitzgs.capture.cameras import Camera, same_shape
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.check_files import FileCheck, mask_error
@@ -42,6 +41,7 @@ from blitzgs.capture.image_files import (
     reduced,
     reduced_mask,
 )
+from blitzgs.capture.shared_images import BoundedCache as BoundedCache
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.capture.undistort import Rectification
 from blitzgs.formats import native
@@ -54,22 +54,15 @@ _Key: TypeAlias = tuple[str, int, int]
 
 @dataclass(frozen=True)
 class ImageMemory:
-    """The largest host memory that images have taken so far, its limits, and the number of decodings.
+    """The largest host memory that images have taken so far, its limits, and the number of decodings."""
 
-    Attributes:
-        compressed_bytes: bytes of compressed images.
-        compressed_budget: limit of these bytes.
-        decoded_bytes: bytes of decoded images and masks, without those that a caller holds; in memory that
-            several processes share, those of all processes.
-        decoded_budget: limit of these bytes at present; it may have been larger before (`ImageStore`).
-        decoded: number of decodings of images and masks.
-    """
-
-    compressed_bytes: int
-    compressed_budget: int
+    compressed_bytes: int  # bytes of compressed images
+    compressed_budget: int  # limit of these bytes
+    # Bytes of decoded images and masks, without those that a caller holds; in memory that several processes
+    # share, those of all processes.
     decoded_bytes: int
-    decoded_budget: int
-    decoded: int
+    decoded_budget: int  # limit of these bytes at present; it may have been larger before (`ImageStore`)
+    decoded: int  # number of decodings of images and masks
 
     def __str__(self) -> str:
         """Return the figures as text, in gigabytes."""
@@ -113,12 +106,7 @@ def has_mask(camera: Camera) -> bool:
 
 
 def decoded_shapes(capture: Capture, factors: Iterable[int] = ()) -> dict[Hashable, tuple[int, ...]]:
-    """Return the shapes of all decoded images and masks of a capture, by the keys of `ImageStore`.
-
-    Args:
-        capture: the capture.
-        factors: by which images are reduced in addition.
-    """
+    """Return the shapes of all decoded images and masks, also reduced ones, by the keys of `ImageStore`."""
     shapes: dict[Hashable, tuple[int, ...]] = {}
     for factor in (1, *factors):
         for index, camera in enumerate(capture.cameras):
@@ -150,7 +138,6 @@ class ImageStore:
         """Read nothing yet.
 
         Args:
-            capture: the capture that has the images.
             budget_bytes: limit of the compressed images in memory.
             threads: number of threads that decode ahead.
             decoded_bytes: limit of the decoded images in memory; None: a quarter of `budget_bytes`, and
@@ -289,13 +276,7 @@ class ImageStore:
                 del self._pending[key]
 
     def _whole(self, kind: str, index: int, spare: bool = False) -> UInt8:
-        """Return an image or mask of the full size from memory, or decode it here and keep it.
-
-        Args:
-            kind: "image" or "mask".
-            index: the camera.
-            spare: it is not what training reads now; see `BoundedCache.put`.
-        """
+        """Return an "image" or "mask" of the full size from memory, or decode it here and keep it."""
         key = (kind, index, 1)
         found = self._found(key)  # another process may have decoded it since the look-up
         if found is not None:

@@ -14,8 +14,8 @@ import numpy as np
 
 from blitzgs.capture import colmap, transforms
 from blitzgs.capture.cameras import Float64
-from blitzgs.capture.files import ImageFinder
 from blitzgs.capture.lens import Lens
+from blitzgs.capture.names import ImageFinder
 from blitzgs.capture.points import SourcePoints, file_points, transforms_points
 from blitzgs.capture.projects.find import FoundProject, find_project, read_project
 from blitzgs.capture.world import WorldFrame, frame_beside
@@ -34,41 +34,27 @@ class SourceView:
     mask_path: Path | None
     lens: Lens
     world_to_camera: Float64
-    part: str | None = None
-    """See `transforms.Frame.part`."""
+    part: str | None = None  # see `transforms.Frame.part`
 
 
 @dataclass(frozen=True)
 class Source:
     """Which files were read, and what of them was not."""
 
-    cameras: str
-    """The model or files that the poses are from, relative to the capture."""
-    split: str = ""
-    """What in the files decides on the split."""
-    notes: tuple[str, ...] = ()
-    """What the reader decided between fields or files, and what has no effect."""
-    without_camera: int = 0
-    """Photographs beside those of the views that have no camera."""
-    frame: WorldFrame | None = None
-    """Where the capture lies in the world; None: the files do not say."""
+    cameras: str  # the model or files that the poses are from, relative to the capture
+    split: str = ""  # what in the files decides on the split
+    notes: tuple[str, ...] = ()  # what the reader decided between fields or files, and what has no effect
+    without_camera: int = 0  # photographs beside those of the views that have no camera
+    frame: WorldFrame | None = None  # where the capture lies in the world; None: the files do not say
 
 
 def read_layout(
     root: Path, images: str, downscale: float, sparse: str = "largest", project: FoundProject | None = None
 ) -> tuple[list[SourceView], SourcePoints, Source]:
-    """Read the views and points of a folder in any of the layouts of docs/captures.md.
+    """Read the views and points of a folder in any of the layouts of docs/captures.md, or of a `project`.
 
-    Args:
-        root: folder of the capture.
-        images: folder of the images, relative to `root`.
-        downscale: see `load_capture`; decides which folder of images is used.
-        sparse: see `load_capture`.
-        project: file of another program's project to read; None: whatever the folder has.
-
-    Raises:
-        FileNotFoundError: the folder has no capture.
-        ValueError: a file is damaged.
+    `downscale` (which decides on the folder of images) and `sparse` are those of `load_capture`.
+    FileNotFoundError: the folder has no capture. ValueError: a file is damaged.
     """
     if not root.is_dir():
         raise FileNotFoundError(
@@ -145,11 +131,7 @@ def _model_in(root: Path) -> Path:
 
 
 def _models(root: Path, sparse: str) -> tuple[list[Path], list[str]]:
-    """Return the COLMAP models to read, the largest first, and a line if others are left out.
-
-    Raises:
-        FileNotFoundError: the folder that `sparse` names has no model.
-    """
+    """Return the COLMAP models to read, the largest first, and a line if others are left out."""
     if sparse not in ("largest", "all"):
         named = root / sparse
         if colmap.find_models(named) and (model := _model_in(named)).is_relative_to(root):

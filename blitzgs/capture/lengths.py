@@ -10,13 +10,15 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture.cameras import Camera, Float64, camera_centres
-from blitzgs.capture.lens import Lens
+
+if TYPE_CHECKING:
+    from blitzgs.capture.layouts import SourceView
 
 # Cameras whose distance is below this share of the points' distance count as being in one place: the parallax
 # between them is far below a pixel.
@@ -40,31 +42,13 @@ _SKIPPED_POINTS, _SKIPPED_VIEWS = 0.02, 0.01
 _PAIRS, _LEAST_POINTS = 10_000_000, 2000
 
 
-class PosedView(Protocol):
-    """What the search for stray cameras reads of a view."""
-
-    @property
-    def name(self) -> str:
-        """Name of the image."""
-
-    @property
-    def lens(self) -> Lens:
-        """Lens at the size that the capture's file states."""
-
-    @property
-    def world_to_camera(self) -> Float64:
-        """Pose, [4, 4]."""
-
-
 @dataclass(frozen=True)
 class StrayCamera:
     """A camera that lies apart from all others and hardly shows a point: its pose is wrong."""
 
     name: str
-    distance: float
-    """From the middle of all cameras, in world units."""
-    others: float
-    """Largest such distance of the cameras that are together."""
+    distance: float  # from the middle of all cameras, in world units
+    others: float  # largest such distance of the cameras that are together
 
 
 def sampled(points: Float64, views: int) -> Float64:
@@ -74,16 +58,12 @@ def sampled(points: Float64, views: int) -> Float64:
 
 
 def find_apart(
-    views: Sequence[PosedView], points: Float64
+    views: Sequence[SourceView], points: Float64
 ) -> tuple[npt.NDArray[np.bool_], list[StrayCamera]]:
     """Find the cameras that must not decide on lengths, and those of them whose pose is wrong.
 
-    Args:
-        views: all views, with finite poses.
-        points: [M, 3] in the same world; may be empty.
-
-    Returns:
-        Whether each view must not decide on lengths [V], and the cameras whose pose is wrong.
+    Poses are finite, and points [M, 3] are in the same world. Returns whether each view must not decide on
+    lengths [V], and the cameras whose pose is wrong.
     """
     centres = camera_centres(np.stack([view.world_to_camera for view in views]))
     middle = np.median(centres, axis=0)
@@ -113,7 +93,7 @@ def find_apart(
     return apart, strays
 
 
-def _shown(view: PosedView, points: Float64) -> float:
+def _shown(view: SourceView, points: Float64) -> float:
     """Return the share of an image's sides on which a view shows the inner 90 % of what it sees."""
     x, y, depth = view.world_to_camera[:3, :3] @ points.T + view.world_to_camera[:3, 3:]
     front = depth > 0
@@ -143,9 +123,9 @@ def depths_seen(camera: Camera, points: Float64) -> Float64:
 class Sight:
     """What the views see of the points, by a sample of them."""
 
+    # [V] depth of the nearest points that each view sees, without the nearest 2 % of them; infinite for a
+    # view that sees none.
     nearest: Float64
-    """[V] depth of the nearest points that each view sees, without the nearest 2 % of them; infinite for a
-    view that sees none."""
     names: list[str]
 
     @classmethod
@@ -176,12 +156,7 @@ class Sight:
         return len(blind)
 
     def near(self, views: Sequence[int], extent: float) -> float:
-        """Return the near plane: less than the depth of what the views see, and at most 0.01 x the extent.
-
-        Args:
-            views: the views that decide.
-            extent: of the scene.
-        """
+        """Return the near plane: less than the depth of what views see, and at most 0.01 x the extent."""
         most = NEAR_OF_EXTENT * extent
         depths = np.sort(self.nearest[list(views)])
         depths = depths[np.isfinite(depths)]
@@ -200,12 +175,7 @@ class Sight:
 
 
 def measured_extent(centres: Float64, points: Float64) -> float:
-    """Return the extent of a scene: see `Capture.extent`.
-
-    Args:
-        centres: of the training cameras that decide on lengths, [V, 3].
-        points: [M, 3] in the same world.
-    """
+    """Return a scene's extent (`Capture.extent`) by its training cameras [V, 3] and points [M, 3]."""
     extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     distance = float(np.median(np.linalg.norm(points - centres[0], axis=1)))
     if extent > _LEAST_SPREAD * distance:
@@ -221,10 +191,9 @@ def measured_extent(centres: Float64, points: Float64) -> float:
 def random_points(
     cameras: Sequence[Camera], offset: Float64, count: int
 ) -> tuple[Float64, npt.NDArray[np.uint8]]:
-    """Return uniform points of random colours in the region that cameras look at, in the capture's own world.
+    """Return uniform points of random colours in the region that cameras look at, in the capture's world.
 
-    Raises:
-        ValueError: all cameras are in one place.
+    ValueError: all cameras are in one place.
     """
     poses = np.stack([camera.world_to_camera for camera in cameras])
     centres, axes = camera_centres(poses), poses[:, 2, :3]

@@ -112,10 +112,8 @@ def check_lens(lens: Lens) -> str:
     """Return what is unusual about a lens, or an empty text.
 
     The limits are far from what is built: from a fisheye of 250 degrees to a telescope, pixels four times as
-    long as wide (anamorphic lenses have two), and a tile cut from a picture ten times as long.
-
-    Raises:
-        ValueError: no camera has such a lens; names the values.
+    long as wide (anamorphic lenses have two), and a tile cut from a picture ten times as long. ValueError: no
+    camera has such a lens; names the values.
     """
     fx, fy, cx, cy = lens.intrinsics
     side = max(lens.width, lens.height)

@@ -29,15 +29,10 @@ def find_masks(
 ) -> list[Path | None]:
     """Return the mask of each image, or None.
 
-    Args:
-        root: folder of the capture.
-        masks: folder of masks relative to it; None: `masks/` if it exists; True: `masks/`; False: no masks.
-        names: of the images, relative to their folder or to the capture.
-        given: the masks that the capture's file names.
-
-    Raises:
-        FileNotFoundError: there is no such folder, or a mask that the file names is missing.
-        ValueError: no file of the folder belongs to an image, or a file belongs to several.
+    Names are relative to the images' folder or to the capture; `given` are the masks that the capture's file
+    names. `masks` is a folder relative to `root`; None: `masks/` if it exists; True: `masks/`; False: no
+    masks. FileNotFoundError: there is no such folder, or a mask that the file names is missing. ValueError:
+    no file of the folder belongs to an image, or a file belongs to several.
     """
     if masks is False:
         return [None] * len(names)
@@ -80,9 +75,6 @@ def _owners(folder: Path, files: Sequence[str], names: Sequence[str | None]) -> 
 
     Every place that a mask of an image may have is a claim on the file there. A file belongs to the image
     with the best claim; of two equally good ones neither may be right.
-
-    Raises:
-        ValueError: two images have equally good claims.
     """
     by_path: dict[str, list[str]] = defaultdict(list)
     for file in files:
@@ -139,19 +131,14 @@ def _places(name: str) -> Iterator[str]:
             yield "/".join((*parts[begin:-1], form.format(name=path.name, stem=path.stem) + suffix))
 
 
-def excluded_share(masks: Sequence[Path | None]) -> float | None:
-    """Return the mean share of the pixels that masks exclude, of a few of them; None: there are no masks.
-
-    Warns if these exclude nothing, or everything. Damaged masks are left to whoever needs them.
-    """
+def check_masks(masks: Sequence[Path | None]) -> None:
+    """Warn if a few of the masks exclude nothing, or everything; damaged ones are left to who needs them."""
     paths = [path for path in dict.fromkeys(masks) if path is not None]
-    if not paths:
-        return None
     sample = [paths[i * len(paths) // min(_SAMPLED, len(paths))] for i in range(min(_SAMPLED, len(paths)))]
     with ThreadPoolExecutor(_SAMPLED) as pool:
         shares = [share for share in pool.map(_share, sample) if share is not None]
     if not shares:
-        return None
+        return
     if max(shares) == 0:
         warnings.warn(
             f"the masks exclude nothing ({len(shares)} of {len(paths)} were looked at; first: {sample[0]}): "
@@ -165,7 +152,6 @@ def excluded_share(masks: Sequence[Path | None]) -> float | None:
             "too; write masks as PNG with white where pixels count, or use --data.masks=false",
             stacklevel=3,
         )
-    return sum(shares) / len(shares)
 
 
 def _share(path: Path) -> float | None:

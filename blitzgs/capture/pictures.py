@@ -54,8 +54,7 @@ def save_image(path: Path | str, image: Tensor) -> None:
 def encode_image(image: Tensor, suffix: str) -> bytes:
     """Return an RGB image, float [H, W, 3] in [0, 1] or uint8, as a file of the format of `suffix`.
 
-    Raises:
-        ValueError: the format is not known, or the image has another shape.
+    ValueError: the format is not known, or the image has another shape.
     """
     if image.dim() != 3 or image.shape[2] != 3:
         raise ValueError(f"an image must be [H, W, 3], got {list(image.shape)}")
@@ -73,14 +72,8 @@ def error_map(
 ) -> Tensor:
     """Return the mean absolute error over channels as colours from dark blue (0) to red (`full` or more).
 
-    Args:
-        render: float [H, W, 3].
-        target: float or uint8 [H, W, 3].
-        mask: uint8 [H, W]; pixels with 0 become grey; or None.
-        full: the error, in [0, 1], that the last colour shows.
-
-    Returns:
-        uint8 RGB [H, W, 3] on the CPU.
+    Images are float (the target also uint8), [H, W, 3]; pixels with 0 in the mask, uint8 [H, W], become grey.
+    Returns uint8 RGB [H, W, 3] on the CPU.
     """
     truth = target.cpu().float() / 255 if target.dtype == torch.uint8 else target.cpu().float()
     error = (render.detach().cpu().float().clamp(0, 1) - truth).abs().mean(dim=-1)
@@ -110,11 +103,5 @@ def strip(images: Sequence[Tensor], labels: Sequence[str]) -> Tensor:
 
 
 def comparison(render: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return render | photograph | error of one view side by side, uint8 RGB.
-
-    Args:
-        render: float [H, W, 3].
-        target: float or uint8 [H, W, 3].
-        mask: uint8 [H, W] of the pixels that count, or None.
-    """
+    """Return render | photograph | error of one view side by side, uint8 RGB; arguments of `error_map`."""
     return strip([render, target, error_map(render, target, mask)], _LABELS)

@@ -12,28 +12,80 @@ from __future__ import annotations
 import math
 import mmap
 import os
+import threading
 import weakref
+from collections import OrderedDict
 from collections.abc import Hashable, Mapping
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from blitzgs.capture.image_files import UInt8
 from blitzgs.formats import native
 
+K = TypeVar("K")
+V = TypeVar("V")
+
+
+class BoundedCache(Generic[K, V]):
+    """A least-recently-used cache with a budget of bytes; an entry larger than the budget is not stored.
+
+    Attributes:
+        budget: the largest size, in bytes.
+        bytes: the size now.
+        most_bytes: the largest size so far.
+    """
+
+    def __init__(self, budget: int) -> None:
+        """Hold at most `budget` bytes."""
+        self.budget = budget
+        self.bytes = 0
+        self.most_bytes = 0
+        self._entries: OrderedDict[K, tuple[V, int]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: K) -> V | None:
+        """Return the entry and mark it as the most recently used; None if it is not stored."""
+        with self._lock:
+            if key not in self._entries:
+                return None
+            self._entries.move_to_end(key)
+            return self._entries[key][0]
+
+    def put(self, key: K, value: V, size: int, spare: bool = False) -> None:
+        """Add or replace an entry of `size` bytes, dropping the oldest until all fit.
+
+        A spare entry drops no other one, and is the first to be dropped.
+        """
+        with self._lock:
+            if key in self._entries:
+                self.bytes -= self._entries.pop(key)[1]
+            if size > self.budget or (spare and self.bytes + size > self.budget):
+                return
+            while self.bytes + size > self.budget:
+                self.bytes -= self._entries.popitem(last=False)[1][1]
+            self._entries[key] = (value, size)
+            self._entries.move_to_end(key, last=not spare)
+            self.bytes += size
+            self.most_bytes = max(self.most_bytes, self.bytes)
+
+    def resize(self, budget: int) -> None:
+        """Change the budget, dropping the oldest entries until the others fit."""
+        with self._lock:
+            self.budget = budget
+            while self.bytes > budget:
+                self.bytes -= self._entries.popitem(last=False)[1][1]
+
+
 _TOKEN_BYTES, _ALIGNMENT = 16, 64
 
 
 class SharedMemoryOffer(NamedTuple):
-    """How other processes of the host find the memory of `SharedImages`.
+    """How other processes of the host find the memory of `SharedImages`."""
 
-    Attributes:
-        path: file under /proc that is this memory, while the process that made it lives.
-        token: the first bytes of the memory. They tell it from another one that has the same path in another
-            container.
-    """
-
-    path: str
+    path: str  # file under /proc that is this memory, while the process that made it lives
+    # The first bytes of the memory. They tell it from another one that has the same path in another
+    # container.
     token: bytes
 
 
@@ -55,11 +107,7 @@ class SharedImages:
 
     @classmethod
     def create(cls, shapes: Mapping[Hashable, tuple[int, ...]]) -> tuple[SharedImages, SharedMemoryOffer]:
-        """Make memory for uint8 images of these shapes; it takes up memory only as images are put there.
-
-        Raises:
-            OSError: the system has no such memory.
-        """
+        """Make memory for uint8 images of these shapes (OSError: the system has none); images fill it up."""
         file = os.memfd_create("blitzgs-images")
         os.ftruncate(file, size_of(shapes))
         images = cls(file, shapes)
@@ -69,11 +117,7 @@ class SharedImages:
 
     @classmethod
     def join(cls, offer: SharedMemoryOffer, shapes: Mapping[Hashable, tuple[int, ...]]) -> SharedImages:
-        """Map the memory that another process of the host has made for the same shapes.
-
-        Raises:
-            OSError: this process has no access to it.
-        """
+        """Map the memory that another process of the host made for the same shapes (OSError: no access)."""
         file = os.open(offer.path, os.O_RDWR)
         if os.fstat(file).st_size != size_of(shapes):
             os.close(file)

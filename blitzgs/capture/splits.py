@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
-from blitzgs.capture.files import read_lines
 from blitzgs.capture.layouts import SourceView
+from blitzgs.capture.names import read_lines
 
 DEFAULT_EVERY = 8
 
@@ -20,11 +20,7 @@ def every_nth(count: int, n: int) -> list[int]:
 
 
 def from_list(names: Sequence[str], path: Path) -> list[int]:
-    """Return the test views that a text file names, one per line, with or without folder and suffix.
-
-    Raises:
-        ValueError: a line names no view, or several.
-    """
+    """Return the test views that a text file names, one per line, with or without folder and suffix."""
     lookup: dict[str, set[int]] = {}
     for index, name in enumerate(names):
         pure = PurePath(name)
@@ -58,15 +54,9 @@ def split_views(
 ) -> tuple[list[int], list[int]]:
     """Return train and test views, both ascending.
 
-    Args:
-        names: of all views, in their order.
-        paths: of their image files.
-        root: folder of the capture.
-        spec: n (every n-th), "val" (Mega-NeRF's layout), a list file (relative to `root` or as it is), or
-            "auto": "val" if such a folder has views, else every 8th.
-
-    Raises:
-        ValueError: the list names unknown views, or no training view is left.
+    `spec` is n (every n-th), "val" (Mega-NeRF's layout), a list file (relative to `root` or as it is), or
+    "auto": "val" if such a folder has views, else every 8th. ValueError: the list names unknown views, or no
+    training view is left.
     """
     if isinstance(spec, str) and spec.removeprefix("-").isdigit():
         spec = int(spec)
@@ -95,11 +85,7 @@ def split_views(
 
 
 def without_unused(views: list[SourceView], spec: int | str | Path) -> list[SourceView]:
-    """Return the views without those that the capture's own lists leave out, if these decide.
-
-    Raises:
-        ValueError: a view is in the list of training views and in one of held-out views.
-    """
+    """Return the views without those that the capture's own lists leave out, if these decide."""
     if spec != "auto":
         return views
     both = [view.name for view in views if view.part == "both"]

@@ -44,9 +44,9 @@ class Frame:
     mask_path: Path | None
     lens: Lens
     world_to_camera: Float64
+    # "train" or "test" (held out) by the files, "unused" if it is in none of their lists, "both" if it is in
+    # two that exclude each other; None if they do not say.
     part: str | None
-    """"train" or "test" (held out) by the files, "unused" if it is in none of their lists, "both" if it is in
-    two that exclude each other; None if they do not say."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,9 @@ class Transforms:
     frames: list[Frame]
     points_path: Path | None
     files: list[Path]
-    split: str
-    """What in the files decides on the split, as text; empty if nothing does."""
-    notes: list[str]
-    """What was decided between fields, and which fields have no effect."""
-    applied: Float64 | None = None
-    """[3, 4] what nerfstudio applied to COLMAP's world, where it says so."""
+    split: str  # what in the files decides on the split, as text; empty if nothing does
+    notes: list[str]  # what was decided between fields, and which fields have no effect
+    applied: Float64 | None = None  # [3, 4] what nerfstudio applied to COLMAP's world, where it says so
 
     def moved(self, positions: Float64) -> Float64:
         """Return positions [N, 3] of COLMAP's world in that of the frames."""
@@ -81,8 +78,7 @@ def find_transforms(root: Path) -> list[Path]:
 def read_transforms(root: Path, files: Sequence[Path] | None = None) -> Transforms:
     """Read every frame of a capture, or of the given files, whose images are relative to `root`.
 
-    Raises:
-        ValueError: a field is missing or makes no sense; names the file, the frame and the field.
+    ValueError: a field is missing or makes no sense; names the file, the frame and the field.
     """
     frames: list[Frame] = []
     points_path, applied = None, None

@@ -52,16 +52,10 @@ FIELDS = frozenset(
 
 
 def read_lens(root: Fields, frame: Fields, path: Path, notes: dict[str, None]) -> Lens:
-    """Return the lens of a frame.
+    """Return the lens of a frame; its image's size is used if the fields have none.
 
-    Args:
-        root: fields of the file.
-        frame: fields of the frame.
-        path: the frame's image, whose size is used if the fields have none.
-        notes: gets what was decided between fields that say different things, as its keys.
-
-    Raises:
-        ValueError: a field is missing, makes no sense or would have no effect; names it.
+    `notes` gets, as its keys, what was decided between fields that say different things. ValueError: a field
+    is missing, makes no sense or would have no effect; names it.
     """
     merged = {**root, **frame}
     _refuse_other_projections(merged)
@@ -80,11 +74,7 @@ def read_lens(root: Fields, frame: Fields, path: Path, notes: dict[str, None]) -
 
 
 def number(fields: Fields, key: str, default: float | None = None) -> float:
-    """Return a field that must be a finite number (as text too).
-
-    Raises:
-        ValueError: it is something else, or absent without a default; names it.
-    """
+    """Return a field that must be a finite number (as text too), or a default; ValueError names it."""
     value = fields.get(key, default)
     try:
         if isinstance(value, bool) or not isinstance(value, (int, float, str)):

@@ -30,11 +30,9 @@ class Rectification:
     lens: Lens
     width: int
     height: int
-    x0: int
-    """Column of the old pixel grid at which the new image begins (negative: left of the old image)."""
+    x0: int  # column of the old pixel grid at which the new image begins (negative: left of the old image)
     y0: int
-    has_invalid: bool
-    """Whether some pixels of the new image were not seen."""
+    has_invalid: bool  # whether some pixels of the new image were not seen
 
     @property
     def is_identity(self) -> bool:
@@ -78,8 +76,7 @@ class Rectification:
 def rectify(lens: Lens, policy: str = "crop") -> Rectification:
     """Choose the pinhole image for a lens; `policy` is "crop" or "mask".
 
-    Raises:
-        ValueError: hardly anything of the image can be kept (damaged distortion parameters).
+    ValueError: hardly anything of the image can be kept (damaged distortion parameters).
     """
     if lens.is_pinhole:
         return Rectification(lens, lens.width, lens.height, 0, 0, has_invalid=False)

@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from blitzgs.capture import transforms
 from blitzgs.capture.cameras import Camera, Float64
-from blitzgs.capture.layouts import SourceView
+from blitzgs.capture.layouts import SourceView, read_layout
 from blitzgs.capture.lengths import StrayCamera, random_points
 from blitzgs.capture.lens import Lens, check_lens
 from blitzgs.capture.points import SourcePoints
+from blitzgs.capture.undistort import rectify
 
 # Coordinates from here on are damage; the squares of smaller ones are finite.
 _FARTHEST = 1e100
@@ -27,11 +29,7 @@ def _is_usable(coordinates: Float64) -> npt.NDArray[np.bool_]:
 
 
 def with_finite_poses(views: list[SourceView]) -> list[SourceView]:
-    """Return the views whose pose is finite; warn of the others.
-
-    Raises:
-        ValueError: there is none.
-    """
+    """Return the views whose pose is finite; warn of the others (ValueError: there is none)."""
     finite = [view for view in views if _is_usable(view.world_to_camera).all()]
     if not finite:
         raise ValueError(f"none of the {len(views)} views has a pose (a finite rotation and translation)")
@@ -113,3 +111,34 @@ def points_at_random(root: Path, cameras: Sequence[Camera], offset: Float64) -> 
         return SourcePoints(*random_points(cameras, offset, _RANDOM_POINTS))
     except ValueError as error:
         raise ValueError(f"{root}: {error}") from error
+
+
+def read_cameras(path: Path, offset: Float64) -> list[Camera]:
+    """Read the cameras of a transforms file of any name, or of a folder with one or with a COLMAP model.
+
+    Lenses with distortion become pinhole cameras, as in a capture; `offset` [3] is subtracted from the
+    positions. FileNotFoundError: there is no such file, or no camera in the folder. ValueError: a file is
+    damaged, or has no camera.
+    """
+    if path.is_file():
+        read = transforms.read_transforms(path.parent, [path])
+        views = [SourceView(f.name, f.path, None, f.lens, f.world_to_camera) for f in read.frames]
+    elif path.is_dir():
+        views, _, _ = read_layout(path, "images", 1)
+    else:
+        raise FileNotFoundError(f"{path}: there is no such transforms file or folder of a COLMAP model")
+    if not views:
+        raise ValueError(f"{path} has no cameras")
+    check_lenses(views)
+    views = sorted(with_finite_poses(views), key=lambda view: view.name)
+    return [_pinhole(view, offset) for view in views]
+
+
+def _pinhole(view: SourceView, offset: Float64) -> Camera:
+    try:
+        plan = rectify(view.lens, "crop")
+    except ValueError as error:
+        raise ValueError(f"the camera of {view.name}: {error}") from error
+    pose = view.world_to_camera.copy()
+    pose[:3, 3] += pose[:3, :3] @ offset
+    return Camera(view.name, plan.width, plan.height, plan.K, pose, view.path, None, 1, plan)

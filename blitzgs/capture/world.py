@@ -93,18 +93,10 @@ class WorldFrame:
 
 
 def fit_similarity(capture: Float64, world: Float64, crs: str = "", source: str = "") -> WorldFrame:
-    """Return the similarity that maps points of a capture to the world by least squares.
+    """Return the similarity that maps points of a capture to the world, [N, 3] each, by least squares.
 
     S. Umeyama, Least-squares estimation of transformation parameters between two point patterns, PAMI 1991.
-
-    Args:
-        capture: [N, 3], N >= 3.
-        world: [N, 3], the same points.
-        crs: see `WorldFrame`.
-        source: see `WorldFrame`.
-
-    Raises:
-        ValueError: there are fewer than three points, or they lie on a line: a turn around it is free.
+    ValueError: there are fewer than three points, or they lie on a line: a turn around it is free.
     """
     if len(capture) < 3:
         raise ValueError(f"a similarity needs at least 3 points, got {len(capture)}: measure more")
@@ -125,11 +117,7 @@ def fit_similarity(capture: Float64, world: Float64, crs: str = "", source: str 
 
 
 def read_frame(path: Path) -> WorldFrame:
-    """Read `geo.json`.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
+    """Read `geo.json` (ValueError: the file is damaged)."""
     try:
         content = json.loads(read_small(path))
         crs, scale = content.get("crs", ""), content.get("scale", 1.0)
@@ -157,10 +145,7 @@ def frame_beside(root: Path) -> WorldFrame | None:
     """Return the frame that a file in the folder of a capture gives; None: there is no such file.
 
     It is `geo.json`, or an offset (`offset.xyz`, `*_offset.xyz` or `offset.txt`: three numbers to add), with
-    the reference system in a `.prj` beside it, if there is one.
-
-    Raises:
-        ValueError: the file is damaged.
+    the reference system in a `.prj` beside it, if there is one. ValueError: the file is damaged.
     """
     if (root / GEO).is_file():
         return read_frame(root / GEO)
@@ -169,11 +154,7 @@ def frame_beside(root: Path) -> WorldFrame | None:
 
 
 def read_offset(path: Path, prj: list[Path]) -> WorldFrame:
-    """Read a file of three numbers that are added to a capture's coordinates.
-
-    Raises:
-        ValueError: there are no three numbers.
-    """
+    """Read a file of three numbers that are added to a capture's coordinates (else ValueError)."""
     words = re.split(r"[\s,;]+", read_small(path).strip())
     try:
         offset = np.array([float(word) for word in words])
@@ -196,11 +177,7 @@ def utm_of_text(text: str) -> str:
 def enu_frame(latitude: float, longitude: float, altitude: float, source: str) -> WorldFrame:
     """Return the frame of a capture whose axes are east, north and up at a place of WGS 84.
 
-    Args:
-        latitude: degrees.
-        longitude: degrees.
-        altitude: metres above the ellipsoid.
-        source: see `WorldFrame`.
+    Latitude and longitude are in degrees, the altitude in metres above the ellipsoid.
     """
     if not (abs(latitude) <= 90 and abs(longitude) <= 360 and abs(altitude) < 1e6):  # NaN too
         raise ValueError(f"{source}: no place on earth: {latitude}, {longitude}, {altitude}")
@@ -226,11 +203,7 @@ def geodetic(position: Float64) -> tuple[float, float, float]:
 
 
 def pyproj_module() -> Any:
-    """Return the package pyproj, which knows the reference systems.
-
-    Raises:
-        ImportError: it is not installed.
-    """
+    """Return the package pyproj, which knows the reference systems (ImportError: it is not installed)."""
     try:
         import pyproj
     except ImportError as error:
@@ -241,9 +214,8 @@ def pyproj_module() -> Any:
 def converted(positions: Float64, source: Any, target: Any) -> Float64:
     """Return positions [N, 3] of one reference system in another one, x east and y north.
 
-    Raises:
-        ImportError: pyproj is not installed.
-        ValueError: a reference system is unknown, or a position has no coordinates in it.
+    ImportError: pyproj is not installed. ValueError: a system is unknown, or a position has no coordinates in
+    it.
     """
     pyproj = pyproj_module()
     try:
@@ -257,19 +229,11 @@ def converted(positions: Float64, source: Any, target: Any) -> Float64:
 
 
 def frame_in(frame: WorldFrame, crs: str, places: Float64) -> tuple[WorldFrame, float]:
-    """Return a frame in another reference system, and its largest error.
+    """Return a frame in another reference system with lengths ("EPSG:32633"), and its largest error.
 
     A map projection is no similarity of space: the error is what the earth's curvature and the projection's
-    scale make of the difference at the places.
-
-    Args:
-        frame: of the capture.
-        crs: wanted, as "EPSG:32633"; its axes must be lengths.
-        places: positions of the capture where the frame must be right, [N, 3].
-
-    Raises:
-        ImportError: pyproj is not installed.
-        ValueError: the reference system is unknown or has angles, or the places are too few.
+    scale make of the difference at the places of the capture, [N, 3]. ImportError: pyproj is not installed.
+    ValueError: the reference system is unknown or has angles, or the places are too few.
     """
     pyproj = pyproj_module()
     try:
@@ -309,10 +273,8 @@ _GPS, _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTI
 def gps_positions(paths: Sequence[Path]) -> list[tuple[float, float, float] | None]:
     """Return longitude, latitude (degrees) and height (metres) of each photograph; None: it has none.
 
-    The height is the receiver's: above the ellipsoid or above sea level, as EXIF does not say.
-
-    Raises:
-        ImportError: Pillow, which reads the tags, is not installed.
+    The height is the receiver's: above the ellipsoid or above sea level, as EXIF does not say. ImportError:
+    Pillow, which reads the tags, is not installed.
     """
     try:
         from PIL import Image

@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -20,7 +20,7 @@ from types import FrameType
 from typing import cast
 
 from blitzgs import __version__
-from blitzgs.cli.flags import Parser, check_given_once, flag_meant, split_fields
+from blitzgs.cli.arguments import Parser, check_given_once, flag_meant, split_fields
 from blitzgs.util.terminal import Output, printable, surviving_output
 
 HELP = """\
@@ -36,7 +36,7 @@ These commands lead from photographs to a capture (with cameras), to pictures an
 blitzgs train --help explains the training; blitzgs train --help FIELD explains a field of its configuration.
 """
 
-# For each command the module that has it, and what it does.
+# For each command the module, with the function that adds it if that is not `add_to`, and what it does.
 COMMANDS = {
     "sfm": ("blitzgs.cli.sfm", "find out where photographs were taken from, and write a capture"),
     "train": ("blitzgs.cli.train", "train a model of photographs with known cameras"),
@@ -44,17 +44,14 @@ COMMANDS = {
     "render": ("blitzgs.cli.render", "render views of a model to pictures, or a path to a film"),
     "view": ("blitzgs.cli.view", "look at a model in the browser"),
     "report": ("blitzgs.cli.report", "write the report of a run"),
-    "compare": ("blitzgs.cli.compare", "put runs side by side"),
-    "export": (
-        "blitzgs.cli.export",
-        "write a model as PLY, SOG, SPZ, GLB ..., or as one HTML file to send",
-    ),
+    "compare": ("blitzgs.cli.report:add_compare", "put runs side by side"),
+    "export": ("blitzgs.cli.export", "write a model as PLY, SOG, SPZ, GLB ..., or as one HTML file to send"),
     "align": ("blitzgs.cli.align", "find out where a model lies in the world: control points, GPS, a CRS"),
     "gate": ("blitzgs.cli.gate", "fit and evaluate spawn gates, which make smaller models"),
     "doctor": ("blitzgs.cli.doctor", "check this installation"),
     "completion": ("blitzgs.cli.completion", "print a script that completes commands in a shell"),
     "synth": (
-        "blitzgs.cli.synth",
+        "blitzgs.cli.arguments:add_synth",
         "make a synthetic city: photographs, cameras and points to train on",
     ),
 }
@@ -99,7 +96,8 @@ def _run(given: list[str]) -> int:
     warnings.formatwarning = lambda message, *_, **__: printable(f"{name}: warning: {message}\n")
     try:
         with _quiet_interrupt(name):
-            parser, command = _parser(chosen)
+            parser, commands = parser_of([chosen])
+        command = commands.get(chosen)
         if not given:
             parser.print_help(sys.stderr)
             return 2
@@ -135,30 +133,18 @@ def _arguments(parser: Parser, command: Parser | None, chosen: str, given: list[
     return args
 
 
-def _parser(chosen: str) -> tuple[Parser, Parser | None]:
-    """Return the parser of all commands, and that of the chosen one, whose module alone is imported."""
-    parser, commands = _new_parser()
-    for name, (module, summary) in COMMANDS.items():
-        if name == chosen:
-            import_module(module).add_to(commands, summary)
-        else:
-            commands.add_parser(name, help=summary)
-    return parser, commands.choices[chosen] if chosen in COMMANDS else None
-
-
-def parser_of_all() -> tuple[Parser, dict[str, str]]:
-    """Return the parser of all commands, whose modules are imported, and what each command does."""
-    parser, commands = _new_parser()
-    for module, summary in COMMANDS.values():
-        import_module(module).add_to(commands, summary)
-    return parser, {name: summary for name, (_, summary) in COMMANDS.items()}
-
-
-def _new_parser() -> tuple[Parser, argparse._SubParsersAction[Parser]]:
+def parser_of(chosen: Container[str]) -> tuple[Parser, dict[str, Parser]]:
+    """Return the parser of all commands, and each command's; only the chosen ones' modules are imported."""
     parser = Parser(prog="blitzgs", description=HELP, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--version", action="version", version=f"blitzgs {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    return parser, commands
+    for name, (place, summary) in COMMANDS.items():
+        if name in chosen:
+            module, _, function = place.partition(":")
+            getattr(import_module(module), function or "add_to")(commands, summary)
+        else:
+            commands.add_parser(name, help=summary)
+    return parser, commands.choices
 
 
 @contextmanager

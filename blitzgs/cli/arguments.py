@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arguments that several commands share."""
+"""Arguments that several commands share, and how flags are read: none of them twice or shortened."""
 
 from __future__ import annotations
 
@@ -14,6 +14,11 @@ from blitzgs.config.ranges import RANGES
 if TYPE_CHECKING:
     from blitzgs.capture.capture import Capture
     from blitzgs.runs.cameras import RunCameras
+import difflib
+import re
+from typing import NoReturn
+
+from blitzgs.util.terminal import printable
 
 Number = TypeVar("Number", int, float)
 Commands = argparse._SubParsersAction  # argparse has no public name for it
@@ -40,6 +45,13 @@ def add_command(
     )
     parser.set_defaults(run=function, parser=parser)
     return parser
+
+
+def add_synth(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
+    """Add `blitzgs synth`, a package of its own."""
+    from blitzgs_synth import command
+
+    command.add_arguments(add_command(commands, "synth", command.run, summary))
 
 
 def named_path(text: str) -> Path:
@@ -110,11 +122,7 @@ def add_split(parser: argparse.ArgumentParser, verb: str) -> None:
 
 
 def chosen_views(split: str, cameras: Capture | RunCameras, folder: Path) -> Sequence[int]:
-    """Return the cameras that --split names, as indices.
-
-    Raises:
-        ValueError: there are none; names the run's folder.
-    """
+    """Return the cameras that --split names, as indices (ValueError: the run in `folder` has none)."""
     indices: Sequence[int] = range(len(cameras.cameras)) if split == "all" else getattr(cameras, split)
     if not indices:
         raise ValueError(f"{folder} has no {split} views: choose another --split")
@@ -134,3 +142,79 @@ def add_device(parser: argparse.ArgumentParser, shares_gpus: bool = False) -> No
             action="store_true",
             help="with torchrun: let several processes use one GPU (slow)",
         )
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser without abbreviations, whose messages contain no control characters."""
+
+    def __init__(self, *arguments: object, **settings: object) -> None:
+        super().__init__(*arguments, **settings | {"allow_abbrev": False})  # type: ignore[arg-type]
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and a message, and exit with status 2."""
+        super().error(printable(message))
+
+
+def split_fields(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return a command's arguments without configuration fields, and these as "--section.field=value".
+
+    A field is a flag with a dot, or one that the command does not have and that has a value after "=". Its
+    value follows after "=" or as the next argument.
+    """
+    others: list[str] = []
+    fields: list[str] = []
+    known = flags_of(parser)
+    waiting = list(arguments)
+    while waiting:
+        text = waiting.pop(0)
+        name, equals, _ = text.partition("=")
+        if text == "--":
+            return [*others, text, *waiting], fields
+        if not name.startswith("--") or name in known or not (equals or "." in name):
+            others.append(text)
+            # The value of a flag is no field, even if it looks like one.
+            if name in known and not equals and known[name] and waiting and not waiting[0].startswith("--"):
+                others.append(waiting.pop(0))
+        elif equals:
+            if "." not in name and (meant := flag_meant(parser, name)):
+                parser.error(f"unrecognized arguments: {text}; did you mean {meant}?")
+            fields.append(text)
+        elif waiting and not waiting[0].startswith("--"):
+            fields.append(f"{text}={waiting.pop(0)}")
+        else:
+            parser.error(f"{text} needs a value: write {text}=VALUE")
+    return others, fields
+
+
+def check_given_once(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> None:
+    """Refuse a value that is given twice, of which the last one would win without a word."""
+    seen: set[str] = set()
+    switches = {flag for flag, has_value in flags_of(parser).items() if not has_value}
+    for text in arguments:
+        if text == "--":
+            return
+        name = text.partition("=")[0]
+        if name.startswith("--") and name in seen - switches:
+            parser.error(f"{name} is given twice: leave out one of them")
+        seen.add(name)
+
+
+def flags_of(parser: argparse.ArgumentParser) -> dict[str, bool]:
+    """Return the long flags of a command, and whether each takes a value."""
+    return {
+        flag: action.nargs != 0
+        for action in parser._actions  # argparse has no public list of them
+        for flag in action.option_strings
+        if flag.startswith("--")
+    }
+
+
+def flag_meant(parser: argparse.ArgumentParser, text: str) -> str | None:
+    """Return the command's flag that an unknown one resembles; None for a field and if no flag is like it."""
+    name = text.partition("=")[0]
+    flags = re.findall(r"--[\w-]+", parser.format_usage())
+    if not name.startswith("--") or "." in name:
+        return None
+    if len(longer := [flag for flag in flags if flag.startswith(name)]) == 1:
+        return longer[0]
+    return next(iter(difflib.get_close_matches(name, flags, n=1, cutoff=0.75)), None)

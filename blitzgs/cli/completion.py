@@ -7,7 +7,7 @@ import argparse
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from blitzgs.cli import parser_of_all
+from blitzgs.cli import COMMANDS, parser_of
 from blitzgs.cli.arguments import Commands, add_command
 from blitzgs.config.fields import Config
 from blitzgs.config.files import to_dict
@@ -43,33 +43,20 @@ complete -o default -F _blitzgs blitzgs
 
 
 class Flag(NamedTuple):
-    """A flag of a command.
+    """A flag of a command."""
 
-    Attributes:
-        name: with its dashes.
-        takes_value: whether a value follows.
-        choices: the values, where they are few.
-        help: what it does.
-    """
-
-    name: str
+    name: str  # with its dashes
     takes_value: bool
-    choices: list[str]
+    choices: list[str]  # where the values are few
     help: str
 
 
 class Command(NamedTuple):
-    """A command.
-
-    Attributes:
-        summary: what it does.
-        flags: those of it and of its actions.
-        actions: words that may follow it, such as `fit` after `gate`.
-    """
+    """A command."""
 
     summary: str
-    flags: list[Flag]
-    actions: list[str]
+    flags: list[Flag]  # also of its actions
+    actions: list[str]  # words that may follow it, such as `fit` after `gate`
 
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
@@ -108,8 +95,7 @@ def script(shell: str) -> str:
 
 def collect() -> dict[str, Command]:
     """Return all commands with their flags, from their parsers."""
-    parser, summaries = parser_of_all()
-    found = {name: _command(sub, summaries[name]) for name, sub in _children(parser).items()}
+    found = {name: _command(sub, COMMANDS[name][1]) for name, sub in parser_of(COMMANDS)[1].items()}
     for section, values in to_dict(Config()).items():
         names = [f"{section}.{name}" for name in values] if isinstance(values, dict) else [section]
         found["train"].flags.extend(Flag(f"--{name}", True, [], "a field") for name in names)

@@ -54,23 +54,14 @@ _REINSTALL = "pip install --force-reinstall --no-deps blitzgs (in a checkout: ma
 
 @dataclass
 class Line:
-    """A line of the report.
+    """A line of the report."""
 
-    Attributes:
-        name: what was looked at.
-        state: see `HELP`.
-        text: what was found.
-        remedy: what mends it; "": nothing has to be mended.
-        required: BlitzGS cannot do without it.
-        values: figures for programs.
-    """
-
-    name: str
-    state: State
-    text: str
-    remedy: str = ""
-    required: bool = True
-    values: dict[str, Any] = field(default_factory=dict)
+    name: str  # what was looked at
+    state: State  # see `HELP`
+    text: str  # what was found
+    remedy: str = ""  # what mends it; "": nothing has to be mended
+    required: bool = True  # BlitzGS cannot do without it
+    values: dict[str, Any] = field(default_factory=dict)  # figures for programs
 
 
 class ProbeError(Exception):
@@ -113,12 +104,7 @@ def run(args: argparse.Namespace) -> int:
 
 def examine(folder: Path | None = None, timeout: float = 120.0) -> list[Line]:
     """Return the lines of the report."""
-    lines = [
-        Line("blitzgs", "ok", f"{__version__} in {_PACKAGE}"),
-        _system(),
-        _memory(),
-        *_packages(),
-    ]
+    lines = [Line("blitzgs", "ok", f"{__version__} in {_PACKAGE}"), _system(), _memory(), *_packages()]
     torch_line = _torch(timeout)
     gpus = torch_line.values.get("gpus", [])
     lines += [
@@ -146,11 +132,7 @@ def examine(folder: Path | None = None, timeout: float = 120.0) -> list[Line]:
 
 
 def probe(name: str, *arguments: str, timeout: float) -> dict[str, Any]:
-    """Run a probe in a process of its own and return what it found.
-
-    Raises:
-        ProbeError: it failed, crashed or took longer than `timeout` seconds.
-    """
+    """Run a probe in a process of its own and return what it found; raises ProbeError as `run_command`."""
     command = [sys.executable, "-m", "blitzgs.cli.doctor_probes", name, *arguments]
     output = run_command(command, timeout)
     try:
@@ -163,8 +145,7 @@ def probe(name: str, *arguments: str, timeout: float) -> dict[str, Any]:
 def run_command(command: Sequence[str], timeout: float) -> str:
     """Run a command, with all processes that it starts, and return its standard output.
 
-    Raises:
-        ProbeError: it cannot be started, failed, was killed or took longer than `timeout` seconds.
+    ProbeError: it cannot be started, failed, was killed or took longer than `timeout` seconds.
     """
     path = os.pathsep.join(filter(None, [str(_PACKAGE.parent), os.environ.get("PYTHONPATH")]))
     try:

@@ -182,13 +182,7 @@ def _spawns(path: Path) -> gate_fit.Spawns:
 
 
 def _spawns_of(folder: Path) -> gate_fit.Spawns:
-    """Read the spawns of a run.
-
-    Raises:
-        FileNotFoundError: the folder is no run, or has no lineage.
-        ValueError: the run is not finished, so it is not known which Gaussians survive; or its lineage is
-            damaged.
-    """
+    """Read the spawns of a run."""
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is not the folder of a run")
     lineage = folder / run_files.LINEAGE

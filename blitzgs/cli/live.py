@@ -48,11 +48,7 @@ def say_where_to_look(args: argparse.Namespace) -> None:
 
 
 def check_live_page(port: int | None) -> None:
-    """Check that the page's package is installed, before any work.
-
-    Raises:
-        ImportError: it is not.
-    """
+    """Check that the page's package is installed, before any work (ImportError: it is not)."""
     if port is not None:
         from blitzgs.viewer.page import require_viser
 

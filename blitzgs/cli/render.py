@@ -100,11 +100,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         help="with --path: dataparser_transforms.json of the nerfstudio training that the path was made for",
     )
     parser.add_argument(
-        "--out",
-        type=named_path,
-        required=True,
-        metavar="OUT",
-        help=f"folder for pictures, or FILE{SUFFIX}",
+        "--out", type=named_path, required=True, metavar="OUT", help=f"folder for pictures, or FILE{SUFFIX}"
     )
     parser.add_argument(
         "--exposure",
@@ -143,11 +139,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _film(args: argparse.Namespace) -> Film | None:
-    """Return what --path asks for; None: the command has no --path.
-
-    Raises:
-        ValueError: flags contradict each other; names them.
-    """
+    """Return what --path asks for; None: the command has no --path."""
     is_film = args.out.suffix.lower() == SUFFIX
     if args.path is None:
         for name in ("size", "fps", "seconds", "dataparser"):
@@ -169,12 +161,9 @@ def _film(args: argparse.Namespace) -> Film | None:
 def _renders(
     opened: Rendered, ranks: Ranks, destination: Callable[[int], int]
 ) -> Iterator[tuple[int, Tensor | None]]:
-    """Render the views, and yield the index of each and its colours, float32 [H, W, 3], on one rank.
+    """Render the views, and yield each index and its colours, float32 [H, W, 3], on the rank `destination`.
 
-    Args:
-        opened: model and views.
-        ranks: the job; every rank goes through all views.
-        destination: returns the rank that gets a view, by its position; the others get None.
+    Every rank goes through all views; `destination` depends on the position, and other ranks get None.
     """
     views, subject = ViewSet(list(opened.cameras), opened.space, ranks.device), opened.subject
     finder, owners = VisibleFinder(subject.scene, subject.lod), TileOwners(ranks)

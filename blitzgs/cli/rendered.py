@@ -13,7 +13,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.capture.own_cameras import read_cameras
+from blitzgs.capture.usable import read_cameras
 from blitzgs.cli.arguments import chosen_views
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
@@ -32,38 +32,20 @@ _SAMPLE = 50_000
 
 @dataclass(frozen=True)
 class Rendered:
-    """A model and the views to render of it.
+    """A model and the views to render of it."""
 
-    Attributes:
-        subject: the model, with this rank's Gaussians.
-        space: maps the trained world to the capture's.
-        box: corners of a box that holds nearly all Gaussians, float64 [2, 3], trained units.
-        cameras: all cameras; pictures are named by all of them.
-        indices: those to render.
-        inputs: files that must not be overwritten.
-        exposures: gain and bias, float32 [2, 3], of cameras by their indices.
-    """
-
-    subject: Subject
-    space: Space
+    subject: Subject  # the model, with this rank's Gaussians
+    space: Space  # maps the trained world to the capture's
+    # Corners of a box that holds nearly all Gaussians, float64 [2, 3], trained units.
     box: npt.NDArray[np.float64]
-    cameras: Sequence[CameraLike]
-    indices: Sequence[int]
-    inputs: Sequence[Path]
-    exposures: dict[int, Tensor]
+    cameras: Sequence[CameraLike]  # all cameras; pictures are named by all of them
+    indices: Sequence[int]  # those to render
+    inputs: Sequence[Path]  # files that must not be overwritten
+    exposures: dict[int, Tensor]  # gain and bias, float32 [2, 3], of cameras by their indices
 
 
 def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> Rendered:
-    """Open the model, and choose the cameras. Collective.
-
-    Args:
-        args: of the command.
-        film: what --path asks for; None: there is none.
-        ranks: the job.
-
-    Raises:
-        ValueError, OSError: a file is missing or damaged, or flags do not fit the model.
-    """
+    """Open the model, and choose the cameras. Collective."""
     if args.model.is_file():
         opened = _open_ply(args, ranks)
         subject, space, box = opened.subject, opened.exhibit.space, opened.exhibit.box
@@ -111,11 +93,7 @@ def _shared_box(table: GaussianTable, ranks: Ranks) -> npt.NDArray[np.float64]:
 
 
 def _exposures(found: Tensor | None, stored: RunCameras) -> dict[int, Tensor]:
-    """Return gain and bias, float32 [2, 3], of each training view, by its index among the cameras.
-
-    Raises:
-        ValueError: the run has no exposures, or those of other cameras.
-    """
+    """Return gain and bias, float32 [2, 3], of each training view, by its index among the cameras."""
     if found is None:
         raise ValueError("--exposure: the run was trained without model.exposure")
     if len(found) != len(stored.train):

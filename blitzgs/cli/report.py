@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command `blitzgs report`, and the report that `blitzgs train` writes at its end."""
+"""The commands `blitzgs report` and `blitzgs compare`, and the report that `blitzgs train` writes."""
 
 from __future__ import annotations
 
@@ -74,12 +74,7 @@ def kept_warnings() -> Iterator[list[str]]:
 
 
 def write_final_report(folder: Path, summary: Mapping[str, object] | None) -> None:
-    """Write the report of a run that ends; a failure is a warning.
-
-    Args:
-        folder: the run.
-        summary: its summary; None: it was stopped.
-    """
+    """Write the report of a run that ends; a failure is a warning."""
     from blitzgs.report.report import look_of, write_report
 
     count = 0 if summary is None else summary["gaussians"]
@@ -91,3 +86,33 @@ def write_final_report(folder: Path, summary: Mapping[str, object] | None) -> No
             f"the report was not written ({type(error).__name__}: {error}); blitzgs report RUN tries again",
             stacklevel=2,
         )
+
+
+COMPARE_HELP = """\
+Put runs side by side in one HTML file that needs no network: their figures, differences of configuration,
+metrics of each view, curves, and pictures of the same views. The others are compared with the first run.
+"""
+
+
+def add_compare(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
+    """Add the command."""
+    parser = add_command(commands, "compare", run_compare, summary, COMPARE_HELP)
+    parser.add_argument(
+        "folders", nargs="+", type=named_path, metavar="RUN", help="folders of two runs or more"
+    )
+    parser.add_argument(
+        "--out",
+        type=named_path,
+        metavar="FILE",
+        default=Path("compare.html"),
+        help="the file (default: %(default)s)",
+    )
+
+
+def run_compare(args: argparse.Namespace) -> int:
+    """Write the page; returns the exit status."""
+    from blitzgs.report.report import compare, write_page
+
+    write_page(args.out, compare(args.folders))
+    print(printable(str(args.out)))
+    return 0

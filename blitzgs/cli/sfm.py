@@ -86,12 +86,8 @@ def find_poses(folder: Path, capture: Path, settings: Settings) -> None:
 def with_poses(config: Config, folder: Path) -> Config:
     """Return a configuration whose capture has poses: of photographs alone they are found first.
 
-    Under torchrun rank 0 finds them and the others, which have not joined yet, wait for its report; where
-    rank 0 fails, torchrun ends them.
-
-    Args:
-        config: of the training.
-        folder: the capture to write, or to use if it is finished.
+    They go into `folder`, which is used as it is if it is finished. Under torchrun rank 0 finds them and the
+    others, which have not joined yet, wait for its report; where rank 0 fails, torchrun ends them.
     """
     root = Path(config.data.path)
     if not config.data.path or not has_photographs_alone(root, config.data.images):

@@ -9,6 +9,7 @@ import json
 import os
 import shlex
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import cast
 
@@ -22,14 +23,13 @@ from blitzgs.cli.report import kept_warnings, write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
 from blitzgs.config.describe import describe, describe_all, describe_page
 from blitzgs.config.fields import Config, Transport
-from blitzgs.config.files import ConfigError, load_config, to_dict
-from blitzgs.config.recipes import default_recipe, recipe_path
+from blitzgs.config.files import ConfigError, default_recipe, load_config, recipe_path, to_dict
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.folder_checks import locked
 from blitzgs.training.budget import LEAST_IMAGES
 from blitzgs.training.estimate import estimate
-from blitzgs.training.inputs import open_capture
+from blitzgs.training.inputs import open_capture, read_ahead
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import check_worlds, understood
 from blitzgs.util.progress import Laps
@@ -188,17 +188,18 @@ def run(args: argparse.Namespace) -> int:
     laps.lap("imports")
     with (
         kept_warnings() as warned,
+        nullcontext(read_ahead(config.data)) as reading,  # while the ranks join
         Ranks.from_environment(
             args.device,
             job.timeout_seconds,
             cast(Transport, job.transport),
             job.share_gpus,
             tables_on_host=config.memory.resident_gb > 0,
+            lap=laps.lap,
         ) as ranks,
     ):
-        laps.lap("processes")
         # A capture that cannot be read leaves no empty folder behind.
-        capture, images = open_capture(config, ranks)
+        capture, images = open_capture(config, ranks, reading=reading)
         check_worlds(capture)
         laps.lap("capture")
         # Otherwise a damaged photograph would be found when its turn comes, a held-out one at the end.

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_model, named_path
-from blitzgs.distributed.group import Ranks, resolve_device
+from blitzgs.distributed.group import Ranks, extend_memory_in_place, resolve_device
 from blitzgs.formats.tiles import PAGE, TILESET
 from blitzgs.runs import files as run_files
 from blitzgs.training.inputs import open_capture
@@ -69,6 +69,7 @@ def run(args: argparse.Namespace) -> int:
     require_viser()
     from blitzgs.viewer.studio import Studio, open_model
 
+    extend_memory_in_place()
     device, _ = resolve_device(args.device, local_rank=0, local_world_size=1, share_gpus=False)
     ranks = Ranks(device=device)
     model: Path = args.model
@@ -116,9 +117,7 @@ class _Handler(SimpleHTTPRequestHandler):
 def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
     """Return a server of a tileset's folder, not running yet; port 0: any free one.
 
-    Raises:
-        ValueError: the tileset is damaged, or another program wrote it.
-        OSError: the address is not this machine's, or the port is in use.
+    ValueError: the tileset is damaged, or another program's. OSError: it cannot listen at the address.
     """
     try:
         tileset = json.loads((folder / TILESET).read_text(encoding="utf-8"))

@@ -150,18 +150,24 @@ class DefaultStrategy(Strategy):
                 f'info["{self.key_for_gradient}"] has no gradient; call step_pre_backward before backward()'
             )
         width, height, views = info["width"], info["height"], info["n_cameras"]
+        across, down = gradients.unbind(-1)
+        norms = torch.hypot(across * (width / 2 * views), down * (height / 2 * views))
         ids, radii = info["gaussian_ids"], info["radii"]
-        if ids is None:
-            seen = (radii > 0).all(dim=-1)
-            ids, radii, gradients = torch.where(seen)[-1], radii[seen], gradients[seen]
-        norms = (gradients * gradients.new_tensor([width / 2 * views, height / 2 * views])).norm(dim=-1)
+        longest = radii.amax(dim=-1).to(norms.dtype) / max(width, height)
         for name in ("grad2d", "count", "radii"):
             if name in state and state[name] is None:
                 state[name] = norms.new_zeros(len(params["means"]))
+        if ids is None:  # sums over the views: for a list of what they see, the host would wait
+            unseen = (radii <= 0).any(dim=-1).flatten(0, -2)
+            norms, longest = (t.flatten(0, -2).masked_fill(unseen, 0) for t in (norms, longest))
+            state["grad2d"] += norms.sum(dim=0)
+            state["count"] += len(unseen) - unseen.sum(dim=0)
+            if "radii" in state:
+                state["radii"] = state["radii"].maximum(longest.amax(dim=0))
+            return
         state["grad2d"].index_add_(0, ids, norms)
         state["count"].index_add_(0, ids, torch.ones_like(norms, dtype=state["count"].dtype))
         if "radii" in state:
-            longest = radii.amax(dim=-1).to(norms.dtype) / max(width, height)
             state["radii"].scatter_reduce_(0, ids.long(), longest, "amax")
 
     def _refine(

@@ -18,11 +18,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from blitzgs.call import rasterization
 from blitzgs.compat.gsplat import DefaultStrategy, MCMCStrategy
 
-_OURS = {
-    "rasterization": rasterization,
-    "DefaultStrategy": DefaultStrategy,
-    "MCMCStrategy": MCMCStrategy,
-}
+_OURS = {"rasterization": rasterization, "DefaultStrategy": DefaultStrategy, "MCMCStrategy": MCMCStrategy}
 
 
 def _with_our_names(function: Any) -> FunctionType:

@@ -32,17 +32,14 @@ _KINDS = {int: "integer", float: "number", bool: "true or false", str: "text", t
 def describe(wanted: str) -> str:
     """Describe fields: meaning, kind, default and allowed values.
 
-    Args:
-        wanted: "section.field", a field's name without its section, or a section; leading dashes are allowed.
-
-    Raises:
-        ConfigError: there is no such field.
+    `wanted` is "section.field", a field's name without its section, or a section; leading dashes are allowed.
+    ConfigError: there is no such field.
     """
     name = wanted.lstrip("-").partition("=")[0]
     sections = _sections()
     if name in sections:
         return _section(name)
-    fields = [(section, field) for section, own in sections.items() for field in own]
+    fields = [(section, field) for section, kind in sections.items() for field in _fields(kind)]
     found = [(section, field) for section, field in fields if name in (field, _joined(section, field))]
     if not found:
         known = [text for section, field in fields for text in (_joined(section, field), field)]
@@ -60,8 +57,7 @@ def describe_all() -> str:
 def describe_page() -> str:
     """Return docs/configuration.md: the first sentence about every field, in a table for each section."""
     parts = [_PAGE_HEAD]
-    for section in _sections():
-        kind = _kind_of(section)
+    for section, kind in _sections().items():
         if section:
             parts.append(f"## {section}\n\n{_about(kind).partition(chr(10))[0]}")
         rows = ["field|default|meaning", "---|---|---"]
@@ -83,20 +79,17 @@ def _first_clause(text: str) -> str:
     return text
 
 
-def _sections() -> dict[str, list[str]]:
-    """Return the names of the fields of each section; "" has those without a section."""
+def _sections() -> dict[str, type]:
+    """Return the class of each section; that of "" has the fields without a section."""
+    found: dict[str, Any] = {"": Config}
     hints = typing.get_type_hints(Config)
-    sections = {name: list(typing.get_type_hints(kind)) for name, kind in hints.items() if _is_section(kind)}
-    return {"": [name for name, kind in hints.items() if not _is_section(kind)]} | sections
+    return found | {name: kind for name, kind in hints.items() if dataclasses.is_dataclass(kind)}
 
 
-def _is_section(kind: Any) -> bool:
-    return dataclasses.is_dataclass(kind)
-
-
-def _kind_of(section: str) -> type:
-    found: type = typing.get_type_hints(Config)[section] if section else Config
-    return found
+def _fields(kind: type) -> dict[str, Any]:
+    """Return the types of a section's fields."""
+    hints = typing.get_type_hints(kind)
+    return {name: hint for name, hint in hints.items() if not dataclasses.is_dataclass(hint)}
 
 
 def _joined(section: str, field: str) -> str:
@@ -105,9 +98,9 @@ def _joined(section: str, field: str) -> str:
 
 def _section(name: str) -> str:
     """Return the description of a section and of all of its fields."""
-    about = _about(_kind_of(name))
-    parts = [f"{name}: {about}" if name else about]
-    return "\n\n".join([*parts, *(_field(name, field) for field in _sections()[name])])
+    kind = _sections()[name]
+    about = f"{name}: {_about(kind)}" if name else _about(kind)
+    return "\n\n".join([about, *(_field(name, field) for field in _fields(kind))])
 
 
 def _about(kind: type) -> str:
@@ -117,10 +110,13 @@ def _about(kind: type) -> str:
 
 def _field(section: str, field: str) -> str:
     """Return a line with kind, default and allowed values, and the meaning below it."""
-    kind, name = _kind_of(section), _joined(section, field)
+    kind, name = _sections()[section], _joined(section, field)
     allowed = f", {RANGES[name]}" if name in RANGES else ""
-    head = f"--{name}={_default(kind, field)}   ({_type(typing.get_type_hints(kind)[field])}{allowed})"
-    return f"{head}\n{textwrap.indent(textwrap.fill(_meanings(kind)[field], _WIDTH), '    ')}"
+    head = f"--{name}={_default(kind, field)}   ({_type(_fields(kind)[field])}{allowed})"
+    names, meaning = next(entry for entry in _entries(kind).items() if field in entry[0])
+    # Fields that share their meaning begin with all their names.
+    text = (f"({', '.join(names)}) " if len(names) > 1 else "") + meaning
+    return f"{head}\n{textwrap.indent(textwrap.fill(text, _WIDTH), '    ')}"
 
 
 def _default(kind: type, field: str) -> str:
@@ -138,15 +134,6 @@ def _type(hint: Any) -> str:
     if origin is tuple:
         return "list" if options[-1] is Ellipsis else f"list of {len(options)}"
     return _KINDS.get(hint, "value")
-
-
-def _meanings(kind: type) -> dict[str, str]:
-    """Return the meaning of each field; those that share one begin with all their names."""
-    return {
-        name: (f"({', '.join(names)}) " if len(names) > 1 else "") + meaning
-        for names, meaning in _entries(kind).items()
-        for name in names
-    }
 
 
 def _entries(kind: type) -> dict[tuple[str, ...], str]:

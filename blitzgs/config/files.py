@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads configurations from YAML files and `--section.field=value` overrides, and checks them."""
+"""Reads configurations from recipes, YAML files and `--section.field=value` overrides, and checks them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ import yaml
 from blitzgs.config.fields import Config
 from blitzgs.config.fields import ConfigError as ConfigError
 from blitzgs.config.ranges import problems
-from blitzgs.config.recipes import base_file
 from blitzgs.util.output import write_file
 
 
@@ -61,15 +60,11 @@ REMOVED: Mapping[str, Any] = {
 
 
 def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -> Config:
-    """Build a configuration from the defaults, then a YAML file, then overrides.
+    """Build a configuration from the defaults, then a YAML file, then overrides, "section.field=value".
 
-    Args:
-        path: YAML file with sections as in `Config`, or None. A file may name another one under `base`
-            (relative to itself, or the name of a recipe); it then changes the values of that file.
-        overrides: "section.field=value" with a YAML value; leading dashes are allowed.
-
-    Raises:
-        ConfigError: unknown field, ill-typed or impossible value, unreadable file.
+    A file may name another one under `base` (relative to itself, or the name of a recipe); it then changes
+    the values of that file. Values of overrides are YAML; leading dashes are allowed. ConfigError: an unknown
+    field, an ill-typed or impossible value, or an unreadable file.
     """
     values: dict[str, Any] = {}
     if path is not None:
@@ -87,7 +82,7 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
         except _UNREADABLE as error:
             raise ConfigError(f"{name}: cannot read the value '{value}': {error}") from error
         _merge(values, _nest(name.split("."), parsed), name)
-    config: Config = _build(Config, values, "")
+    config = from_dict(values)
     for problem in problems(config):
         raise ConfigError(problem)
     return config
@@ -95,14 +90,17 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
 
 def from_dict(values: dict[str, Any]) -> Config:
     """Rebuild a configuration from `to_dict`'s nested dictionary; raises ConfigError like `load_config`."""
-    config: Config = _build(Config, values, "")
-    return config
+    return typing.cast(Config, _build(Config, values, ""))
 
 
 def to_dict(config: Config) -> dict[str, Any]:
     """Return the configuration as nested dictionaries of JSON-able values."""
-    result: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
-    return result
+    return typing.cast(dict[str, Any], json.loads(json.dumps(dataclasses.asdict(config))))
+
+
+def changed(config: Config, section: str, **fields: Any) -> Config:
+    """Return a configuration with other values of some fields of a section."""
+    return dataclasses.replace(config, **{section: dataclasses.replace(getattr(config, section), **fields)})
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -281,9 +279,63 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
     if hint is int and isinstance(value, float) and value.is_integer():
         return int(value)
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
-        raise ConfigError(f"{path}: must be {_kind(hint)}, got {value!r} ({type(value).__name__})")
+        kinds = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
+        raise ConfigError(f"{path}: must be {kinds[hint]}, got {value!r} ({type(value).__name__})")
     return value
 
 
-def _kind(hint: type) -> str:
-    return {int: "an integer", float: "a number", bool: "true or false", str: "text"}.get(hint, hint.__name__)
+# The name that stands for the default of every field, without a file.
+DEFAULTS = "defaults"
+_PACKAGE = Path(__file__).resolve().parent.parent
+# In an installed package and in a checkout (setup.py copies the files).
+_FOLDERS = (_PACKAGE / "configs", _PACKAGE.parent / "configs")
+
+
+def recipe_names() -> list[str]:
+    """Return the names of the recipes, in alphabetical order."""
+    return sorted({path.stem for folder in _FOLDERS for path in folder.glob("*.yaml")})
+
+
+def recipe_path(given: str) -> Path | None:
+    """Return the YAML file of a path or of a name of `recipe_names`; None for `DEFAULTS`."""
+    if Path(given).is_file():
+        return Path(given)
+    if given == DEFAULTS:
+        return None
+    if (found := _recipe(given)) is not None:
+        return found
+    raise ConfigError(f"{given}: no such file or recipe; {_known(given)}")
+
+
+def base_file(given: str, file: Path) -> Path:
+    """Return the file that `base` names in a configuration file: a path relative to it, or a recipe.
+
+    The name may end in ".yaml": a copy of a recipe's file names its base so.
+    """
+    beside = file.parent / given
+    if beside.is_file():
+        return beside
+    if (found := _recipe(given.removesuffix(".yaml"))) is not None:
+        return found
+    raise ConfigError(
+        f"{file}: base: {given}: no such file in {file.parent} and no such recipe; {_known(given)}"
+    )
+
+
+def _recipe(name: str) -> Path | None:
+    """Return the file of a recipe; None if there is none of this name."""
+    files = (folder / f"{name}.yaml" for folder in _FOLDERS if "/" not in name)
+    return next((file for file in files if file.is_file()), None)
+
+
+def _known(given: str) -> str:
+    """Return which recipes there are, and which of them may have been meant."""
+    known = [*recipe_names(), DEFAULTS]
+    close = difflib.get_close_matches(Path(given).stem, known, n=1)
+    hint = f"did you mean '{close[0]}'? " if close else ""
+    return f"{hint}recipes are {', '.join(known)}"
+
+
+def default_recipe(on_gpu: bool) -> str:
+    """Return the recipe of a run that names none."""
+    return "aerial" if on_gpu else "aerial_cpu"

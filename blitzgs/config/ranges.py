@@ -39,79 +39,39 @@ REDUCTIONS = (2, 4, 8)
 # Images of a whole run: its table of learning rates takes 48 bytes a step.
 MAX_IMAGES = 10_000_000
 SCALE = Range(1e-4, 1e4)
-_TIME = Range(0, 1e9)
-_EVERY = Range(1, 1e9)
-_EVERY_OR_NEVER = Range(0, 1e9)
-_SHARE = Range(0, 1, low_open=True)
-_RATE = Range(0, 10)
-_LENGTH = Range(0, 1e6)
 
-RANGES: Mapping[str, Range] = {
-    "data.downscale": Range(1, 1000),
-    "data.cache_bytes": Range(0, 2**50),
-    "data.prefetch": Range(0, 1000),
-    "model.sh_degree": Range(0, 3),
-    "model.background": Range(0, 1),
-    "model.near": Range(0, 1e6),
-    "lod.fork": Range(1.01, 100),
-    "lod.visible_threshold": Range(0, 1, high_open=True),
-    "schedule.iterations": Range(1, 1e9),
-    "schedule.scale": SCALE,
-    "schedule.images_per_view": Range(0, 1e6),
-    "schedule.minutes": Range(0, 1e6),
-    "schedule.pace": Range(1e-4, 1e9),
-    "schedule.batch_size": Range(1, 32),
-    "schedule.resolution": Range(1, 1e9),
-    "schedule.densify_from": _TIME,
-    "schedule.densify_until": _TIME,
-    "schedule.densify_every": _EVERY,
-    "schedule.size_prune_after": _TIME,
-    "schedule.reset_every": _EVERY_OR_NEVER,
-    "schedule.gate_from": _TIME,
-    "schedule.t1": _EVERY_OR_NEVER,
-    "schedule.t2": _EVERY_OR_NEVER,
-    "schedule.sh_every": _EVERY,
-    "schedule.position_decay": _EVERY,
-    "schedule.checkpoint_every": _EVERY_OR_NEVER,
-    "schedule.evaluate_every": _EVERY_OR_NEVER,
-    "optimiser.position": Range(0, 1),
-    "optimiser.position_final": Range(1e-20, 1),
-    "optimiser.sh_dc": _RATE,
-    "optimiser.sh_rest": _RATE,
-    "optimiser.opacity": _RATE,
-    "optimiser.scale": _RATE,
-    "optimiser.rotation": _RATE,
-    "optimiser.final": Range(1e-9, 1),
-    "optimiser.position_noise": Range(0, 1e12),
-    "loss.ssim": Range(0, 1),
-    "loss.opacity": Range(0, 1e6),
-    "loss.opacity_total": Range(0, 1e6),
-    "loss.scale": Range(0, 1e6),
-    "loss.scale_reference": Range(1e-6, 1e6),
-    "population.growth": Range(0, 10),
-    "population.grad_threshold": Range(0, 1e30),
-    "population.clone_scale": _LENGTH,
-    "population.min_opacity": Range(0, 1, high_open=True),
-    "population.prune_screen_radius": _LENGTH,
-    "population.prune_world_scale": _LENGTH,
-    "population.max_gaussians": Range(0, 1e11),
-    "population.pixels_per_gaussian": Range(0, 1e9),
-    "population.gaussians_per_point": Range(0, 1e6),
-    "population.min_observations": Range(1, 1e6),
-    "population.gate_rate": Range(0, 1),
-    "population.pass1_keep": _SHARE,
-    "population.pass2_mass": _SHARE,
-    "population.pass2_keep": _SHARE,
-    "population.pass2_views": Range(0, 1e6),
-    "view.footprint": Range(0, 1000),
-    "memory.resident_gb": Range(0, 1e6),
-    "ranks.timeout_seconds": Range(1, 1e6),
-    "log.every": _EVERY,
-    "log.pictures": Range(0, 1e6),
-    "log.checkpoint_seconds": Range(0, 1e9),
-    "log.keep_checkpoints": Range(1, 1e6),
-    "seed": Range(0, 2**63 - 1),
+_FIELDS: Mapping[Range, str] = {
+    Range(0, 1): "model.background optimiser.position loss.ssim population.gate_rate",
+    Range(0, 1, high_open=True): "lod.visible_threshold population.min_opacity",
+    Range(0, 1, low_open=True): "population.pass1_keep population.pass2_mass population.pass2_keep",
+    Range(0, 3): "model.sh_degree",
+    Range(0, 10): "optimiser.sh_dc optimiser.sh_rest optimiser.opacity optimiser.scale optimiser.rotation "
+    "population.growth",
+    Range(0, 1000): "data.prefetch view.footprint",
+    Range(0, 1e6): "model.near schedule.images_per_view schedule.minutes loss.opacity loss.opacity_total "
+    "loss.scale population.clone_scale population.prune_screen_radius population.prune_world_scale "
+    "population.gaussians_per_point population.pass2_views memory.resident_gb log.pictures",
+    Range(0, 1e9): "schedule.densify_from schedule.densify_until schedule.size_prune_after "
+    "schedule.reset_every schedule.gate_from schedule.t1 schedule.t2 schedule.checkpoint_every "
+    "schedule.evaluate_every population.pixels_per_gaussian log.checkpoint_seconds",
+    Range(0, 1e11): "population.max_gaussians",
+    Range(0, 1e12): "optimiser.position_noise",
+    Range(0, 1e30): "population.grad_threshold",
+    Range(0, 2**50): "data.cache_bytes",
+    Range(0, 2**63 - 1): "seed",
+    Range(1e-20, 1): "optimiser.position_final",
+    Range(1e-9, 1): "optimiser.final",
+    Range(1e-6, 1e6): "loss.scale_reference",
+    SCALE: "schedule.scale",
+    Range(1e-4, 1e9): "schedule.pace",
+    Range(1, 32): "schedule.batch_size",
+    Range(1, 1000): "data.downscale",
+    Range(1, 1e6): "population.min_observations ranks.timeout_seconds log.keep_checkpoints",
+    Range(1, 1e9): "schedule.iterations schedule.resolution schedule.densify_every schedule.sh_every "
+    "schedule.position_decay log.every",
+    Range(1.01, 100): "lod.fork",
 }
+RANGES: Mapping[str, Range] = {name: found for found, names in _FIELDS.items() for name in names.split()}
 
 CHOICES: Mapping[str, tuple[str, ...]] = {
     "data.undistort": ("crop", "mask"),

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The schedule of a run: the events of each step, and the learning rates of all steps."""
+"""The schedule of a run: the events of each step, the learning rates of all steps, and changes of pace."""
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -11,7 +13,46 @@ import torch
 from torch import Tensor
 
 from blitzgs.config.fields import MAX_STRETCH, OptimiserConfig, ScheduleConfig
-from blitzgs.config.pace import Pace
+
+
+class Pace:
+    """An increasing, piecewise linear map from times of the configuration to images of the run, and back.
+
+    A later change of pace does not change any bit of the map before it.
+    """
+
+    def __init__(self, scale: float, changes: Sequence[tuple[int, float]]) -> None:
+        """Make a map of `scale` images of the run per image of the configuration.
+
+        `changes`, (image of the run, factor) with increasing images above 0: from there, times the factor.
+        """
+        self._images = [0.0, *(float(image) for image, _ in changes)]
+        self._scales = [scale, *(scale * factor for _, factor in changes)]
+        self._times = [0.0]
+        for begin, end, rate in zip(self._images, self._images[1:], self._scales, strict=False):
+            self._times.append(self._times[-1] + (end - begin) / rate)
+
+    @property
+    def scale(self) -> float:
+        """Images of the run per image of the configuration, after the last change."""
+        return self._scales[-1]
+
+    def image(self, time: float) -> float:
+        """Return the image of the run at a time >= 0 of the configuration."""
+        piece = bisect_right(self._times, time) - 1
+        return self._images[piece] + (time - self._times[piece]) * self._scales[piece]
+
+    def time(self, image: float) -> float:
+        """Return the time of the configuration at an image >= 0 of the run."""
+        piece = bisect_right(self._images, image) - 1
+        return self._times[piece] + (image - self._images[piece]) / self._scales[piece]
+
+    def times(self, images: Tensor) -> Tensor:
+        """Return `time` of each element of a float64 tensor [...]."""
+        begins, times, scales = torch.tensor([self._images, self._times, self._scales], dtype=torch.float64)
+        piece = torch.bucketize(images, begins, right=True) - 1
+        return times[piece] + (images - begins[piece]) / scales[piece]
+
 
 EventKind = Literal["densify", "reset_opacities", "pass_1", "pass_2", "clear_cull", "evaluate", "checkpoint"]
 # The events of this number of images are searched at once.
@@ -34,10 +75,6 @@ def stretched(config: ScheduleConfig, views: int) -> ScheduleConfig:
 
     The factor is between 1 and `MAX_STRETCH`. The result has `images_per_view` 0, so that a second call
     changes nothing.
-
-    Args:
-        config: the schedule as configured.
-        views: number of training views.
     """
     factor = min(max(config.images_per_view * views / config.iterations, 1.0), MAX_STRETCH)
     if config.minutes > 0:
@@ -50,20 +87,14 @@ class Schedule:
 
     `pace` maps every time of the configuration to an image of the run (without changes of pace: multiplied by
     `scale`), rounded down. The schedule therefore has the same shape at any length.
-
-    Attributes:
-        pace: maps times of the configuration to images of the run.
-        batch_size: views per step, B.
-        steps: optimiser steps of the whole run.
-        iterations: images of the whole run, steps x B.
     """
 
     def __init__(self, config: ScheduleConfig) -> None:
         self._config = config
         self.pace = Pace(config.scale, config.pace)
-        self.batch_size = config.batch_size
-        self.steps = max(1, math.ceil(self._scaled(config.iterations) / self.batch_size))
-        self.iterations = self.steps * self.batch_size
+        self.batch_size = config.batch_size  # views per step, B
+        self.steps = max(1, math.ceil(self._scaled(config.iterations) / self.batch_size))  # of the whole run
+        self.iterations = self.steps * self.batch_size  # images of the whole run
         self._found: tuple[int, int, list[Event]] = (0, 0, [])  # the events of [first, last) images
         self._reductions = [(factor, self._scaled(until)) for factor, until in config.resolution]
 
@@ -140,14 +171,6 @@ class Schedule:
         # `time` is rounded down, so the next event is the first at `time + 1` or later.
         following = math.ceil((self.pace.time(time + 1) - first) / every)
         return first + following * every >= self._config.densify_until
-
-    def has_lod_gate(self, begin: int) -> bool:
-        """Tell whether the step at [begin, begin + B) may leave out Gaussians by their octree levels.
-
-        It may not while statistics for density control are gathered, because a Gaussian that is left out
-        would gather no gradients.
-        """
-        return not self.gathers_statistics(begin)
 
     def has_new_levels(self, begin: int) -> bool:
         """Tell whether levels follow footprints again before the step at [begin, begin + B)."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import re
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import timedelta
 from types import TracebackType
@@ -70,6 +70,7 @@ class Ranks:
         transport: Transport = "auto",
         share_gpus: bool = False,
         tables_on_host: bool = False,
+        lap: Callable[[str], None] = lambda _: None,
     ) -> Ranks:
         """Join the job that torchrun's environment describes: Gloo on the CPU, NCCL on CUDA.
 
@@ -85,6 +86,7 @@ class Ranks:
                 for development.
             tables_on_host: whether collectives will carry tensors that are on the CPU although the ranks
                 compute on CUDA.
+            lap: called with the name of each part of this work at its end (`Laps.lap`).
 
         Returns:
             The ranks; without torchrun, or with a single process, an object with `world_size` 1.
@@ -109,7 +111,7 @@ class Ranks:
         _share_cores(local_world_size)
         chosen, shared = resolve_device(device, local_rank, local_world_size, share_gpus)
         if chosen.type == "cuda":
-            _extend_memory_in_place()
+            extend_memory_in_place()
         ranks = cls(
             rank=rank,
             world_size=world_size,
@@ -120,11 +122,13 @@ class Ranks:
         )
         if chosen.type == "cuda":
             torch.cuda.set_device(chosen)
+            torch.cuda.synchronize()
+        lap("device")
         if world_size > 1:
-            ranks._join(transport, tables_on_host)
+            ranks._join(transport, tables_on_host, lap)
         return ranks
 
-    def _join(self, transport: Transport, tables_on_host: bool) -> None:
+    def _join(self, transport: Transport, tables_on_host: bool, lap: Callable[[str], None]) -> None:
         if self.shares_gpu:
             # Torch reads this variable whenever it maps shared memory.
             os.environ["TORCH_SYMM_MEM_ALLOW_OVERLAPPING_DEVICES"] = "1"
@@ -145,7 +149,9 @@ class Ranks:
             timedelta(seconds=max(self.timeout_seconds, BUSY_SECONDS) + margin), dist.group.WORLD
         )
         self.watchdog = Watchdog(self.rank, self.world_size, self.timeout_seconds)
+        lap("processes")
         self._choose_transport(transport, self.timeout_seconds + margin)
+        lap("shared memory")
 
     def _choose_transport(self, transport: Transport, timeout_seconds: float) -> None:
         memory: SharedMemory | str = "not asked for"
@@ -299,11 +305,12 @@ def _share_cores(local_world_size: int) -> None:
         torch.set_num_threads(max(1, len(os.sched_getaffinity(0)) // local_world_size))
 
 
-def _extend_memory_in_place() -> None:
+def extend_memory_in_place() -> None:
     """Let torch's CUDA allocator extend its memory, unless the user has configured it; before its first use.
 
     A table that grows by some percent in each density event does not fit into the memory that its last copy
-    has left. By default, torch then asks CUDA for new memory for every column.
+    has left, nor a frame of a viewer into that of a smaller one. By default, torch then asks CUDA for new
+    memory for every column.
     """
     if not any(name in os.environ for name in ALLOCATOR_VARIABLES):
         os.environ[ALLOCATOR_VARIABLES[0]] = "expandable_segments:True"

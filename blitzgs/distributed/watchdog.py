@@ -2,11 +2,11 @@
 """Ends a job in which a rank no longer arrives at collectives, and names that rank.
 
 Each rank publishes what it is doing in the job's key-value store, from a thread of its own. A rank that has
-waited in a collective for longer than the timeout reads what the others published, prints which of them never
-arrived, and exits; torchrun then ends the job. A rank that raises publishes its error first, so that the
-others print its message instead of a message about a closed socket; ranks that wait for it end at once. A
-rank that works on its host for long, for example on a slow disk, announces this, and the others wait for it
-as long as it keeps publishing.
+waited in a collective for long reads what the others published, and prints which of them have not arrived.
+After the timeout it exits, or earlier if a rank no longer publishes; torchrun then ends the job. A rank that
+raises publishes its error first, so that the others print its message instead of a message about a closed
+socket; ranks that wait for it end at once. A rank that works on its host for long, for example on a slow
+disk, announces this, and the others wait for it as long as it keeps publishing.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from torch.distributed import PrefixStore, TCPStore  # type: ignore[attr-defined
 EXIT_STUCK = 75  # EX_TEMPFAIL: a restart may help
 # How long a rank continues to wait after another rank has reported a failure.
 GRACE_SECONDS = 4.0
+# How long a rank waits until it names those that have not arrived, and for a rank that no longer publishes.
+PATIENCE_SECONDS = 20.0
 # Longest time that ranks wait for a rank that keeps publishing and has announced its work.
 BUSY_SECONDS = 3600.0
 
@@ -221,31 +223,29 @@ class Watchdog:
         return reports
 
     def _is_silent(self, rank: int) -> bool:
-        return time.monotonic() - self._heard[rank][1] > 1.5 * self.period
+        return self._silence(rank) > 1.5 * self.period
+
+    def _silence(self, rank: int) -> float:
+        """Return the seconds since the last report of a rank."""
+        return time.monotonic() - self._heard[rank][1]
 
     def _late_ranks(self) -> str:
         """List the ranks that have entered fewer collectives than this one, or stopped publishing."""
         late = []
         for rank, report in self._listen().items():
             if self._is_silent(rank):
-                silent = time.monotonic() - self._heard[rank][1]
-                late.append(
-                    f"rank {rank} has stopped reporting {silent:.0f} s ago: it was killed or its host is gone"
-                )
+                silent = f"has stopped reporting {self._silence(rank):.0f} s ago"
+                late.append(f"rank {rank} {silent}: it was killed or its host is gone")
             elif report.calls < self.calls:
                 doing = report.busy or f"last collective: {report.name}, number {report.calls}"
                 late.append(f"rank {rank} has not arrived ({doing})")
         return "; ".join(late)
 
-    def _waits_for_work(self) -> str:
-        """Describe the work of all late ranks; empty if one of them is silent or has announced none."""
-        work = []
-        for rank, report in self._listen().items():
-            if self._is_silent(rank) or (report.calls < self.calls and not report.busy):
-                return ""
-            if report.calls < self.calls:
-                work.append(f"rank {rank} ({report.busy})")
-        return ", ".join(work)
+    def _waits_for_work(self) -> bool:
+        """Tell whether some ranks are late, and all of them work on their host."""
+        reports = self._listen()
+        late = [report for report in reports.values() if report.calls < self.calls]
+        return bool(late) and all(report.busy for report in late) and not any(map(self._is_silent, reports))
 
     def _publish(self) -> None:
         content = json.dumps([self.calls, self.name, time.time(), self.busy])
@@ -268,25 +268,23 @@ class Watchdog:
                 # A failed rank will not arrive at any collective. Gloo may still report that first.
                 if waited > GRACE_SECONDS and self._first_failure():
                     limit = min(limit, GRACE_SECONDS)
-                if (
-                    limit < waited < BUSY_SECONDS
-                    and not self._first_failure()
-                    and (work := self._waits_for_work())
-                ):
+                elif any(self._silence(rank) > PATIENCE_SECONDS for rank in self._heard):
+                    limit = min(limit, PATIENCE_SECONDS)
+                if limit < waited < BUSY_SECONDS and not self._first_failure() and self._waits_for_work():
                     self._excused = time.monotonic()
-                    self.announce(work, waited)
-                    continue
                 # A rank that has finished its work needs some time to arrive and to publish that.
                 if time.monotonic() - max(since, self._excused) > limit:
                     self._abort(f"waited {limit:.0f} s in {self.name}")
+                if waited > min(limit, PATIENCE_SECONDS) and (late := self._late_ranks()):
+                    self.announce(late, waited)
             except RuntimeError:
                 return  # the store's host has ended; the collectives report that themselves
 
-    def announce(self, work: str, waited: float) -> None:
-        """Print about once a minute what this rank waits for."""
+    def announce(self, late: str, waited: float) -> None:
+        """Print about once a minute which ranks this one waits for."""
         if time.monotonic() - self._announced > 60:
             self._announced = time.monotonic()
-            text = f"rank {self.rank}: has waited {waited:.0f} s in {self.name} for {work}"
+            text = f"rank {self.rank}: has waited {waited:.0f} s in {self.name}: {late}"
             print(text, file=sys.stderr, flush=True)
 
     def _abort(self, reason: str) -> None:

@@ -26,11 +26,11 @@ class Format:
     Attributes:
         title: what it is.
         suffix: end of its files' names.
-        write: writes a file; the file appears under its name only when it is complete.
+        write: writes a file block by block; it appears under its name only when it is complete.
         starts: how its files begin, of which one is true; empty: nothing tells.
         states: what its viewers find in the file besides the Gaussians.
         harmonics: whether it holds SH coefficients beyond the DC.
-        streams: whether it is written in bounded memory.
+        quantised: whether positions are finer near the origin than float32 makes them.
     """
 
     title: str
@@ -39,7 +39,7 @@ class Format:
     starts: tuple[bytes, ...] = ()
     states: tuple[str, ...] = ()
     harmonics: bool = True
-    streams: bool = False
+    quantised: bool = True
 
     def unstated(self, source: GaussianSource) -> list[str]:
         """Return what a viewer of the file will not know of a model, each a sentence without a full stop."""
@@ -59,7 +59,7 @@ class Format:
 # By the name of the flag of `blitzgs export`.
 FORMATS = {
     "ply": Format(
-        "PLY", ".ply", save_ply, (b"ply",), ("antialiasing", "levels"), streams=True
+        "PLY", ".ply", save_ply, (b"ply",), ("antialiasing", "levels"), quantised=False
     ),
     "compressed-ply": Format(
         "compressed PLY", ".ply", packed.write_compressed_ply, (b"ply",), ("antialiasing",)
@@ -67,7 +67,7 @@ FORMATS = {
     "splat": Format(".splat", ".splat", packed.write_splat, harmonics=False),
     "spz": Format("SPZ", ".spz", packed.write_spz, (b"\x1f\x8b", b"NGSP"), ("antialiasing",)),
     "sog": Format("SOG", ".sog", write_sog, (b"PK",), ("antialiasing",)),
-    "glb": Format("GLB", ".glb", write_glb, (b"glTF",), ("levels",), streams=True),
+    "glb": Format("GLB", ".glb", write_glb, (b"glTF",), ("levels",), quantised=False),
 }  # fmt: skip
 
 

@@ -8,36 +8,41 @@ the SH coefficients of compressed PLY files wrongly, and gsply reads files witho
 
 from __future__ import annotations
 
+import gzip
 import importlib
 import json
 import re
+import shutil
 import struct
 import tempfile
 import zipfile
 import zlib
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 import psutil
 import torch
 
-from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource, is_antialiased, unit_quats
+from blitzgs.formats.gaussians import BLOCK, MIP, Gaussians, GaussianSource, is_antialiased, unit_quats
 from blitzgs.formats.ply import read_ply
-from blitzgs.util.output import new_file, write_file
+from blitzgs.util.output import new_file
 
 # Deflate compresses by at most this factor.
 _DEFLATE = 1040
 _SPZ_MAGIC = 0x5053474E
-_SPZ_ANTIALIASED = 1
+_SPZ_ANTIALIASED, _SPZ_HEADER = 1, 16
 # An SPZ file may end with extensions.
 _SPZ_EXTENSIONS = 1 << 20
 _META_BYTES = 64 << 20
 # Largest palette of SH coefficients, in pixels.
 _PALETTE = 1 << 20
+# Gaussians of a chunk of compressed PLY, and bytes of its bounds.
+_CHUNK, _CHUNK_BYTES = 256, 72
 _SH_C0 = 0.28209479177387814
 _COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
 # Signs of the SH coefficients after half a turn about x, in the order of INRIA's basis.
@@ -64,21 +69,35 @@ def _check_room(path: Path, count: int, degree: int) -> None:
         )
 
 
-def collected(source: GaussianSource) -> Gaussians:
-    """Return all Gaussians of a source in one piece, with unit quaternions and without normals.
+def unit_blocks(source: GaussianSource) -> Iterator[Gaussians]:
+    """Yield all Gaussians, `BLOCK` at a time and the rest, with unit quaternions and without normals.
 
     Raises:
         ValueError: there is none, or a value cannot be shown.
     """
     if len(source) == 0:
         raise ValueError("the model has no Gaussian, and this format holds no empty model")
-    blocks = [source] if isinstance(source, Gaussians) else list(source.blocks())
-    for block in blocks:
+    waiting: list[Gaussians] = []
+    for block in source.blocks():
         block.check()
-    names = ("means", "quats", "scales", "opacities", "sh")
-    columns = {name: torch.cat([getattr(block, name) for block in blocks]) for name in names}
-    columns["quats"] = unit_quats(columns["quats"]).float()
-    return Gaussians(**columns, comments=source.comments)
+        waiting.append(replace(block, quats=unit_quats(block.quats).float(), normals=None, levels=None))
+        if sum(map(len, waiting)) >= BLOCK:
+            model = _joined(waiting)
+            yield model.rows(slice(0, BLOCK))
+            waiting = [model.rows(slice(BLOCK, None))]
+    if (model := _joined(waiting)) and len(model):
+        yield model
+
+
+def _joined(parts: list[Gaussians]) -> Gaussians:
+    return replace(
+        parts[0],
+        means=torch.cat([part.means for part in parts]),
+        quats=torch.cat([part.quats for part in parts]),
+        scales=torch.cat([part.scales for part in parts]),
+        opacities=torch.cat([part.opacities for part in parts]),
+        sh=torch.cat([part.sh for part in parts]),
+    )
 
 
 # --- gaussforge ---
@@ -119,12 +138,43 @@ def _gsdata(model: Gaussians) -> Any:
 
 
 def write_compressed_ply(path: Path, source: GaussianSource) -> None:
-    """Write a compressed PLY file, with the header lines of the model."""
-    model = collected(source)
-    content: bytes = _package("gsply").compress_to_bytes(_gsdata(model))
-    first, second, rest = content.split(b"\n", 2)
-    lines = [line.encode() for line in model.comments]
-    write_file(path, b"\n".join([first, second, *lines, rest]))
+    """Write a compressed PLY file block by block, with the header lines of the model."""
+    count, rest = len(source), 3 * (_COEFFICIENTS[source.degree] - 1)
+    chunks, first = -(-count // _CHUNK), 0
+    with new_file(path) as partial, open(partial, "r+b") as file:
+        for block in unit_blocks(source):
+            content: bytes = _package("gsply").compress_to_bytes(_gsdata(block))
+            header, _, body = content.partition(b"end_header\n")
+            if first == 0:
+                for element, of_all in (("chunk", chunks), ("vertex", count), ("sh", count)):
+                    header = re.sub(
+                        rf"element {element} \d+".encode(), f"element {element} {of_all}".encode(), header
+                    )
+                head, second, others = header.split(b"\n", 2)
+                lines = [line.encode() for line in source.comments]
+                begin = file.write(b"\n".join([head, second, *lines, others]) + b"end_header\n")
+            own = -(-len(block) // _CHUNK)
+            columns = [(first // _CHUNK, own, chunks, _CHUNK_BYTES), (first, len(block), count, 16)]
+            _write_columns(file, begin, body, [*columns, (first, len(block), count, rest)])
+            first += len(block)
+
+
+def _write_columns(
+    file: BinaryIO, begin: int, content: bytes, columns: Iterable[tuple[int, int, int, int]]
+) -> None:
+    """Write the rows of a block into the columns of a file, which follow each other from `begin` on.
+
+    Args:
+        file: the file.
+        begin: where its first column begins.
+        content: the rows of the block, column after column.
+        columns: of each column the first row, the rows of the block and of the file, and the bytes of a row.
+    """
+    view, at = memoryview(content), 0
+    for first, rows, count, width in columns:
+        file.seek(begin + first * width)
+        file.write(view[at : at + rows * width])
+        at, begin = at + rows * width, begin + count * width
 
 
 def read_compressed_ply(path: Path) -> Gaussians:
@@ -165,14 +215,15 @@ _SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), 
 
 
 def write_splat(path: Path, source: GaussianSource) -> None:
-    """Write a .splat file, which holds no SH coefficients beyond the DC."""
-    model = collected(source)
-    rows = np.zeros(len(model), dtype=_SPLAT)
-    rows["mean"], rows["scale"] = model.means.numpy(), model.scales.exp().numpy()
-    shade = torch.cat([0.5 + _SH_C0 * model.sh[:, 0], model.opacities.sigmoid()[:, None]], dim=1)
-    rows["color"] = (shade.clamp(0, 1) * 255).round().numpy()
-    rows["quat"] = (model.quats * 128 + 128).round().clamp(0, 255).numpy()
-    write_file(path, rows.tobytes())
+    """Write a .splat file block by block; it holds no SH coefficients beyond the DC."""
+    with new_file(path) as partial, open(partial, "wb") as file:
+        for block in unit_blocks(source):
+            rows = np.zeros(len(block), dtype=_SPLAT)
+            rows["mean"], rows["scale"] = block.means.numpy(), block.scales.exp().numpy()
+            shade = torch.cat([0.5 + _SH_C0 * block.sh[:, 0], block.opacities.sigmoid()[:, None]], dim=1)
+            rows["color"] = (shade.clamp(0, 1) * 255).round().numpy()
+            rows["quat"] = (block.quats * 128 + 128).round().clamp(0, 255).numpy()
+            file.write(rows.data)
 
 
 def read_splat(path: Path) -> Gaussians:
@@ -207,20 +258,32 @@ def read_splat(path: Path) -> Gaussians:
 
 
 def write_spz(path: Path, source: GaussianSource) -> None:
-    """Write an SPZ file of version 3, which all its readers know."""
-    model = _half_turn(collected(source))
-    largest = max(float(model.means.abs().max()), 1e-3)
+    """Write an SPZ file of version 3, which all its readers know.
+
+    The model is read twice, block by block; a temporary file in the same folder holds the columns.
+    """
+    count, largest, middles = len(source), 1e-3, []
+    for block in unit_blocks(source):
+        largest = max(largest, float(block.means.abs().max()))
+        middles.append(block.scales.median(dim=1).values)
     # Positions have 24 bits. The step shall be a 16th of the median Gaussian or less, if the range permits.
-    middle = float(model.scales.median(dim=1).values.median().clamp(-15, 15).exp())
+    middle = float(torch.cat(middles).median().clamp(-15, 15).exp())
     bits = int(np.clip(np.ceil(np.log2(16 / middle)), 12, 24))
     bits = max(1, min(bits, int(np.floor(np.log2((2**23 - 1) / largest)))))
-    with new_file(path) as partial:
-        _package("gsply").write_spz(partial, _gsdata(model), fractional_bits=bits)
-        if is_antialiased(model):
-            content = bytearray(zlib.decompress(partial.read_bytes(), wbits=31))
-            content[14] |= _SPZ_ANTIALIASED
-            pack = zlib.compressobj(6, wbits=31)
-            partial.write_bytes(pack.compress(content) + pack.flush())
+    widths, first = (9, 1, 3, 3, 4, 3 * (_COEFFICIENTS[source.degree] - 1)), 0
+    with new_file(path) as partial, tempfile.TemporaryFile(dir=path.parent) as file:
+        for block in unit_blocks(source):
+            _package("gsply").write_spz(partial, _gsdata(_half_turn(block)), fractional_bits=bits)
+            content = zlib.decompress(partial.read_bytes(), wbits=31)
+            if first == 0:
+                flags = content[14] | (_SPZ_ANTIALIASED if is_antialiased(source) else 0)
+                file.write(content[:8] + struct.pack("<I", count) + content[12:14] + bytes([flags, 0]))
+            columns = ((first, len(block), count, width) for width in widths)
+            _write_columns(file, _SPZ_HEADER, content[_SPZ_HEADER:], columns)
+            first += len(block)
+        file.seek(0)
+        with open(partial, "wb") as target, gzip.GzipFile("", "wb", 6, target, mtime=0) as packed:
+            shutil.copyfileobj(file, packed, 1 << 20)
 
 
 def read_spz(path: Path) -> Gaussians:

@@ -11,10 +11,9 @@ from torch import Tensor
 
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.knn_distances import knn_distances
-from blitzgs.ops.population import voxel_keys
 from blitzgs.table.table import GaussianTable, opacity_logit
 from blitzgs.view.levels import Levels
-from blitzgs.view.point_blocks import PointBlocks
+from blitzgs.view.point_blocks import BLOCK_POINTS, PAIRS_OF_POINTS, PointBlocks
 
 SH_C0 = 0.28209479177387814
 # Smallest size of a first Gaussian, relative to the coarsest voxel: two voxel centres may coincide.
@@ -28,7 +27,7 @@ INITIAL_OPACITY = 0.1
 
 @dataclass(frozen=True)
 class FirstGaussians:
-    """What distinguishes the first Gaussians of a model from each other; the tensors are on the CPU.
+    """What distinguishes the first Gaussians of a model from each other.
 
     Attributes:
         means: float32 [C, 3].
@@ -96,9 +95,9 @@ def octree_gaussians(
     its 3 nearest neighbours as its size.
 
     Args:
-        points: SfM points, float64 [M, 3], on the CPU.
+        points: SfM points, float64 [M, 3], on any device.
         colors: their colours, uint8 [M, 3].
-        centres: camera centres, float64 [V, 3]; their device measures the distances.
+        centres: camera centres, float64 [V, 3].
         levels: from `measure_levels` on the same points and cameras.
         visible_threshold: a voxel is kept when its level is resolvable in more than this share of the
             cameras.
@@ -114,9 +113,9 @@ def octree_gaussians(
     for level in range(levels.count):
         means, mean_colors = _voxels(points, colors, origin, levels.voxel_size_of(level))
         keep = _seen_by_more(means, centres, levels.farthest(level), visible_threshold)
-        parts.append(
-            (means[keep], mean_colors[keep], torch.full((int(keep.sum()),), level, dtype=torch.uint8))
-        )
+        own = means[keep]
+        level_of = torch.full((len(own),), level, dtype=torch.uint8, device=own.device)
+        parts.append((own, mean_colors[keep], level_of))
     means, mean_colors, level_of = (torch.cat(column) for column in zip(*parts, strict=True))
     if len(means) == 0:
         raise ValueError(
@@ -134,7 +133,7 @@ def octree_gaussians(
 
 def _thinned(levels: Tensor, most: int, seed: int) -> Tensor:
     """Return `most` rows, in order: those of the coarsest levels, and a random part of the next level."""
-    draws = uniform(torch.arange(len(levels)), seed, 0, 0)
+    draws = uniform(torch.arange(len(levels), device=levels.device), seed, 0, 0)
     order = torch.argsort(draws, stable=True)
     order = order[torch.argsort(levels[order].long(), stable=True)]
     return order[:most].sort().values
@@ -151,22 +150,25 @@ def _voxels(points: Tensor, colors: Tensor, origin: Tensor, size: float) -> tupl
 
     Outliers beyond the grid are left out, because their clamped cells would be at another position.
     """
-    inside = ((points >= origin) & (points < origin + size * 2**_CELL_BITS)).all(dim=1)
-    keys, cell_of = voxel_keys(points[inside], origin.tolist(), size).unique(return_inverse=True)
+    cells = ((points - origin) / size).floor()
+    inside = ((cells >= 0) & (cells < 2**_CELL_BITS)).all(dim=1)
+    x, y, z = cells[inside].long().unbind(1)
+    keys, cell_of = (x | y << _CELL_BITS | z << 2 * _CELL_BITS).unique(return_inverse=True)
     counts = torch.bincount(cell_of, minlength=len(keys)).double()
-    sums = torch.zeros(len(keys), 3, dtype=torch.float64).index_add_(0, cell_of, colors[inside].double())
+    # Sums of integers are exact, so that their order does not matter.
+    sums = torch.zeros(len(keys), 3, dtype=torch.float64, device=points.device)
+    sums.index_add_(0, cell_of, colors[inside].double())
     mask = (1 << _CELL_BITS) - 1
-    cells = torch.stack([keys >> (axis * _CELL_BITS) & mask for axis in range(3)], dim=1)
-    return origin + (cells.double() + 0.5) * size, sums / counts[:, None]
+    found = torch.stack([keys >> (axis * _CELL_BITS) & mask for axis in range(3)], dim=1)
+    return origin + (found.double() + 0.5) * size, sums / counts[:, None]
 
 
 def _seen_by_more(means: Tensor, centres: Tensor, farthest: float, share: float) -> Tensor:
-    """Tell which means have more than a share of the cameras within `farthest`, bool [C] on the CPU."""
+    """Tell which means have more than a share of the cameras within `farthest`, bool [C]."""
     if math.isinf(farthest) or len(means) == 0:
-        return torch.full((len(means),), share < 1)
-    places = means.to(centres.device)
-    blocks = PointBlocks.of(places)
-    least, most = (torch.zeros(len(blocks), dtype=torch.int64, device=places.device) for _ in range(2))
+        return torch.full((len(means),), share < 1, device=means.device)
+    blocks = PointBlocks.of(means)
+    least, most = (torch.zeros(len(blocks), dtype=torch.int64, device=means.device) for _ in range(2))
     for _, nearest, greatest in blocks.distances(centres):
         least += (greatest <= farthest).sum(dim=0)
         most += (nearest <= farthest).sum(dim=0)
@@ -174,21 +176,24 @@ def _seen_by_more(means: Tensor, centres: Tensor, farthest: float, share: float)
     def enough(count: Tensor) -> Tensor:
         return count.double() / len(centres) > share
 
-    seen = blocks.rows(enough(least))
-    # Only these rows need their distances.
-    rows = blocks.order[blocks.rows(enough(most)) & ~seen]
-    undecided, near = places[rows], torch.zeros_like(rows)
-    for centre in centres:
-        near += (undecided - centre).norm(dim=1) <= farthest
-    kept = torch.zeros(len(places), dtype=torch.bool, device=places.device)
-    kept[blocks.order] = seen
-    kept[rows] = enough(near)
-    return kept.cpu()
+    # Only the distances between these blocks and the cameras whose reach ends in them are needed.
+    undecided = (enough(most) & ~enough(least)).nonzero().squeeze(1)
+    near = least[:, None].repeat(1, BLOCK_POINTS)
+    for some, nearest, greatest in blocks.distances(centres, undecided):
+        pairs = ((nearest <= farthest) & (greatest > farthest)).nonzero()
+        for cameras, chosen in (part.unbind(1) for part in pairs.split(PAIRS_OF_POINTS)):
+            own = undecided[chosen]
+            within = blocks.distances_of(some[cameras], own[:, None], math.inf)[:, 0] <= farthest
+            near.index_add_(0, own, within.long())
+    kept = torch.empty(len(means), dtype=torch.bool, device=means.device)
+    kept[blocks.order] = enough(near).flatten()[: len(means)]
+    return kept
 
 
 def _spacing(means: Tensor) -> Tensor:
     """Return the mean distance to the 3 nearest neighbours (or fewer, if there are fewer), float64 [C]."""
     neighbours = min(3, len(means) - 1)
     if neighbours == 0:
-        return torch.ones(1, dtype=torch.float64)
-    return knn_distances(means, neighbours).mean(dim=1)
+        return torch.ones(1, dtype=torch.float64, device=means.device)
+    # As the means are stored: the op has float64 on the CPU alone.
+    return knn_distances(means.float(), neighbours).double().mean(dim=1)

@@ -19,9 +19,8 @@ from blitzgs.capture.cameras import camera_centres
 from blitzgs.runs import exposure
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import CAMERAS, RunCameras, load_cameras
-from blitzgs.runs.evaluation import METRICS
+from blitzgs.runs.evaluation import FOLDER, INDEX, METRICS, PARTS, preview_file
 from blitzgs.runs.folder import RunFolder, open_run
-from blitzgs.runs.previews import FOLDER, INDEX, PARTS, preview_file
 from blitzgs.viewer.world import horizontal, up_direction
 
 Point = tuple[float, float | None, float]
@@ -38,25 +37,15 @@ _NO_ENVIRONMENT = ("t", "run", "event", "origin", "train", "test")
 
 @dataclass
 class RunData:
-    """What is known of a run.
-
-    Attributes:
-        folder: the run.
-        summary: `summary.json`; empty while the run is not finished.
-        log: records of the newest run in the folder, oldest first.
-        cameras: all cameras, or None if the file is missing or damaged.
-        measured: folder of the newest evaluation of the held-out views, or None.
-        views: metrics of each view, by its name.
-        problems: what could not be read, as sentences.
-    """
+    """What is known of a run."""
 
     folder: RunFolder
-    summary: dict[str, Any]
-    log: list[dict[str, Any]]
-    cameras: RunCameras | None
-    measured: Path | None
-    views: dict[str, dict[str, float]]
-    problems: list[str] = field(default_factory=list)
+    summary: dict[str, Any]  # `summary.json`; empty while the run is not finished
+    log: list[dict[str, Any]]  # records of the newest run in the folder, oldest first
+    cameras: RunCameras | None  # all cameras, or None if the file is missing or damaged
+    measured: Path | None  # folder of the newest evaluation of the held-out views, or None
+    views: dict[str, dict[str, float]]  # metrics of each view, by its name
+    problems: list[str] = field(default_factory=list)  # what could not be read, as sentences
 
     @property
     def is_test(self) -> bool:
@@ -65,11 +54,7 @@ class RunData:
 
 
 def read_run(path: Path) -> RunData:
-    """Read a run; damaged files are left out, and named in `problems`.
-
-    Raises:
-        FileNotFoundError: the folder is not a run.
-    """
+    """Read a run (FileNotFoundError: it is none); damaged files are left out, and named in `problems`."""
     folder = open_run(path)
     data = RunData(folder, {}, [], None, None, {})
     try:
@@ -193,10 +178,13 @@ def plan(data: RunData) -> dict[str, Any] | None:
 
 
 def _other_views(data: RunData) -> dict[str, dict[str, float]]:
-    """Return the metrics of training views that `blitzgs eval --split train` or `all` has measured."""
+    """Return the metrics of training views, of the run's end and of `blitzgs eval --split train` or `all`."""
     found: dict[str, dict[str, float]] = {}
-    for split in ("all", "train"):
-        file = data.folder.path / run_files.EVALUATION / split / "metrics.json"
+    folder = data.folder.path / run_files.EVALUATION
+    for file in (
+        *sorted(folder.glob(f"*/{run_files.TRAINED_VIEWS}")),
+        *(folder / split / "metrics.json" for split in ("all", "train")),
+    ):
         if file.exists():
             found |= _views_of(file, data.problems)
     return found

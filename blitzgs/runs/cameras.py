@@ -67,9 +67,7 @@ def checked_camera(
 ) -> RunCamera:
     """Return a camera with these values, in arrays of its own.
 
-    Raises:
-        TypeError: a size is no number, or a matrix not made of numbers; the message names it.
-        ValueError: a value is impossible; the message names it.
+    A size or matrix that is none is a TypeError, an impossible value a ValueError; the message names it.
     """
     for argument, size in (("width", width), ("height", height)):
         if isinstance(size, bool) or not isinstance(size, (int, float, np.integer, np.floating)):
@@ -83,11 +81,7 @@ def checked_camera(
 
 
 def _check(sizes: Float64, Ks: Float64, poses: Float64) -> None:  # noqa: N803
-    """Refuse impossible values of cameras: sizes [N, 2], Ks [N, 3, 3] and poses [N, 4, 4].
-
-    Raises:
-        ValueError: the message names the first one.
-    """
+    """Refuse impossible values of cameras: sizes [N, 2], Ks [N, 3, 3] and poses [N, 4, 4]."""
     rotations = poses[:, :3, :3]
     with np.errstate(invalid="ignore"):
         turned = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) < 1e-3
@@ -150,12 +144,7 @@ def save_cameras(folder: Path, capture: Capture, run_id: str = "") -> None:
 
 
 def load_cameras(folder: Path) -> RunCameras:
-    """Read the cameras of a run.
-
-    Raises:
-        FileNotFoundError: the run is older than this file.
-        ValueError: the file is damaged.
-    """
+    """Read a run's cameras (FileNotFoundError: it is older than this file; ValueError: it is damaged)."""
     path = folder / CAMERAS
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -9,16 +9,16 @@ compares the files with the digests. The folder must be on a file system that ev
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import re
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import torch
@@ -27,11 +27,10 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.sharding import global_positions
-from blitzgs.runs.shard_file import file_digest, header_of, write_shard
-from blitzgs.util.output import check_space, explain, is_lack_of_space, sync_to_disk
+from blitzgs.runs.manifest import DAMAGE, Shard, finish, verified
+from blitzgs.runs.shard_file import header_of, write_shard
+from blitzgs.util.output import check_space, explain, is_lack_of_space
 
-FORMAT = 2
-MANIFEST = "manifest.json"
 SHARED = "shared.safetensors"
 _NAME = re.compile(r"checkpoint_(\d{6,})")
 _UNFINISHED = ".unfinished_"
@@ -49,16 +48,6 @@ class CheckpointError(RuntimeError):
         self.lacks_space = lacks_space
 
 
-@dataclass
-class Shard:
-    """One file of a checkpoint: name, rows of the table in it, size and SHA-256."""
-
-    file: str
-    rows: int
-    bytes: int
-    sha256: str
-
-
 def save(
     directory: str | os.PathLike[str],
     columns: Mapping[str, Tensor],
@@ -68,83 +57,150 @@ def save(
     shared: Mapping[str, Tensor] | None = None,
     reached: Callable[[str], None] = lambda point: None,
 ) -> Path:
-    """Write a checkpoint; return on every rank when it is on disk.
+    """Write a checkpoint and delete older ones; return its folder. Else as for `Saving`."""
+    saving = Saving(directory, columns, state, ranks, keep, shared, reached)
+    path = saving.finish()
+    if saving.deleting is not None:
+        saving.deleting.join()
+    return path
 
-    Args:
-        directory: folder of checkpoints, made if missing.
-        columns: name -> [N_rank, ...], this rank's shard; the same names, dtypes and widths on every rank.
-        state: the rest of what a resumed run needs, as JSON values; rank 0's is stored.
-        ranks: the job.
-        keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
-        shared: tensors that are the same on all ranks; rank 0's are stored, in a separate file.
-        reached: called at each point at which the save may be interrupted, with the point's name; the tests
-            of crashes stop the process there.
 
-    Returns:
-        The folder of the new checkpoint, `directory/checkpoint_NNNNNN`; later numbers may have more digits.
+class Saving:
+    """A checkpoint that a thread of each rank writes; there is none until `finish` has returned.
 
-    Raises:
-        CheckpointError: on every rank, if any rank could not write; earlier checkpoints are unchanged.
-        ValueError: the columns differ in length, or `keep` < 1.
+    Attributes:
+        deleting: deletes older checkpoints on rank 0, after `finish`.
     """
-    if keep < 1:
-        raise ValueError(f"checkpoint: keep must be at least 1, got {keep}")
-    rows = _common_length(columns)
-    directory = Path(directory)
-    name, problem = "", None
-    if ranks.rank == 0:
-        try:
-            name = _next_name(directory)
-            _delete_unfinished(directory)
-        except OSError as error:
-            problem = f"no checkpoint was saved, because rank 0 could not read {directory}: {error}."
-    name, problem = ranks.broadcast_object((name, problem))
-    if problem:
-        raise CheckpointError(problem)
-    lacks_space = True
-    unfinished = directory / (_UNFINISHED + name)
-    mine, common = None, None
-    try:
-        reached("begin")
-        unfinished.mkdir(parents=True, exist_ok=True)
-        check_space(unfinished, columns)
-        reached("folder made")
-        file = f"shard_{ranks.rank:04d}_of_{ranks.world_size:04d}.safetensors"
-        with ranks.watchdog.working("writing a checkpoint"):
-            size, digest = write_shard(unfinished / file, columns, reached)
-        mine = Shard(file, rows, size, digest)
-        if shared and ranks.rank == 0:
-            common = Shard(SHARED, 0, *write_shard(unfinished / SHARED, shared, lambda point: None))
-    except OSError as error:
-        problem = f"rank {ranks.rank} could not write: {explain(error)}"
-        lacks_space = is_lack_of_space(error)
-    results = ranks.all_gather_object((mine, problem, lacks_space))
-    problems = [text for _, text, _ in results if text]
-    lacks_space = all(lacks for _, _, lacks in results)
-    if not problems and ranks.rank == 0:
-        try:
-            with ranks.watchdog.working("finishing a checkpoint"):
-                shards = [shard for shard, _, _ in results if shard]
-                _finish(directory, name, shards, common, state, ranks.world_size, reached)
-        except OSError as error:
-            problems.append(f"rank 0 could not write: {explain(error)}")
-            lacks_space = is_lack_of_space(error)
-    problems, lacks_space = ranks.broadcast_object((problems, lacks_space))
-    if problems:
+
+    def __init__(
+        self,
+        directory: str | os.PathLike[str],
+        columns: Mapping[str, Tensor],
+        state: Mapping[str, Any],
+        ranks: Ranks,
+        keep: int = 3,
+        shared: Mapping[str, Tensor] | None = None,
+        reached: Callable[[str], None] = lambda point: None,
+    ) -> None:
+        """Begin to write a checkpoint. Collective.
+
+        Args:
+            directory: folder of checkpoints, made if missing.
+            columns: name -> [N_rank, ...], this rank's shard; the same names, dtypes and widths on every
+                rank. They must not change before `finish` has returned, and neither must the following two.
+            state: the rest of what a resumed run needs, as JSON values; rank 0's is stored.
+            ranks: the job.
+            keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
+            shared: tensors that are the same on all ranks; rank 0's are stored, in a separate file.
+            reached: called at each point at which the save may be interrupted, with the point's name; the
+                tests of crashes stop the process there.
+
+        Raises:
+            CheckpointError: rank 0 cannot read the folder.
+            ValueError: the columns differ in length, or `keep` < 1.
+        """
+        if keep < 1:
+            raise ValueError(f"checkpoint: keep must be at least 1, got {keep}")
+        self._rows = _common_length(columns)
+        self._directory, self._state, self._ranks, self._keep = Path(directory), state, ranks, keep
+        self._reached = reached
+        name, problem = "", None
         if ranks.rank == 0:
-            shutil.rmtree(unfinished, ignore_errors=True)
-        raise CheckpointError(
-            f"checkpoint {directory / name} was not saved: {'; '.join(problems)}. "
-            "Earlier checkpoints are untouched.",
-            lacks_space,
-        )
-    if ranks.rank == 0:
+            try:
+                name = _next_name(self._directory)
+                _delete_unfinished(self._directory)
+            except OSError as error:
+                problem = f"no checkpoint was saved, because rank 0 could not read {directory}: {error}."
+        self._name, problem = ranks.broadcast_object((name, problem))
+        if problem:
+            raise CheckpointError(problem)
+        self._folder = self._directory / (_UNFINISHED + self._name)
+        shared = shared if ranks.rank == 0 else None
+        device = next(iter(columns.values())).device
+        ready = torch.cuda.current_stream(device).record_event() if device.type == "cuda" else None
+        pool = ThreadPoolExecutor(1, "blitzgs-checkpoint")
+        self.deleting: Thread | None = None
+        self._written = pool.submit(self._write, columns, shared or {}, device, ready)
+        pool.shutdown(wait=False)
+
+    @property
+    def is_written(self) -> bool:
+        """Whether this rank has written its files, or has failed to."""
+        return self._written.done()
+
+    def wait(self) -> None:
+        """Wait until this rank has written its files; the columns may change afterwards."""
+        self._written.exception()
+
+    def _write(
+        self,
+        columns: Mapping[str, Tensor],
+        shared: Mapping[str, Tensor],
+        device: torch.device,
+        ready: torch.cuda.Event | None,
+    ) -> tuple[Shard | None, Shard | None, str | None, bool]:
+        """Write this rank's files; return what they are, or why there are none and whether space lacks."""
+        ranks, reached = self._ranks, self._reached
         try:
-            _delete_old(directory, keep, reached)
+            reached("begin")
+            self._folder.mkdir(parents=True, exist_ok=True)
+            check_space(self._folder, columns)
+            reached("folder made")
+            file = f"shard_{ranks.rank:04d}_of_{ranks.world_size:04d}.safetensors"
+            # On a stream of its own, copies to the host wait for no later work.
+            with torch.cuda.stream(None if ready is None else torch.cuda.Stream(device)):
+                if ready is not None:
+                    ready.wait()
+                mine = Shard(file, self._rows, *write_shard(self._folder / file, columns, reached))
+                common = None
+                if shared:
+                    written = write_shard(self._folder / SHARED, shared, lambda point: None)
+                    common = Shard(SHARED, 0, *written)
+            return mine, common, None, True
         except OSError as error:
-            # The new checkpoint is complete; the next save tries to delete the old ones again.
-            warnings.warn(f"an older checkpoint could not be deleted: {error}", stacklevel=2)
-    return directory / name
+            text = f"rank {ranks.rank} could not write: {explain(error)}"
+            return None, None, text, is_lack_of_space(error)
+
+    def finish(self) -> Path:
+        """Wait until all ranks have written, and give the checkpoint its name. Collective.
+
+        Returns:
+            The folder of the new checkpoint, `directory/checkpoint_NNNNNN`; later numbers may have more
+            digits.
+
+        Raises:
+            CheckpointError: on every rank, if any rank could not write; earlier checkpoints are unchanged.
+            ValueError: a column has a dtype that the format lacks.
+        """
+        ranks, path = self._ranks, self._directory / self._name
+        with ranks.watchdog.working("writing a checkpoint"):
+            mine, common, problem, lacks_space = self._written.result()
+        results = ranks.all_gather_object((mine, problem, lacks_space))
+        problems = [text for _, text, _ in results if text]
+        lacks_space = all(lacks for _, _, lacks in results)
+        if not problems and ranks.rank == 0:
+            try:
+                with ranks.watchdog.working("finishing a checkpoint"):
+                    shards = [shard for shard, _, _ in results if shard]
+                    finish(self._folder, path, shards, common, self._state, ranks.world_size, self._reached)
+            except OSError as error:
+                problems.append(f"rank 0 could not write: {explain(error)}")
+                lacks_space = is_lack_of_space(error)
+        problems, lacks_space = ranks.broadcast_object((problems, lacks_space))
+        if problems:
+            if ranks.rank == 0:
+                shutil.rmtree(self._folder, ignore_errors=True)
+            raise CheckpointError(
+                f"checkpoint {path} was not saved: {'; '.join(problems)}. Earlier checkpoints are untouched.",
+                lacks_space,
+            )
+        if ranks.rank == 0:
+            try:
+                self.deleting = _delete_old(self._directory, self._keep, self._reached)
+            except OSError as error:
+                # The new checkpoint is complete; the next save tries to delete the old ones again.
+                warnings.warn(f"an older checkpoint could not be deleted: {error}", stacklevel=2)
+        return path
 
 
 @dataclass
@@ -237,7 +293,7 @@ def load(
         # Each rank checks some of the files, so that every file is read for its digest once.
         with ranks.watchdog.working("reading a checkpoint"):
             manifest = verified(path, ranks.rank, ranks.world_size)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except DAMAGE as error:
         problem = str(error) or type(error).__name__
     problems = [text for text in ranks.all_gather_object(problem) if text]
     if problems or manifest is None:
@@ -247,15 +303,6 @@ def load(
         with _opened(path / manifest.shared.file) as file:
             shared = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     return read_share(path, manifest.shards, ranks, torch.device(device)), manifest.state, shared
-
-
-@dataclass
-class Manifest:
-    """The files of a checkpoint, and its state."""
-
-    shards: list[Shard]
-    shared: Shard | None
-    state: dict[str, Any]
 
 
 def read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.device) -> dict[str, Tensor]:
@@ -291,99 +338,26 @@ def _opened(path: Path) -> Iterator[Any]:
             yield shard
 
 
-def verified(path: Path, part: int = 0, parts: int = 1) -> Manifest:
-    """Read the manifest of a checkpoint, and compare part of the files with their digests.
-
-    Raises:
-        OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError: it is damaged.
-    """
-    manifest = _read_manifest(path)
-    for shard in [*manifest.shards, *([manifest.shared] if manifest.shared else [])][part::parts]:
-        _verify(path, shard)
-    return manifest
-
-
-def _read_manifest(path: Path) -> Manifest:
-    try:
-        content = json.loads((path / MANIFEST).read_text())
-    except FileNotFoundError:
-        raise ValueError(f"{MANIFEST} is missing") from None
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{MANIFEST} is not valid JSON ({error})") from error
-    if content["format"] not in (1, FORMAT):
-        raise ValueError(f"{MANIFEST} has format {content['format']}, this version reads 1 and {FORMAT}")
-    # Format 1 had no digest of the manifest.
-    if content["format"] != 1 and content.pop("sha256") != _digest(content):
-        raise ValueError(f"{MANIFEST} does not match its own SHA-256")
-    shared = content.get("shared")
-    shards = [Shard(**shard) for shard in content["shards"]]
-    if not shards:
-        raise ValueError(f"{MANIFEST} names no files")
-    return Manifest(shards, None if shared is None else Shard(**shared), content["state"])
-
-
-def _digest(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def _verify(path: Path, shard: Shard) -> None:
-    file = path / shard.file
-    if not file.exists():
-        raise ValueError(f"{shard.file} is missing")
-    if file.stat().st_size != shard.bytes:
-        raise ValueError(f"{shard.file} has {file.stat().st_size} bytes, the manifest says {shard.bytes}")
-    if file_digest(file) != shard.sha256:
-        raise ValueError(f"{shard.file} does not match its SHA-256")
-
-
-def _finish(
-    directory: Path,
-    name: str,
-    shards: list[Shard],
-    shared: Shard | None,
-    state: Mapping[str, Any],
-    world_size: int,
-    reached: Callable[[str], None],
-) -> None:
-    """Write the manifest beside the shards and give the folder its final name, each step synced."""
-    unfinished = directory / (_UNFINISHED + name)
-    missing = [shard.file for shard in shards if not (unfinished / shard.file).exists()]
-    if missing:
-        raise OSError(f"{', '.join(missing)} not in {unfinished}: every rank must see the same file system")
-    content = {
-        "format": FORMAT,
-        "world_size": world_size,
-        "shards": [asdict(shard) for shard in shards],
-        "shared": None if shared is None else asdict(shared),
-        "state": dict(state),
-    }
-    content = json.loads(json.dumps(content))  # tuples become lists: what is read back has the same digest
-    with open(unfinished / MANIFEST, "w") as file:
-        json.dump(content | {"sha256": _digest(content)}, file, indent=1)
-        reached("manifest written")
-        file.flush()
-        os.fsync(file.fileno())
-    sync_to_disk(unfinished)
-    reached("manifest synced")
-    unfinished.rename(directory / name)
-    reached("renamed")
-    sync_to_disk(directory)
-    reached("finished")
-
-
-def _delete_old(directory: Path, keep: int, reached: Callable[[str], None]) -> None:
-    """Delete all but the newest `keep`."""
+def _delete_old(directory: Path, keep: int, reached: Callable[[str], None]) -> Thread:
+    """Start to delete all but the newest `keep`: deleting gigabytes takes seconds."""
     for name in names_of(directory)[:-keep]:
         # Rename first: an interrupted deletion must not leave half a checkpoint under a final name.
         (directory / name).rename(directory / (_UNFINISHED + name))
         reached("old one renamed")
-    _delete_unfinished(directory)
+    # The next save makes a folder that is not among these.
+    deleting = Thread(target=_delete, args=(list(directory.glob(_UNFINISHED + "*")),))
+    deleting.start()
+    return deleting
 
 
 def _delete_unfinished(directory: Path) -> None:
     """Delete the files that interrupted saves and deletions have left."""
-    for leftover in directory.glob(_UNFINISHED + "*"):
-        shutil.rmtree(leftover, ignore_errors=True)
+    _delete(directory.glob(_UNFINISHED + "*"))
+
+
+def _delete(folders: Iterable[Path]) -> None:
+    for folder in folders:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def names_of(directory: Path) -> list[str]:

@@ -57,16 +57,11 @@ def contributions(
 
 @dataclass(frozen=True)
 class Cleaned:
-    """What cleaning leaves.
+    """What cleaning leaves."""
 
-    Attributes:
-        kept: bool [N].
-        picture: of what goes, as JPEG; None: nothing goes.
-        psnr: mean PSNR of the held-out views before and after; None: there are no photographs.
-    """
-
-    kept: Tensor
-    picture: bytes | None
+    kept: Tensor  # bool [N]
+    picture: bytes | None  # of what goes, as JPEG; None: nothing goes
+    # Mean PSNR of the held-out views before and after; None: there are no photographs.
     psnr: tuple[float, float] | None
 
     def write_picture(self, path: Path) -> None:
@@ -84,12 +79,7 @@ def cleaned(
 ) -> Cleaned:
     """Find the Gaussians of a run that at most so many training views count, far from the rest or large.
 
-    Args:
-        model: the model.
-        cameras: of the run.
-        most_views: see `floaters`.
-        ranks: the device of the model.
-        photograph: returns the photograph of a camera; None: there are none.
+    `photograph` returns the photograph of a camera; None: there are none.
     """
     table = table_of_parameters({name: getattr(model, name) for name in (*PARAMETERS, "level")})
     gate = None if model.lod is None else model.lod.gate

@@ -1,27 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures renders against their photographs: PSNR, SSIM and, given weights, LPIPS; writes pictures."""
+"""Measures renders against their photographs: PSNR, SSIM and, given weights, LPIPS; writes pictures.
+
+The report shows small pictures of the best and worst views, and of evenly spaced ones: `previews` beside
+`metrics.json` has NUMBER_render.webp, NUMBER_photograph.webp and NUMBER_error.webp, where NUMBER is that of
+the camera among all of the run, and `views.json`, the list of these numbers.
+"""
 
 from __future__ import annotations
 
+import heapq
 import json
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from blitzgs.capture.images import Images, PhotographError
-from blitzgs.capture.pictures import comparison, encode_image
+from blitzgs.capture.pictures import comparison, encode_image, error_map, to_uint8
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import RenderOptions
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.tiles import TileAssignment, collect_images
 from blitzgs.ops.photometric import ssim
-from blitzgs.runs.previews import Previews
 from blitzgs.util.memory import explain_memory
 from blitzgs.util.output import OutputFolder
 from blitzgs.util.progress import Report
@@ -58,17 +66,10 @@ def image_metrics(render: Tensor, target: Tensor, mask: Tensor | None) -> dict[s
 
 
 def correct_colours(pixels: Tensor, wanted: Tensor) -> Tensor:
-    """Apply the affine colour map (a 3 x 4 matrix) that brings `pixels` closest to `wanted`.
+    """Apply the affine colour map (3 x 4) that brings `pixels` closest to `wanted`, float64 [P, 3]; clamped.
 
     The map is fitted by least squares over the pixels of one view. It removes differences of exposure and
     white balance, which are properties of the photograph and not of the scene.
-
-    Args:
-        pixels: float64 [P, 3].
-        wanted: float64 [P, 3].
-
-    Returns:
-        float64 [P, 3], clamped to [0, 1].
     """
     known = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
     # The pseudo-inverse also handles a view of a single colour, for which many maps are equally good.
@@ -109,16 +110,7 @@ def render_view(
 ) -> Tensor | None:
     """Render camera `index` with the Gaussians of all ranks; every rank calls this.
 
-    Args:
-        finder: finds this rank's Gaussians in the view.
-        views: all cameras.
-        index: the camera to render.
-        options: how to render.
-        owners: divides the tiles among the ranks.
-        destination: rank that gets the image.
-
-    Returns:
-        float32 [H, W, 3] on rank `destination`, the same bits at any number of ranks; None elsewhere.
+    Returns float32 [H, W, 3] on rank `destination`, the same bits at any number of ranks; None elsewhere.
     """
     picked, ranks = views.pick([index]), owners.ranks
     table, active, _ = finder.find(*picked.as_arguments(), options.limits)
@@ -167,19 +159,10 @@ def evaluate(
     """Render views and compare them with their photographs; the ranks take turns at comparing.
 
     Args:
-        scene: this rank's Gaussians, without pending optimiser steps.
-        views: all cameras, on the device.
-        cameras: the same cameras, for their names.
-        images: the photographs.
-        indices: cameras to evaluate.
-        options: how to render.
         folder: folder for `metrics.json` and the pictures; None: nothing is written.
-        owners: divides the tiles among the ranks; every rank calls this function.
         pictures: number of evenly spaced views for which render | photograph | error are written side by
             side; if not 0, the previews of the report are written too.
-        lpips: from `load_lpips`.
         report: called with (views rendered, number of views) after each view.
-        inputs: files that must not be overwritten.
         optional_files: if a file cannot be written, warn instead of raising an error; used during training.
         lod: leaves out Gaussians whose octree level is too fine for their distance; None: no gate.
         stops: asked after each round in which every rank compares one view; if it returns True, the
@@ -245,14 +228,7 @@ def _over_all_ranks(
 ) -> dict[str, Any]:
     """Collect the metrics of all ranks, and return what `evaluate` returns. Collective.
 
-    Args:
-        per_view: the metrics of the views that this rank compared.
-        lost: why this rank could not read a photograph; None: it has read all.
-        names: names of all views, in the order of the result.
-        ranks: the job.
-
-    Raises:
-        PhotographError: a rank could not read a photograph.
+    `lost` says why this rank could not read a photograph; None: it has read all.
     """
     parts = ranks.all_gather_object((per_view, lost))
     if reasons := [reason for _, reason in parts if reason is not None]:
@@ -277,6 +253,12 @@ def worst_views(views: Mapping[str, Mapping[str, float]], count: int = 3) -> lis
     """Return names and PSNR of the views of lowest PSNR, the worst first; none of a single view."""
     ordered = sorted((view["psnr"], name) for name, view in views.items())
     return [(name, psnr) for psnr, name in ordered[:count]] if len(ordered) > 1 else []
+
+
+def spread(indices: Sequence[int]) -> list[int]:
+    """Order indices such that the first few of them are spread evenly, however many are taken."""
+    share = (math.sqrt(5) - 1) / 2
+    return [index for _, index in sorted((k * share % 1, index) for k, index in enumerate(indices))]
 
 
 class _Files:
@@ -307,3 +289,70 @@ class _Files:
         if not self._optional:
             raise error
         warnings.warn(f"the evaluation could not write a file and goes on without it: {error}", stacklevel=2)
+
+
+FOLDER, INDEX = "previews", "views.json"
+PARTS = ("render", "photograph", "error")
+# Longest side in pixels, and quality of WebP.
+_SIDE, _QUALITY = 720, 80
+# So many of the best and as many of the worst views.
+_EXTREMES = 4
+
+
+class Previews:
+    """Keeps the encoded pictures of this rank's candidates until all views are measured."""
+
+    def __init__(self, folder: Path, fixed: set[int]) -> None:
+        """Begin; `fixed` are cameras whose pictures are kept whatever their PSNR."""
+        self._folder, self._fixed = folder / FOLDER, fixed
+        self._kept: dict[int, dict[str, bytes]] = {}
+        # The smallest entry of each is the next to be dropped: (PSNR, camera) and (-PSNR, camera).
+        self._best: list[tuple[float, int]] = []
+        self._worst: list[tuple[float, int]] = []
+
+    def add(self, index: int, psnr: float, render: Tensor, target: Tensor, mask: Tensor | None) -> None:
+        """Take a measured view; arguments are those of `blitzgs.capture.pictures.comparison`."""
+        dropped = _push(self._best, (psnr, index)) | _push(self._worst, (-psnr, index))
+        if index in self._needed():
+            pictures = (to_uint8(render), to_uint8(target), to_uint8(error_map(render, target, mask)))
+            self._kept[index] = {
+                part: _encoded(picture) for part, picture in zip(PARTS, pictures, strict=True)
+            }
+        for other in dropped - self._needed():
+            self._kept.pop(other, None)
+
+    def _needed(self) -> set[int]:
+        return {index for _, index in (*self._best, *self._worst)} | self._fixed
+
+    def files(self, psnr: Mapping[int, float], lists: bool) -> Iterator[tuple[Path, bytes]]:
+        """Return this rank's files, given the PSNR of all ranks' views; one rank also `lists` the cameras."""
+        ordered = sorted(psnr, key=lambda index: (psnr[index], index))
+        chosen = {*ordered[:_EXTREMES], *ordered[-_EXTREMES:]} | (self._fixed & psnr.keys())
+        for index in sorted(chosen & self._kept.keys()):
+            for part, content in self._kept[index].items():
+                yield preview_file(self._folder, index, part), content
+        if lists:
+            yield self._folder / INDEX, json.dumps(sorted(chosen)).encode()
+
+
+def preview_file(folder: Path, index: int, part: str) -> Path:
+    """Return the file of one of `PARTS` of a camera."""
+    return folder / f"{index:06d}_{part}.webp"
+
+
+def _push(heap: list[tuple[float, int]], entry: tuple[float, int]) -> set[int]:
+    """Add an entry; return the camera of the one that no longer fits, if any."""
+    if len(heap) < _EXTREMES:
+        heapq.heappush(heap, entry)
+        return set()
+    return {heapq.heappushpop(heap, entry)[1]}
+
+
+def _encoded(picture: npt.NDArray[np.uint8]) -> bytes:
+    height, width = picture.shape[:2]
+    scale = min(1.0, _SIDE / max(height, width))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    if scale < 1:
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    _, data = cv2.imencode(".webp", picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
+    return bytes(data)

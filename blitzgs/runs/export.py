@@ -28,17 +28,12 @@ _MAX_ROUNDING = 0.01
 
 @dataclass(frozen=True)
 class Exported:
-    """What a caller has to tell the user about a written file.
+    """What a caller has to tell the user about a written file."""
 
-    Attributes:
-        offset: add this to x, y, z to get coordinates of the capture's world; None: they are already.
-        sidecar: file that has the offset.
-        rounding: largest rounding error of a coordinate in float32, in the capture's unit.
-    """
-
+    # Add this to x, y, z to get coordinates of the capture's world; None: they are already.
     offset: tuple[float, float, float] | None
-    sidecar: Path | None
-    rounding: float
+    sidecar: Path | None  # file that has the offset
+    rounding: float  # largest rounding error of a coordinate in float32, in the capture's unit
 
 
 def export_ply(model: Model, path: Path, coordinates: str = "auto", crs: str = "") -> Exported:
@@ -47,12 +42,7 @@ def export_ply(model: Model, path: Path, coordinates: str = "auto", crs: str = "
 
 
 def export(
-    source: GaussianSource,
-    space: Space,
-    kind: Format,
-    path: Path,
-    coordinates: str = "auto",
-    crs: str = "",
+    source: GaussianSource, space: Space, kind: Format, path: Path, coordinates: str = "auto", crs: str = ""
 ) -> Exported:
     """Write a model as a file.
 
@@ -62,9 +52,6 @@ def export(
 
     Args:
         source: the Gaussians, in the capture's unit around the model's origin.
-        space: of the model.
-        kind: format of the file.
-        path: file to write.
         coordinates: "capture" writes the capture's coordinates, "centred" the re-centred ones; "auto" writes
             the capture's if the format resolves them finely enough.
         crs: reference system of the capture's coordinates, for the file of the offset; empty: unknown.
@@ -81,8 +68,7 @@ def export(
     reach, middle = _measured(source, offset)
     rounding = _spacing(reach[1])
     centred = coordinates == "centred" or (coordinates == "auto" and rounding > _MAX_ROUNDING * middle)
-    if coordinates == "auto" and not kind.streams:
-        # Quantised positions are fine only near the origin.
+    if coordinates == "auto" and kind.quantised:
         centred |= float(np.linalg.norm(offset)) > 2 * space.extent * space.unit
     sidecar = path.with_name(path.name + ".offset.json")
     if centred:
@@ -160,12 +146,9 @@ def without_antialiasing(model: Model, cameras: Sequence[CameraLike]) -> Model:
     """Return a model for viewers without antialiasing: its opacities contain the compensation.
 
     The antialiased mode scales a splat's opacity by rho = sqrt(det(cov) / det(cov + eps2d I)), which depends
-    on the view. This function multiplies each opacity by the mean of rho over the given views, weighted with
-    the splat's area in pixels. Nearer and farther views keep errors of opposite sign.
-
-    Args:
-        model: trained with `model.antialiased`.
-        cameras: views from which the model should look right, for example the training views.
+    on the view. This function multiplies each opacity by the mean of rho over the given views (the training
+    views, for example), weighted with the splat's area in pixels. Nearer and farther views keep errors of
+    opposite sign.
     """
     opacities = model.opacities.sigmoid()
     areas = torch.zeros_like(opacities, dtype=torch.float64)

@@ -17,12 +17,9 @@ SHARED = "exposures"
 
 
 def effective(measured: Tensor) -> Tensor:
-    """Return gain and bias of each training view as they are used, float64 [T, 2, 3]; does not wait.
+    """Return gain and bias of each training view as they are used, float64 [T, 2, 3], from the measured ones.
 
-    Their means over the views are 1 and 0. Photographs that agree all have 1 and 0.
-
-    Args:
-        measured: float64 [T, 2, 3], the gain and the bias of each channel, for each training view.
+    Their means over the views are 1 and 0. Photographs that agree all have 1 and 0. Does not wait.
     """
     mean = measured.mean(0)
     same = torch.zeros_like(mean)

@@ -23,10 +23,10 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint, exposure
 from blitzgs.runs.checkpoint import CheckpointError
+from blitzgs.runs.folder_checks import check_own
 from blitzgs.runs.guard import bad_column, check_before_saving
-from blitzgs.runs.identity import check_own
 from blitzgs.table.blocks import sort_rows
-from blitzgs.table.host_table import HostTable
+from blitzgs.table.host_table import HostTable, available_bytes
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.views import Space
@@ -37,6 +37,8 @@ CHECKPOINTS = "checkpoints"
 SUMMARY = "summary.json"
 REPORT = "report.html"
 EVALUATION = "evaluation"
+# In the folder of a run's last evaluation: metrics of some training views.
+TRAINED_VIEWS = "trained.json"
 LINEAGE = "lineage"
 # Sections and fields that a resumed run may change, because they do not change the result beyond rounding.
 # The exception is `data.allow_missing`: a run whose photograph is lost could not be resumed without it.
@@ -55,77 +57,59 @@ FREE_FIELDS = (
 
 @dataclass
 class Progress:
-    """The progress of a run; saved with every checkpoint.
+    """The progress of a run; saved with every checkpoint."""
 
-    Attributes:
-        step: number of optimiser steps taken.
-        sh_degree: spherical-harmonics degree of the last step.
-        level_count: number of octree levels K.
-        peak_gaussians: largest number of Gaussians so far.
-        seconds: seconds of training so far, without evaluations.
-        milestones: number of Gaussians at named points of the run, such as "before_pass_1".
-        ledger: ledger of the lineage (`blitzgs.spawn.lineage.Ledger`), if births and deaths are logged.
-        reference_distance: d_0 of the levels (`blitzgs.view.levels.Levels`), in the unit of the means.
-        finest_level: finest level that the LOD gate keeps; None: there is no gate at this point of the run.
-        gated_views: for each training view, in order, "1" if it has the LOD gate and "0" if the gate would
-            keep almost all Gaussians; empty without a gate.
-        least_kept: the smallest share of the Gaussians that a training view keeps with the LOD gate; 0
-            without a gate, and in old checkpoints.
-        train_views: digest of the names of the training views, in their order; empty in old checkpoints.
-        curve: result of `blitzgs.training.curve.Curve.saved`; empty in old checkpoints.
-        gate: digest of the spawn gate's files; empty without a gate, and in old checkpoints.
-        stages: seconds of each kind of work besides the optimiser steps; see `TrainingState.stage`.
-        events_left: (time, order, kind) of the events of the last step that a signal kept from running.
-        sorted_spread: spread of the blocks of all ranks when density events last sorted the rows, as
-            `blitzgs.training.events.densify` measures it; 0: they have not.
-    """
-
-    step: int
-    sh_degree: int
-    level_count: int
-    peak_gaussians: int
-    seconds: float
+    step: int  # number of optimiser steps taken
+    sh_degree: int  # spherical-harmonics degree of the last step
+    level_count: int  # number of octree levels K
+    peak_gaussians: int  # largest number of Gaussians so far
+    seconds: float  # seconds of training so far, without evaluations
+    # Number of Gaussians at named points of the run, such as "before_pass_1".
     milestones: dict[str, int] = dataclasses.field(default_factory=dict)
+    # Ledger of the lineage (`blitzgs.spawn.lineage.Ledger`), if births and deaths are logged.
     ledger: dict[str, int] = dataclasses.field(default_factory=dict)
+    # d_0 of the levels (`blitzgs.view.levels.Levels`), in the unit of the means.
     reference_distance: float = 0.0
+    # Finest level that the LOD gate keeps; None: there is no gate at this point of the run.
     finest_level: int | None = None
+    # For each training view, in order, "1" if it has the LOD gate and "0" if the gate would keep almost all
+    # Gaussians; empty without a gate.
     gated_views: str = ""
+    # The smallest share of the Gaussians that a training view keeps with the LOD gate; 0 without a gate, and
+    # in old checkpoints.
     least_kept: float = 0.0
+    # Digest of the names of the training views, in their order; empty in old checkpoints.
     train_views: str = ""
+    # Fields of `blitzgs.training.curve.Curve`; empty in old checkpoints.
     curve: dict[str, Any] = dataclasses.field(default_factory=dict)
-    gate: str = ""
+    gate: str = ""  # digest of the spawn gate's files; empty without a gate, and in old checkpoints
+    # Seconds of each kind of work besides the optimiser steps; see `TrainingState.stage`.
     stages: dict[str, float] = dataclasses.field(default_factory=dict)
+    # (time, order, kind) of the events of the last step that a signal kept from running.
     events_left: list[tuple[Any, ...]] = dataclasses.field(default_factory=list)
+    # Spread of the blocks of all ranks when density events last sorted the rows, as
+    # `blitzgs.training.events.densify` measures it; 0: they have not.
     sorted_spread: int = 0
 
 
 @dataclass
 class TrainedModel:
-    """A model read from a run's checkpoint, without pending optimiser steps, ready to render.
-
-    Attributes:
-        config: configuration of the run.
-        progress: progress of the run at the checkpoint.
-        space: maps between the trained world and the capture's world.
-        table: this rank's Gaussians.
-        exposures: gain and bias of each training photograph, [T, 2, 3]; None if the run has none.
-        pool_bytes: bytes of a device that the Gaussians may take, if the run trained with a pool; else 0.
-    """
+    """A model read from a run's checkpoint, without pending optimiser steps, ready to render."""
 
     config: Config
-    progress: Progress
-    space: Space
-    table: GaussianTable
+    progress: Progress  # progress of the run at the checkpoint
+    space: Space  # maps between the trained world and the capture's world
+    table: GaussianTable  # this rank's Gaussians
+    # Bytes of a device that the Gaussians may take, if the run trained with a pool; else 0.
     pool_bytes: int = 0
+    # Gain and bias of each training photograph, [T, 2, 3]; None if the run has none.
     exposures: torch.Tensor | None = None
 
     def scene(self, device: torch.device) -> Scene:
         """Return the scene that views are rendered from on a device.
 
-        With a pool, the first call moves the table into memory that the pool can reach.
-
-        Raises:
-            PoolError: the pool has room for fewer than two blocks.
+        With a pool, the first call moves the table into memory that the pool can reach. PoolError: the pool
+        has room for fewer than two blocks.
         """
         if self.pool_bytes == 0:
             return self.table
@@ -144,15 +128,13 @@ def save(
     ranks: Ranks,
     run_id: str = "",
     shared: Mapping[str, torch.Tensor] | None = None,
-) -> Path:
-    """Write a checkpoint of a run; pending optimiser steps stay pending, so that saving changes nothing.
+    in_background: bool = False,
+) -> checkpoint.Saving:
+    """Begin to write a checkpoint of a run; pending optimiser steps stay pending: saving changes nothing.
 
-    Returns:
-        The checkpoint's folder.
-
-    Raises:
-        NonFiniteError: a value is not finite; nothing is written, and earlier checkpoints are kept.
-        CheckpointError: a rank could not write; earlier checkpoints are kept.
+    With `in_background`, the table may change before `Saving.finish`: a copy of it is written, or, if memory
+    lacks for that, the call returns when the files are written. Earlier checkpoints are kept if a value is
+    not finite (NonFiniteError: nothing is written) or a rank could not write (CheckpointError).
     """
     check_before_saving(table, progress.step, ranks)
     state = {
@@ -163,46 +145,41 @@ def save(
     }
     keep = config.log.keep_checkpoints
     columns = {name: table[name] for name in table}
-    return checkpoint.save(folder / CHECKPOINTS, columns, state, ranks, keep, shared)
+    has_room = in_background and 2 * table.memory_bytes < _memory_left(table.device)
+    if has_room:
+        columns = {name: column.clone() for name, column in columns.items()}
+    saving = checkpoint.Saving(folder / CHECKPOINTS, columns, state, ranks, keep, shared)
+    if in_background and not has_room:
+        with ranks.watchdog.working("writing a checkpoint"):
+            saving.wait()
+    return saving
+
+
+def _memory_left(device: torch.device) -> int:
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else available_bytes() or 0
 
 
 @dataclass
 class Restored:
-    """The content of a run's checkpoint.
+    """The content of a run's checkpoint."""
 
-    Attributes:
-        table: this rank's Gaussians.
-        progress: progress of the run at the checkpoint.
-        space: maps between the trained world and the capture's world.
-        config: configuration of the run.
-        run_id: identifies the run in its log.
-        source: name of the checkpoint and why it was chosen, as text.
-        shared: tensors that are the same on all ranks: `TileOwners.columns`, and those of the exposures.
-    """
-
-    table: GaussianTable
-    progress: Progress
-    space: Space
+    table: GaussianTable  # this rank's Gaussians
+    progress: Progress  # progress of the run at the checkpoint
+    space: Space  # maps between the trained world and the capture's world
     config: Config
-    run_id: str
-    source: str
+    run_id: str  # identifies the run in its log
+    source: str  # name of the checkpoint and why it was chosen, as text
+    # Tensors that are the same on all ranks: `TileOwners.columns`, and those of the exposures.
     shared: dict[str, torch.Tensor]
 
 
 def restore(
     folder: Path, ranks: Ranks, device: torch.device | None = None, only: str | None = None
 ) -> Restored | None:
-    """Read the newest undamaged checkpoint of a run; return None if the run has no checkpoint.
+    """Read a run's newest undamaged checkpoint, or the one named `only`; None: the run has no checkpoint.
 
-    Args:
-        folder: folder of the run.
-        ranks: the job.
-        device: device of the Gaussians; None: the ranks' device.
-        only: name of the one checkpoint to read; None: the newest.
-
-    Raises:
-        CheckpointError: there are checkpoints, but all are damaged, or the newest is of another version or
-            of another run.
+    The Gaussians go to `device`, else to the ranks' device. CheckpointError: all checkpoints are damaged, or
+    the newest is of another version or of another run.
     """
     loaded = checkpoint.load_latest(
         folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns, only
@@ -220,22 +197,12 @@ def restore(
         sort_rows(table)
         progress.sorted_spread = 0
     return Restored(
-        table,
-        progress,
-        space,
-        config,
-        state.get("run", ""),
-        f"{loaded.name} ({why}{skipped})",
-        loaded.shared,
+        table, progress, space, config, state.get("run", ""), f"{loaded.name} ({why}{skipped})", loaded.shared
     )
 
 
 def parsed(state: Mapping[str, Any], path: Path) -> tuple[Progress, Space, Config]:
-    """Return what the state of a checkpoint says.
-
-    Raises:
-        CheckpointError: it is that of another version of the program.
-    """
+    """Return what the state of a checkpoint says (CheckpointError: it is that of another version)."""
     try:
         known = {field.name for field in dataclasses.fields(Progress)}
         progress = Progress(**{name: value for name, value in state["progress"].items() if name in known})
@@ -256,11 +223,7 @@ def run_and_checkpoint(path: Path) -> tuple[Path, str | None]:
 
 
 def check_is_run(folder: Path) -> None:
-    """Check that a folder looks like a run.
-
-    Raises:
-        FileNotFoundError: it has neither a configuration nor checkpoints.
-    """
+    """Refuse a folder that has neither a configuration nor checkpoints (FileNotFoundError)."""
     if not (folder / CONFIG).exists() and not (folder / CHECKPOINTS).exists():
         raise FileNotFoundError(f"{folder} is not a run: it has no {CONFIG} and no {CHECKPOINTS}")
 
@@ -274,15 +237,9 @@ def open_model(
 ) -> TrainedModel:
     """Open the newest model of a run for rendering, with the configuration that was saved with it.
 
-    Args:
-        folder: folder of the run.
-        ranks: the job.
-        data: present folder of the capture; None: unchanged.
-        resident_gb: gigabytes of each device for Gaussians; 0: no limit; None: as the run.
-        only: name of the one checkpoint to open; None: the newest.
-
-    Raises:
-        FileNotFoundError: the folder is not a run, or holds no checkpoint.
+    `data` is the present folder of the capture, `resident_gb` the gigabytes of each device for Gaussians (0:
+    no limit, None: as the run), `only` the name of a checkpoint. FileNotFoundError: the folder is no run, or
+    holds no checkpoint.
     """
     check_is_run(folder)
     pool_bytes = int((_resident_gb(folder / CONFIG) if resident_gb is None else resident_gb) * 1e9)
@@ -321,11 +278,7 @@ def compare_with_file(config: Config, path: Path) -> None:
 
 
 def check_resumable(saved: Config, wanted: Config) -> None:
-    """Check that a configuration gives the same result as the one that a checkpoint was trained with.
-
-    Raises:
-        ConfigError: a field differs; the message names the first one.
-    """
+    """Refuse a configuration that gives another result than the checkpoint's (ConfigError names a field)."""
     for name, old, new in _differences(saved, wanted):
         # The number of minutes may change: the rest of the run is then fitted into the rest of the new time.
         is_budget = name == "schedule.minutes" and old > 0 and new > 0

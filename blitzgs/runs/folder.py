@@ -186,11 +186,7 @@ class RunFolder:
     """The folder of a run, made by `blitzgs train --out`."""
 
     def __init__(self, path: Path | str) -> None:
-        """Open a folder.
-
-        Raises:
-            FileNotFoundError: it is not the folder of a run.
-        """
+        """Open a folder (FileNotFoundError: it is not the folder of a run)."""
         self.path = Path(path)
         run_files.check_is_run(self.path)
 

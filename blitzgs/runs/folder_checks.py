@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks a run's folder before training: all ranks can write to it, it has space, no other run uses it."""
+"""Checks the folder of a run: ranks can write to it, there is space, no other run uses it or wrote in it."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import fcntl
+import json
 import os
 import secrets
 import shutil
@@ -16,6 +17,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.runs.cameras import CAMERAS
+from blitzgs.runs.checkpoint import CheckpointError
+from blitzgs.runs.log import LOG
 from blitzgs.table.table import GaussianTable
 
 LOCK = ".lock"
@@ -32,10 +36,8 @@ class FolderError(RuntimeError):
 def locked(folder: Path, ranks: Ranks) -> Iterator[None]:
     """Lock a folder against other runs while the context lasts; every rank calls this.
 
-    The operating system releases the lock when the process ends, also after a crash.
-
-    Raises:
-        FolderError: on every rank, when another process is training in the folder.
+    The operating system releases the lock when the process ends, also after a crash. FolderError, on every
+    rank: another process is training in the folder.
     """
     descriptor, problem = None, None
     if ranks.rank == 0:
@@ -84,11 +86,7 @@ def _lock(path: Path) -> tuple[int | None, str | None]:
 
 
 def check_writable(folder: Path, ranks: Ranks) -> None:
-    """Check that every rank can write to the folder and that all of them see the same one.
-
-    Raises:
-        FolderError: on every rank, naming those that cannot.
-    """
+    """Check that all ranks can write to the folder, and see the same one (FolderError names the others)."""
     token = ranks.broadcast_object(f".probe_{secrets.token_hex(6)}")
     problem = None
     own = folder / f"{token}_{ranks.rank}"
@@ -123,13 +121,8 @@ def check_writable(folder: Path, ranks: Ranks) -> None:
 def check_unclaimed(checkpoints: Path, files: Sequence[str], ranks: Ranks) -> None:
     """Check that a run will not replace files of another program: every run has a folder of checkpoints.
 
-    Args:
-        checkpoints: that folder; it may be missing.
-        files: names of the files and folders beside it that a run writes.
-        ranks: the job.
-
-    Raises:
-        FileExistsError: on every rank; it is missing, and one of the files exists.
+    FileExistsError, on every rank: it is missing, and one of the `files`, which a run writes beside it,
+    exists.
     """
     found = None
     if ranks.rank == 0 and not os.path.lexists(checkpoints):
@@ -142,17 +135,7 @@ def check_unclaimed(checkpoints: Path, files: Sequence[str], ranks: Ranks) -> No
 
 
 def check_room(folder: Path, table: GaussianTable, ranks: Ranks, most_gaussians: int) -> None:
-    """Check that a checkpoint fits on the disk, and warn if one of the largest population will not fit.
-
-    Args:
-        folder: folder of the run.
-        table: this rank's Gaussians.
-        ranks: the job.
-        most_gaussians: limit of the population; 0: none is known.
-
-    Raises:
-        FolderError: on every rank, if not even a checkpoint of the present population fits.
-    """
+    """Check that a checkpoint fits on the disk (else FolderError); warn if `most_gaussians` will not fit."""
     row = sum(table.row_bytes.values())
     parts = ranks.all_gather_object((len(table), row))
     rows, row = sum(count for count, _ in parts), max(size for _, size in parts)
@@ -175,3 +158,51 @@ def check_room(folder: Path, table: GaussianTable, ranks: Ranks, most_gaussians:
 
 def _gigabytes(size: float) -> str:
     return f"{size / 1e9:.2f} GB"
+
+
+# The last records of a log are within this number of bytes.
+_TAIL_BYTES = 1 << 16
+
+
+def check_own(folder: Path, checkpoint: Path, run_id: str, ranks: Ranks) -> None:
+    """Check that a checkpoint was written by the run whose cameras and log are in `folder`. Collective.
+
+    CheckpointError, on every rank: it was written by another run. Old checkpoints have no id and are not
+    checked.
+    """
+    known = ranks.broadcast_object(known_id(folder) if ranks.rank == 0 else "")
+    if known and run_id and known != run_id:
+        raise CheckpointError(
+            f"{checkpoint} was written by another run ({run_id}) than the one in {folder} ({known}), whose "
+            "cameras would be used with it: put back this run's own checkpoints, or use the folder of the "
+            "other run"
+        )
+
+
+def known_id(folder: Path) -> str:
+    """Return the id of the run in a folder, from its cameras, else from its log; empty if it is not known."""
+    try:
+        found = json.loads((folder / CAMERAS).read_text(encoding="utf-8")).get("run", "")
+    except (OSError, ValueError, AttributeError, RecursionError):
+        found = ""
+    if isinstance(found, str) and found:
+        return found
+    for line in reversed(_tail(folder / LOG)):
+        try:
+            found = json.loads(line).get("run", "")
+        except (ValueError, AttributeError, RecursionError):
+            continue  # an incomplete line
+        if isinstance(found, str) and found:
+            return found
+    return ""
+
+
+def _tail(path: Path) -> list[str]:
+    """Return the last lines of a file."""
+    try:
+        with open(path, "rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - _TAIL_BYTES))
+            return file.read().decode(errors="replace").splitlines()
+    except OSError:
+        return []

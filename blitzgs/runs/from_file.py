@@ -22,12 +22,9 @@ from blitzgs.view.views import Space
 
 
 def trained_columns(found: Gaussians, space: Space, ranks: Ranks) -> dict[str, Tensor]:
-    """Return this rank's Gaussians as columns of a table, on the CPU.
+    """Return this rank's Gaussians as columns of a table, on the CPU: rank m of M gets the rows m, m + M, ...
 
-    Args:
-        found: from `read_gaussians`, in the capture's coordinates, or in those less the offset of the header.
-        space: maps between the trained world and the capture's world.
-        ranks: the job; rank m of M gets the rows m, m + M, ...
+    `found` has the capture's coordinates, or those less the offset of its header.
     """
     rows = slice(ranks.rank, None, ranks.world_size)
     shift = torch.from_numpy(np.array(offset_of(found.comments)) - np.array(space.offset))
@@ -46,12 +43,7 @@ def trained_columns(found: Gaussians, space: Space, ranks: Ranks) -> dict[str, T
 
 
 def gate_of(found: Gaussians, unit: float) -> LodGate | None:
-    """Return the LOD gate that `blitzgs export` writes into a header; None: there is none.
-
-    Args:
-        found: from `read_gaussians`.
-        unit: length of one trained unit in the file's unit.
-    """
+    """Return the LOD gate in a header of `blitzgs export`; `unit` is a trained unit in the file's."""
     pattern = r"comment lod reference_distance (\S+) fork (\S+) levels (\d+) finest (\d+)( smooth)?"
     matches = [match for line in found.comments if (match := re.fullmatch(pattern, line.strip()))]
     if not matches or found.levels is None:
@@ -61,15 +53,7 @@ def gate_of(found: Gaussians, unit: float) -> LodGate | None:
 
 
 def model_of_file(found: Gaussians, config: Config, space: Space, near: float, ranks: Ranks) -> TrainedModel:
-    """Return a model to be rendered in the views of a capture.
-
-    Args:
-        found: from `read_gaussians`.
-        config: how it is rendered.
-        space: of the capture.
-        near: near plane in the capture's unit.
-        ranks: the job; each rank gets its share on its device.
-    """
+    """Return a model to be rendered in the views of a capture; `near` is in the capture's unit."""
     columns = trained_columns(found, space, ranks)
     table = table_of_parameters({name: column.to(ranks.device) for name, column in columns.items()})
     progress = Progress(step=0, sh_degree=found.degree, level_count=1, peak_gaussians=len(found), seconds=0.0)

@@ -33,17 +33,10 @@ class LossGuard:
     def check(
         self, step: int, names: Sequence[str], sums: HostSum, table: GaussianTable, frame: Frame
     ) -> None:
-        """Check the losses of the B views `names` in step `step` (from 1).
+        """Check the losses of the B views `names` in step `step`; on CUDA, those of the step before.
 
-        Args:
-            step: number of the step.
-            names: names of its views.
-            sums: their `LossTerms.parts` over all ranks, [2 B]; further values are ignored.
-            table: this rank's Gaussians.
-            frame: the rendered frame.
-
-        Raises:
-            NonFiniteError: this loss (or, on CUDA, the previous step's) is not finite.
+        `sums` are their `LossTerms.parts` over all ranks, [2 B]; further values are ignored. NonFiniteError:
+        one is not finite.
         """
         if frame.renders.device.type != "cuda":
             _check_loss(step, names, sums, lambda: _origin(table, frame, names))
@@ -127,11 +120,7 @@ def bad_column(table: GaussianTable, names: Iterable[str] = PARAMETERS) -> str |
 
 
 def check_table(table: GaussianTable, step: int, names: Iterable[str] = PARAMETERS) -> None:
-    """Check parameters of this rank's Gaussians.
-
-    Raises:
-        NonFiniteError: names the step, the column and the Gaussians.
-    """
+    """Check parameters of this rank's Gaussians (NonFiniteError: names step, column and Gaussians)."""
     if (culprit := bad_column(table, names)) is not None:
         raise NonFiniteError(
             f"step {step}: {culprit}. Lower the learning rates (optimiser.*) or resume from a checkpoint"
@@ -139,11 +128,7 @@ def check_table(table: GaussianTable, step: int, names: Iterable[str] = PARAMETE
 
 
 def check_before_saving(table: GaussianTable, step: int, ranks: Ranks) -> None:
-    """Check every column that would be saved, of all ranks; each of them calls this.
-
-    Raises:
-        NonFiniteError: on every rank, naming the step, the rank, the column and the Gaussians.
-    """
+    """Check every column that would be saved; every rank calls this, and gets the NonFiniteError of any."""
     floats = [name for name in table if table.row_of(name).dtype.is_floating_point]
     found = ranks.all_gather_object(bad_column(table, floats))
     culprits = [f"rank {rank}: {text}" for rank, text in enumerate(found) if text is not None]

@@ -44,14 +44,7 @@ def level_fork(config: Config) -> float:
 
 
 def scene_gate(config: Config, progress: Progress, table: GaussianTable, ranks: Ranks) -> SceneGate | None:
-    """Return the LOD gate of a model for any camera; None if it is not open. Collective.
-
-    Args:
-        config: configuration of the run.
-        progress: progress of the run.
-        table: this rank's Gaussians, without pending optimiser steps.
-        ranks: the job.
-    """
+    """Return a model's LOD gate for any camera; None: it is not open. No step may be pending. Collective."""
     gate = lod_gate(config, progress)
     if gate is None:
         return None

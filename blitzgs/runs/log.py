@@ -67,14 +67,10 @@ class RunLog:
     def __init__(
         self, folder: Path | None, total: int, done: int, tensorboard: bool, run_id: str = ""
     ) -> None:
-        """Open the log, and drop the records that a resumed run will write again.
+        """Open the log, and drop the records that a resumed run, with `done` images, will write again.
 
-        Args:
-            folder: folder of the run, to whose `log.jsonl` records are appended. None: log nothing.
-            total: images of the whole run.
-            done: images that a resumed run has seen before.
-            tensorboard: also write events to `folder/tensorboard`, if the package is installed.
-            run_id: identifies the run in every record.
+        Records are appended to `folder/log.jsonl` and, if the package is installed, to `folder/tensorboard`.
+        Without a folder nothing is logged.
         """
         self._failures = _Failures()
         self._file: _JsonLines | None = None
@@ -120,11 +116,7 @@ class RunLog:
     def work(self, what: str) -> Iterator[Report]:
         """Show how far other work is while the context lasts: a bar on a terminal, else a line now and then.
 
-        Args:
-            what: what is counted, for example "views measured".
-
-        Yields:
-            A function to call with (number done, number of all).
+        Yields a function to call with (number done, number of all) of `what`, for example "views measured".
         """
         if self._progress is not None:
             bar = self._progress

@@ -45,19 +45,9 @@ class ColumnSpec:
 
 
 def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[str], None]) -> tuple[int, str]:
-    """Write `columns` to `path` and sync it.
+    """Write and sync columns, on any device; return the size in bytes and the SHA-256 in hexadecimal.
 
-    Args:
-        path: file to create.
-        columns: name -> tensor on any device.
-        reached: called at labelled points of the write.
-
-    Returns:
-        Size in bytes and SHA-256 in hexadecimal.
-
-    Raises:
-        OSError: the disk is full or the folder cannot be written.
-        ValueError: a column has a dtype that the format lacks.
+    `reached` is called at labelled points. ValueError: a column has a dtype that the format lacks.
     """
     # Widest elements first, so that every column starts at a multiple of its element size.
     names = sorted(columns, key=lambda name: (-columns[name].element_size(), name))

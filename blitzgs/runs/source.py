@@ -20,10 +20,11 @@ from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint
 from blitzgs.runs import files as run_files
-from blitzgs.runs.checkpoint import CheckpointError, Shard
+from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.folder import Model
-from blitzgs.runs.identity import check_own
+from blitzgs.runs.folder_checks import check_own
 from blitzgs.runs.lod import lod_gate
+from blitzgs.runs.manifest import DAMAGE, Shard, verified
 from blitzgs.runs.shard_file import header_of, read_rows
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import LodGate
@@ -32,18 +33,11 @@ from blitzgs.view.views import Space
 
 @dataclass
 class RunSource:
-    """Gaussians of a run, a `GaussianSource`.
+    """Gaussians of a run, a `GaussianSource`."""
 
-    Attributes:
-        trained: the Gaussians in the trained world.
-        space: maps between the trained world and the capture's world.
-        comments: header lines.
-        config: configuration of the run.
-    """
-
-    trained: GaussianSource
-    space: Space
-    comments: list[str]
+    trained: GaussianSource  # the Gaussians in the trained world
+    space: Space  # maps between the trained world and the capture's world
+    comments: list[str]  # header lines
     config: Config
 
     def __len__(self) -> int:
@@ -84,15 +78,10 @@ def source_of(model: Model) -> RunSource:
 
 
 def open_source(folder: Path, only: str | None = None) -> RunSource:
-    """Open the newest undamaged checkpoint of a run without reading its Gaussians into memory.
+    """Open the newest undamaged checkpoint of a run, or the one named `only`, without reading its Gaussians.
 
-    Args:
-        folder: folder of the run.
-        only: name of the one checkpoint to open; None: the newest.
-
-    Raises:
-        FileNotFoundError: the folder is not a run, or holds no checkpoint.
-        CheckpointError: all checkpoints are damaged, or the newest is of another version or of another run.
+    FileNotFoundError: the folder is no run, or holds no checkpoint. CheckpointError: all checkpoints are
+    damaged, or the newest is of another version or of another run.
     """
     run_files.check_is_run(folder)
     refused = []
@@ -100,8 +89,8 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
     for name in reversed(names) if only is None else [only]:
         path = folder / run_files.CHECKPOINTS / name
         try:
-            manifest = checkpoint.verified(path)
-        except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+            manifest = verified(path)
+        except DAMAGE as error:
             refused.append(f"checkpoint {path} is damaged: {error}")
             continue
         if refused:

@@ -10,17 +10,11 @@ from blitzgs.view.look import Look, Picture
 
 
 class Wish(NamedTuple):
-    """What a watcher wants between two steps.
+    """What a watcher wants between two steps."""
 
-    Attributes:
-        look: a picture to draw, or None.
-        pause: whether the training is to wait; it asks again at once.
-        save: whether the model is to be saved now.
-    """
-
-    look: Look | None = None
-    pause: bool = False
-    save: bool = False
+    look: Look | None = None  # a picture to draw, or None
+    pause: bool = False  # whether the training is to wait; it asks again at once
+    save: bool = False  # whether the model is to be saved now
 
 
 class Watcher(Protocol):

@@ -28,11 +28,7 @@ def save_frame(folder: Path, frame: WorldFrame) -> Path:
 
 
 def load_frame(folder: Path) -> WorldFrame | None:
-    """Return the frame of a run's capture; None: nothing says where it lies.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
+    """Return the frame of a run's capture (ValueError: its file is damaged); None: nothing says it."""
     path = folder / GEO
     return read_frame(path) if path.is_file() else None
 

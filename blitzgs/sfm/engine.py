@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the stages of a reconstruction in processes of their own: by pycolmap, or by the program `colmap`."""
+"""Runs the stages of a reconstruction in processes of their own, and reads COLMAP's database."""
 
 from __future__ import annotations
 
@@ -7,14 +7,67 @@ import importlib.util
 import json
 import re
 import shutil
+import sqlite3
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from blitzgs.sfm.database import camera_of
+import numpy as np
+
+from blitzgs.capture.colmap import Float64
+
+_PAIR_IDS = 2147483647  # the id of a pair of images a < b is this number times a, plus b
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found in a photograph: features, and verified matches with other photographs."""
+
+    features: int = 0
+    matches: int = 0
+    neighbours: int = 0
+
+
+def _rows(database: Path, query: str) -> list[Any]:
+    with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as connection:
+        return connection.execute(query).fetchall()
+
+
+def read_found(database: Path) -> dict[str, Found]:
+    """Return what was found in each photograph, by name."""
+    features = dict(_rows(database, "SELECT image_id, rows FROM keypoints"))
+    matches: dict[int, list[int]] = defaultdict(list)
+    for pair, count in _rows(database, "SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0"):
+        for image in (pair // _PAIR_IDS, pair % _PAIR_IDS):
+            matches[image].append(count)
+    images = _rows(database, "SELECT image_id, name FROM images")
+    return {name: Found(features.get(i, 0), sum(matches[i]), len(matches[i])) for i, name in images}
+
+
+def read_positions(database: Path) -> dict[str, Float64]:
+    """Return the positions by GPS, by name: latitude, longitude in degrees and altitude in metres [3].
+
+    They are metres east, north and up once pycolmap has used them.
+    """
+    query = "SELECT name, position FROM pose_priors JOIN images ON image_id = corr_data_id"
+    try:
+        rows = _rows(database, query)
+    except sqlite3.OperationalError:  # the table of a COLMAP before 4.0 has other columns
+        return {}
+    positions = {name: np.frombuffer(blob) for name, blob in rows if blob and len(blob) == 24}
+    return {name: position for name, position in positions.items() if np.isfinite(position[:2]).all()}
+
+
+def camera_of(database: Path, names: Sequence[str]) -> int | None:
+    """Return the camera that an interrupted stage gave to one of the photographs, or None."""
+    known = dict(_rows(database, "SELECT name, camera_id FROM images")) if database.exists() else {}
+    return next((known[name] for name in names if name in known), None)
+
 
 Report = Callable[[int, int], None]
 STAGES = {"features": "features", "pairs": "matches", "cameras": "poses"}
@@ -54,11 +107,7 @@ class StageError(ValueError):
 
 
 def backend() -> str:
-    """Return "pycolmap", or the path of the program `colmap`.
-
-    Raises:
-        ImportError: neither is installed.
-    """
+    """Return "pycolmap", or the path of the program `colmap` (ImportError: neither is installed)."""
     if importlib.util.find_spec("pycolmap") is not None:
         return "pycolmap"
     if (program := shutil.which("colmap")) is None:
@@ -67,17 +116,9 @@ def backend() -> str:
 
 
 def run_stage(stage: str, job: Job, log: Path, lock: int, report: Report) -> None:
-    """Do a stage; what COLMAP says is added to the file `log`.
+    """Do a stage of `STAGES`; what COLMAP says is added to the file `log`, its last words are a StageError.
 
-    Args:
-        stage: a key of `STAGES`.
-        job: what to do.
-        log: file to append to.
-        lock: descriptor of a locked file, which the processes hold until they end.
-        report: called with what is done, and the total.
-
-    Raises:
-        StageError: COLMAP failed; has its last words.
+    Its processes hold the locked file `lock`, a descriptor, until they end.
     """
     program = backend()
     Path(job.models).mkdir(parents=True, exist_ok=True)
@@ -179,13 +220,8 @@ def _gpu_flags(program: str, command: str) -> list[str]:
 def decided(job: Job, gps: bool, use_altitude: bool) -> Job:
     """Return the job with what "auto" means for its photographs.
 
-    Args:
-        job: as the user wants it.
-        gps: whether the photographs' positions tell neighbours apart; pycolmap also uses them for poses.
-        use_altitude: whether their altitudes can be used.
-
-    Raises:
-        ValueError: the user wants neighbours by GPS, and there are none.
+    `gps`: their positions tell neighbours apart; pycolmap also uses them for poses, with altitudes if these
+    can be used. ValueError: the user wants neighbours by GPS, and there are none.
     """
     if job.pairs == "gps" and not gps:
         raise ValueError(

@@ -53,29 +53,20 @@ def has_photographs_alone(root: Path, images: str) -> bool:
 
 @dataclass(frozen=True)
 class Photographs:
-    """Photographs that can be used, and why others cannot.
+    """Photographs that can be used, and why others cannot."""
 
-    Attributes:
-        folder: folder of them all.
-        names: relative to the folder.
-        sizes: width and height in pixels as stored.
-        masks: of each, or None.
-        damage: what is wrong with the others, by name.
-    """
-
-    folder: Path
-    names: list[str]
-    sizes: list[tuple[int, int]]
-    masks: list[Path | None]
-    damage: dict[str, str]
+    folder: Path  # folder of them all
+    names: list[str]  # relative to the folder
+    sizes: list[tuple[int, int]]  # width and height in pixels as stored
+    masks: list[Path | None]  # of each, or None
+    damage: dict[str, str]  # what is wrong with the others, by name
 
     @classmethod
     def of(cls, folder: Path) -> Photographs:
         """Read the photographs of a folder; masks are searched in `masks/` in it and beside it.
 
-        Raises:
-            FileNotFoundError: the folder has no photographs.
-            ValueError: fewer than three can be used, or masks belong to none of them.
+        FileNotFoundError: there are none. ValueError: fewer than three can be used, or masks belong to none
+        of them.
         """
         names = find_photographs(folder) if folder.is_dir() else []
         if not names:

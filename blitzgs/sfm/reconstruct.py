@@ -20,8 +20,16 @@ import numpy as np
 
 from blitzgs.capture.colmap import FILES, count_images
 from blitzgs.capture.world import GEO, enu_frame, read_small
-from blitzgs.sfm.database import read_found, read_positions
-from blitzgs.sfm.engine import STAGES, Job, StageError, backend, decided, run_stage
+from blitzgs.sfm.engine import (
+    STAGES,
+    Job,
+    StageError,
+    backend,
+    decided,
+    read_found,
+    read_positions,
+    run_stage,
+)
 from blitzgs.sfm.photographs import Photographs, judge_positions
 from blitzgs.sfm.report import Reconstruction, examine
 from blitzgs.util.output import write_file
@@ -52,18 +60,9 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
     """Find the poses of photographs and write a capture, whose `images` is a link to their folder.
 
     Stages that an earlier call finished for the same photographs and settings are left out. New photographs
-    are added to what is there; after any other change the work begins anew.
-
-    Args:
-        photographs: what to find the poses of.
-        capture: folder to write. Nothing in it that another program wrote is replaced.
-        settings: what not to leave to the photographs.
-
-    Raises:
-        BlockingIOError: another process is at it.
-        FileExistsError: the capture has a model or images that this function did not make.
-        ValueError: no poses were found, or the capture is in the folder of the photographs.
-        ImportError: COLMAP is not installed.
+    are added to what is there; after any other change the work begins anew. Nothing in the capture that
+    another program wrote is replaced (FileExistsError). BlockingIOError: another process is at it.
+    ValueError: no poses were found, or the capture is in the folder of the photographs.
     """
     backend()
     folder = photographs.folder

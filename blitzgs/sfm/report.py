@@ -17,8 +17,7 @@ from blitzgs.capture.colmap import ColmapModel, Float64, count_images, read_mode
 from blitzgs.capture.layouts import SourceView
 from blitzgs.capture.lengths import find_apart
 from blitzgs.capture.lens import Lens
-from blitzgs.sfm.database import Found, read_found, read_positions
-from blitzgs.sfm.engine import Job
+from blitzgs.sfm.engine import Found, Job, read_found, read_positions
 from blitzgs.sfm.photographs import Photographs
 from blitzgs.util.output import write_file
 
@@ -32,26 +31,17 @@ _SIDE, _BAR, _LINE, _NAMED = 900, 420, 18, 40
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What was reconstructed.
+    """What was reconstructed."""
 
-    Attributes:
-        capture: its folder.
-        errors: mean reprojection error of each photograph with a pose, in pixels, by name.
-        points: how many points each of them observes.
-        unregistered: why each other photograph has no pose.
-        doubtful: photographs with a pose that may be wrong, and why.
-        total: number of points.
-        decisions: which pairs were matched, by which mapper, and what positions by GPS were used for.
-        gps_residuals: medians of the distances to GPS, across and up, in metres; None where unused.
-    """
-
-    capture: Path
-    errors: dict[str, float]
-    points: dict[str, int]
-    unregistered: dict[str, str]
-    doubtful: dict[str, str]
-    total: int
+    capture: Path  # its folder
+    errors: dict[str, float]  # mean reprojection error of each photograph with a pose, in pixels, by name
+    points: dict[str, int]  # how many points each of them observes
+    unregistered: dict[str, str]  # why each other photograph has no pose
+    doubtful: dict[str, str]  # photographs with a pose that may be wrong, and why
+    total: int  # number of points
+    # Which pairs were matched, by which mapper, and what positions by GPS were used for.
     decisions: dict[str, str]
+    # Medians of the distances to GPS, across and up, in metres; None where unused.
     gps_residuals: tuple[float, float | None] | None = None
 
     @property

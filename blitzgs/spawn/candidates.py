@@ -33,19 +33,12 @@ _COLUMNS_OF = itemgetter("grad_sum", "grad_count", "opacities", "scales", "birth
 
 @dataclass(frozen=True)
 class Candidates:
-    """The candidates of one density event on this rank, M of them.
+    """The candidates of one density event on this rank, M of them."""
 
-    Attributes:
-        parents: int64 [M], persistent ids of the Gaussians to be cloned or split.
-        is_split: bool [M], whether the candidate is split; false: cloned.
-        features: float32 [M, F], see `FEATURES`.
-        time: time of the event, in images.
-    """
-
-    parents: Tensor
-    is_split: Tensor
-    features: Tensor
-    time: int
+    parents: Tensor  # int64 [M], persistent ids of the Gaussians to be cloned or split
+    is_split: Tensor  # bool [M], whether the candidate is split; false: cloned
+    features: Tensor  # float32 [M, F], see `FEATURES`
+    time: int  # time of the event, in images
 
 
 # A veto returns which candidates are withheld, bool [M]; every rank calls it, also without candidates.
@@ -53,12 +46,7 @@ Veto = Callable[[Candidates, Ranks], Tensor]
 
 
 def spawn_features(
-    table: GaussianTable,
-    rows: Tensor,
-    is_split: Tensor,
-    time: int,
-    extent: float,
-    level_count: int,
+    table: GaussianTable, rows: Tensor, is_split: Tensor, time: int, extent: float, level_count: int
 ) -> Tensor:
     """Return the features of candidates at a density event, before its statistics are reset.
 

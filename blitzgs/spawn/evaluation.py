@@ -25,21 +25,11 @@ CELLS, LEAST_IN_CELL = 32, 30
 def evaluate(
     gate: SpawnGate, runs: Sequence[Spawns], gate_from: Sequence[float], output: OutputFolder
 ) -> list[dict[str, Any]]:
-    """Evaluate a gate on runs, and draw survival.svg and regions_NAME.svg.
+    """Evaluate a gate on runs, whose schedules may differ, and draw survival.svg and regions_NAME.svg.
 
-    Args:
-        gate: the gate.
-        runs: the runs; their schedules may differ.
-        gate_from: for each run, the time in images from which on a gate judges spawns; only later spawns are
-            in the maps.
-        output: folder for the pictures.
-
-    Returns:
-        For each run: `gate_fit.judge`, whether the gate was fitted on its scene, the share of initial
-        Gaussians and of each birth cohort that survived, and `regions`.
-
-    Raises:
-        OSError: a picture cannot be written, or would replace a file that BlitzGS did not write.
+    Maps have only spawns from `gate_from` on, in images, for each run. Returns for each run: `fit.judge`,
+    whether the gate was fitted on its scene, the share of initial Gaussians and of each birth cohort that
+    survived, and `regions`.
     """
     results, curves = [], {}
     runs = with_distinct_names(runs)
@@ -90,11 +80,9 @@ def region_rates(
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
     """Return survival by region, in the projection of the scene with the largest area.
 
-    The predicted survivors are the spawns of the highest scores, as many as actually survived.
-
-    Returns:
-        Which cells have enough spawns, bool [rows, columns]; their actual and predicted shares of survivors,
-        NaN in the others.
+    The predicted survivors are the spawns of the highest scores, as many as actually survived. Returns which
+    cells have enough spawns, bool [rows, columns]; their actual and predicted shares of survivors, NaN in the
+    others.
     """
     predicted = np.zeros(len(scores), bool)
     predicted[np.argsort(-scores, kind="stable")[: int(run.survived.sum())]] = True

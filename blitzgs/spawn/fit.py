@@ -42,27 +42,17 @@ HELD_OUT = 0.25
 
 @dataclass(frozen=True)
 class Spawns:
-    """The spawns of one run, K of them, without its initial Gaussians.
+    """The spawns of one run, K of them, without its initial Gaussians."""
 
-    Attributes:
-        name: name of the run.
-        scene: fingerprint of its capture.
-        schedule: fields of its configuration that decide how long Gaussians live.
-        features: float32 [K, F], see `candidates.FEATURES`; NaN where the log is older than a feature.
-        survived: bool [K].
-        parents: int64 [K].
-        positions: float32 [K, 3], where they were born.
-        initial_survival: share of the run's initial Gaussians that reached its final model.
-    """
-
-    name: str
-    scene: str
-    schedule: dict[str, Any]
+    name: str  # name of the run
+    scene: str  # fingerprint of its capture
+    schedule: dict[str, Any]  # fields of its configuration that decide how long Gaussians live
+    # float32 [K, F], see `candidates.FEATURES`; NaN where the log is older than a feature.
     features: NDArray[np.float32]
-    survived: NDArray[np.bool_]
-    parents: NDArray[np.int64]
-    positions: NDArray[np.float32]
-    initial_survival: float = math.nan
+    survived: NDArray[np.bool_]  # bool [K]
+    parents: NDArray[np.int64]  # int64 [K]
+    positions: NDArray[np.float32]  # float32 [K, 3], where they were born
+    initial_survival: float = math.nan  # share of the run's initial Gaussians that reached its final model
 
     @property
     def times(self) -> NDArray[np.float32]:
@@ -82,16 +72,10 @@ class Spawns:
 
 
 def read_spawns(folder: Path, gaussians: int | None = None) -> Spawns:
-    """Read the spawns of a finished run from its lineage.
+    """Read the spawns of a finished run, of a number of Gaussians if that is known, from its lineage.
 
-    Args:
-        folder: folder of the lineage.
-        gaussians: number of Gaussians of the finished model, which the lineage must have; None: unknown.
-
-    Raises:
-        FileNotFoundError: there is no lineage.
-        ValueError: a file is damaged or lost, there are no spawns, or all or none of them survived.
-        ImportError: pyarrow is not installed.
+    FileNotFoundError: there is no lineage. ValueError: a file is damaged or lost, there are no spawns, or all
+    or none of them survived.
     """
     tables = read_lineage(folder)
     about = read_about((folder / ABOUT).read_bytes(), folder / ABOUT)
@@ -115,11 +99,7 @@ def read_spawns(folder: Path, gaussians: int | None = None) -> Spawns:
 
 
 def read_about(text: bytes | str, file: Path) -> dict[str, Any]:
-    """Read the description of a run that is stored with its spawns.
-
-    Raises:
-        ValueError: it is damaged; names the file.
-    """
+    """Read the description of a run that is stored with its spawns (ValueError: `file` is damaged)."""
     try:
         about = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -131,11 +111,7 @@ def read_about(text: bytes | str, file: Path) -> dict[str, Any]:
 
 
 def check_outcomes(survived: NDArray[np.bool_], source: object) -> None:
-    """Check that some spawns survived and some did not.
-
-    Raises:
-        ValueError: this is not so; names `source`.
-    """
+    """Check that some spawns survived and some did not (ValueError: this is not so; names `source`)."""
     if not 0 < survived.sum() < len(survived):
         raise ValueError(
             f"{source}: {int(survived.sum()):,} of {len(survived):,} spawns survived; a gate needs a "
@@ -166,11 +142,8 @@ def feature_columns(columns: Mapping[str, NDArray[Any]], count: int) -> NDArray[
 def auc(scores: NDArray[Any], positive: NDArray[np.bool_]) -> float:
     """Return the area under the ROC curve, from the sum of ranks (Mann and Whitney 1947).
 
-    It is the probability that a positive scores higher than a negative; ties count half.
-
-    Args:
-        scores: [K].
-        positive: bool [K], some true and some false.
+    It is the probability that a positive scores higher than a negative; ties count half. Some are positive,
+    bool [K], and some are not.
     """
     _, inverse, counts = np.unique(scores, return_inverse=True, return_counts=True)
     ends = counts.cumsum()
@@ -187,24 +160,13 @@ def best_feature(spawns: Spawns) -> tuple[str, float]:
 
 
 def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0, seed: int = 0) -> dict[str, Any]:
-    """Fit a gate on all runs, and measure how well such a gate predicts on scenes that it was not fitted on.
+    """Fit a gate on runs, and measure how well such a gate predicts on scenes that it was not fitted on.
 
     With several scenes, each scene is left out once: a gate is fitted on the runs of the other scenes and
     evaluated on the spawns of this one. With a single scene, a quarter of the parents is held out instead.
-
-    Args:
-        runs: at least one run.
-        path: path of the model, `NAME.json`; its metadata are written beside it.
-        gate_from: time in images from which on a gate is going to judge spawns; see `judge`.
-        seed: seed of the draws of rows.
-
-    Returns:
-        The figures that go into the metadata: `judge` for each run held out.
-
-    Raises:
-        ValueError: the runs are of different schedules, or a run has too few spawns.
-        FileExistsError: one of the two files exists and belongs to no gate.
-        ImportError: xgboost is not installed.
+    The metadata, which are written beside the model `path`, get the returned figures: `judge` for each run
+    held out. ValueError: the runs are of different schedules, or a run has too few spawns. FileExistsError:
+    one of the two files exists and belongs to no gate.
     """
     xgboost = _xgboost()
     check_no_other(path)
@@ -233,17 +195,11 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0, seed: int = 
 
 
 def judge(run: Spawns, scores: NDArray[Any], gate_from: float = 0.0) -> dict[str, Any]:
-    """Return how scores separate the spawns of a run that survived from the others.
+    """Return how scores [K] separate the spawns of a run that survived from the others.
 
-    Args:
-        run: the spawns, some of which survived and some did not.
-        scores: [K], the gate's.
-        gate_from: time in images from which on a gate judges spawns.
-
-    Returns:
-        The AUC of the scores, that of the best single feature and its name, the number of spawns, and the
-        share that survived. `judged` has the same of the spawns from `gate_from` on, if this leaves some out
-        and if some of these survived and some did not.
+    Returns the AUC of the scores, that of the best single feature and its name, the number of spawns, and the
+    share that survived. `judged` has the same of the spawns from `gate_from` on (images), if this leaves some
+    out and if some of these survived and some did not.
     """
     name, single = best_feature(run)
     found = {

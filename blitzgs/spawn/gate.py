@@ -47,19 +47,12 @@ class GateError(ValueError):
 
 @dataclass(frozen=True)
 class GateInfo:
-    """What a gate was fitted on.
+    """What a gate was fitted on."""
 
-    Attributes:
-        features: names of the model's inputs, in order.
-        schedule: fields of the configurations of the runs that it was fitted on.
-        scenes: {"name": fingerprint} of the captures.
-        auc: measured figures, see `blitzgs.spawn.fit`.
-    """
-
-    features: tuple[str, ...]
-    schedule: dict[str, Any]
-    scenes: dict[str, str]
-    auc: dict[str, Any] = field(default_factory=dict)
+    features: tuple[str, ...]  # names of the model's inputs, in order
+    schedule: dict[str, Any]  # fields of the configurations of the runs that it was fitted on
+    scenes: dict[str, str]  # {"name": fingerprint} of the captures
+    auc: dict[str, Any] = field(default_factory=dict)  # measured figures, see `blitzgs.spawn.fit`
 
 
 def gate_file(name: str) -> Path:
@@ -78,12 +71,7 @@ def write_info(path: Path, info: GateInfo) -> None:
 
 
 def check_no_other(path: Path) -> None:
-    """Check that a new gate would replace only the files of a gate, which its metadata show.
-
-    Raises:
-        FileExistsError: there is a model file without metadata, or another file at the path of the metadata.
-        OSError: one of the two is no regular file.
-    """
+    """Refuse to replace files that are not a gate's, as its metadata show (FileExistsError, OSError)."""
     metadata = info_path(path)
     for file in (path, metadata):
         check_replaceable(file)
@@ -102,11 +90,7 @@ def check_no_other(path: Path) -> None:
 
 
 def read_info(path: Path) -> GateInfo:
-    """Read the metadata of a model file.
-
-    Raises:
-        GateError: they are missing, damaged, of another format, or of other features.
-    """
+    """Read a model file's metadata (GateError: missing, damaged, of another format or other features)."""
     if not path.name:
         raise GateError(f"{path}: no such gate; `blitzgs gate fit` makes one")
     beside = info_path(path)
@@ -140,13 +124,9 @@ class SpawnGate:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read a model and its metadata.
+        """Read a model in XGBoost's JSON and its metadata.
 
-        Args:
-            path: a model in XGBoost's JSON.
-
-        Raises:
-            GateError: a file is missing, damaged or of another kind; for UBJSON it says how to convert it.
+        GateError: a file is missing, damaged or of another kind; for UBJSON it says how to convert it.
         """
         self.info = read_info(path)
         if path.suffix == ".ubj":
@@ -162,13 +142,9 @@ class SpawnGate:
             raise GateError(f"{path} is not a binary classifier in XGBoost's JSON: {error!r}") from error
 
     def scores(self, features: Tensor) -> Tensor:
-        """Score candidates by their chance to survive.
+        """Score candidates by their chance to survive, from features float32 [M, F]; NaN: unknown.
 
-        Args:
-            features: float32 [M, F], see `FEATURES`; NaN: unknown.
-
-        Returns:
-            int64 [M], the sum of the trees' leaves in units of 2^-32: log odds up to a constant.
+        Returns int64 [M], the sum of the trees' leaves in units of 2^-32: log odds up to a constant.
         """
         self._trees = self._trees.to(features.device)
         trees = self._trees
@@ -225,16 +201,10 @@ def veto_draws(candidates: Candidates, seed: int) -> Tensor:
 
 
 def veto_lowest(scores: Tensor, candidates: Candidates, rate: float, ranks: Ranks) -> Tensor:
-    """Mark the ceil(rate n) lowest of all ranks' n clones, and likewise of their splits.
+    """Mark the ceil(rate n) lowest of all ranks' n clones, and likewise of their splits. Collective.
 
-    Args:
-        scores: float32 [M].
-        candidates: candidates of this rank.
-        rate: vetoed share in [0, 1]; its decimal value counts.
-        ranks: the job; every rank calls this.
-
-    Returns:
-        bool [M], the same candidates at every world size; ties go to the smaller parent id.
+    Scores are float32 [M]; of the rate, in [0, 1], the decimal value counts. Returns bool [M], the same
+    candidates at every world size; ties go to the smaller parent id.
     """
     vetoed = torch.zeros_like(candidates.is_split)
     for group in (~candidates.is_split, candidates.is_split):
@@ -247,19 +217,12 @@ def veto_lowest(scores: Tensor, candidates: Candidates, rate: float, ranks: Rank
 
 @dataclass(frozen=True)
 class _Trees:
-    """All nodes of all trees, one after the other, as `tree_sums` takes them.
+    """All nodes of all trees, one after the other, as `tree_sums` takes them."""
 
-    Attributes:
-        roots: int32 [T].
-        nodes: int32 [n, 4].
-        leaves: int64 [n], in units of 2^-32.
-        depth: of the deepest tree.
-    """
-
-    roots: Tensor
-    nodes: Tensor
-    leaves: Tensor
-    depth: int
+    roots: Tensor  # int32 [T]
+    nodes: Tensor  # int32 [n, 4]
+    leaves: Tensor  # int64 [n], in units of 2^-32
+    depth: int  # of the deepest tree
 
     @classmethod
     def of(cls, model: dict[str, Any]) -> _Trees:
@@ -307,11 +270,7 @@ class _Trees:
 
 
 def _depth(left: list[int], right: list[int]) -> int:
-    """Return how many comparisons the longest path through a tree has.
-
-    Raises:
-        ValueError: a child of a node is outside the tree, or the nodes do not form a tree.
-    """
+    """Return how many comparisons the longest path through a tree has."""
     depth, level, met = 0, [0], 1
     while level := [child for node in level for child in (left[node], right[node]) if left[node] >= 0]:
         depth, met = depth + 1, met + len(level)

@@ -17,7 +17,6 @@ An event only queues work on the device that makes its rows. Other threads copy 
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import json
 import re
@@ -59,35 +58,22 @@ class LineageError(RuntimeError):
 
 @dataclass(frozen=True)
 class Births:
-    """Gaussians born on this rank, M of them.
+    """Gaussians born on this rank, M of them."""
 
-    Attributes:
-        ids: int64 [M].
-        parents: int64 [M].
-        means: float32 [M, 3].
-        features: float32 [M, F], features of the candidates.
-    """
-
-    ids: Tensor
-    parents: Tensor
-    means: Tensor
-    features: Tensor
+    ids: Tensor  # int64 [M]
+    parents: Tensor  # int64 [M]
+    means: Tensor  # float32 [M, 3]
+    features: Tensor  # float32 [M, F], features of the candidates
 
 
 @dataclass(frozen=True)
 class Ledger:
-    """Totals of births and deaths so far, over all ranks; part of a checkpoint.
+    """Totals of births and deaths so far, over all ranks; part of a checkpoint."""
 
-    Attributes:
-        births: number of births.
-        deaths: number of deaths.
-        id_sum: sum of the hashed ids of births less that of deaths, modulo 2^64, as a signed integer.
-        parts: number of parts that each rank has written, the largest of all ranks; 0 in old checkpoints.
-    """
-
-    births: int = 0
-    deaths: int = 0
-    id_sum: int = 0
+    births: int = 0  # number of births
+    deaths: int = 0  # number of deaths
+    id_sum: int = 0  # sum of the hashed ids of births less that of deaths, modulo 2^64, as a signed integer
+    # Number of parts that each rank has written, the largest of all ranks; 0 in old checkpoints.
     parts: int = 0
 
 
@@ -97,17 +83,11 @@ class Lineage:
     def __init__(
         self, folder: Path, ranks: Ranks, step: int, ledger: Ledger, about: dict[str, Any] | None = None
     ) -> None:
-        """Begin a log, or continue one from a checkpoint. Collective.
+        """Begin a log, or continue one from the checkpoint of `step` and `ledger`. Collective.
 
-        Args:
-            folder: folder of the parts of all ranks, made if missing.
-            ranks: the job.
-            step: optimiser step of the checkpoint; parts that were written later are deleted.
-            ledger: ledger of the checkpoint. One without births begins a log: all parts are deleted.
-            about: description of the run, for the file `ABOUT`.
-
-        Raises:
-            ImportError: pyarrow is not installed.
+        The folder is that of all ranks' parts; those that were written after the checkpoint are deleted, and
+        all if the ledger has no births. `about` describes the run, for the file `ABOUT`. ImportError: pyarrow
+        is not installed.
         """
         self._writer = PartWriter(folder, ranks.device)
         self._folder, self._ranks, self.ledger = folder, ranks, ledger
@@ -137,32 +117,15 @@ class Lineage:
         self._log("births", (torch.stack((births.ids, births.parents)), floats), step)
 
     def died(self, ids: Tensor, causes: Tensor, time: int, step: int) -> None:
-        """Log deaths.
-
-        Args:
-            ids: int64 [M]; kept, so it must not change any more.
-            causes: [M], values of `Cause`; the same holds.
-            time: time of the event, in images.
-            step: optimiser step.
-        """
+        """Log deaths: ids, int64 [M], and values of `Cause` [M], which must not change any more."""
         times = torch.full_like(ids, time, dtype=torch.int32)
         self._log("deaths", (ids[None], times[None], causes.to(torch.uint8)[None]), step)
 
     def flush_and_check(self, ids: Tensor, step: int) -> Ledger:
-        """Write all pending rows and check that births - deaths is the population. Collective.
+        """Write pending rows, before a checkpoint, and check that births less deaths are the population.
 
-        Call this before a checkpoint is written.
-
-        Args:
-            ids: int64 [N], ids of this rank's live Gaussians.
-            step: optimiser step.
-
-        Returns:
-            The present ledger.
-
-        Raises:
-            LineageError: on every rank, when births - deaths is not the live population.
-            OSError: on every rank, when one could not write a part; a later call tries that part again.
+        Returns the present ledger. LineageError, on every rank: births - deaths is not the live population.
+        OSError, on every rank: one could not write a part; a later call tries that part again.
         """
         self.flush(step)
         failed = [(error.errno, str(error)) for error in self._writer.finish()]
@@ -233,16 +196,6 @@ def initial_births(ids: Tensor, parents: Tensor, means: Tensor) -> Births:
     features = torch.full((len(ids), len(FEATURES)), torch.nan, device=ids.device)
     features[:, FEATURES.index("time")] = 0
     return Births(ids, parents, means, features)
-
-
-def ledger_of(state: dict[str, int] | None) -> Ledger:
-    """Read a ledger back from a checkpoint."""
-    return Ledger(**(state or {}))
-
-
-def ledger_state(ledger: Ledger) -> dict[str, int]:
-    """Return a ledger for a checkpoint."""
-    return dataclasses.asdict(ledger)
 
 
 def _is_later(name: re.Match[str], step: int, ledger: Ledger) -> bool:

@@ -41,15 +41,7 @@ class PartWriter:
     """
 
     def __init__(self, folder: Path, device: torch.device) -> None:
-        """Start the threads, which wait for parts.
-
-        Args:
-            folder: folder of the parts.
-            device: device of the rows; rows on the CPU are possible in any case.
-
-        Raises:
-            ImportError: pyarrow is not installed.
-        """
+        """Start the threads, which wait for parts (ImportError: pyarrow is not installed)."""
         self._parquet = import_pyarrow()
         self._folder = folder
         self._to_host = _HostArrays(device)
@@ -61,10 +53,7 @@ class PartWriter:
     def add(self, name: str, table: str, groups: Sequence[Tensor]) -> None:
         """Have a part written; it is on disk when `finish` has returned without messages.
 
-        Args:
-            name: name of the file.
-            table: name of the table.
-            groups: its columns as in `TABLES`, contiguous; they must not change any more.
+        Groups are columns as in `TABLES`, contiguous; they must not change any more.
         """
         ready = None
         if groups[0].is_cuda:
@@ -120,11 +109,9 @@ class _HostArrays:
         self._staging = torch.empty(_STAGING_BYTES if is_gpu else 0, dtype=torch.uint8, pin_memory=is_gpu)
 
     def __call__(self, source: Tensor, ready: torch.cuda.Event | None) -> np.ndarray[Any, Any]:
-        """Return the values of a contiguous tensor.
+        """Return the values of a contiguous tensor, which exist when `ready` happens; None: they exist.
 
-        Args:
-            source: on the GPU, or on the CPU, whose memory the array then shares.
-            ready: happens when the values exist; this thread waits for it. None: they exist.
+        An array of a tensor on the CPU shares its memory.
         """
         if self._stream is None or ready is None:
             return source.numpy()
@@ -144,18 +131,9 @@ class _HostArrays:
 
 
 def read_lineage(folder: Path) -> dict[str, dict[str, Any]]:
-    """Read the log of a run.
+    """Read the log of a run: {"births": columns, "deaths": columns}, numpy arrays by name.
 
-    Args:
-        folder: that of the parts.
-
-    Returns:
-        {"births": columns, "deaths": columns}, numpy arrays by name.
-
-    Raises:
-        FileNotFoundError: there is no log.
-        ValueError: a file is damaged; names it.
-        ImportError: pyarrow is not installed.
+    FileNotFoundError: there is no log. ValueError: a file is damaged. ImportError: pyarrow is not installed.
     """
     arrow, _ = import_pyarrow()
     tables = {}
@@ -185,14 +163,9 @@ def read_lineage(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def read_numbers(path: Path) -> Any:
-    """Read a Parquet file whose columns are numbers or truth values, none of them missing.
+    """Read a Parquet file whose columns are numbers or truth values, none of them missing, as pyarrow has it.
 
-    Returns:
-        The table, as pyarrow has it.
-
-    Raises:
-        ValueError: it is no such file, or is damaged; names the file.
-        ImportError: pyarrow is not installed.
+    ValueError: it is no such file, or is damaged; names the file.
     """
     arrow, parquet = import_pyarrow()
     try:

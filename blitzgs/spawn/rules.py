@@ -60,19 +60,9 @@ def lineage_subject(config: Config, capture: Capture) -> dict[str, Any]:
 def open_spawn_gate(config: Config, capture: Capture, ranks: Ranks, known: str) -> tuple[Veto | None, str]:
     """Open the gate that a configuration names, and warn if it does not suit the run. Collective.
 
-    Args:
-        config: configuration of the run.
-        capture: capture of the run.
-        ranks: the job.
-        known: digest of the gate that the run has used so far; empty: not known.
-
-    Returns:
-        The veto and the digest of the gate's files. The digest is "" if a random veto takes the gate's place,
-        and if the configuration names no gate; the veto then is None.
-
-    Raises:
-        GateError: its files are missing, damaged, of another kind, or do not have the digest `known`.
-        MismatchError: the ranks read different files.
+    `known` is the digest of the gate that the run has used so far, if that is known. Returns the veto (None:
+    no gate) and the digest of the gate's files (empty: no gate, or a random veto). GateError: its files are
+    missing, damaged, of another kind, or do not have the digest `known`.
     """
     population = config.population
     if population.gate is None:

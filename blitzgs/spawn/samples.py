@@ -29,17 +29,8 @@ _AXES = ("x", "y", "z")
 def write_sample(run: Spawns, path: Path, most: int = MAX_ROWS) -> float:
     """Write the spawns of some parents, drawn by the hash of their ids, so that siblings stay together.
 
-    Args:
-        run: the spawns of a run.
-        path: path of the file, `NAME.parquet`.
-        most: expected number of rows; if there are fewer spawns, all are written.
-
-    Returns:
-        The share of the parents that was drawn.
-
-    Raises:
-        FileExistsError: the file exists and is not a sample.
-        ImportError: pyarrow is not installed.
+    `most` is the expected number of rows. Returns the share of the parents that was drawn. FileExistsError:
+    the file exists and is not a sample.
     """
     arrow, parquet = import_pyarrow()
     check_no_other(path)
@@ -65,12 +56,7 @@ def write_sample(run: Spawns, path: Path, most: int = MAX_ROWS) -> float:
 
 
 def check_no_other(path: Path) -> None:
-    """Check that a new sample replaces no file of another kind, such as a part of a lineage.
-
-    Raises:
-        FileExistsError: the file exists and is not a sample.
-        OSError: it is no regular file.
-    """
+    """Refuse to replace a file of another kind, such as a part of a lineage (FileExistsError, OSError)."""
     check_replaceable(path)
     if not path.exists():
         return
@@ -85,13 +71,7 @@ def check_no_other(path: Path) -> None:
 
 
 def read_sample(path: Path) -> Spawns:
-    """Read a sample back.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is not a sample, or is damaged; names the file.
-        ImportError: pyarrow is not installed.
-    """
+    """Read a sample back (FileNotFoundError: there is none; ValueError: it is none, or is damaged)."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: there is no such sample of spawns")
     table = read_numbers(path)

@@ -20,6 +20,7 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.host import HostCopy, to_device
+from blitzgs.runs.checkpoint import Saving
 
 # The ranks agree at least this often: in steps, and in seconds as far as single steps allow. On GPUs they
 # learn the decision one step later.
@@ -59,10 +60,15 @@ class StopRequest:
 
 
 class SaveClock:
-    """Tells when the next checkpoint by wall time is due."""
+    """Tells when the next checkpoint by wall time is due.
+
+    Attributes:
+        saving: the checkpoint that is being written; None: there is none. No other one is due meanwhile.
+    """
 
     def __init__(self, seconds: float) -> None:
-        """Start the clock; `seconds` is the time between two checkpoints, 0: none by wall time."""
+        """Start the clock; `seconds` is the time between two checkpoints; 0: none by wall time."""
+        self.saving: Saving | None = None
         self._seconds = seconds or math.inf
         self.restart()
 
@@ -73,24 +79,23 @@ class SaveClock:
     @property
     def is_due(self) -> bool:
         """Tell whether the time has passed."""
-        return time.monotonic() >= self._at
+        return self.saving is None and time.monotonic() >= self._at
+
+    @property
+    def is_written(self) -> bool:
+        """Tell whether this rank has written its part of a checkpoint."""
+        return self.saving is not None and self.saving.is_written
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What all ranks must do after a step.
+    """What all ranks must do after a step."""
 
-    Attributes:
-        signal: name of the signal that ends the run, or None.
-        save: whether a checkpoint is due.
-        lost: whether a rank could not read a photograph and continues without it.
-        watched: whether those who watch the run want something.
-    """
-
-    signal: str | None
-    save: bool
-    lost: bool = False
-    watched: bool = False
+    signal: str | None  # name of the signal that ends the run, or None
+    save: bool  # whether a checkpoint is due
+    written: bool = False  # whether all ranks have written their parts of the checkpoint that has begun
+    lost: bool = False  # whether a rank could not read a photograph and continues without it
+    watched: bool = False  # whether those who watch the run want something
 
 
 class Agreement:
@@ -102,10 +107,7 @@ class Agreement:
     def __init__(
         self, ranks: Ranks, stop: StopRequest, clock: SaveClock, wants: Callable[[], bool] = lambda: False
     ) -> None:
-        """Prepare to collect the requests that `stop`, `clock` and `wants` note on each of `ranks`.
-
-        `wants` returns whether those who watch the run want something of all ranks.
-        """
+        """Prepare; `wants` returns whether those who watch the run want something of all ranks."""
         self._ranks, self._stop, self._clock, self._wants = ranks, stop, clock, wants
         self._next = 0
         self._last: tuple[int, float] | None = None
@@ -132,7 +134,8 @@ class Agreement:
     def now(self, step: int, lost: bool = False) -> Decision:
         """Return a decision at once, whatever the step; every rank calls this."""
         if self._ranks.world_size == 1:
-            return self._decision(self._stop.number, self._clock.is_due, lost, self._wants())
+            clock = self._clock
+            return self._decision(self._stop.number, clock.is_due, clock.is_written, lost, self._wants())
         return self._answer(step, *self._ask(step, lost))
 
     def _ask(self, step: int, lost: bool) -> tuple[int, HostCopy]:
@@ -142,20 +145,21 @@ class Agreement:
         seconds = MAX_SECONDS
         if self._last is not None and step > self._last[0]:
             seconds = (now - self._last[1]) / (step - self._last[0])
-        requests = [self._stop.number, self._clock.is_due, seconds, lost, self._wants()]
+        unwritten = not self._clock.is_written
+        requests = [self._stop.number, self._clock.is_due, unwritten, seconds, lost, self._wants()]
         values = to_device(torch.tensor(requests, dtype=torch.float64), self._ranks.device)
         return step, HostCopy(self._ranks.all_reduce(values, "max").view(torch.int64))
 
     def _answer(self, step: int, asked: int, requests: HostCopy) -> Decision:
         """Decide after `step` by the requests of all ranks after step `asked`; wait for them."""
         with self._ranks.watchdog.waiting("agree"):
-            number, due, slowest, any_lost, watched = requests.read().view(torch.float64).tolist()
+            number, due, unwritten, slowest, any_lost, watched = requests.read().view(torch.float64).tolist()
         self._asked = None
         interval = max(1, min(MAX_STEPS, int(MAX_SECONDS / max(slowest, 1e-9))))
         self._next, self._last = (asked // interval + 1) * interval, (step, time.monotonic())
         self._agreed_to_stop = number > 0
-        return self._decision(int(number), due > 0, any_lost > 0, watched > 0)
+        return self._decision(int(number), due > 0, not unwritten, any_lost > 0, watched > 0)
 
     @staticmethod
-    def _decision(number: int, due: bool, lost: bool, watched: bool) -> Decision:
-        return Decision(signal.Signals(number).name if number else None, due, lost, watched)
+    def _decision(number: int, due: bool, written: bool, lost: bool, watched: bool) -> Decision:
+        return Decision(signal.Signals(number).name if number else None, due, written, lost, watched)

@@ -8,6 +8,7 @@ import math
 import time
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +16,26 @@ import torch
 from torch import Tensor
 
 from blitzgs.capture.images import Images
+from blitzgs.frame.frame import Views
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
 from blitzgs.ops.host import current_stream
-from blitzgs.training.batch import Batch
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.view.views import VIEW_NUMBERS, ViewSet, unpack_views
+
+
+@dataclass(frozen=True)
+class Batch:
+    """One step's views and photographs on the device."""
+
+    indices: list[int]  # the B cameras of the batch, as indices into the capture
+    views: Views  # the same cameras as the renderer takes them, at the resolution of the step
+    # uint8 [B, H, W, 3]; on several ranks, undefined outside the pixels that this rank's loss reads.
+    targets: Tensor
+    masks: Tensor | None  # uint8 [B, H, W], 0 = excluded pixel; None when no view of the batch has a mask
+    samples: Tensor  # float32 [B], number of values in a view's mean: 3 x its pixels that count, at least 1
+    ranges: TileRanges | None  # the tiles of each rank; None on one rank
+
 
 # Photographs are decoded further ahead than batches are uploaded: for every batch that is uploaded ahead,
 # those of this number of later batches. Decoding one takes as long as several steps on a fast GPU.
@@ -30,7 +45,7 @@ MAX_MASKED = 0.95
 
 
 class _Plan(NamedTuple):
-    """What is known about a batch before its photographs are decoded."""
+    """What is known about a batch before its photographs are decoded; see `Batch`."""
 
     indices: list[int]
     ranges: TileRanges | None
@@ -52,16 +67,10 @@ class _BatchMemory:
     On the CPU, host memory and device memory are the same. All parts of a batch are in one allocation, so
     that few calls upload it: during each call, this thread and the thread that launches kernels may block
     each other.
-
-    Attributes:
-        shape: views, height, width, and whether there are masks.
-        numbers: on the host, float32: the views as `ViewSet.write` writes them, then each view's samples.
-        pixels: on the host, uint8 [B, H, W, 3].
-        included: on the host, uint8 [B, H, W], 0 = excluded pixel; None without masks.
     """
 
     def __init__(self, shape: tuple[int, int, int, bool], device: torch.device) -> None:
-        self.shape = shape
+        self.shape = shape  # views, height, width, and whether there are masks
         count, height, width, masked = shape
         area, on_gpu = count * height * width, device.type == "cuda"
         # Each part begins at a multiple of 256 bytes, as a separate tensor would.
@@ -70,6 +79,8 @@ class _BatchMemory:
         size = self._end + masked * area
         self._host = torch.empty(size, dtype=torch.uint8, pin_memory=on_gpu)
         self._device = torch.empty(size, dtype=torch.uint8, device=device) if on_gpu else self._host
+        # On the host: views as `ViewSet.write` writes them, then each view's samples; uint8 [B, H, W, 3]; and
+        # uint8 [B, H, W], 0 = excluded pixel.
         numbers, pixels, included = self._parts(self._host)
         self.numbers, self.pixels = numbers.numpy(), pixels.numpy()
         self.included = None if included is None else included.numpy()
@@ -84,10 +95,7 @@ class _BatchMemory:
         return numbers, pixels, memory[self._end :].view(count, height, width) if masked else None
 
     def upload(self, rows: list[tuple[int, int]]) -> None:
-        """Start to upload all but the pixel rows before the first and after the last needed one.
-
-        `rows` has the needed rows [y0, y1) of each view.
-        """
+        """Upload from the first to the last needed pixel row; `rows` has those of each view, [y0, y1)."""
         if self._device is self._host:
             return
         count, height, width, _ = self.shape
@@ -106,17 +114,13 @@ class _BatchMemory:
 
 
 class _Slot:
-    """The memory of one batch; on CUDA later batches use it again.
-
-    Attributes:
-        uploaded: on CUDA, the event after the upload of the newest batch.
-        consumed: on CUDA, the event after all work that reads that batch.
-    """
+    """The memory of one batch; on CUDA later batches use it again."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._memory: _BatchMemory | None = None
         if device.type == "cuda":
+            # After the upload of the newest batch, and after all work that reads it.
             self.uploaded, self.consumed = torch.cuda.Event(), torch.cuda.Event()
 
     def reserve(self, shape: tuple[int, int, int, bool]) -> _BatchMemory:
@@ -133,12 +137,6 @@ class BatchLoader:
 
     On CUDA, images are uploaded from pinned memory on a separate stream, so that uploads overlap the kernels.
     A batch is valid until the next one is requested; its memory is then used again.
-
-    Attributes:
-        lost: on several ranks, why this rank could not read a photograph (the first one, if there are
-            several). The rank cannot stop alone in the middle of a step, so it continues and treats all
-            pixels of such photographs as masked. None: it has read all photographs.
-        waited: seconds that the caller has waited for batches so far.
     """
 
     def __init__(
@@ -151,26 +149,19 @@ class BatchLoader:
         ahead: int,
         owners: TileOwners | None = None,
     ) -> None:
-        """Prepare the loader.
+        """Prepare to upload `ahead` batches beyond the requested one; the photographs of more are decoded.
 
-        Args:
-            images: the photographs.
-            views: all cameras.
-            train: for each of the sampler's views, its camera in the capture.
-            sampler: chooses the views of each step.
-            device: device of the batches.
-            ahead: number of batches to prepare beyond the requested one; 0: each batch is prepared when it is
-                requested. The photographs of further batches are decoded.
-            owners: divides the tiles of each batch; this rank then decodes and uploads only the pixel rows
-                that its tiles' loss reads. None: whole photographs.
+        With `owners`, this rank decodes and uploads only the pixel rows that its tiles' loss reads.
         """
         self._images = images
         self._views = views
         self._owners = owners
         self._sample_counts: dict[tuple[int, int], float] = {}  # by view and reduction
         self._masked: dict[int, bool] = {}  # of each view that was read, whether nearly all is masked
+        # On several ranks, why this rank could not read the first of the photographs that it could not read.
+        # It cannot stop alone in the middle of a step, so it continues and treats all pixels as masked.
         self.lost: str | None = None
-        self.waited = 0.0
+        self.waited = 0.0  # seconds that the caller has waited for batches so far
         self._train = train
         self._sampler = sampler
         self._device = device
@@ -217,14 +208,9 @@ class BatchLoader:
         return batch
 
     @property
-    def views_read(self) -> int:
-        """The number of views that have been read so far, each counted once."""
-        return len(self._masked)
-
-    @property
-    def views_masked(self) -> int:
-        """The number of views, among the `views_read`, of which a mask excludes more than `MAX_MASKED`."""
-        return sum(self._masked.values())
+    def views_masked(self) -> tuple[int, int]:
+        """Of how many views a mask excludes more than `MAX_MASKED`, and how many were read so far."""
+        return sum(self._masked.values()), len(self._masked)
 
     def close(self) -> None:
         """Stop the thread."""
@@ -237,14 +223,16 @@ class BatchLoader:
 
     def _plan(self, step: int) -> _Plan:
         """Choose the views of a step and divide their tiles."""
-        indices, reduction = (
-            [self._train[view] for view in self._sampler.batch(step)],
-            self._sampler.reduction(step),
-        )
+        indices = [self._train[view] for view in self._sampler.batch(step)]
+        reduction = self._sampler.reduction(step)
+        width, height = self._views.size(indices, reduction)
+        if self._owners is None:
+            return _Plan(indices, None, [(0, height)] * len(indices), reduction)
         # This is done in the caller's thread and not in the other one, and always as many steps ahead: at
-        # this point all ranks know the same costs.
-        ranges = self._divide(step, indices, reduction)
-        return _Plan(indices, ranges, self._rows(indices, ranges, reduction), reduction)
+        # this point all ranks know the same costs. Those of another resolution belong to another number of
+        # tiles, and are not used.
+        ranges = self._owners.plan(step, indices, width, height, halo=LOSS_HALO)
+        return _Plan(indices, ranges, ranges.pixel_rows(self._owners.ranks.rank), reduction)
 
     def _drop(self, step: int) -> None:
         """Forget the plan of a step, and its batch if that is prepared."""
@@ -266,18 +254,6 @@ class BatchLoader:
         width, height = self._views.size(plan.indices, plan.reduction)
         size = 4 * width * height * len(plan.indices)  # images and masks
         return 2 * batches * size <= self._images.memory().decoded_budget
-
-    def _divide(self, step: int, indices: list[int], reduction: int) -> TileRanges | None:
-        if self._owners is None:
-            return None
-        # Costs of another resolution belong to another number of tiles, and are not used.
-        return self._owners.plan(step, indices, *self._views.size(indices, reduction), halo=LOSS_HALO)
-
-    def _rows(self, indices: list[int], ranges: TileRanges | None, reduction: int) -> list[tuple[int, int]]:
-        """Return the pixel rows [y0, y1) of each view that this rank needs."""
-        if ranges is None or self._owners is None:
-            return [(0, self._views.size([index], reduction)[1]) for index in indices]
-        return ranges.pixel_rows(self._owners.ranks.rank)
 
     def _load(self, plan: _Plan) -> tuple[Batch, _Slot]:
         # Read before taking a slot, so that an unreadable image does not occupy one.

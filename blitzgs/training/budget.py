@@ -43,34 +43,23 @@ SHOWN_CHANGE = 0.1
 
 @dataclass(frozen=True)
 class Plan:
-    """What rank 0 decides after a step.
+    """What rank 0 decides after a step."""
 
-    Attributes:
-        next: step after which the pace is reconsidered.
-        factor: factor of `schedule.scale` (which is 1) from this step on; None: unchanged.
-        images_per_second: the measured speed.
-        seconds: predicted training time of the whole run.
-    """
-
-    next: int
-    factor: float | None = None
-    images_per_second: float = 0.0
-    seconds: float = 0.0
+    next: int  # step after which the pace is reconsidered
+    factor: float | None = None  # factor of `schedule.scale` (which is 1) from this step on; None: unchanged
+    images_per_second: float = 0.0  # the measured speed
+    seconds: float = 0.0  # predicted training time of the whole run
 
 
 class Budget:
-    """Keeps a run within `schedule.minutes`; does nothing if that is 0.
-
-    Attributes:
-        next_step: step after which the pace is reconsidered.
-    """
+    """Keeps a run within `schedule.minutes`; does nothing if that is 0."""
 
     def __init__(self, state: TrainingState) -> None:
         """Begin; the next few steps are not measured."""
         self._state = state
         self._seconds = 60 * state.config.schedule.minutes
         self._interval = WARM_UP_STEPS
-        self.next_step = state.progress.step + WARM_UP_STEPS
+        self.next_step = state.progress.step + WARM_UP_STEPS  # after which the pace is reconsidered
         self._mark: tuple[int, float] | None = None
         self._shown = 0
 
@@ -122,12 +111,10 @@ class Budget:
         text = None
         if abs(total - self._shown) > SHOWN_CHANGE * total:
             self._shown = total
-            end = (
-                f"will end after about {plan.seconds / 60:.3g} minutes (--minutes: {self._seconds / 60:.3g})"
-            )
             text = (
                 f"{plan.images_per_second:.1f} images/s: {total:,} images in all, a scale of "
-                f"{values['scale']:.3g}; {end}"
+                f"{values['scale']:.3g}; will end after about {plan.seconds / 60:.3g} minutes (--minutes: "
+                f"{self._seconds / 60:.3g})"
             )
         state.log.event(state.images_seen, "pace", values, text)
 
@@ -144,18 +131,11 @@ LEAST_IMAGES = 100
 
 
 def extended(config: Config, step: int, by: float) -> Config:
-    """Return the configuration of a finished run with a longer schedule.
+    """Return the configuration of a finished run with a longer schedule: `by` images, or `by` times as long.
 
-    The times of all events stay, so the new part of the run has no density events and no importance passes.
-    Learning rates stay at their final values.
-
-    Args:
-        config: the run's own configuration.
-        step: number of steps that the run has taken.
-        by: number of images to add, if at least `LEAST_IMAGES`; else the factor of the run's length.
-
-    Raises:
-        ConfigError: the run is not finished, or would become too long.
+    It is a number of images from `LEAST_IMAGES` on. The times of all events stay, so the new part of the run
+    has no density events and no importance passes. Learning rates stay at their final values. ConfigError:
+    the run is not finished, or would become too long.
     """
     schedule = Schedule(config.schedule)
     if step < schedule.steps:

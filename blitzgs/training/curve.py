@@ -3,10 +3,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 # Log records whose mean is compared: the views of one batch differ by more than a fall.
 WINDOW = 16
@@ -16,40 +13,17 @@ FALL = 3.0
 
 @dataclass
 class Curve:
-    """Means of the training PSNR in the log records of a run; the same on every rank, and saved.
+    """Means of the training PSNR in the log records of a run; the same on every rank, and saved."""
 
-    Attributes:
-        recent: PSNR of the last `WINDOW` records, dB.
-        best: highest mean of so many records, dB; None before there are so many.
-        best_at: images that the run had seen then.
-        fall: largest fall of the mean below the best one before it, dB.
-        fall_at: images that the run had seen then.
-        warned: whether the present fall has been reported.
-    """
-
-    recent: list[float] = field(default_factory=list)
-    best: float | None = None
-    best_at: int = 0
-    fall: float = 0.0
-    fall_at: int = 0
-    warned: bool = False
-
-    @classmethod
-    def of(cls, saved: Mapping[str, Any]) -> Curve:
-        """Restore a curve from `saved`; an empty mapping gives a new one."""
-        return cls(**saved)
-
-    def saved(self) -> dict[str, Any]:
-        """Return the curve as JSON values."""
-        return dataclasses.asdict(self)
+    recent: list[float] = field(default_factory=list)  # PSNR of the last `WINDOW` records, dB
+    best: float | None = None  # highest mean of so many records, dB; None before there are so many
+    best_at: int = 0  # images that the run had seen then
+    fall: float = 0.0  # largest fall of the mean below the best one before it, dB
+    fall_at: int = 0  # images that the run had seen then
+    warned: bool = False  # whether the present fall has been reported
 
     def add(self, images: int, psnr: float) -> str | None:
-        """Add a record; return a warning when the mean has fallen by `FALL` for the first time.
-
-        Args:
-            images: images that the run has seen.
-            psnr: of the record's batch, dB.
-        """
+        """Add a record; return a warning when the mean has fallen by `FALL` for the first time."""
         self.recent = [*self.recent[1 - WINDOW :], psnr]
         if len(self.recent) < WINDOW:
             return None

@@ -28,21 +28,13 @@ _DENSITY_GROWTH = 5
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a training takes, within a factor of 2 to 3.
+    """What a training takes, within a factor of 2 to 3."""
 
-    Attributes:
-        gaussians: at most.
-        device_bytes: memory of the GPU; 0 on a CPU.
-        host_bytes: memory of the host.
-        minutes: of training.
-        images: that the run trains on.
-    """
-
-    gaussians: int
-    device_bytes: int
-    host_bytes: int
-    minutes: float
-    images: int
+    gaussians: int  # at most
+    device_bytes: int  # memory of the GPU; 0 on a CPU
+    host_bytes: int  # memory of the host
+    minutes: float  # of training
+    images: int  # that the run trains on
 
     def __str__(self) -> str:
         digits = max(0, len(str(self.gaussians)) - 2)

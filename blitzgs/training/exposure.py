@@ -12,7 +12,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.exposure import FILE, SHARED, effective
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.util.output import write_file
 
 # One step in so many measures the photographs of its batch, at one pixel in so many of each row and column.
@@ -33,22 +33,13 @@ class Exposures:
     The model has the mean exposure: over the training views the gains have the mean 1 and the biases the mean
     0. A photograph is measured by least squares against the render of its view, over the pixels that count.
     While the gains differ by less than `LEAST_SPREAD`, renders are compared with the photographs as they are.
-
-    Attributes:
-        measured: float64 [T, 2, 3], the gain and the bias of each channel as measured, for each training
-            view.
-        counts: float64 [T], measurements of each view.
     """
 
     def __init__(self, train: Sequence[int], ranks: Ranks) -> None:
-        """Begin with equal exposures.
-
-        Args:
-            train: the training views, as indices into the capture.
-            ranks: the job.
-        """
+        """Begin with equal exposures of the training views, which are indices into the capture."""
         self._ranks = ranks
         self._rows = {index: row for row, index in enumerate(train)}
+        # Gain and bias of each training view's channels as measured, and by how many measurements.
         self.measured = torch.zeros(len(train), 2, 3, dtype=torch.float64, device=ranks.device)
         self.measured[:, 0] = 1
         self.counts = torch.zeros(len(train), dtype=torch.float64, device=ranks.device)
@@ -71,13 +62,7 @@ class Exposures:
         return chosen[:, 0, None, None], chosen[:, 1, None, None]
 
     def measure(self, step: int, renders: Tensor, batch: Batch) -> None:
-        """Measure the photographs of a batch in one step of `_EVERY`. Collective.
-
-        Args:
-            step: number of the step, from 1.
-            renders: [B, H, W, 3] as the model shows the views, valid at this rank's pixels.
-            batch: the views' photographs.
-        """
+        """Measure a batch's photographs, in one step of `_EVERY`, by renders [B, H, W, 3]. Collective."""
         if step % _EVERY:
             return
         pick = (slice(None), slice(None, None, _STRIDE), slice(None, None, _STRIDE))

@@ -8,6 +8,7 @@ import hashlib
 import os
 import socket
 from collections.abc import Hashable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -29,8 +30,21 @@ LEAST_SIDE = 11
 _CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
+def read_ahead(data: DataConfig) -> Future[Capture] | None:
+    """Begin to read a capture for `open_capture` in a thread; None: it is read by the ranks together."""
+    if data.allow_missing or not data.path:
+        return None
+    pool = ThreadPoolExecutor(1, "blitzgs-capture")
+    reading = pool.submit(load_configured, data)
+    pool.shutdown(wait=False)
+    return reading
+
+
 def open_capture(
-    config: Config, ranks: Ranks, remedy: str = "--data.allow_missing=true"
+    config: Config,
+    ranks: Ranks,
+    remedy: str = "--data.allow_missing=true",
+    reading: Future[Capture] | None = None,
 ) -> tuple[Capture, ImageStore]:
     """Load the capture that a configuration names, and open its images.
 
@@ -38,10 +52,9 @@ def open_capture(
     the decoded images if they all fit into half of that. Collective.
 
     Args:
-        config: configuration of the run.
-        ranks: the job.
         remedy: the flag of the caller's command that leaves out views without a photograph, for the error
             message.
+        reading: of `read_ahead`.
 
     Raises:
         ConfigError: `data.path` is not set.
@@ -51,7 +64,10 @@ def open_capture(
     if not data.path:
         raise ConfigError("data.path: no capture given; use --data DIR")
     try:
-        capture = load_configured(data, partial(_damaged_of_share, ranks))
+        if reading is not None:
+            capture = reading.result()
+        else:
+            capture = load_configured(data, partial(_damaged_of_share, ranks))
     except MissingImagesError as error:
         raise MissingImagesError(f"{error} ({remedy})") from error
     budget = min(data.cache_bytes, _host_memory() // 2)
@@ -127,7 +143,6 @@ def sharing_hint(
     """Return what to do if the decoded images are too many to be shared by the ranks of a host.
 
     Args:
-        capture: the images.
         cache_bytes: `DataConfig.cache_bytes`.
         local_ranks: number of ranks of the host.
         factors: by which images are reduced in addition.

@@ -17,25 +17,20 @@ from blitzgs.ops.photometric import photometric_fwd_bwd
 if TYPE_CHECKING:
     from blitzgs.frame.frame import Frame
     from blitzgs.table.table import GaussianTable
-    from blitzgs.training.batch import Batch
+    from blitzgs.training.batches import Batch
 
 
 class LossTerms(NamedTuple):
-    """A batch's loss and its gradients by the images and by the Gaussians' axes and opacities.
+    """A batch's loss and its gradients by the images and by the Gaussians' axes and opacities."""
 
-    Attributes:
-        parts: sums of |render - photograph| and of the SSIM map over this rank's pixels and the channels,
-            float64 [B, K, 2], in K parts; see `photometric`.
-        v_renders: gradient of the batch's mean loss by the images, [B, H, W, 3].
-        scale_reg: gradient of the loss by the smallest axis of each visible Gaussian, per view [B]; None if
-            `loss.scale` is 0.
-        opacity_reg: gradient of the loss by the opacity of each visible Gaussian, per view [B]; None if
-            `loss.opacity` is 0.
-    """
-
+    # Sums of |render - photograph| and of the SSIM map over this rank's pixels and the channels, float64 [B,
+    # K, 2], in K parts; see `photometric`.
     parts: Tensor
-    v_renders: Tensor
+    v_renders: Tensor  # gradient of the batch's mean loss by the images, [B, H, W, 3]
+    # Gradient of the loss by the smallest axis of each visible Gaussian, per view [B]; None if `loss.scale`
+    # is 0.
     scale_reg: Tensor | None
+    # Gradient of the loss by the opacity of each visible Gaussian, per view [B]; None if `loss.opacity` is 0.
     opacity_reg: Tensor | None
 
 
@@ -44,10 +39,6 @@ def weighted(config: LossConfig, views: int) -> LossConfig:
 
     This share, `opacity_total` / `views`, is kept between `LEAST_OPACITY` and `MAX_OPACITY`. The result has
     `opacity_total` 0, so that a second call changes nothing.
-
-    Args:
-        config: weights as configured.
-        views: number of training views.
     """
     if config.opacity_total == 0:
         return config
@@ -58,14 +49,9 @@ def weighted(config: LossConfig, views: int) -> LossConfig:
 def loss_terms(
     frame: Frame, batch: Batch, config: LossConfig, extent: float, shown: Tensor | None = None
 ) -> LossTerms:
-    """Compare rendered views with their photographs.
-
-    On several ranks each compares its own tiles.
+    """Compare rendered views with their photographs; on several ranks each compares its own tiles.
 
     Args:
-        frame: rendered batch of B views.
-        batch: their photographs.
-        config: weights.
         extent: size of the scene in the unit of the means; L_scale is relative to it.
         shown: the images to compare, [B, H, W, 3], instead of the frame's; `v_renders` is then their
             gradient.
@@ -89,10 +75,7 @@ def loss_terms(
         opacity_weight=config.opacity,
     )
     return LossTerms(
-        parts,
-        v_renders,
-        scale_reg if config.scale > 0 else None,
-        opacity_reg if config.opacity > 0 else None,
+        parts, v_renders, scale_reg if config.scale > 0 else None, opacity_reg if config.opacity > 0 else None
     )
 
 
@@ -107,10 +90,8 @@ def _weights(ssim: float, count: int, device: torch.device) -> tuple[Tensor, Ten
 def photometric(sums: Tensor, samples: Tensor, config: LossConfig) -> Tensor:
     """Return (1 - lambda) L1 + lambda (1 - SSIM) of each view, float32 [B].
 
-    Args:
-        sums: `LossTerms.parts` added up over all ranks, [2 B]; see `HostSum.read`.
-        samples: `Batch.samples`, on the device of the sums.
-        config: weights.
+    `sums` are `LossTerms.parts` added up over all ranks, [2 B] (`HostSum.read`); `samples` those of the
+    batch, on their device.
     """
     l1, ssim = sums.view(2, -1)
     return ((1.0 - config.ssim) * l1 - config.ssim * ssim) / samples + config.ssim

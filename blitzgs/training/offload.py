@@ -5,22 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from blitzgs.config.fields import LossConfig
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.frame import Frame, RenderOptions, ViewFilter
-from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.transport import Mark, unmarked
 from blitzgs.ops.host import to_device
 from blitzgs.ops.projection_types import MAX_VIEWS
-from blitzgs.optim.table_adam import TableAdam
-from blitzgs.population.position_noise import PositionNoise
 from blitzgs.table.block_visibility import Cameras
 from blitzgs.table.pool import Pool
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.training.loss import LossTerms
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
@@ -28,20 +25,9 @@ from blitzgs.view.views import ViewSet
 
 
 class UpcomingCameras:
-    """The cameras of the present and the next steps.
-
-    Attributes:
-        batch_size: views of a step.
-    """
+    """The cameras of the present and the next steps."""
 
     def __init__(self, sampler: BatchSampler, train: Sequence[int], views: ViewSet) -> None:
-        """Prepare to look ahead.
-
-        Args:
-            sampler: chooses the views of each step.
-            train: for each of the sampler's views, its camera in the capture.
-            views: all cameras.
-        """
         self.batch_size = sampler.batch_size
         self._sampler, self._train, self._views = sampler, list(train), views
 
@@ -74,31 +60,12 @@ class OffloadingStepper(Stepper):
 
     scene: Pool
 
-    def __init__(
-        self,
-        pool: Pool,
-        upcoming: UpcomingCameras,
-        optimiser: TableAdam,
-        owners: TileOwners,
-        loss: LossConfig,
-        extent: float,
-        noise: PositionNoise | None = None,
-    ) -> None:
-        """Prepare to step.
-
-        Args:
-            pool: this rank's Gaussians, some of which it holds on the device.
-            upcoming: the cameras of the next steps.
-            optimiser: as for `Stepper`, like the following arguments.
-            owners: records what the tiles cost.
-            loss: weights of the loss.
-            extent: size of the scene in the unit of the means.
-            noise: noise on the means after each step; None: none.
-        """
+    def __init__(self, pool: Pool, upcoming: UpcomingCameras, *shared: Any) -> None:
+        """Prepare to step with a pool; further arguments are those of `Stepper` after the table."""
         self._pool, self._upcoming = pool, upcoming
         self._reported = pool.moved
         self._up_to_date_at: int | None = None
-        super().__init__(pool.held, optimiser, owners, loss, extent, noise)
+        super().__init__(pool.held, *shared)
         self.scene = pool
 
     def reindex(self) -> None:
@@ -150,12 +117,7 @@ class OffloadingStepper(Stepper):
         return rendered
 
     def backward(
-        self,
-        step: int,
-        frame: Frame,
-        terms: LossTerms,
-        mark: Mark = unmarked,
-        keep_means2d: bool = False,
+        self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked, keep_means2d: bool = False
     ) -> Tensor | None:
         """See `Stepper.backward`."""
         v_means2d = super().backward(step, frame, terms, mark, keep_means2d)

@@ -40,8 +40,8 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import decimal_share, smallest
 from blitzgs.ops.counter_random import hash_keys
 from blitzgs.runs import files as run_files
-from blitzgs.runs.checkpoint import MANIFEST
 from blitzgs.runs.folder_checks import locked
+from blitzgs.runs.manifest import MANIFEST
 from blitzgs.spawn.candidates import Candidates, Veto
 from blitzgs.spawn.gate import RandomVeto, RankVeto, SampledVeto, SpawnGate, veto_draws
 from blitzgs.spawn.lineage_parts import read_lineage
@@ -72,24 +72,15 @@ class CandidateRecord:
 
 
 class OracleVeto:
-    """Vetoes candidates whose children did not survive in a reference run.
-
-    Attributes:
-        seen: number of candidates so far, on this rank.
-        matched: number of those that the reference run had too.
-    """
+    """Vetoes candidates whose children did not survive in a reference run."""
 
     def __init__(self, known: Tensor, dead: Tensor, rate: float | None, seed: int) -> None:
-        """Store the reference run's candidates and events.
+        """Take the `event_keys` of the reference's candidates and of its non-surviving events, int64 [K].
 
-        Args:
-            known: int64 [K], `event_keys` of its candidates.
-            dead: int64 [D], `event_keys` of its non-surviving spawn events.
-            rate: veto at most this share of the clones and of the splits; None: no limit.
-            seed: seed of the draw among non-surviving candidates if there are more.
+        With a `rate`, at most this share of the clones and of the splits is vetoed, drawn by `seed`.
         """
         self._known, self._dead, self._rate, self._seed = known, dead, rate, seed
-        self.seen = self.matched = 0
+        self.seen = self.matched = 0  # this rank's candidates, and those that the reference had too
 
     def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
         """Tell which candidates are vetoed, bool [M]. Collective."""
@@ -180,29 +171,14 @@ def replay(
 ) -> Iterator[dict[str, Any]]:
     """Train every arm to the end, one after the other. Collective.
 
-    Args:
-        config: of the run that is branched, with `population.lineage`.
-        capture: of the run.
-        images: of the capture.
-        source: folder of the run.
-        out: gets a folder for each arm.
-        gate: the learned ranking.
-        rate: share that is vetoed.
-        ranks: the job.
+    Yields, for each arm: its name, psnr, ssim, peak and final Gaussians, the seconds of training since the
+    branch, the reference's share of non-surviving events (`dead`) and of candidates that the limit of the
+    population held back (`held_back`), and of an oracle the share of the candidates that it knew (`matched`).
 
-    Yields:
-        For each arm, when it is trained: its name, psnr, ssim, peak and final Gaussians, the seconds of
-        training since the branch, the reference's share of non-surviving events (`dead`) and of candidates
-        that the limit of the population held back (`held_back`), and of an oracle the share of the candidates
-        that it knew (`matched`).
-
-    Raises:
-        ValueError: the run logged no lineage, has no candidates from the gate's onset on, was trained by the
-            clock, ends before the onset, or all pixels of the views that are measured are masked.
-        FileNotFoundError: it has no checkpoint from before the onset.
-        FileExistsError: `out` holds a replay already, or another folder with the name of an arm. A replay
-            that ended before its first arm was trained is begun again.
-        FolderError: another process is training in the folder of an arm.
+    ValueError, FileNotFoundError: the run cannot be branched, or its arms could not be compared.
+    FileExistsError: `out` holds a replay already, or another folder with the name of an arm; a replay that
+    ended before its first arm was trained is begun again. FolderError: another process is training in the
+    folder of an arm.
     """
     _check_comparable(config, capture, images, source)
     _check_unclaimed(out, ranks)
@@ -258,12 +234,7 @@ def replay(
 
 
 def _check_unclaimed(out: Path, ranks: Ranks) -> None:
-    """Check that a replay will not replace anything in its folder, except a reference that was not trained.
-
-    Raises:
-        FileExistsError: on every rank; a replay has trained an arm there, or the folder has another file or
-            folder with the name of one that the replay writes.
-    """
+    """Refuse to replace anything in the folder of a replay, except a reference that was not trained."""
     found = None
     # Rank 0 checks for all, because another rank might check after rank 0 has begun to write.
     if ranks.rank == 0:
@@ -292,12 +263,7 @@ def _branch(point: Path, folder: Path) -> None:
 
 
 def _check_comparable(config: Config, capture: Capture, images: Images, source: Path) -> None:
-    """Check that arms can be branched from a run and that their results can be compared.
-
-    Raises:
-        ValueError: the run logged no lineage, has no candidates, was trained by the clock, or all pixels of
-            the views that are measured are masked.
-    """
+    """Check that arms can be branched from a run and that their results can be compared."""
     if not config.population.lineage:
         raise ValueError(
             f"{source} was trained without --population.lineage=true: there is nothing to branch"

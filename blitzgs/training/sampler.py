@@ -31,10 +31,6 @@ class BatchSampler:
     With a tour, an epoch still has every view once, but follows the tour from a random place in a random
     direction, and each view comes later by a random share of up to an eighth of the tour. So the views of a
     piece are shuffled, and what they see stays in the memory of the device meanwhile.
-
-    Attributes:
-        batch_size: views per batch, B.
-        schedule: decides on the resolution; None: it is always the full one.
     """
 
     def __init__(
@@ -45,17 +41,10 @@ class BatchSampler:
         schedule: Schedule | None = None,
         tour: Sequence[int] | None = None,
     ) -> None:
-        """Group the views.
+        """Group the views by their image sizes, which are any hashable values.
 
-        Args:
-            sizes: image size of each view, any hashable value.
-            batch_size: views per batch, B.
-            seed: of the shuffles.
-            schedule: see above.
-            tour: all views, so ordered that neighbours see the same places; None: no place matters.
-
-        Raises:
-            ValueError: there is no view, or the tour does not have each view once.
+        A tour has all views, so ordered that neighbours see the same places; None: no place matters.
+        ValueError: there is no view, or the tour does not have each view once.
         """
         if not sizes:
             raise ValueError("there are no training views: check the capture and its split")
@@ -68,8 +57,8 @@ class BatchSampler:
             groups.setdefault(size, []).append(view)
         self._groups = [torch.tensor(views) for views in groups.values()]
         self._counts = [len(views) for views in groups.values()]
-        self.batch_size, self.schedule = batch_size, schedule
-        self._seed = seed
+        # The schedule decides on the resolution; None: it is always the full one.
+        self.batch_size, self.schedule, self._seed = batch_size, schedule, seed
         # The latest round: its first step and its batches. Most steps use the same round as the one before.
         self._round: tuple[int, list[tuple[int, int]]] = (0, [])
         self._epoch = lru_cache(maxsize=2 * len(groups))(self._make_epoch)
@@ -143,14 +132,10 @@ class BatchSampler:
 
 
 def tour_of(cameras: Sequence[Camera], points: Float64) -> list[int]:
-    """Return the cameras in the Morton order of the places that they show.
+    """Return the cameras in the Morton order of the places that they show; points are [M, 3] in their world.
 
     The place is on the optical axis, at the median depth of the points that the camera sees; the camera's own
     place if it sees none. Points behind others count, as they do where Gaussians are loaded for a view.
-
-    Args:
-        cameras: the views.
-        points: [M, 3], in the world of the cameras; may be empty.
     """
     sample = sampled(points, len(cameras))
     poses = np.stack([camera.world_to_camera for camera in cameras])

@@ -31,7 +31,7 @@ from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writab
 from blitzgs.runs.from_file import trained_columns
 from blitzgs.runs.log import LOG, RunLog
 from blitzgs.runs.world import save_frame
-from blitzgs.spawn.lineage import Lineage, initial_births, ledger_of
+from blitzgs.spawn.lineage import Ledger, Lineage, initial_births
 from blitzgs.spawn.rules import lineage_subject, open_spawn_gate
 from blitzgs.table.blocks import sort_rows
 from blitzgs.table.host_table import HostTable
@@ -44,7 +44,7 @@ from blitzgs.training.exposure import Exposures
 from blitzgs.training.inputs import check_alike, check_capture, check_resolution
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
-from blitzgs.training.population_report import PICTURE
+from blitzgs.training.records import PICTURE
 from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
@@ -67,11 +67,7 @@ def set_up(
     """Make the state of a new run, or restore the state of the run in `folder`.
 
     Args:
-        config: what to compute.
-        capture: cameras and points.
-        images: its photographs.
         folder: folder of the run, for configuration, log, checkpoints, evaluation and summary.
-        ranks: the job.
         resume: continue from the newest checkpoint in `folder`, if there is one.
         extend: with `resume`, train a finished run longer, see `extension.extended`.
         lap: called with the name of each part of this work at its end (`Laps.lap`).
@@ -159,17 +155,13 @@ def set_up(
         save_clock=SaveClock(config.log.checkpoint_seconds),
         veto=veto,
         lineage=lineage,
-        curve=Curve.of(progress.curve),
+        curve=Curve(**progress.curve),
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )
 
 
 def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
-    """Check that a run may write to its folder, and that it replaces nothing there.
-
-    Raises:
-        FileExistsError, FolderError: as for `set_up`.
-    """
+    """Check that a run may write to its folder, and that it replaces nothing there."""
     written = (
         run_files.CONFIG, CAMERAS, LOG, run_files.SUMMARY, PICTURE, run_files.LINEAGE, run_files.REPORT,
         exposure.FILE,
@@ -209,11 +201,7 @@ def _resolved(config: Config, capture: Capture, restored: run_files.Restored | N
 
 
 def _continued(config: Config, restored: run_files.Restored, extend: float | None) -> Config:
-    """Return the configuration to continue a run with: `config`, or one with a longer schedule.
-
-    Raises:
-        ConfigError: it differs from that of the run, or the run to extend is not finished.
-    """
+    """Return the configuration to continue a run with: `config`, or one with a longer schedule."""
     if extend is not None:
         # An interrupted extension may have left its schedule in the folder's configuration.
         config = replace(config, schedule=restored.config.schedule)
@@ -292,7 +280,7 @@ def _start_lineage(
     """Open the log of births and deaths, for a new run or at the checkpoint's state; None if it is off."""
     if not config.population.lineage:
         return None
-    about, ledger = lineage_subject(config, capture), ledger_of(progress.ledger)
+    about, ledger = lineage_subject(config, capture), Ledger(**progress.ledger)
     lineage = Lineage(folder / run_files.LINEAGE, ranks, progress.step, ledger, about)
     if not progress.ledger:
         lineage.born(initial_births(table["id"], table["parent"], table["means"]), progress.step)
@@ -313,12 +301,12 @@ def first_gaussians(
 ) -> tuple[GaussianTable, Progress]:
     """Make the first Gaussians; each rank keeps its share of them at `home`."""
     lod, device = config.lod, ranks.device
-    points = torch.from_numpy(capture.points) / space.unit
+    points = torch.from_numpy(capture.points).to(device) / space.unit
     # Cameras that are far from the others would stretch the octree over distances that no photograph covers.
     together = [i for i in capture.train if i not in capture.apart] or capture.train
     centres = trained_centres([capture.cameras[i] for i in together], space).to(device)
-    levels = measure_levels(points.to(device), centres, lod.fork)
-    colors, most = torch.from_numpy(capture.colors), config.population.max_gaussians
+    levels = measure_levels(points, centres, lod.fork)
+    colors, most = torch.from_numpy(capture.colors).to(device), config.population.max_gaussians
     if config.model.start:
         return _of_file(config, space, levels, ranks, home)
     first = octree_gaussians(

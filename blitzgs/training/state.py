@@ -45,61 +45,35 @@ def never() -> bool:
 
 @dataclass
 class TrainingState:
-    """One run on one rank; an event is a function `run(state, event)` that may change it.
-
-    Attributes:
-        config: what to compute.
-        capture: cameras and points.
-        images: the capture's photographs.
-        folder: folder of the run; rank 0 writes most of its files.
-        ranks: the job.
-        schedule: tells which events happen at which step.
-        space: maps between the trained world and the capture's world.
-        table: this rank's Gaussians.
-        progress: progress of the run.
-        views: all cameras of the capture, on the device.
-        sampler: chooses the views of each step.
-        optimiser: optimiser of the table.
-        stepper: takes the training steps.
-        owners: measures what tiles cost, and divides them among the ranks.
-        lpips: the perceptual metric, or None.
-        run_id: identifies the run in its log, also after it is resumed.
-        origin: describes where the run begins, for the log.
-        save_clock: tells when the next checkpoint by wall time is due.
-        veto: withholds candidates of densification from `schedule.gate_from` on, or None.
-        lineage: logs births and deaths, or None.
-        growth_was_limited: whether the log has already reported that a limit holds growth back.
-        log: log of the run; it does nothing until the loop opens the run's log.
-        stops: returns whether the run has to stop soon, the same on every rank; long events call it every few
-            seconds. The loop sets it.
-        curve: training PSNR of the run.
-        clock: returns monotonic seconds, by which training time is measured.
-    """
+    """One run on one rank; an event is a function `run(state, event)` that may change it."""
 
     config: Config
-    capture: Capture
-    images: Images
-    folder: Path
+    capture: Capture  # cameras and points
+    images: Images  # the capture's photographs
+    folder: Path  # folder of the run; rank 0 writes most of its files
     ranks: Ranks
-    schedule: Schedule
-    space: Space
-    table: GaussianTable
+    schedule: Schedule  # tells which events happen at which step
+    space: Space  # maps between the trained world and the capture's world
+    table: GaussianTable  # this rank's Gaussians
     progress: Progress
-    views: ViewSet
-    sampler: BatchSampler
+    views: ViewSet  # all cameras of the capture, on the device
+    sampler: BatchSampler  # chooses the views of each step
     optimiser: TableAdam
-    stepper: Stepper
-    owners: TileOwners
-    lpips: Lpips | None
-    run_id: str
-    origin: str
-    save_clock: SaveClock
-    veto: Veto | None
-    lineage: Lineage | None
-    log: RunLog
-    growth_was_limited: bool = False
-    curve: Curve = field(default_factory=Curve)
+    stepper: Stepper  # takes the training steps
+    owners: TileOwners  # measures what tiles cost, and divides them among the ranks
+    lpips: Lpips | None  # the perceptual metric, or None
+    run_id: str  # identifies the run in its log, also after it is resumed
+    origin: str  # describes where the run begins, for the log
+    save_clock: SaveClock  # tells when the next checkpoint by wall time is due
+    veto: Veto | None  # withholds candidates of densification from `schedule.gate_from` on, or None
+    lineage: Lineage | None  # logs births and deaths, or None
+    log: RunLog  # log of the run; it does nothing until the loop opens the run's log
+    growth_was_limited: bool = False  # whether the log has already reported that a limit holds growth back
+    curve: Curve = field(default_factory=Curve)  # training PSNR of the run
+    # Returns whether the run has to stop soon, the same on every rank; long events call it every few seconds.
+    # The loop sets it.
     stops: Callable[[], bool] = never
+    # Returns monotonic seconds, by which training time is measured.
     clock: Callable[[], float] = time.monotonic
     _started: float = field(default_factory=time.monotonic)
 

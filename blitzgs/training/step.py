@@ -24,24 +24,18 @@ if TYPE_CHECKING:
     from blitzgs.optim.table_adam import TableAdam
     from blitzgs.population.position_noise import PositionNoise
     from blitzgs.table.table import GaussianTable
-    from blitzgs.training.batch import Batch
+    from blitzgs.training.batches import Batch
     from blitzgs.training.exposure import Exposures
     from blitzgs.view.visible import Scene
 
 
 class Stepper:
-    """Takes training steps with one table: `forward`, then `backward`. Neither waits for the loss.
+    """Takes training steps with one table: `forward`, then `backward`. Neither waits for the loss."""
 
-    Attributes:
-        table: the table whose rows a frame's ids refer to: all of this rank's Gaussians, or a pool with those
-            that a step may need.
-        scene: all of this rank's Gaussians, for rendering between steps; call `catch_up` before.
-        exposures: of the training photographs; None: all are taken as they are.
-    """
-
+    # The rows to which a frame's ids refer: all of this rank's Gaussians, or those of a pool.
     table: GaussianTable
-    scene: Scene
-    exposures: Exposures | None = None
+    scene: Scene  # all of this rank's Gaussians, for rendering between steps; call `catch_up` before
+    exposures: Exposures | None = None  # of the training photographs; None: all are taken as they are
 
     def __init__(
         self,
@@ -52,16 +46,7 @@ class Stepper:
         extent: float,
         noise: PositionNoise | None = None,
     ) -> None:
-        """Prepare to step.
-
-        Args:
-            table: this rank's Gaussians; neighbours in space should be neighbours in the table.
-            optimiser: optimiser of the table.
-            owners: records what the tiles cost.
-            loss: weights of the loss.
-            extent: size of the scene in the unit of the means.
-            noise: noise on the means after each step; None: none.
-        """
+        """Prepare to step; `extent` is the scene's in the unit of the means."""
         self.table = self.scene = table
         self._optimiser, self._owners = optimiser, owners
         self._loss, self._extent, self._noise = loss, extent, noise
@@ -99,16 +84,8 @@ class Stepper:
     ) -> tuple[Frame, LossTerms, HostSum]:
         """Apply pending steps of the rows that the views may see, render, and compare with the photographs.
 
-        Args:
-            step: number of the step, from 1.
-            options: how to render.
-            batch: B views, their photographs, and the tiles of each rank.
-            mark: called at the end of each stage with the stage's name.
-            view_filter: what the views leave out; None: nothing.
-
-        Returns:
-            The frame, the loss's terms, and the sums of its `LossTerms.parts` over all ranks, which
-            begin with [2 B].
+        Returns the frame, the loss's terms, and the sums of its `LossTerms.parts` over all ranks, which begin
+        with [2 B].
         """
         table, ranks, views = self.table, self._owners.ranks, batch.views
         rules = None if view_filter is None else view_filter.rules(table)
@@ -153,24 +130,11 @@ class Stepper:
         return frame, terms, sums
 
     def backward(
-        self,
-        step: int,
-        frame: Frame,
-        terms: LossTerms,
-        mark: Mark = unmarked,
-        keep_means2d: bool = False,
+        self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked, keep_means2d: bool = False
     ) -> Tensor | None:
         """Propagate the gradients of `forward`'s loss to the Gaussians, and take an optimiser step.
 
-        Args:
-            step: as for `forward`.
-            frame: from `forward`.
-            terms: from `forward`.
-            mark: called at the end of each stage with the stage's name.
-            keep_means2d: whether to return the gradient of the splats' means2d.
-
-        Returns:
-            The gradient of means2d, [P, 2] per pixel; None without `keep_means2d`.
+        With `keep_means2d`, returns the gradient of the splats' means2d, [P, 2] per pixel.
         """
         table = self.table
         gradients = pipeline.backward_splats(frame, terms.v_renders, mark)

@@ -37,15 +37,8 @@ def track_gains(capture: Capture, images: Images, ranks: Ranks) -> Tensor | None
     """Return the gain of each training photograph's channels, float64 [T, 3] with mean 1. Collective.
 
     The logarithm of a photograph's gain is the median, over its points, of the logarithm of the colour that
-    it shows against the mean over the point's photographs, each divided by its own gain.
-
-    Args:
-        capture: the capture.
-        images: its photographs.
-        ranks: the job; each rank reads its share of the photographs.
-
-    Returns:
-        The gains, the same on every rank; None if the capture has no tracks.
+    it shows against the mean over the point's photographs, each divided by its own gain. Each rank reads its
+    share of the photographs. None: the capture has no tracks.
     """
     observed = _observed_points(capture)
     if observed is None:

@@ -17,6 +17,7 @@ from blitzgs.capture.capture import Capture
 from blitzgs.capture.images import Images, PhotographError
 from blitzgs.config.fields import Config
 from blitzgs.config.files import config_hash, save_config
+from blitzgs.config.schedule import Event
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.frame import Frame
 from blitzgs.ops.population import density_stats_
@@ -32,12 +33,19 @@ from blitzgs.training import view_level
 from blitzgs.training.agreement import MAX_STEPS, Agreement, StopRequest
 from blitzgs.training.batches import MAX_MASKED, BatchLoader
 from blitzgs.training.budget import Budget
-from blitzgs.training.events import evaluate, events_left, handle_all, save
-from blitzgs.training.glances import Glances
-from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
+from blitzgs.training.events import evaluate, handle_all, save
+from blitzgs.training.events.evaluate import Glances
+from blitzgs.training.records import (
+    MemoryMeter,
+    StepRecord,
+    describe,
+    log_step,
+    measure_step,
+    population_report,
+    write_picture,
+)
 from blitzgs.training.setup import set_up
 from blitzgs.training.state import never
-from blitzgs.training.step_report import StepRecord, log_step, measure_step
 from blitzgs.training.understood import hints_of, largest_size
 from blitzgs.training.watching import Watching
 from blitzgs.util.output import write_file
@@ -46,14 +54,7 @@ from blitzgs.view.views import render_options
 
 
 class Trainer:
-    """Trains a model of a capture, from the start or from a checkpoint, to the end of the schedule.
-
-    Attributes:
-        state: state of the run.
-        loader: the batches of the coming steps.
-        memory: measures the GPU's memory over the run.
-        warned: texts of warnings, which the log takes over at the end.
-    """
+    """Trains a model of a capture, from the start or from a checkpoint, to the end of the schedule."""
 
     def __init__(
         self,
@@ -70,7 +71,7 @@ class Trainer:
         begin, self._laps = time.monotonic(), laps or Laps()
         self.state = state = set_up(config, capture, images, folder, ranks, resume, extend, self._laps.lap)
         state.add_stage("setup", time.monotonic() - begin)
-        self.warned: list[str] = []
+        self.warned: list[str] = []  # texts of warnings, which the log takes over at the end
         self._saves_first = extend is not None
         self.loader = BatchLoader(
             images,
@@ -91,11 +92,9 @@ class Trainer:
         self.memory = MemoryMeter()
 
     def watch(self, watcher: Watcher | None, stays: bool = False) -> None:
-        """Let somebody watch the training; every rank calls this before `train`.
+        """Let somebody watch the training; every rank calls this before `train`, rank 0 with a watcher.
 
-        Args:
-            watcher: who watches; None on ranks other than 0.
-            stays: after a whole training, the watcher stays until `show_on` ends.
+        After a whole training, a watcher that `stays` does so until `show_on` ends.
         """
         self._watching, self._watched_on = Watching(self.state, watcher), stays
 
@@ -145,7 +144,8 @@ class Trainer:
                 if self._saves_first:  # so that --resume knows the longer schedule
                     save.run(state)
                 budget, glances = Budget(state), Glances(state)
-                if not handle_all(state, events_left(state.progress)):
+                # What a stop kept from happening after the last step comes first.
+                if not handle_all(state, [Event(*entry) for entry in state.progress.events_left]):
                     self._stop(_stopped_by(agreement.now(done).signal))
                     return None
                 # The budget may change the number of steps.
@@ -180,6 +180,9 @@ class Trainer:
                     if decision.save:
                         with state.stage("checkpoint"):
                             save.run(state)
+                    if decision.written:
+                        with state.stage("checkpoint"):
+                            save.finish(state)
                     if decision.watched and watching is not None:
                         self._write_record()
                         watching.serve(state.stops)
@@ -198,13 +201,7 @@ class Trainer:
             self.close()
 
     def _save_without_room(self, error: PoolError, what: str, is_saved: bool = False) -> NoReturn:
-        """Save the model and raise the error that the Gaussians of a step or event do not fit into the pool.
-
-        Args:
-            error: says so.
-            what: what needs the Gaussians, as text.
-            is_saved: whether the newest checkpoint already has all steps.
-        """
+        """Save the model, unless it `is_saved`; raise the error that `what` does not fit into the pool."""
         state = self.state
         if is_saved or state.ranks.world_size > 1:
             raise error  # with several ranks, the others are in the middle of the step or event
@@ -222,13 +219,11 @@ class Trainer:
                 f"{'; '.join(lost)}. The last steps, {MAX_STEPS + 1} at most, went without it"
             )
 
-    def _stop(self, reason: str) -> None:
+    def _stop(self, reason: str, saves: bool = True) -> None:
         """Write the log record of the last step, save a checkpoint, and log why the run stops."""
-        self._write_record()
-        save.run_last(self.state, save.STOPPING_PATIENCE_SECONDS, lambda: False)
-        self._log_stop(reason)
-
-    def _log_stop(self, reason: str) -> None:
+        if saves:
+            self._write_record()
+            save.run_last(self.state, save.STOPPING_PATIENCE_SECONDS, lambda: False)
         self.state.log.event(self.state.images_seen, "stopped", {"reason": reason}, reason)
 
     def close(self) -> None:
@@ -267,10 +262,7 @@ class Trainer:
         if is_logged:
             self._unwritten = measure_step(state, frame, batch, sums)
         v_means2d = state.stepper.backward(
-            step,
-            frame,
-            terms,
-            keep_means2d=schedule.gathers_statistics(begin),
+            step, frame, terms, keep_means2d=schedule.gathers_statistics(begin)
         )
         if v_means2d is not None:
             self._add_statistics(frame, v_means2d, reduction)
@@ -285,7 +277,7 @@ class Trainer:
 
     def _check_masks(self) -> None:
         """Warn once if masks exclude nearly all of some training views, as inverted masks do."""
-        masked, read = self.loader.views_masked, self.loader.views_read
+        masked, read = self.loader.views_masked
         if not masked or self._warned_of_masks:
             return
         self._warned_of_masks = True
@@ -365,8 +357,7 @@ class Trainer:
     def finish(self, agreement: Agreement) -> dict[str, Any] | None:
         """Save and evaluate the trained model; return and write the summary.
 
-        Returns:
-            The summary; None if the run was asked to stop before the evaluation's end. It is then saved.
+        If the run is asked to stop before the evaluation's end, it is saved and has no summary.
         """
         state, step = self.state, self.state.progress.step
         residency = state.stepper.report(whole=True)
@@ -382,7 +373,7 @@ class Trainer:
         with state.stage("evaluate"):
             metrics = evaluate.run(state)
         if not metrics:
-            self._log_stop(_stopped_by(agreement.now(step).signal))
+            self._stop(_stopped_by(agreement.now(step).signal), saves=False)
             return None
         summary = metrics | self._figures(population) | residency
         if state.ranks.rank == 0:

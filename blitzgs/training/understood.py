@@ -30,25 +30,15 @@ class HopelessCaptureError(ValueError):
 
 @dataclass(frozen=True)
 class Pictures:
-    """Figures of some photographs.
+    """Figures of some photographs."""
 
-    Attributes:
-        means: mean of each, over the pixels that count, 0 to 255.
-        masked: share of each that its mask excludes, of those with a mask.
-        unread: what is wrong with those that could not be decoded.
-    """
-
-    means: list[float]
-    masked: list[float]
-    unread: list[str]
+    means: list[float]  # mean of each, over the pixels that count, 0 to 255
+    masked: list[float]  # share of each that its mask excludes, of those with a mask
+    unread: list[str]  # what is wrong with those that could not be decoded
 
 
 def check_worlds(capture: Capture) -> None:
-    """Refuse a capture of which no view sees a point.
-
-    Raises:
-        HopelessCaptureError: see above.
-    """
+    """Refuse a capture of which no view sees a point (HopelessCaptureError: see above)."""
     views = len(capture.cameras)
     if capture.about.blind == views and capture.about.random_points:
         raise HopelessCaptureError(
@@ -132,7 +122,7 @@ def _warn_of_pictures(capture: Capture, pictures: Pictures, near: float) -> None
                 stacklevel=3,
             )
     views = capture.train[:_PROJECTED]
-    points = sampled(capture.points, len(views))
+    points = sampled(capture.points, len(capture.cameras))
     depths = [depths_seen(capture.cameras[i], points) for i in views]
     cut = sum(len(d) > 0 and bool(d.max() <= near) for d in depths)
     if 2 * cut > len(views):

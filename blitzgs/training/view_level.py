@@ -8,6 +8,7 @@ import math
 import warnings
 
 from blitzgs.capture.capture import Capture, train_views_fingerprint
+from blitzgs.config.schedule import Event
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.files import Progress
 from blitzgs.runs.lod import level_fork, lod_gate, scene_gate
@@ -26,7 +27,8 @@ def follow_schedule(state: TrainingState, begin: int) -> None:
     Collective: every rank calls this before every step.
     """
     view = state.config.view
-    if not (view.lod and state.schedule.has_lod_gate(begin)):
+    # A Gaussian that is left out gathers no gradients for density control.
+    if not view.lod or state.schedule.gathers_statistics(begin):
         return
     opens = state.progress.finest_level is None
     if view.footprint > 0 and (opens or state.schedule.has_new_levels(begin)):
@@ -100,12 +102,7 @@ def keep_to_views(table: GaussianTable, progress: Progress, capture: Capture, ra
 
 
 def batch_gate(state: TrainingState, indices: list[int]) -> ViewGate | None:
-    """Return LOD gate and cull mask of a batch of training views; None if it has neither.
-
-    Args:
-        state: state of the run.
-        indices: training cameras, as indices into the capture.
-    """
+    """Return LOD gate and cull mask of training views (indices into the capture); None: there is neither."""
     columns = [state.columns[index] for index in indices]
     lod, flags = lod_gate(state.config, state.progress), state.progress.gated_views
     lod_views = 0 if lod is None else lod_bits([flags[column] == "1" for column in columns])
@@ -113,3 +110,13 @@ def batch_gate(state: TrainingState, indices: list[int]) -> ViewGate | None:
     if not (lod_views or masked):
         return None
     return ViewGate(lod.reach() if lod is not None else [math.inf], lod_views, columns if masked else ())
+
+
+def clear_cull(state: TrainingState, event: Event) -> None:
+    """Delete the cull mask and free its memory."""
+    if CULL not in state.table:
+        return
+    state.stepper.write_back()
+    del state.table[CULL]
+    state.stepper.reindex()
+    state.log.event(event.time, "clear_cull", {}, "the cull mask is cleared")

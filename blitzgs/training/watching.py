@@ -39,11 +39,7 @@ class Watching:
         self._asked(lambda watcher: watcher.told(t, values), None)
 
     def serve(self, stops: Callable[[], bool]) -> None:
-        """Fulfil what the watcher wants between two steps; every rank calls this together.
-
-        Args:
-            stops: returns whether the run has to stop, the same on every rank.
-        """
+        """Fulfil what the watcher wants between two steps, until `stops`; every rank calls this together."""
         wish = self._next()
         if wish.pause:
             with self._state.paused_clock(), self._state.stage("paused"):

@@ -18,13 +18,9 @@ _NAME, _CELLS = 14, 320
 def line_chart(
     lines: Mapping[str, Sequence[tuple[float, float]]], x_label: str, y_label: str, most: float | None = None
 ) -> str:
-    """Draw a line chart whose axes begin at zero.
+    """Draw lines, name -> (x, y) with x and y >= 0, over axes that begin at zero.
 
-    Args:
-        lines: name -> (x, y), x and y >= 0.
-        x_label: below the axis.
-        y_label: above the axis.
-        most: the top of the axis; None: a round number, at least the largest y.
+    The y axis ends at `most`; None: at a round number, at least the largest y.
     """
     points = [point for line in lines.values() for point in line]
     last = max((x for x, _ in points), default=0.0) or 1.0
@@ -59,8 +55,7 @@ def line_chart(
 def maps(cells: Mapping[str, NDArray[np.float64]]) -> str:
     """Draw maps of shares in [0, 1] side by side: orange for 0, blue for 1; NaN is left white.
 
-    Args:
-        cells: name -> [rows, columns], the first row at the bottom.
+    They are name -> [rows, columns], the first row at the bottom.
     """
     parts = []
     for k, (name, values) in enumerate(cells.items()):

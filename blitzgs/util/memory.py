@@ -28,11 +28,7 @@ def is_lack_of_memory(error: BaseException) -> bool:
 def explain_memory(
     error: BaseException, views: int, width: int, height: int, gaussians: int, device: torch.device
 ) -> None:
-    """Explain an error with which rendering ended, if it is that of a failed allocation.
-
-    Raises:
-        NotEnoughMemoryError: it is.
-    """
+    """Raise NotEnoughMemoryError for an error with which rendering ended, if an allocation failed."""
     if isinstance(error, NotEnoughMemoryError) or not is_lack_of_memory(error):
         return
     # A pixel has three colours, an opacity and the number of its last splat.

@@ -80,17 +80,10 @@ def write_file(path: Path, content: bytes | str, sync: bool = True) -> None:
 
 
 def check_replaceable(path: Path, ours: tuple[bytes, ...] = (), otherwise: str = "") -> None:
-    """Check that `path` does not exist, or is a regular file that may be replaced.
+    """Check that `path` does not exist, or is a regular file that may be replaced (else OSError).
 
-    Args:
-        path: the file.
-        ours: if there are any, a file that is not empty must have one of these in its first 2000 bytes, or
-            at its start if they have 8 bytes or fewer.
-        otherwise: what else it is, as it follows in the error after "FILE exists".
-
-    Raises:
-        OSError: it is a link, a device, a folder or something else that must not be replaced.
-        FileExistsError: the file has none of `ours`.
+    If there are marks, `ours`, a file that is not empty must have one in its first 2000 bytes, or at its
+    start if the mark has 8 bytes or fewer; else FileExistsError says "FILE exists" and `otherwise`.
     """
     try:
         mode = path.lstat().st_mode
@@ -115,12 +108,7 @@ class OutputFolder:
     """
 
     def __init__(self, root: Path, inputs: Iterable[Path] = ()) -> None:
-        """Prepare the folder; the first write creates it.
-
-        Args:
-            root: the folder.
-            inputs: files that must not be overwritten.
-        """
+        """Prepare the folder; the first write creates it."""
         self.root = root
         self._inputs: dict[tuple[int, int], Path] = {}
         self._input_folders: dict[str, Path] = {}
@@ -170,11 +158,7 @@ class OutputFolder:
         return found
 
     def check(self, path: Path) -> None:
-        """Check that a path below the folder may be written.
-
-        Raises:
-            OSError: see `paths`.
-        """
+        """Check that a path below the folder may be written (OSError: see `paths`)."""
         root, folder = os.path.realpath(self.root), os.path.realpath(path.parent)
         if os.path.commonpath([root, folder]) != root:
             raise OSError(

@@ -18,12 +18,7 @@ Report = Callable[[int, int], None]
 def image_progress(what: str, shown: bool = True) -> Iterator[Report]:
     """Show a bar on standard error while the context lasts, if standard error is a terminal.
 
-    Args:
-        what: label of the bar.
-        shown: False: show no bar, for ranks other than 0.
-
-    Yields:
-        A function to call with (images done, number of images).
+    Yields a function to call with (images done, number of images).
     """
     console = Console(stderr=True)
     columns = (

@@ -76,10 +76,7 @@ def surviving_output() -> Iterator[dict[str, Output]]:
     """Let `sys.stdout` and `sys.stderr` survive errors while the context lasts: text is lost, nothing else.
 
     Names that are not valid UTF-8 are printed with escapes. A stream that is no file of the process, as in
-    tests and notebooks, stays as it is.
-
-    Yields:
-        The streams by the names "stdout" and "stderr", those that were replaced.
+    tests and notebooks, stays as it is. Yields the streams that were replaced, "stdout" and "stderr".
     """
     outputs: dict[str, Output] = {}
     previous: dict[str, TextIO | None] = {}

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TypeVar, cast
 
 import numpy as np
@@ -16,14 +17,17 @@ from torch import Tensor
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import Frame, RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.tiles import TileAssignment, TileRanges, collect_images
-from blitzgs.ops.blocks import ActiveRows
+from blitzgs.frame.tiles import TileAssignment, collect_images
+from blitzgs.frame.transport import LocalTransport
+from blitzgs.ops.blocks import BLOCK_ROWS, ActiveRows
+from blitzgs.ops.host import to_host
+from blitzgs.ops.projection_types import Sizes
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import PARAMETERS, GaussianTable, schema
 from blitzgs.view.gate import SceneGate
-from blitzgs.view.look import Look, Picture
-from blitzgs.view.visible import Scene, VisibleFinder
+from blitzgs.view.look import Look, Mode, Picture
+from blitzgs.view.visible import Scene, VisibleFinder, VisibleScene
 
 T = TypeVar("T")
 
@@ -32,6 +36,11 @@ _SH_0 = 0.28209479177387814
 # Bytes of a frame for each Gaussian that a view may see (the splat, its copy on another rank, list entries
 # and their sorting), and for each pixel.
 _ROW_BYTES, _PIXEL_BYTES = 300, 64
+# About so many Gaussians are projected, listed and composited at a time (`VisibleFinder.depths`), so that a
+# frame of any model takes some hundred megabytes of a GPU. The CPU has more memory and takes longer by layer.
+LAYER_ROWS = {"cuda": 2_000_000, "cpu": 16_000_000}
+# Where less light than this comes through the layers in front, pixels do not count what is behind.
+_OPAQUE = 1e-3
 # Colours of the octree levels from coarse to fine, repeated beyond the last.
 LEVEL_COLOURS = (
     (0.27, 0.00, 0.33), (0.23, 0.32, 0.55), (0.13, 0.57, 0.55), (0.37, 0.79, 0.38), (0.99, 0.91, 0.14),
@@ -84,6 +93,7 @@ class Drawer:
     def __init__(self, subject: Subject, owners: TileOwners) -> None:
         """Prepare; `owners` divides the tiles among the ranks."""
         self._subject, self._owners = subject, owners
+        self._transport = LocalTransport() if owners.ranks.world_size == 1 else None
         self._finders: dict[tuple[bool, bool | None], VisibleFinder] = {}
 
     @torch.no_grad()
@@ -101,23 +111,67 @@ class Drawer:
         pose, K = (torch.from_numpy(matrix).float()[None].to(device) for matrix in (look.viewmat, look.K))  # noqa: N806
         views = Views(pose, K, look.width, look.height)
         options = self._options(look)
-        if ranks.world_size > 1:
-            self._together(lambda: _reserve(subject.scene, look, device))
-        table, active = self._together(lambda: self._found(look, views, options))
         ranges = assignment = None
         if ranks.world_size > 1:
+            self._together(lambda: _reserve(subject.scene, look, device))
             ranges = self._owners.divide([None], look.width, look.height, options.tile_size)
             assignment = TileAssignment(ranks, ranges)
-        frame = pipeline.forward(table, views, options, active, assignment)
-        image = self._together(lambda: _image(frame, look, subject.unit, ranges))
+        depths = [options.near_plane, options.far_plane]
+        if assignment is None:
+            blocks = LAYER_ROWS[device.type] // BLOCK_ROWS
+            depths = self._together(lambda: self._finder(look).depths(views, depths, blocks))
+        seen, layered = torch.zeros((), dtype=torch.int64, device=device), None
+        for near, far in pairwise(depths):
+            layer = replace(options, near_plane=near, far_plane=far)
+            count, layered = self._layer(look, views, layer, assignment, layered)
+            seen += count.sum()
+        assert layered is not None
+        behind = subject.options.background if look.background is None else look.background
+        image = self._together(lambda: _image(*layered, look.mode, behind, subject.unit))
         if ranges is not None:
             collect_images(image, ranges, ranks, destination=0)
-        seen = int(frame.visible.sum())
         if ranks.rank != 0:
             return None
-        values = image[0].cpu().numpy()
+        values = to_host(image[0]).numpy()
         values = values[..., 0] if values.shape[-1] == 1 else values
-        return Picture(values, seen, 1000 * (time.perf_counter() - begin))
+        return Picture(values, int(seen), 1000 * (time.perf_counter() - begin))
+
+    def _layer(
+        self,
+        look: Look,
+        views: Views,
+        options: RenderOptions,
+        assignment: TileAssignment | None,
+        front: tuple[Tensor, Tensor] | None,
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """Composite the Gaussians between two depths behind what is in front of them.
+
+        Returns:
+            How many are seen, int64 [1]; what is composited by now, float32 [1, H, W, C], and the light that
+            still comes through it, [1, H, W].
+        """
+        scene, painted = self._subject.scene, look.mode == "level"
+        table: GaussianTable
+        active: ActiveRows | Callable[[Sizes | None], ActiveRows]
+        if assignment is None and not isinstance(scene, Pool):
+
+            def active(sizes: Sizes | None) -> ActiveRows:
+                room = sizes.blocks if sizes is not None and scene.device.type == "cuda" else None
+                return self._together(lambda: self._found(look, views, options, room)).active
+
+            table = scene
+        else:
+            # All ranks find their rows before any projects: an error of one rank is one of all.
+            table, active, _ = self._together(lambda: self._found(look, views, options))
+        frame = pipeline.forward(
+            _painted(table) if painted else table, views, options, active, assignment, self._transport
+        )
+        image, light = self._together(lambda: _channels(frame, look.mode)), frame.saved.composited[0]
+        if front is not None:
+            before, through = front
+            shown = through > _OPAQUE if look.mode == "count" else through
+            image, light = image.mul_(shown[..., None]).add_(before), light.mul_(through)
+        return frame.visible, (image, light)
 
     def _together(self, work: Callable[[], T]) -> T:
         """Do this rank's part; an error on one rank is one on all, before they wait for each other."""
@@ -134,11 +188,13 @@ class Drawer:
                 raise DrawingError("; ".join(reasons))
         return cast(T, result)
 
-    def _found(self, look: Look, views: Views, options: RenderOptions) -> tuple[GaussianTable, ActiveRows]:
-        table, active, _ = self._finder(look).find(*views.as_arguments(), options.limits)
-        if look.crop is not None:
-            active = _cropped(active, table["means"], look.crop)
-        return (_painted(table) if look.mode == "level" else table), active
+    def _found(
+        self, look: Look, views: Views, options: RenderOptions, room: int | None = None
+    ) -> VisibleScene:
+        found = self._finder(look).find(*views.as_arguments(), options.limits, room)
+        if look.crop is None:
+            return found
+        return found._replace(active=_cropped(found.active, found.table["means"], look.crop))
 
     def _options(self, look: Look) -> RenderOptions:
         options, gate = self._subject.options, self._gate(look)
@@ -148,7 +204,7 @@ class Drawer:
             sh_degree=0 if look.mode == "level" else min(options.sh_degree, wanted),
             near_plane=options.near_plane if look.near is None else look.near,
             far_plane=options.far_plane if look.far is None else look.far,
-            background=options.background if look.background is None else look.background,
+            background=(0.0, 0.0, 0.0),  # `_image` adds the one of the look
             fade=() if gate is None else gate.gate.fade(),
         )
 
@@ -192,31 +248,43 @@ def _cropped(
 def _painted(table: GaussianTable) -> GaussianTable:
     """Return a table of the same Gaussians, coloured by their octree levels."""
     colours = torch.tensor(LEVEL_COLOURS, device=table.device)
-    levels = table["level"].long() % len(colours)
+    levels = table["level"].int() % len(colours)
     sh = ((colours - 0.5) / _SH_0)[levels][:, None]
     columns = {name: table[name] for name in (*PARAMETERS[:4], "level", "id")}
     return table_of_parameters(columns | {"sh": sh})
 
 
-def _image(frame: Frame, look: Look, unit: float, ranges: TileRanges | None) -> Tensor:
-    """Return what to show of a rendered frame: uint8 [1, H, W, 3], or float32 [1, H, W, 1]."""
+def _channels(frame: Frame, mode: Mode) -> Tensor:
+    """Return what the Gaussians of a frame add to each pixel of a mode, float32 [1, H, W, C]."""
     transmittances, last_ids, *_ = frame.saved.composited
-    if look.mode == "alpha":
-        return (1 - transmittances)[..., None].contiguous()
-    if look.mode == "count":
-        return last_ids[..., None].float().contiguous()
-    if look.mode == "depth":
-        splats, lists = frame.splats, frame.saved.lists
-        tiles = (0, -1) if frame.assignment is None else frame.assignment.composited_tiles
-        depth, alphas = rasterize(
-            splats.means2d, splats.conics, splats.opacities, splats.depths[:, None], *lists,
-            n_cameras=1, width=look.width, height=look.height, tile_size=frame.options.tile_size,
-            tile_begin=tiles[0], tile_end=tiles[1],
-        )  # fmt: skip
-        mean = depth * unit / alphas[..., None].clamp_min(1e-10)
-        return mean.where(alphas[..., None] > 0.05, 0.0).contiguous()
-    colours = frame.renders.clamp(0, 1).mul(255).add_(0.5)
-    return colours.to(torch.uint8)
+    if mode == "alpha":
+        return (1 - transmittances)[..., None]
+    if mode == "count":
+        return last_ids[..., None].float()
+    if mode != "depth":
+        return frame.renders
+    splats, views = frame.splats, frame.views
+    tiles = (0, -1) if frame.assignment is None else frame.assignment.composited_tiles
+    depth, _ = rasterize(
+        splats.means2d, splats.conics, splats.opacities, splats.depths[:, None], *frame.saved.lists,
+        n_cameras=1, width=views.width, height=views.height, tile_size=frame.options.tile_size,
+        tile_begin=tiles[0], tile_end=tiles[1],
+    )  # fmt: skip
+    return depth
+
+
+def _image(
+    channels: Tensor, light: Tensor, mode: Mode, background: tuple[float, float, float], unit: float
+) -> Tensor:
+    """Return what to show: uint8 [1, H, W, 3], or float32 [1, H, W, 1]."""
+    light = light[..., None]
+    if mode == "depth":
+        mean = channels * unit / (1 - light).clamp_min(1e-10)
+        return mean.where(light < 0.95, 0.0)
+    if mode in ("alpha", "count"):
+        return channels.contiguous()
+    behind = torch.tensor(background, device=channels.device)
+    return channels.addcmul(light, behind).clamp_(0, 1).mul_(255).add_(0.5).to(torch.uint8)
 
 
 def intrinsics(width: int, height: int, vertical_fov: float) -> np.ndarray:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from blitzgs.view.point_blocks import BLOCK_POINTS, PointBlocks
+from blitzgs.view.point_blocks import BLOCK_POINTS, PAIRS_OF_POINTS, PointBlocks
 
 # Finest sensible voxel relative to the box of the points; it sets the coarsest level's size.
 BASE_RESOLUTION = 0.001
@@ -116,7 +116,7 @@ def measure_levels(
             f"octree levels need points and cameras, got {len(points)} points and {len(centres)} cameras"
         )
     blocks = PointBlocks.of(points)
-    d_max, d_min = (_quantile(_distance_quantiles(blocks, centres, q), q).item() for q in (0.999, 0.001))
+    d_max, d_min = (_quantile(values, q).item() for q, values in _distance_quantiles(blocks, centres).items())
     box = 1.1 * max((_quantile(axis, 0.99) - _quantile(axis, 0.01)).item() for axis in points.unbind(1))
     if not (box > 0 and d_min > 0):
         raise ValueError(
@@ -129,27 +129,25 @@ def measure_levels(
     return Levels(count=count, fork=fork, reference_distance=d_max, voxel_size=box / fork**base)
 
 
-def _distance_quantiles(blocks: PointBlocks, centres: Tensor, q: float) -> Tensor:
-    """Return a quantile of each camera's distances to points, near one of their ends, float64 [V].
-
-    Args:
-        blocks: of the points.
-        centres: float64 [V, 3].
-        q: quantile.
-    """
-    values, count = [], len(blocks.order)
-    rank = _values_needed(count, q) - 1
-    # So many blocks, in the order of their bounds, have all values that the quantile needs.
-    enough = min(-(-rank // BLOCK_POINTS), len(blocks) - 1) + 1
+def _distance_quantiles(blocks: PointBlocks, centres: Tensor) -> dict[float, Tensor]:
+    """Return the quantiles 0.999 and 0.001 of each camera's distances to the points, float64 [V] each."""
+    parts: dict[float, list[Tensor]] = {0.999: [], 0.001: []}
+    count = len(blocks.order)
     for some, nearest, farthest in blocks.distances(centres):
-        if q > 0.5:
-            needed = farthest >= nearest.topk(enough).values[:, -1:]
-        else:
-            needed = nearest <= farthest.topk(enough, largest=False).values[:, -1:]
-        for centre, own in zip(some, needed, strict=True):
-            distances = (blocks.points_of(own) - centre).norm(dim=1)
-            values.append(_quantile(distances, q, count))
-    return torch.stack(values)
+        for q, values in parts.items():
+            top = q > 0.5
+            inner, outer = (nearest, farthest) if top else (farthest, nearest)
+            # So many blocks, in the order of their bounds, have all values that the quantile needs.
+            rank = _values_needed(count, q) - 1
+            enough = min(-(-rank // BLOCK_POINTS), len(blocks) - 1) + 1
+            limit = inner.topk(enough, largest=top).values[:, -1:]
+            most = int((outer >= limit if top else outer <= limit).sum(dim=1).amax())
+            chosen = outer.topk(most, largest=top).indices
+            pieces = max(1, PAIRS_OF_POINTS // most)
+            for cameras, own in zip(some.split(pieces), chosen.split(pieces), strict=True):
+                distances = blocks.distances_of(cameras, own, -math.inf if top else math.inf)
+                values.append(_quantile(distances.flatten(1), q, count))
+    return {q: torch.cat(values) for q, values in parts.items()}
 
 
 def _values_needed(count: int, q: float) -> int:
@@ -161,12 +159,12 @@ def _quantile(values: Tensor, q: float, count: int | None = None) -> Tensor:
     """Return the linearly interpolated quantile of values near one of their ends, without a full sort.
 
     Args:
-        values: [M], or as many of them as include `_values_needed`.
+        values: [..., M], or as many of them as include `_values_needed`.
         q: quantile.
         count: M; None: `values` has all.
     """
-    count = count or len(values)
+    count = count or values.shape[-1]
     position = (1.0 - q if q > 0.5 else q) * (count - 1)
     below, needed = math.floor(position), _values_needed(count, q)
     ends = values.topk(needed, largest=q > 0.5).values
-    return ends[below] + (ends[needed - 1] - ends[below]) * (position - below)
+    return ends[..., below] + (ends[..., needed - 1] - ends[..., below]) * (position - below)

@@ -20,6 +20,8 @@ BLOCK_POINTS = 256
 _MARGIN = 1e-12
 # Largest number of pairs of a camera and a block that are in memory at once.
 _PAIRS = 1 << 20
+# Largest number of pairs of a camera and a block whose distances are computed at once.
+PAIRS_OF_POINTS = 1 << 13
 
 
 @dataclass(frozen=True)
@@ -53,24 +55,40 @@ class PointBlocks:
         """Return the value [B] of each block for each of its points, [M] in the order of `order`."""
         return values.repeat_interleave(BLOCK_POINTS)[: len(self.order)]
 
-    def points_of(self, chosen: Tensor) -> Tensor:
-        """Return the points of the chosen blocks (bool [B]), float64 [m, 3]."""
-        points = self.points[chosen].flatten(0, 1)
-        filling = -len(self.order) % BLOCK_POINTS
-        return points[: len(points) - filling] if chosen[-1] else points
+    def distances_of(self, centres: Tensor, chosen: Tensor, filling: float) -> Tensor:
+        """Return the distances of cameras to all points of some blocks.
 
-    def distances(self, centres: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        Args:
+            centres: float64 [P, 3].
+            chosen: int64 [P, k], the blocks of each camera.
+            filling: what stands for the points that fill up the last block.
+
+        Returns:
+            float64 [P, k, `BLOCK_POINTS`].
+        """
+        distances = (self.points[chosen] - centres[:, None, None]).norm(dim=3)
+        count = len(self.order) - (len(self) - 1) * BLOCK_POINTS
+        if count < BLOCK_POINTS:
+            rest = distances[..., count:]
+            rest.masked_fill_((chosen == len(self) - 1)[..., None], filling)
+        return distances
+
+    def distances(
+        self, centres: Tensor, which: Tensor | None = None
+    ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Bound the distances of cameras to the points of each block, for some cameras at a time.
 
         Args:
             centres: float64 [V, 3], on the device of the points.
+            which: int64 [B], the blocks; None: all.
 
         Yields:
             The next v centres, and two bounds, float64 [v, B]: no point of the block is nearer than the first
             or farther than the second.
         """
-        for some in centres.split(max(1, _PAIRS // len(self))):
-            below, above = self.low - some[:, None], some[:, None] - self.high
+        low, high = (self.low, self.high) if which is None else (self.low[which], self.high[which])
+        for some in centres.split(max(1, _PAIRS // max(1, len(low)))):
+            below, above = low - some[:, None], some[:, None] - high
             nearest = torch.maximum(below, above).clamp_(min=0).norm(dim=2)
             farthest = torch.minimum(below, above).neg_().norm(dim=2)
             yield some, nearest * (1 - _MARGIN), farthest * (1 + _MARGIN)

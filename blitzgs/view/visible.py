@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from blitzgs.frame.frame import Views
 from blitzgs.ops.blocks import ActiveRows, gate_views_
 from blitzgs.table.block_visibility import Cameras
 from blitzgs.table.blocks import BlockIndex
@@ -18,6 +19,9 @@ from blitzgs.view.gate import SceneGate
 
 # The Gaussians that views are rendered from: a table on the device, or a table on the host with its pool.
 Scene = GaussianTable | Pool
+
+# Depths are chosen among so many quantiles.
+_DEPTHS = 64
 
 
 class VisibleScene(NamedTuple):
@@ -55,8 +59,45 @@ class VisibleFinder:
         self._scene, self._lod = scene, lod
         self._index = None if isinstance(scene, Pool) else BlockIndex(scene)
 
+    def depths(self, views: Views, planes: Sequence[float], blocks: int) -> list[float]:
+        """Divide the depths of one view such that about a number of blocks lies between two of them.
+
+        Args:
+            views: the view.
+            planes: the near and the far plane.
+            blocks: number of blocks.
+
+        Returns:
+            The near plane, depths in ascending order, the far plane. Only these planes if few blocks are in
+            the view, or if the scene is in a pool, which bounds the memory anyway.
+        """
+        near, far = planes
+        if self._index is None or len(self._index.bounds) <= blocks:
+            return [near, far]
+        low, high = self._index.bounds[:, :3], self._index.bounds[:, 3:6]
+        reach = (high - low).norm(dim=1) / 2
+        x, y, z = ((low + high) / 2 @ views.viewmats[0, :3, :3].T + views.viewmats[0, :3, 3]).unbind(1)
+        (fx, _, cx), (_, fy, cy), _ = views.Ks[0].unbind(0)
+        inside = (z + reach > near) & (z - reach < far)
+        for place, focal, centre, size in ((x, fx, cx, views.width), (y, fy, cy, views.height)):
+            middle = place + z * (centre - size / 2) / focal
+            inside &= middle.abs() < (z.abs() + reach) * (size / 2 / focal) + reach
+        ordered = z.where(inside, torch.inf).sort().values
+        count = inside.sum()
+        parts = torch.arange(1, _DEPTHS, device=z.device) * count // _DEPTHS
+        found: list[float] = torch.cat((count[None].float(), ordered[parts])).tolist()
+        layers = min(_DEPTHS, -(-int(found[0]) // blocks))
+        inner = {found[_DEPTHS * k // layers] for k in range(1, layers)}
+        return [near, *sorted(depth for depth in inner if near < depth < far), far]
+
     def find(
-        self, viewmats: Tensor, Ks: Tensor, width: int, height: int, limits: tuple[float, float, float]
+        self,
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+        limits: tuple[float, float, float],
+        room: int | None = None,
     ) -> VisibleScene:
         """Find the Gaussians to render for a batch of views. Collective if there is a gate.
 
@@ -66,6 +107,8 @@ class VisibleFinder:
             width: pixels.
             height: pixels.
             limits: near plane, far plane and eps2d.
+            room: the lists have room for so many blocks and their number tells whether that sufficed; None:
+                for all.
 
         Raises:
             PoolError: the pool is too small for the views.
@@ -79,9 +122,12 @@ class VisibleFinder:
             table, rows_of = scene, _same_rows
         assert index is not None
         rules = None if self._lod is None else self._lod.rules(table["level"], viewmats)
-        # The lists have room for all blocks, so that the host does not wait for the number of blocks.
-        room = max(1, len(index.bounds))
-        active = index.active(table, viewmats, Ks, width, height, *limits, rules, room)._replace(blocks=None)
+        # Either way, the host does not wait for the number of blocks.
+        active = index.active(
+            table, viewmats, Ks, width, height, *limits, rules, room or max(1, len(index.bounds))
+        )
+        if room is None:
+            active = active._replace(blocks=None)
         if rules is not None:
             gate_views_(active, table["means"], viewmats, rules)
         return VisibleScene(table, active, rows_of)

@@ -12,12 +12,11 @@ from types import SimpleNamespace
 import bm_quality
 import numpy as np
 import pytest
+import quality_plan
 import quality_report
 import quality_run
-import quality_stress
 import torch
-from opponents import relocation
-from opponents.gsplat_training import GsplatOptions, GsplatTrainer
+from opponents.gsplat_training import GsplatOptions, GsplatTrainer, covariances
 from opponents.spatial_partition import HALO, LEAST_SEEN, Grid, coverage, divide, makespan
 from quality_plan import SAFE, RunSpec, read_plan, runs_of
 
@@ -107,36 +106,11 @@ def test_settings_tell_recipes_apart_but_not_seeds_or_places(capture):
     assert mcmc.options() == GsplatOptions.of("mcmc", {"cap_max": 1_000_000})
 
 
-def test_relocation_is_equation_9():
-    """The weights equal the double sum of arXiv 2404.09591, computed with Python's integers and floats."""
-    g = torch.Generator().manual_seed(0)
-    opacities = torch.rand(60, generator=g) * 0.98 + 0.01
-    scales = torch.rand(60, 3, generator=g) + 0.1
-    ratios = torch.randint(1, 20, (60,), generator=g)
-    ratios[:3] = torch.tensor([1, 51, 400])
-    new_opacities, new_scales = relocation.compute_relocation(opacities, scales, ratios)
-    for i, (o, count) in enumerate(zip(opacities.double().tolist(), ratios.tolist(), strict=True)):
-        N = min(count, 51)
-        a = 1 - (1 - o) ** (1 / N)
-        total = sum(
-            math.comb(m - 1, k) * (-1) ** k * a ** (k + 1) / math.sqrt(k + 1)
-            for m in range(1, N + 1)
-            for k in range(m)
-        )
-        assert new_opacities[i].item() == pytest.approx(a, rel=1e-5)
-        torch.testing.assert_close(new_scales[i], scales[i] * (o / total), rtol=1e-5, atol=0)
-    # One part is the Gaussian itself; several parts at one place have the same transmittance together.
-    torch.testing.assert_close(new_scales[0], scales[0])
-    torch.testing.assert_close(
-        (1 - new_opacities) ** ratios.clamp(max=51), 1 - opacities, rtol=1e-4, atol=1e-6
-    )
-
-
 def test_covariances_are_those_of_the_definition():
     g = torch.Generator().manual_seed(0)
     quats, scales = torch.randn(20, 4, generator=g), torch.rand(20, 3, generator=g)
     factors = covariance_factors(quats.double(), scales.double())
-    found, none = relocation.covariances(quats, scales, compute_preci=False)
+    found, none = covariances(quats, scales, compute_preci=False)
     torch.testing.assert_close(found.double(), factors @ factors.mT, rtol=1e-5, atol=1e-6)
     assert none is None
 
@@ -206,21 +180,23 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_parts_make_up_the_grid_and_every_recipe_can_be_configured(tmp_path):
-    grid = quality_stress.recipes(str(ROOT / "configs" / "aerial.yaml"))
+    grid = quality_plan.stress_recipes(str(ROOT / "configs" / "aerial.yaml"))
     assert len(grid) == 9 * 4 * 3 and all(set(name) <= SAFE for name in grid)
-    parts = [quality_stress.part_of(grid, (k, 5)) for k in range(1, 6)]
+    parts = [quality_plan.part_of(grid, (k, 5)) for k in range(1, 6)]
     assert {name: text for part in parts for name, text in part.items()} == grid
     some = dict(list(grid.items())[::17])
     specs = runs_of({"x": str(tmp_path)}, some, [0], [], None, "cpu")
     assert len(specs) == len(some)
-    doubled = quality_stress.recipes(str(ROOT / "configs" / "aerial.yaml"))["position=200+schedule=25+B=1"]
+    doubled = quality_plan.stress_recipes(str(ROOT / "configs" / "aerial.yaml"))[
+        "position=200+schedule=25+B=1"
+    ]
     assert "--optimiser.position=0.00032" in doubled and "--schedule.scale=0.25" in doubled
 
 
 def test_refuses_parts_that_there_are_not():
     with pytest.raises(ValueError, match="3/2"):
-        quality_stress.parse_part("3/2")
-    assert quality_stress.parse_part("2/2") == (2, 2)
+        quality_plan.parse_part("3/2")
+    assert quality_plan.parse_part("2/2") == (2, 2)
 
 
 def test_the_table_compares_the_worst_seed_with_its_column():
@@ -233,7 +209,7 @@ def test_the_table_compares_the_worst_seed_with_its_column():
         }  # fmt: skip
 
     runs = [run("base", 30.0, 0.1, 0), run("base", 29.5, 0.4, 1), run("position=200", 27.0, 3.5, 0)]
-    text = quality_stress.markdown([*runs, {"capture": "park", "recipe": "aerial", "status": "done"}])
+    text = quality_plan.stress_markdown([*runs, {"capture": "park", "recipe": "aerial", "status": "done"}])
     assert "| park | schedule=50+B=4 | base | 2 | 29.50 | 0.00 | 0.40 |" in text
     assert "| park | schedule=50+B=4 | position=200 | 1 | 27.00 | 2.50 | 3.50 |" in text
 

@@ -387,15 +387,8 @@ def test_values_may_be_replaced_and_deleted():
 
 
 LATE_READERS = (
-    "dict",
-    "unpacked",
-    "keyword arguments",
-    "update",
-    "shallow copy",
-    "deep copy",
-    "pickle",
-    "repr",
-)
+    "dict", "unpacked", "keyword arguments", "update", "shallow copy", "deep copy", "pickle", "repr",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("reader", [READERS[name] for name in (*LATE_READERS, "items", "values")])

@@ -86,13 +86,9 @@ def test_values_of_any_channel_count(channels, per_view):
 
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(
-    seed=st.integers(0, 10**6),
-    n=st.integers(1, 120),
-    scale=st.floats(0.01, 0.6),
-    degree=st.integers(0, 3),
-    width=st.integers(1, 40),
-    height=st.integers(1, 32),
-)
+    seed=st.integers(0, 10**6), n=st.integers(1, 120), scale=st.floats(0.01, 0.6), degree=st.integers(0, 3),
+    width=st.integers(1, 40), height=st.integers(1, 32),
+)  # fmt: skip
 def test_random_scenes_against_the_reference(seed, n, scale, degree, width, height):
     scene = random_scene(n=n, seed=seed, cameras=1, scale=scale, width=width, height=height)
     scene.sh_degree = degree
@@ -161,18 +157,11 @@ def wrong(row, column, value):
 # Calls that take each way through the renderer: queued, in several groups of views, and without a look at
 # what each view sees.
 CALLS = {
-    "rasterization": {},
-    "not packed": {"packed": False},
-    "40 views": {"views": 40},
-    "another tile size": {"tile_size": 8},
-    "covars": {"covars": True},
-    "no Gaussians": {"count": 0},
-    "nothing in sight": {"depth": -3.0},
-    "scenes": {"scenes": 2},
-    "raw_rasterization": {},
-    "raw, 40 views": {"views": 40},
-    "contributions": {},
-}
+    "rasterization": {}, "not packed": {"packed": False}, "40 views": {"views": 40},
+    "another tile size": {"tile_size": 8}, "covars": {"covars": True}, "no Gaussians": {"count": 0},
+    "nothing in sight": {"depth": -3.0}, "scenes": {"scenes": 2}, "raw_rasterization": {},
+    "raw, 40 views": {"views": 40}, "contributions": {},
+}  # fmt: skip
 
 
 def render(name, matrices, device="cpu", count=5, depth=3.0, views=0, scenes=1, covars=False, **options):

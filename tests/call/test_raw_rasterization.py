@@ -14,13 +14,9 @@ NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 def raw_parameters(scene):
     """Leaves, as gsplat's trainer has them."""
     values = {
-        "means": scene.means,
-        "quats": scene.quats,
-        "scales": scene.scales.log(),
-        "opacities": scene.opacities.logit(),
-        "sh0": scene.colors[:, :1],
-        "shN": scene.colors[:, 1:],
-    }
+        "means": scene.means, "quats": scene.quats, "scales": scene.scales.log(),
+        "opacities": scene.opacities.logit(), "sh0": scene.colors[:, :1], "shN": scene.colors[:, 1:],
+    }  # fmt: skip
     return {name: value.detach().clone().requires_grad_() for name, value in values.items()}
 
 

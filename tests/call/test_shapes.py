@@ -245,23 +245,11 @@ class RendererConfig_MixedBatch:  # noqa: N801
 
 
 DEFAULTS = {
-    "packed": True,
-    "tile_size": None,
-    "channel_chunk": 32,
-    "segmented": False,
-    "camera_model": "pinhole",
-    "covars": None,
-    "with_ut": False,
-    "with_eval3d": False,
-    "return_normals": False,
-    "global_z_order": True,
-    "radial_coeffs": None,
-    "ftheta_coeffs": None,
-    "rolling_shutter": RollingShutterType.GLOBAL,
-    "viewmats_rs": None,
-    "extra_signals": None,
-    "renderer_config": RendererConfig_MixedBatch(),
-}
+    "packed": True, "tile_size": None, "channel_chunk": 32, "segmented": False, "camera_model": "pinhole",
+    "covars": None, "with_ut": False, "with_eval3d": False, "return_normals": False, "global_z_order": True,
+    "radial_coeffs": None, "ftheta_coeffs": None, "rolling_shutter": RollingShutterType.GLOBAL,
+    "viewmats_rs": None, "extra_signals": None, "renderer_config": RendererConfig_MixedBatch(),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])

@@ -78,6 +78,13 @@ def write_capture(root: Path, names: list[str], width: int = 64, height: int = 4
     return root
 
 
+def as_text(folder: Path) -> None:
+    """Replace the binary files of a COLMAP model by text."""
+    pycolmap.Reconstruction(str(folder)).write_text(str(folder))
+    for path in folder.glob("*.bin"):
+        path.unlink()
+
+
 def edit_model(root, change):
     """Read the COLMAP model of a capture, let `change` alter it, and write it back."""
     folder = root / "sparse" / "0"

@@ -238,13 +238,10 @@ def test_distorted_captures_become_pinhole_ones(tmp_path):
     assert store.get(0).shape == (camera.height, camera.width, 3) and store.mask(0) is None
     source = cv2.imread(str(tmp_path / "images" / camera.name))[..., ::-1]
     rays = cv2.initUndistortRectifyMap(
-        np.array([[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]),
-        np.array(params[4:]),
-        np.eye(3),
-        camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]),
-        (camera.width, camera.height),
+        np.array([[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]), np.array(params[4:]), np.eye(3),
+        camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), (camera.width, camera.height),
         cv2.CV_32FC1,
-    )
+    )  # fmt: skip
     expected = cv2.remap(source, *rays, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     assert np.abs(store.get(0).numpy().astype(int) - expected).max() <= 2
 

@@ -2,11 +2,13 @@
 """Damaged files give a ValueError or a model of the size of the file: no crash, no wild allocation."""
 
 import json
+import os
 import resource
 import struct
 import subprocess
 import sys
 import tempfile
+import traceback
 from pathlib import Path
 
 import cv2
@@ -98,12 +100,39 @@ LITTLE = 24
 BLOCKS = 128
 
 
-def in_fresh_process(function, path: Path):
+def serve() -> None:
+    """Call functions of this file on paths, [name, path] in each line, in a fork of this process each."""
+    for line in sys.stdin:
+        name, path = json.loads(line)
+        reads, writes = os.pipe()
+        if os.fork() == 0:
+            try:
+                found = {"result": globals()[name](path)}
+            except BaseException:  # noqa: BLE001 - reported to the test
+                found = {"error": traceback.format_exc()}
+            os.write(writes, json.dumps(found).encode())
+            os._exit(0)
+        os.close(writes)
+        with open(reads) as pipe:
+            found = pipe.read()
+        _, status = os.wait()
+        print(found or json.dumps({"error": f"the process ended with status {status}"}), flush=True)
+
+
+@pytest.fixture(scope="module")
+def in_fresh_process():
     """Call a function of this file on a path in a process of its own, which has no freed memory."""
-    program = f"from tests.capture import test_fuzz; test_fuzz.{function.__name__}({str(path)!r})"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    command = [sys.executable, "-c", "from tests.capture import test_fuzz; test_fuzz.serve()"]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(command, **pipes, text=True, cwd=ROOT) as server:
+
+        def call(function, path: Path):
+            print(json.dumps([function.__name__, str(path)]), file=server.stdin, flush=True)
+            found = json.loads(server.stdout.readline())
+            assert "error" not in found, found["error"]
+            return found["result"]
+
+        yield call
 
 
 def limit_memory(mebibytes: int) -> None:
@@ -112,7 +141,7 @@ def limit_memory(mebibytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 
-def read_damaged(path: str) -> None:
+def read_damaged(path: str) -> dict[str, int]:
     name, sample = Path(path).name, Path(path).read_bytes()
     outcomes = {"read": 0, "refused": 0}
 
@@ -139,24 +168,24 @@ def read_damaged(path: str) -> None:
         attempt(sample[:at] + b"\x7f\x7f\x7f" + sample[at + 3 :])
         attempt(sample[:at] + b"99999999" + sample[at:])
     run()
-    print(json.dumps(outcomes))
+    return outcomes
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_damaged_files_never_crash_or_allocate_wildly(samples, tmp_path, name):
+def test_damaged_files_never_crash_or_allocate_wildly(samples, tmp_path, in_fresh_process, name):
     (tmp_path / name).write_bytes(samples[name])
     outcomes = in_fresh_process(read_damaged, tmp_path / name)
     assert outcomes["read"] > 0 and outcomes["refused"] > 0
 
 
-def check_huge(path: str) -> None:
+def check_huge(path: str) -> str:
     limit_memory(BLOCKS + LITTLE)
     read_whole(Path(path))
-    print(json.dumps("whole"))
+    return "whole"
 
 
 @pytest.mark.parametrize(("components", "height"), [(1, 16384), (3, 5456), (3, 16384), (4, 65535)])
-def test_a_small_jpeg_of_many_blocks_allocates_little(tmp_path, components, height):
+def test_a_small_jpeg_of_many_blocks_allocates_little(tmp_path, in_fresh_process, components, height):
     """Each component has a scan in which one code of 15 zero bits stands for 16,384 empty blocks."""
 
     def segment(marker: int, *payload: int) -> bytes:

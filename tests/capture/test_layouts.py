@@ -11,8 +11,8 @@ import pytest
 
 from blitzgs.capture.capture import MissingImagesError, load_capture
 from blitzgs.capture.images import ImageStore
-from blitzgs.capture.own_cameras import read_cameras
 from blitzgs.capture.transforms import read_transforms
+from blitzgs.capture.usable import read_cameras
 from tests.capture.helpers import edit_model, smooth_image, write_capture, write_image
 from tests.training.tiny import tiny_scene, write_tiny_capture
 

@@ -117,15 +117,6 @@ def test_a_lossy_mask_of_labels_0_and_1_is_said_to_exclude_all(tmp_path):
         load_capture(root)
 
 
-def test_the_share_that_masks_exclude_is_known(tmp_path):
-    root = write_capture(tmp_path, ["a.png", "b.png", "c.png"])
-    (root / "masks").mkdir()
-    for name in ("a.png", "b.png"):
-        (root / "masks" / name).write_bytes(WAYS["shape in both"])
-    about = load_capture(root).about
-    assert about.with_mask == 2 and about.mask_share == pytest.approx(1 - COUNTS.mean())
-
-
 # Names of images, files below masks/, and for each image its file (None: it has none).
 OWNERS = [
     (["a.jpg"], ["a.jpg.png"], ["a.jpg.png"]),

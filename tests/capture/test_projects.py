@@ -106,11 +106,8 @@ def test_realitycapture_with_the_points_of_a_bundle(tmp_path, header):
 
 def test_realitycapture_angles_are_those_of_its_help(tmp_path):
     rows = [
-        ["down.jpg", 0, 0, 0],
-        ["down_east.jpg", 90, 0, 0],
-        ["north.jpg", 0, 90, 0],
-        ["east.jpg", 90, 90, 0],
-    ]
+        ["down.jpg", 0, 0, 0], ["down_east.jpg", 90, 0, 0], ["north.jpg", 0, 90, 0], ["east.jpg", 90, 90, 0],
+    ]  # fmt: skip
     text = "#name,heading,pitch,roll,x,y,alt,f\n"
     text += "".join(",".join(map(str, row)) + ",1,2,3,30\n" for row in rows)
     (tmp_path / "r.csv").write_text(text)

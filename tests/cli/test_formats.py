@@ -1,21 +1,32 @@
-"""Models of files and for files, from the command line."""
+# SPDX-License-Identifier: Apache-2.0
+"""Models of files and for files, and the place of a run in the world, from the command line."""
 
 import json
 import os
 import re
-
-os.environ.setdefault("NUMBA_DISABLE_JIT", "1")
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from blitzgs.capture.capture import load_capture
+from blitzgs.capture.world import geodetic
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.models import FORMATS, read_gaussians
 from blitzgs.runs.files import open_model
+from blitzgs.runs.world import load_frame
+from blitzgs.viewer.overlay import overlay
 from blitzgs.viewer.studio import open_model as open_viewed
+from blitzgs.viewer.world import Stance, World
+from tests.capture import helpers as files
+from tests.training.tiny import OVERRIDES, as_flags
+
+os.environ.setdefault("NUMBA_DISABLE_JIT", "1")
 
 
 @pytest.fixture(scope="module")
@@ -125,3 +136,122 @@ def test_files_of_all_formats_are_viewed(whole, tmp_path):
     opened = open_viewed(path, Ranks())
     assert len(opened.table) == len(read_gaussians(whole)) and opened.exhibit.title == "a.splat"
     assert torch.isfinite(opened.table["means"]).all()
+
+
+TURN = Rotation.from_euler("z", 65, degrees=True).as_matrix()
+SHIFT = np.array([465_000.0, 5_250_000.0, 430.0])
+
+
+@pytest.fixture
+def survey(trained):
+    """The capture of a run, and rows of surveyed places and marks."""
+    capture = load_capture(trained[0])
+    points = capture.points[np.random.default_rng(5).permutation(len(capture.points))[:7]]
+    rows = []
+    for k, point in enumerate(points):
+        e, n, h = 12.5 * TURN @ (point + capture.offset) + SHIFT
+        for camera in capture.cameras:
+            x, y, z = camera.world_to_camera[:3, :3] @ point + camera.world_to_camera[:3, 3]
+            u, v = camera.K[0, 0] * x / z + camera.K[0, 2], camera.K[1, 1] * y / z + camera.K[1, 2]
+            if z > 0 and 0 <= u <= camera.width and 0 <= v <= camera.height:
+                rows.append(
+                    f"P{k},{float(e)!r},{float(n)!r},{float(h)!r},{camera.name},{float(u)!r},{float(v)!r}"
+                )
+    yield capture, rows
+    (trained[1] / "geo.json").unlink(missing_ok=True)
+
+
+def test_control_points_give_the_world(trained, survey, tmp_path, capsys):
+    capture, rows = survey
+    path = tmp_path / "gcp.csv"
+    wrong = [row.replace("P6,46", "P6,56") for row in rows]  # a slip of the surveyor by 100 km
+    path.write_text("\n".join(["name,E,N,h,image,x,y", *wrong]))
+    assert main(["align", str(trained[1]), "--gcp", str(path), "--crs", "EPSG:32632"]) == 0
+    out = capsys.readouterr().out
+    assert "6 of 7 points used; RMS 0.0000 horizontal, 0.0000 vertical" in out and "contradicts" in out
+    frame = load_frame(trained[1])
+    assert frame.crs == "EPSG:32632" and frame.scale == pytest.approx(12.5, rel=1e-9)
+    np.testing.assert_allclose(frame.to_world(np.ones(3)), 12.5 * TURN @ np.ones(3) + SHIFT, atol=1e-6)
+    assert main(["export", str(trained[1]), "--ply", str(tmp_path / "m.ply"), "--coordinates", "world"]) == 0
+    assert json.loads((tmp_path / "m.ply.offset.json").read_text())["crs"] == "EPSG:32632"
+    # Into the next zone, where grid north is elsewhere: a turn by the convergence of both.
+    pytest.importorskip("pyproj")
+    assert main(["align", str(trained[1]), "--crs", "EPSG:32633"]) == 0
+    assert "is wrong by at most" in capsys.readouterr().out
+    moved = load_frame(trained[1])
+    assert moved.crs == "EPSG:32633" and moved.scale == pytest.approx(12.5, rel=0.01)
+    assert abs(moved.translation[0] - frame.translation[0]) > 1e5
+
+
+def test_what_cannot_be_aligned_is_refused(trained, survey, tmp_path, capsys):
+    _, rows = survey
+    path = tmp_path / "gcp.csv"
+    path.write_text("\n".join(["name,E,N,h,image,x,y", *(row for row in rows if row[:2] in ("P0", "P1"))]))
+    run = str(trained[1])
+    assert main(["align", run, "--gcp", str(path)]) == 1
+    assert "2 of 2 control points can be used, and 3 are needed" in capsys.readouterr().err
+    assert main(["align", run, "--gps"]) == 1
+    assert "0 of 8 photographs have a GPS position, and 3 are needed" in capsys.readouterr().err
+    pytest.importorskip("pyproj")
+    assert main(["align", run, "--crs", "EPSG:4326"]) == 1
+    assert "EPSG:4326 has angles" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["align", run])
+    assert load_frame(trained[1]) is None
+
+
+def test_positions_in_exif_give_the_world(trained, survey, tmp_path, monkeypatch, capsys):
+    pyproj = pytest.importorskip("pyproj")
+    capture, _ = survey
+    to_geodetic = pyproj.Transformer.from_crs(pyproj.CRS("EPSG:32632").to_3d(), "EPSG:4979", always_xy=True)
+    data = tmp_path / "capture"
+    (data / "images").mkdir(parents=True)
+    (data / "sparse").symlink_to(trained[0] / "sparse")
+    for k, camera in enumerate(capture.cameras):
+        centre = -camera.world_to_camera[:3, :3].T @ camera.world_to_camera[:3, 3] + capture.offset
+        world = 12.5 * TURN @ centre + SHIFT + ([40, 0, 0] if k == 2 else 0)
+        longitude, latitude, height = to_geodetic.transform(*world)
+        exif = Image.Exif()
+        exif[0x8825] = {1: "N", 2: dms(latitude), 3: "E", 4: dms(longitude), 5: b"\x00", 6: height}
+        with Image.open(camera.image_path) as image:
+            image.save(data / "images" / camera.name, exif=exif)
+    assert main(["align", str(trained[1]), "--gps", "--crs", "EPSG:32632", "--data", str(data)]) == 0
+    out = capsys.readouterr().out
+    assert "7 of 8 positions used" in out
+    frame = load_frame(trained[1])
+    assert frame.scale == pytest.approx(12.5, rel=1e-3)
+    centre = capture.offset
+    np.testing.assert_allclose(frame.to_world(centre), 12.5 * TURN @ centre + SHIFT, atol=0.05)
+
+
+def test_a_training_of_a_project_knows_its_world_and_resuming_keeps_an_alignment(tmp_path, capsys):
+    posed = files.Posed()
+    files.opensfm(posed, posed.write_images(tmp_path / "site") / "reconstruction.json", (47.5, 8.25, 432.0))
+    run = tmp_path / "run"
+    flags = ["--out", str(run), "--schedule.scale=0.05", *as_flags("config=defaults", *OVERRIDES)]
+    assert main(["train", "--data", str(tmp_path / "site" / "reconstruction.json"), *flags]) == 0
+    frame = load_frame(run)
+    assert frame.crs == "EPSG:4978" and frame.scale == 1
+    place = frame.to_world(np.zeros(3))
+    np.testing.assert_allclose(geodetic(place), [47.5, 8.25, 432.0], atol=1e-8)
+    opened = open_viewed(run, Ranks())
+    visitor = SimpleNamespace(
+        world=World(opened.exhibit.space, opened.exhibit.cameras), exhibit=opened.exhibit, motion="orbit",
+        client=SimpleNamespace(camera=SimpleNamespace(look_at=(0, 0, 1), position=(0, 0, 0), aspect=1.5)),
+    )  # fmt: skip
+    visitor.stance = Stance(visitor.world.page_position(np.zeros(3)), np.eye(3), 0.8)
+    picture = SimpleNamespace(gaussians=1, milliseconds=1.0)
+    ask = SimpleNamespace(look=SimpleNamespace(width=3, height=2, mode="RGB"), camera=None)
+    shown = SimpleNamespace(ask=ask, picture=picture, psnr=None, low=None, high=None)
+    assert "47.5000000\N{DEGREE SIGN} 8.2500000\N{DEGREE SIGN} 432.00 m (WGS 84)" in overlay(
+        visitor, shown, ""
+    )
+    pytest.importorskip("pyproj")
+    assert main(["align", str(run), "--crs", "EPSG:32632"]) == 0
+    assert main(["train", "--out", str(run), "--extend", "1.2"]) == 0
+    assert load_frame(run).crs == "EPSG:32632"
+
+
+def dms(degrees):
+    minutes = degrees % 1 * 60
+    return (float(int(degrees)), float(int(minutes)), minutes % 1 * 60)

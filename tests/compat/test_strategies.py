@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The strategies do what gsplat's do, with `torch.optim.Adam` and with `LazyAdam`."""
+"""gsplat's strategies with our renderer and optimiser, and ours that do what gsplat's do."""
 
 import inspect
 import math
@@ -7,19 +7,96 @@ import math
 import pytest
 import torch
 
+import blitzgs
 from blitzgs.compat.gsplat import DefaultStrategy, MCMCStrategy
-from tests.call.test_gsplat_parts import Trainer
-from tests.call.test_raw_rasterization import NAMES
-from tests.helpers import random_scene, relative_error
+from blitzgs.optim import LazyAdam
+from tests.call.test_raw_rasterization import NAMES, activated, raw, raw_parameters
+from tests.helpers import random_scene, rasterize_scene, relative_error
 
 gsplat = pytest.importorskip("gsplat", reason="needs gsplat, which pip installs without CUDA too")
+
+RATES = dict(zip(NAMES, (2.0**-9, 2.0**-10, 2.0**-8, 2.0**-6, 2.0**-8, 2.0**-10), strict=True))
+
+
+class Trainer:
+    """The loop of gsplat's simple_trainer: its strategy, an optimiser for each parameter."""
+
+    def __init__(self, scene, strategy, lazy, packed, moments):
+        self.scene, self.strategy = scene, strategy
+        self.lazy, self.packed, self.moments = lazy, packed, moments
+        self.splats = torch.nn.ParameterDict(
+            {name: torch.nn.Parameter(p.detach()) for name, p in raw_parameters(scene).items()}
+        )
+        self.optimizers = {
+            name: (LazyAdam if lazy else torch.optim.Adam)(
+                [{"params": p, "lr": RATES[name], "name": name}], eps=1e-15
+            )
+            for name, p in self.splats.items()
+        }
+        strategy.check_sanity(self.splats, self.optimizers)
+        self.state = strategy.initialize_state(scene_scale=10.0)
+        self.state["count"] = torch.zeros(len(scene.means), dtype=torch.float32)  # it adds float32 to it
+
+    def render(self, view):
+        one = random_scene(n=1, cameras=1, width=self.scene.width, height=self.scene.height)
+        one.viewmats, one.Ks = self.scene.viewmats[view, None], self.scene.Ks[view, None]
+        p = {name: self.splats[name] for name in NAMES}
+        if self.lazy:
+            return raw(p, one, optimizers=self.optimizers)
+        return activated(p, one, packed=self.packed)
+
+    def step(self, step, view, target):
+        image, _, info = self.render(view)
+        self.strategy.step_pre_backward(self.splats, self.optimizers, self.state, step, info)
+        blitzgs.l1_ssim(image, target).backward()
+        for optimizer in self.optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+            if self.lazy:
+                optimizer.catch_up(moments=self.moments)
+        packed = self.lazy or self.packed
+        self.strategy.step_post_backward(self.splats, self.optimizers, self.state, step, info, packed=packed)
+
+
+@pytest.mark.parametrize("function", [blitzgs.rasterization, blitzgs.raw_rasterization])
+def test_the_renderers_take_the_defaults_of_all_gsplats_arguments(function):
+    scene = random_scene(n=20)
+    parameters = inspect.signature(gsplat.rasterization).parameters.values()
+    defaults = {p.name: p.default for p in parameters if p.default is not p.empty}
+    if function is blitzgs.rasterization:
+        expected, actual = (
+            rasterize_scene(scene, **options) for options in ({}, {**defaults, "sh_degree": 3})
+        )
+    else:
+        expected, actual = (raw(raw_parameters(scene), scene, **options) for options in ({}, defaults))
+    assert torch.equal(actual[0], expected[0])
+
+
+def test_meta_agrees_with_the_projection_in_torch():
+    from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
+
+    scene = random_scene(n=60, cameras=3)
+    _, _, meta = rasterize_scene(scene, packed=False, rasterize_mode="antialiased")
+    quats = torch.nn.functional.normalize(scene.quats, dim=1)
+    covars, _ = _quat_scale_to_covar_preci(quats, scene.scales, True, False)
+    radii, means2d, depths, conics, compensations = _fully_fused_projection(
+        scene.means, covars, scene.viewmats, scene.Ks, scene.width, scene.height, calc_compensations=True
+    )
+    seen = (meta["radii"] > 0).all(dim=-1)
+    assert seen.any() and not (seen & ~(radii > 0).all(dim=-1)).any()
+    for ours, theirs in (("means2d", means2d), ("depths", depths), ("conics", conics)):
+        assert relative_error(meta[ours][seen], theirs[seen]) < 1e-3, ours
+    assert relative_error(meta["opacities"][seen], (scene.opacities * compensations)[seen]) < 1e-3
+    assert math.isclose(seen.float().mean(), (radii > 0).all(dim=-1).float().mean(), abs_tol=0.3)
+
 
 VIEWS, STEPS = 5, 30
 DEFAULT = {"refine_start_iter": 4, "refine_every": 8, "grow_grad2d": 0.005, "prune_opa": 0.3}
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def in_double():
+    """The strategies make tensors of the default dtype."""
     torch.set_default_dtype(torch.float64)
     yield
     torch.set_default_dtype(torch.float32)
@@ -47,7 +124,7 @@ class Scene:
         self.origin = torch.cat([self.origin, self.origin[sources]])
 
 
-def train(strategy, lazy=False, packed=False, **extra):
+def train(strategy, lazy=False, packed=False, moments=False, **extra):
     scene = random_scene(n=50, cameras=VIEWS, width=20, height=16, dtype=torch.float64)
     targets = torch.rand(VIEWS, 1, 16, 20, 3, generator=torch.Generator().manual_seed(1))
     mcmc = isinstance(strategy, (MCMCStrategy, gsplat.MCMCStrategy))
@@ -55,7 +132,7 @@ def train(strategy, lazy=False, packed=False, **extra):
         begin = strategy.initialize_state
         strategy.initialize_state = lambda scene_scale: begin()
         extra["lr"] = 0.0
-    trainer = Trainer(scene, strategy, lazy, packed, moments=False)
+    trainer = Trainer(scene, strategy, lazy, packed, moments)
     trainer.splats["opacities"].data[::5] = -6  # dead for MCMC
     step_of = strategy.step_post_backward
 
@@ -89,16 +166,22 @@ class ResetsToo(gsplat.DefaultStrategy):
 
 
 OTHERS = {
-    "refine_scale2d_stop_iter": 25,
-    "grow_scale2d": 0.3,
-    "prune_scale2d": 0.8,
-    "revised_opacity": True,
-    "reset_every": 13,
-    "pause_refine_after_reset": 2,
-    "prune_scale3d": 0.04,
-}
+    "refine_scale2d_stop_iter": 25, "grow_scale2d": 0.3, "prune_scale2d": 0.8, "revised_opacity": True,
+    "reset_every": 13, "pause_refine_after_reset": 2, "prune_scale3d": 0.04,
+}  # fmt: skip
 
 
+@pytest.mark.usefixtures("in_double")
+def test_gsplats_own_strategy_does_the_same_whatever_renders_and_steps():
+    kinds = ((False, False, False), (False, True, False), (True, True, False), (True, True, True))
+    options = {**DEFAULT, "reset_every": 20, "verbose": False}
+    dense, *others = (train(gsplat.DefaultStrategy(**options), *kind) for kind in kinds)
+    assert 60 < len(dense.splats["means"]) < 400
+    for trainer in others:
+        same(trainer, dense)
+
+
+@pytest.mark.usefixtures("in_double")
 @pytest.mark.parametrize("options", [{"reset_every": 10**6}, OTHERS], ids=["defaults", "others"])
 def test_the_default_strategy_is_gsplats(options):
     options = {**DEFAULT, **options}
@@ -148,6 +231,7 @@ def sample(weights, count, replacement=True):
     return torch.searchsorted(total, torch.rand(count) * total[-1], right=True)
 
 
+@pytest.mark.usefixtures("in_double")
 @pytest.mark.parametrize("lazy", [False, True])
 def test_the_mcmc_strategy_is_gsplats(lazy, monkeypatch):
     # gsplat computes relocation on a GPU only.

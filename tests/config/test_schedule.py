@@ -12,8 +12,7 @@ import torch
 
 from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
 from blitzgs.config.files import ConfigError, from_dict, load_config, save_config, to_dict
-from blitzgs.config.pace import Pace
-from blitzgs.config.schedule import Schedule, stretched
+from blitzgs.config.schedule import Pace, Schedule, stretched
 from blitzgs.optim.table_adam import BETA1, BETA2, EPS, TableAdam
 from tests.training.tiny import random_gaussians
 
@@ -102,14 +101,9 @@ def test_events_do_not_depend_on_how_the_run_is_cut():
 @pytest.mark.parametrize("scale", [0.1, 1.0, 3.0])
 def test_importance_passes_scale_and_follow_density_control(scale):
     config = ScheduleConfig(
-        iterations=3_000,
-        densify_from=500,
-        densify_until=1_500,
-        densify_every=100,
-        t1=1_000,
-        t2=1_600,
+        iterations=3_000, densify_from=500, densify_until=1_500, densify_every=100, t1=1_000, t2=1_600,
         scale=scale,
-    )
+    )  # fmt: skip
     _, steps = all_events(config)
     events = [(event.kind, event.time) for step in steps for event in step]
     assert (
@@ -125,15 +119,8 @@ def test_importance_passes_scale_and_follow_density_control(scale):
 def test_sh_degree_grows_in_the_step_that_contains_the_event():
     schedule = Schedule(ScheduleConfig(batch_size=4, sh_every=10))
     assert [schedule.sh_degree(begin, 3) for begin in (0, 4, 8, 12, 16, 20, 28, 40)] == [
-        0,
-        0,
-        1,
-        1,
-        1,
-        2,
-        3,
-        3,
-    ]
+        0, 0, 1, 1, 1, 2, 3, 3,
+    ]  # fmt: skip
     # Where the degree practically never grows, the share of the first step is lost to rounding.
     assert Schedule(ScheduleConfig(sh_every=10**9)).sh_degree(0, 3) == 0
 
@@ -210,13 +197,9 @@ def test_times_and_images_are_those_of_a_walk_image_by_image(scale):
 def phases_of(schedule, begin):
     """Return all properties of the step that begins with an image, except for events and rates."""
     return (
-        schedule.sh_degree(begin, 3),
-        schedule.reduction(begin),
-        schedule.gathers_statistics(begin),
-        schedule.has_lod_gate(begin),
-        schedule.has_spawn_gate(begin),
-        schedule.prunes_by_size(begin),
-    )
+        schedule.sh_degree(begin, 3), schedule.reduction(begin), schedule.gathers_statistics(begin),
+        schedule.has_spawn_gate(begin), schedule.prunes_by_size(begin),
+    )  # fmt: skip
 
 
 def test_a_change_of_pace_does_not_change_past_events():
@@ -224,21 +207,10 @@ def test_a_change_of_pace_does_not_change_past_events():
     chance = random.Random(3)
     for batch_size in (1, 4):
         config = ScheduleConfig(
-            iterations=3_000,
-            batch_size=batch_size,
-            densify_from=50,
-            densify_until=1_500,
-            densify_every=40,
-            reset_every=300,
-            resolution=((4, 310), (2, 877)),
-            t1=700,
-            t2=1_600,
-            sh_every=100,
-            gate_from=900,
-            size_prune_after=400,
-            position_decay=2_500,
-            evaluate_every=333,
-        )
+            iterations=3_000, batch_size=batch_size, densify_from=50, densify_until=1_500, densify_every=40,
+            reset_every=300, resolution=((4, 310), (2, 877)), t1=700, t2=1_600, sh_every=100, gate_from=900,
+            size_prune_after=400, position_decay=2_500, evaluate_every=333,
+        )  # fmt: skip
         optimiser = OptimiserConfig(final=0.1)
         schedule, happened, phases, step = Schedule(config), [], [], 0
         rates = schedule.learning_rates(optimiser, 2.0)

@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Intersection on CUDA gives the CPU's lists in the same order."""
+"""Intersection gives the CPU's lists in the same order; contributions equal the renderer's bits."""
 
 import pytest
 import torch
 
-from tests.cuda.scenes import Scene, ops
+from blitzgs.ops.blocks import ActiveRows, gate_views_
+from blitzgs.ops.importance import STEPS, MassCut
+from blitzgs.table.table import GaussianTable
+from blitzgs.view.gate import ViewGate
+from tests.cuda.scenes import Scene, ops, relative_error
+from tests.table.test_blocks import make_views
+from tests.view.test_gate import GATE, bits, kept_by_definition, make_scene
 
 
 def lists(splats, grid, device, ids=None, count=-1):
@@ -131,3 +137,142 @@ def test_no_splats(scene):
     splats = [t[:0] for t in scene.project("cpu")]
     entries, offsets = lists(splats, scene.grid(), "cuda")
     assert len(entries) == 0 and not offsets.any()
+
+
+def survey(scene, device="cuda", dtype=torch.float32, tile_size=16, begin=0, end=-1):
+    """Splats, lists and contributions of a scene whose splats are those of the CPU in float32."""
+    projected = scene.project("cpu")
+    splats = [projected.means2d, projected.conics, projected.opacities]
+    grid = scene.grid(tile_size, begin, end)
+    lists = ops.intersect(*splats, projected.depths, projected.camera_ids, None, *grid, -1)
+    moved = [t.to(device, dtype) for t in splats]
+    lists = [t.to(device) for t in lists]
+    return moved, lists, grid, ops.contributions(*moved, *lists, *grid, squares=True)
+
+
+def test_a_crowded_scene_has_the_bits_of_its_image():
+    """Each chosen splat has its own channel, four splats per image."""
+    scene = Scene(5000, width=170, height=110)
+    splats, lists, grid, (weights, pixels, squares) = survey(scene)
+    count = len(splats[0])
+    without = ops.contributions(*splats, *lists, *grid)
+    assert torch.equal(without[0], weights) and torch.equal(without[1], pixels) and not len(without[2])
+    chosen = torch.randperm(count, generator=torch.Generator().manual_seed(1))[:64]
+    assert pixels.max() > 256
+    for four in chosen.view(-1, 4):
+        channels = torch.zeros(count, 4, device="cuda")
+        channels[four, torch.arange(4)] = 1
+        images = ops.rasterize_fwd(*splats, channels, None, *lists, *grid, True, False)[0]
+        units = (images.double() * 2.0**32).round().long().sum((0, 1, 2))
+        assert torch.equal(weights[four.cuda()], units)
+        assert torch.equal(pixels[four.cuda()], (images > 0).sum((0, 1, 2)).int())
+        # A float64 holds the square of the 24 bits of a float32 exactly.
+        exact = ((images.double() * 2.0**32).round() ** 2 / 2.0**32).floor().long().sum((0, 1, 2))
+        assert torch.equal(squares[four.cuda()], exact)
+
+
+def test_close_to_float64():
+    scene = Scene(3000)
+    *_, ours = survey(scene)
+    *_, exact = survey(scene, "cpu", torch.float64)
+    # A pixel on a cut changes a weight by about 1/255, and a count by one.
+    assert relative_error(ours[0], exact[0]) < 1e-3
+    assert relative_error(ours[1], exact[1]) < 5e-3
+    assert relative_error(ours[2], exact[2]) < 1e-3
+
+
+def test_repeats_and_adds_up():
+    scene = Scene(20_000, views=4, width=500, height=300)
+    splats, lists, grid, sums = survey(scene)
+    for _ in range(20):
+        again = ops.contributions(*splats, *lists, *grid, squares=True)
+        assert all(torch.equal(a, b) for a, b in zip(again, sums, strict=True))
+    tiles = len(lists[1]) - 1
+    cuts = [0, 1, 1, 90, tiles // 2, tiles]
+    parts = [
+        ops.contributions(*splats, *lists, *grid[:4], a, b, squares=True)
+        for a, b in zip(cuts, cuts[1:], strict=False)
+    ]
+    assert all(torch.equal(sum(pieces), whole) for *pieces, whole in zip(*parts, sums, strict=True))
+
+
+def test_entries_after_the_last_splat_are_not_read():
+    splats, lists, grid, sums = survey(Scene(500))
+    count = len(splats[0])
+    padded = [torch.cat((t, torch.full_like(t, float("nan")))) for t in splats]
+    known = torch.tensor([count], device="cuda")
+    got = ops.contributions(*padded, *lists, *grid, known, squares=True)
+    assert all(torch.equal(a[:count], b) and not a[count:].any() for a, b in zip(got, sums, strict=True))
+
+
+def test_a_splat_over_every_pixel_fits():
+    """Even the largest sums that a tile can have do not overflow from one field into the next."""
+    means2d = torch.tensor([[64.0, 64.0]] * 3, device="cuda")
+    conics = torch.tensor([[1e-9, 0.0, 1e-9]] * 3, device="cuda")
+    opacities = torch.tensor([1.0, 0.9, 0.95], device="cuda")
+    grid = [1, 128, 128, 16, 0, -1]
+    tiles = (128 // 16) ** 2
+    entries = torch.arange(3, dtype=torch.int32, device="cuda").repeat(tiles)
+    offsets = torch.arange(0, 3 * tiles + 1, 3, device="cuda")
+    weights, pixels, squares = ops.contributions(
+        means2d, conics, opacities, entries, offsets, *grid, squares=True
+    )
+    assert pixels.tolist() == [128 * 128, 128 * 128, 0]  # the third would take T below 1e-4
+    alpha = torch.tensor(0.99)
+    units = (alpha.double() * 2.0**32).round().long().item()
+    assert weights[0].item() == units * 128 * 128
+    assert squares[0].item() == (units**2 >> 32) * 128 * 128
+    assert abs(weights[1].item() / 2.0**32 / (128 * 128) - 0.9 * 0.01) < 1e-5
+
+
+def test_other_tile_sizes_are_refused():
+    splats, lists, grid, _ = survey(Scene(50), tile_size=16)
+    with pytest.raises(RuntimeError, match="tile_size must be 16 on CUDA, got 64"):
+        ops.contributions(*splats, lists[0], lists[1][:13], *grid[:3], 64, 0, -1)
+
+
+SHARE = 99, 100
+
+
+@pytest.mark.parametrize("n_segments", [4, 32])
+def test_cuda_equals_cpu_on_many_items(n_segments):
+    g = torch.Generator().manual_seed(2)
+    n = 300_000
+    owners = torch.arange(n, dtype=torch.int32).repeat_interleave(3)
+    segments = torch.randint(0, n_segments, (3 * n,), generator=g, dtype=torch.int32)
+    weights = (torch.randn(3 * n, generator=g) * 3 + 22).exp().long()
+    weights[::5] = 1 << 30
+    ids = torch.randperm(n, generator=g)
+    found = []
+    for device in ("cpu", "cuda"):
+        cut = MassCut.begin(*(t.to(device) for t in (weights, segments, owners, ids)), n_segments)
+        cut.take_steps(SHARE, 0, STEPS)
+        found.append(cut.chosen.cpu())
+    assert torch.equal(*found) and 0.1 < found[0].double().mean() < 0.99
+
+
+def gated(table, viewmats, gate, count):
+    """Gate the first `count` rows of lists with a capacity for all rows; return their views."""
+    device, capacity = table.device, len(table)
+    active = ActiveRows(
+        torch.arange(capacity, dtype=torch.int32, device=device),
+        torch.full((capacity,), -1, dtype=torch.int32, device=device),
+        torch.tensor([count], dtype=torch.int32, device=device),
+    )
+    gate_views_(active, table["means"], viewmats, gate.rules(table))
+    assert (active.views[count:] == -1).all()
+    return active.views[:count]
+
+
+# The launch has as many threads as fit on the GPU; the last sizes make them take turns.
+@pytest.mark.parametrize("count", [0, 1, 255, 257, 100_000, 1_000_000])
+def test_the_gpu_leaves_out_what_the_cpu_leaves_out(count):
+    table = make_scene(1_000_000)
+    viewmats, _ = make_views(32)
+    gate = ViewGate(GATE.reach(), 0xFFFF0FF1, [view * 2 if view % 3 else -1 for view in range(32)])
+    on_gpu = GaussianTable({name: table[name].cuda() for name in table})
+    expected = gated(table, viewmats, gate, count)
+    found = gated(on_gpu, viewmats.cuda(), gate, count).cpu()
+    _, close = kept_by_definition(table, viewmats)
+    assert torch.equal(bits(found, 32) | close[:count], bits(expected, 32) | close[:count])
+    assert count < 1000 or 0.1 < bits(found, 32).double().mean() < 0.9

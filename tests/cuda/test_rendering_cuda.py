@@ -90,12 +90,9 @@ def require_same_meta(ours, exact, absgrad):
 def test_every_render_mode(render_mode, rasterize_mode, packed):
     backgrounds = torch.tensor([[0.2, 0.5, 0.9], [1.0, 0.0, 0.3]]) if "RGB" in render_mode else None
     require_agreement(
-        random_scene(n=200, width=70, height=50),
-        backgrounds,
-        render_mode=render_mode,
-        rasterize_mode=rasterize_mode,
-        packed=packed,
-    )
+        random_scene(n=200, width=70, height=50), backgrounds, render_mode=render_mode,
+        rasterize_mode=rasterize_mode, packed=packed,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("absgrad", [False, True])

@@ -25,14 +25,9 @@ CONTEXT.set_forkserver_preload(["torch", "torch.distributed", "blitzgs.cli.train
 def _child(function, rank, world_size, port, timeout_seconds, join, device, transport, arguments, pipe):
     torch.set_num_threads(1)
     os.environ.update(
-        RANK=str(rank),
-        LOCAL_RANK=str(rank),
-        WORLD_SIZE=str(world_size),
-        LOCAL_WORLD_SIZE=str(world_size),
-        MASTER_ADDR="127.0.0.1",
-        MASTER_PORT=str(port),
-        TORCHELASTIC_USE_AGENT_STORE="True",
-    )
+        RANK=str(rank), LOCAL_RANK=str(rank), WORLD_SIZE=str(world_size), LOCAL_WORLD_SIZE=str(world_size),
+        MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port), TORCHELASTIC_USE_AGENT_STORE="True",
+    )  # fmt: skip
     try:
         if join:
             with Ranks.from_environment(device, timeout_seconds, transport, share_gpus=True) as ranks:

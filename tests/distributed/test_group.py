@@ -2,6 +2,7 @@
 """Groups of ranks, and sums over the ranks of a host."""
 
 import os
+import signal
 import time
 
 import pytest
@@ -13,7 +14,7 @@ from blitzgs.distributed.group import (
     ALLOCATOR_VARIABLES,
     MismatchError,
     Ranks,
-    _extend_memory_in_place,
+    extend_memory_in_place,
     resolve_device,
 )
 from blitzgs.distributed.host_sum import HostSum
@@ -114,6 +115,8 @@ def test_ranks_share_gpus_only_when_told(monkeypatch):
 
 
 def _fail(ranks, how):
+    if how == "stop":  # a host that is gone closes no connection
+        watchdog.PATIENCE_SECONDS = 3.0
     ranks.barrier()
     if ranks.rank == 1:
         if how == "raise":
@@ -121,8 +124,8 @@ def _fail(ranks, how):
         if how == "memory":
             with ranks.watchdog.waiting("project"):
                 raise torch.OutOfMemoryError("no room for shard 1")
-        if how == "kill":
-            os.kill(os.getpid(), 9)
+        if how in ("kill", "stop"):
+            os.kill(os.getpid(), signal.SIGKILL if how == "kill" else signal.SIGSTOP)
         time.sleep(60)
         return
     ranks.all_reduce(torch.zeros(4))
@@ -135,13 +138,16 @@ def _fail(ranks, how):
         ("memory", "rank 1 failed: OutOfMemoryError: no room for shard 1"),
         ("kill", "rank 1 has stopped reporting"),
         ("hang", "exit code 75"),
+        ("stop", "exit code 75"),
     ],
 )
 def test_a_bad_rank_ends_the_job_with_its_message(how, expected):
     start = time.monotonic()
     with pytest.raises(RankError) as failure:
-        run_ranks(_fail, 3, how, timeout_seconds=5.0, limit=45)
+        run_ranks(_fail, 3, how, timeout_seconds=600.0 if how == "stop" else 5.0, limit=45)
     assert time.monotonic() - start < 45
+    if how == "stop":
+        assert "in all_reduce: rank 1 has stopped reporting" in failure.value.blame
     if how == "hang":
         assert "waited 5 s in all_reduce: rank 1 has not arrived" in failure.value.blame
     assert expected in failure.value.messages[0]
@@ -150,7 +156,7 @@ def test_a_bad_rank_ends_the_job_with_its_message(how, expected):
 
 def _work(ranks, hang):
     announced = []
-    ranks.watchdog.announce = lambda work, waited: announced.append(work)
+    ranks.watchdog.announce = lambda late, waited: announced.append(late)
     ranks.barrier()
     if ranks.rank == 1:
         with ranks.watchdog.working("writing to a slow disk"):
@@ -163,7 +169,7 @@ def _work(ranks, hang):
 def test_a_rank_that_is_at_work_is_waited_for():
     """A rank may work longer than the timeout if it reports what it does and sends signs of life."""
     first, second = run_ranks(_work, 2, False, timeout_seconds=3.0, limit=60)
-    assert first == (2.0, ["rank 1 (writing to a slow disk)"]) and second == (2.0, [])
+    assert first == (2.0, ["rank 1 has not arrived (writing to a slow disk)"]) and second == (2.0, [])
     with pytest.raises(RankError) as failure:
         run_ranks(_work, 2, True, timeout_seconds=3.0, limit=60)
     assert "rank 1 has not arrived (last collective: barrier" in failure.value.blame
@@ -190,11 +196,11 @@ def test_memory_is_extended_in_place_unless_the_user_has_configured_it(monkeypat
     for name in ALLOCATOR_VARIABLES:
         monkeypatch.setenv(name, "max_split_size_mb:128")  # so that the test's end restores both
         monkeypatch.delenv(name)
-    _extend_memory_in_place()
+    extend_memory_in_place()
     assert os.environ[present] == "expandable_segments:True"
     monkeypatch.delenv(present)
     monkeypatch.setenv(former, "max_split_size_mb:128")
-    _extend_memory_in_place()
+    extend_memory_in_place()
     assert present not in os.environ
 
 

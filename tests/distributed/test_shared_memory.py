@@ -232,11 +232,8 @@ def test_two_shares_in_turn_use_different_words(alone):
     assert later.everyone.tolist() == [[first + second, first + second + 1, first + second + 2]]
     assert later.host.data_ptr() != got.host.data_ptr() == memory.share(numbers).host.data_ptr()
     assert queued == [
-        (1, True, first, True),
-        (2, False, 1, False),
-        (3, True, first + second, True),
-        (4, True, first, True),
-    ]
+        (1, True, first, True), (2, False, 1, False), (3, True, first + second, True), (4, True, first, True),
+    ]  # fmt: skip
     assert 1 + 2 * second + 1 == len(control)
 
 

@@ -18,22 +18,12 @@ from tests.training.tiny import events_of, tiny_config, tiny_scene
 
 # 30 steps of 2 images, with a checkpoint after 10, and density events after 28, 36, 44 and 52 images.
 SETTINGS = (
-    "schedule.iterations=60",
-    "schedule.batch_size=2",
-    "schedule.densify_from=28",
-    "schedule.densify_until=60",
-    "schedule.densify_every=8",
-    "schedule.size_prune_after=0",
-    "schedule.checkpoint_every=19",
-    "population.grad_threshold=4e-3",
-    "population.clone_scale=0.02",
-    "population.min_opacity=0.06",
-    "model.antialiased=true",
-    "optimiser.opacity=0.1",
-    "optimiser.position_noise=1e6",
-    "log.every=2",
-    "log.keep_checkpoints=9",
-)
+    "schedule.iterations=60", "schedule.batch_size=2", "schedule.densify_from=28",
+    "schedule.densify_until=60", "schedule.densify_every=8", "schedule.size_prune_after=0",
+    "schedule.checkpoint_every=19", "population.grad_threshold=4e-3", "population.clone_scale=0.02",
+    "population.min_opacity=0.06", "model.antialiased=true", "optimiser.opacity=0.1",
+    "optimiser.position_noise=1e6", "log.every=2", "log.keep_checkpoints=9",
+)  # fmt: skip
 RELOCATION = (
     "population.strategy=relocation",
     "loss.opacity=0.01",
@@ -41,16 +31,10 @@ RELOCATION = (
 )
 # The second importance pass at the end of density control keeps half. Then rates fall.
 PRUNED = (
-    "population.importance=true",
-    "population.score=weight",
-    "population.pass2_mass=1",
-    "population.pass2_keep=0.5",
-    "schedule.t1=0",
-    "schedule.densify_until=54",
-    "schedule.t2=54",
-    "schedule.position_decay=60",
-    "optimiser.final=0.1",
-)
+    "population.importance=true", "population.score=weight", "population.pass2_mass=1",
+    "population.pass2_keep=0.5", "schedule.t1=0", "schedule.densify_until=54", "schedule.t2=54",
+    "schedule.position_decay=60", "optimiser.final=0.1",
+)  # fmt: skip
 OPTIONS = {
     "relocation": RELOCATION,
     "relocation, pruned": (*RELOCATION, *PRUNED),

@@ -34,19 +34,11 @@ from tests.training.tiny import (
 ROOT = Path(__file__).parents[2]
 # 10 + 20 steps of 2 images; density events (after 28, 36, 44 and 52 images) fall into the 20 steps.
 SETTINGS = (
-    "schedule.iterations=60",
-    "schedule.batch_size=2",
-    "schedule.densify_from=28",
-    "schedule.densify_until=60",
-    "schedule.densify_every=8",
-    "schedule.size_prune_after=0",
-    "population.grad_threshold=4e-3",
-    "population.clone_scale=0.02",
-    "population.max_gaussians=490",
-    "schedule.checkpoint_every=19",
-    "log.every=2",
-    "log.keep_checkpoints=9",
-)
+    "schedule.iterations=60", "schedule.batch_size=2", "schedule.densify_from=28",
+    "schedule.densify_until=60", "schedule.densify_every=8", "schedule.size_prune_after=0",
+    "population.grad_threshold=4e-3", "population.clone_scale=0.02", "population.max_gaussians=490",
+    "schedule.checkpoint_every=19", "log.every=2", "log.keep_checkpoints=9",
+)  # fmt: skip
 
 
 def _train(ranks, folder, *overrides):
@@ -376,24 +368,30 @@ def test_a_resume_on_as_many_ranks_repeats_every_bit(capture, trained, tmp_path)
         assert torch.equal(got[name], want[name]), name
 
 
+# `blitzgs train` under torchrun, whose rank 1 is killed once, in the middle of a step.
+KILLED_ONCE = """
+import os, signal, sys
+from blitzgs.cli import main
+from blitzgs.training.trainer import Trainer
+step = Trainer.step
+def killed_once(self, number):
+    first = os.environ["TORCHELASTIC_RESTART_COUNT"] == "0"
+    if number == 25 and first and self.state.ranks.rank == 1:
+        (self.state.folder / "killed").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    step(self, number)
+Trainer.step = killed_once
+sys.exit(main())
+"""
+
+
 def test_torchrun_restarts_after_a_rank_is_killed(capture, trained, tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--standalone",
-        "--nproc-per-node=2",
-        "--max-restarts=1",
-    ]
-    command += [str(Path(__file__).with_name("killed_once.py"))]
-    done = subprocess.run(
-        command + train_flags(capture, tmp_path, "train"),
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=270,
-        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
-    )
+    program = tmp_path / "killed_once.py"
+    program.write_text(KILLED_ONCE)
+    torchrun = f"{sys.executable} -m torch.distributed.run --standalone --nproc-per-node=2 --max-restarts=1"
+    command = [*torchrun.split(), str(program), *train_flags(capture, tmp_path, "train")]
+    variables = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=270, env=variables)
     assert done.returncode == 0, done.stderr[-3000:]
     assert "rank 0: " in done.stderr and "rank 1 has stopped reporting" in done.stderr
     assert "number 0" not in done.stderr

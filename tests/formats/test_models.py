@@ -198,6 +198,27 @@ def test_other_readers_find_the_values(tmp_path, model, name):
     assert plain.comments == []
 
 
+class Pieces:
+    """A model that comes in blocks of any size."""
+
+    def __init__(self, model):
+        self.model, self.degree, self.comments, self.has_levels = model, model.degree, model.comments, False
+
+    def __len__(self):
+        return len(self.model)
+
+    def blocks(self):
+        for first, last in ((0, 37), (37, 38), (38, 295), (295, 300)):
+            yield self.model.rows(slice(first, last))
+
+
+@pytest.mark.parametrize("name", PACKED)
+def test_a_model_in_pieces_gives_the_same_file(tmp_path, model, name, monkeypatch):
+    whole = written(tmp_path, name, model).read_bytes()
+    monkeypatch.setattr(packed, "BLOCK", 256)
+    assert written(tmp_path, name, Pieces(model)).read_bytes() == whole
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2])
 @pytest.mark.parametrize("name", PACKED)
 def test_lower_degrees_and_single_gaussians(tmp_path, name, degree):
@@ -217,7 +238,7 @@ def test_files_of_the_other_package_are_read(tmp_path, model, name, kind):
             gsply.write_spz(path, packed._gsdata(turned(model)), version=version)
             compare(read_gaussians(path), model, (2e-4, *BOUNDS["spz"][1:]))
     else:
-        unit = packed.collected(with_degree(model, 0) if kind == "splat" else model)
+        (unit,) = packed.unit_blocks(with_degree(model, 0) if kind == "splat" else model)
         columns = {"positions": unit.means, "rotations": unit.quats, "scales": unit.scales}
         columns |= {"alphas": unit.opacities, "colors": unit.sh[:, 0], "sh": unit.sh[:, 1:]}
         content = {name: column.contiguous().numpy().tobytes() for name, column in columns.items()}

@@ -19,12 +19,9 @@ from tests.formats.helpers import some_gaussians
 def gaussians(n: int, degree: int, seed: int = 0) -> dict[str, torch.Tensor]:
     g = torch.Generator().manual_seed(seed)
     shapes = {
-        "means": (n, 3),
-        "quats": (n, 4),
-        "scales": (n, 3),
-        "opacities": (n,),
+        "means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,),
         "sh": (n, (degree + 1) ** 2, 3),
-    }
+    }  # fmt: skip
     return {name: torch.randn(*shape, generator=g) for name, shape in shapes.items()}
 
 

@@ -19,7 +19,7 @@ from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges, collect_i
 from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops.projection_types import Sizes
 from blitzgs.table.table import GaussianTable
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term
 from tests.distributed.rank_harness import EIGHT, on_each_device, run_ranks
 from tests.helpers import parameter_gradients, sum_parts

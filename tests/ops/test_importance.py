@@ -27,11 +27,8 @@ def lists_of(scene, tile_size=16):
     )  # fmt: skip
     splats = projected.means2d, projected.conics, projected.opacities
     grid = {
-        "n_cameras": len(scene.Ks),
-        "width": scene.width,
-        "height": scene.height,
-        "tile_size": tile_size,
-    }
+        "n_cameras": len(scene.Ks), "width": scene.width, "height": scene.height, "tile_size": tile_size,
+    }  # fmt: skip
     return splats, intersect(*splats, projected.depths, projected.camera_ids, **grid), grid
 
 

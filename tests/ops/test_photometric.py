@@ -143,15 +143,8 @@ def test_a_partition_of_the_tiles_adds_up_to_the_whole(device, tile_size):
         known = F.max_pool2d(owned[:, None].float(), 21, 1, 10)[:, 0, :, :, None] > 0
         known_x = torch.where(known, x, torch.full_like(x, 7.0))
         part = sums_and_gradient(
-            known_x,
-            targets,
-            masks,
-            weights,
-            -weights,
-            tile_size,
-            begin,
-            end,
-        )
+            known_x, targets, masks, weights, -weights, tile_size, begin, end,
+        )  # fmt: skip
         torch.testing.assert_close(part[2][owned], whole[2][owned], rtol=1e-5, atol=1e-6)
         clean = torch.ops.blitzgs.photometric_bwd(
             known_x, targets, masks, weights, -weights, tile_size, begin, end

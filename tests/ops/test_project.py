@@ -15,17 +15,9 @@ FLOATS = ("means2d", "conics", "depths", "opacities", "colors")
 def project_scene(scene, **options):
     colors = options.pop("sh", scene.colors)
     return project(
-        scene.means,
-        scene.quats,
-        scene.scales,
-        scene.opacities,
-        colors,
-        scene.viewmats,
-        scene.Ks,
-        scene.width,
-        scene.height,
-        **{"sh_degree": 3, "raw": False, **options},
-    )
+        scene.means, scene.quats, scene.scales, scene.opacities, colors, scene.viewmats, scene.Ks,
+        scene.width, scene.height, **{"sh_degree": 3, "raw": False, **options},
+    )  # fmt: skip
 
 
 def before_activation(scene):
@@ -326,16 +318,8 @@ def test_opcheck():
         options = inputs.options
         ids = torch.arange(10)
         arguments = (
-            inputs.gaussians,
-            *inputs.cameras,
-            *[None] * 4,
-            ids,
-            None,
-            *options,
-            [0, 6],
-            None,
-            None,
-        )
+            inputs.gaussians, *inputs.cameras, *[None] * 4, ids, None, *options, [0, 6], None, None,
+        )  # fmt: skip
         # With gradients opcheck's own traced comparison cannot sum integer outputs; the next test is that
         # check.
         utilities = ("test_schema", "test_autograd_registration", "test_faketensor")

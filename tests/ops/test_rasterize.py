@@ -26,16 +26,8 @@ def forward(splats, n_cameras=1, tile_size=16, backgrounds=None, tile_begin=0, t
     """All outputs of the op."""
     tile_lists = lists(splats, n_cameras, tile_size=tile_size)
     return torch.ops.blitzgs.rasterize_fwd(
-        *splats.values(),
-        backgrounds,
-        *tile_lists,
-        n_cameras,
-        WIDTH,
-        HEIGHT,
-        tile_size,
-        tile_begin,
-        tile_end,
-    )
+        *splats.values(), backgrounds, *tile_lists, n_cameras, WIDTH, HEIGHT, tile_size, tile_begin, tile_end,
+    )  # fmt: skip
 
 
 def backward(
@@ -123,14 +115,9 @@ def test_absolute_gradients_sum_each_pixels_gradient():
     means2d = splats.means2d.clone().requires_grad_()
     told = []
     renders, _ = rasterize(
-        means2d,
-        *splats.values()[1:],
-        *lists(splats),
-        n_cameras=1,
-        width=WIDTH,
-        height=HEIGHT,
+        means2d, *splats.values()[1:], *lists(splats), n_cameras=1, width=WIDTH, height=HEIGHT,
         tell_absgrad=told.append,
-    )
+    )  # fmt: skip
     renders.backward(v_renders)
     (absolute,) = told
     assert torch.equal(absolute, found[4])

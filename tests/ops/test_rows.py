@@ -170,13 +170,10 @@ RANKS = 3
 def columns(n, dtype=torch.float32):
     g = torch.Generator().manual_seed(0)
     return [
-        torch.randn(n, 2, generator=g).to(dtype),
-        torch.randn(n, generator=g).to(dtype),
-        torch.arange(n, dtype=torch.int32),
-        torch.randint(0, 2**62, (n,), generator=g),
-        torch.randn(n, 7, generator=g).half(),
-        torch.randn(n, 3, 2, generator=g).bfloat16(),
-    ]
+        torch.randn(n, 2, generator=g).to(dtype), torch.randn(n, generator=g).to(dtype),
+        torch.arange(n, dtype=torch.int32), torch.randint(0, 2**62, (n,), generator=g),
+        torch.randn(n, 7, generator=g).half(), torch.randn(n, 3, 2, generator=g).bfloat16(),
+    ]  # fmt: skip
 
 
 def destinations(n):

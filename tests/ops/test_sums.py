@@ -183,18 +183,9 @@ def test_density_stats_match_the_definition(device, with_phi):
     sums, counts, radii = state(device=device)
     for _ in range(2):
         density_stats_(
-            sums,
-            counts,
-            radii,
-            visible,
-            offsets,
-            gradients,
-            conics,
-            WIDTH,
-            HEIGHT,
-            B,
+            sums, counts, radii, visible, offsets, gradients, conics, WIDTH, HEIGHT, B,
             phi if with_phi else None,
-        )
+        )  # fmt: skip
     expected_sum, expected_count, expected_radius = torch.zeros(50), torch.zeros(50), torch.zeros(50)
     largest = torch.linalg.eigvalsh(covariance)[:, 1]
     for u, g in enumerate(visible.tolist()):

@@ -71,12 +71,9 @@ def variables(environment):
 def run(environment, *command):
     """Run a program of the environment and return its output."""
     done = subprocess.run(
-        [environment / "bin" / command[0], *command[1:]],
-        env=variables(environment),
-        cwd=environment,
-        capture_output=True,
-        text=True,
-    )
+        [environment / "bin" / command[0], *command[1:]], env=variables(environment), cwd=environment,
+        capture_output=True, text=True,
+    )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 

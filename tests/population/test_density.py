@@ -152,14 +152,9 @@ def test_split_children_scatter_like_their_parent():
     mean, scales = table["means"][0].double(), table["scales"][0].double().exp()
     axes = rotations(table["quats"][:1].double())[0]
     densify(
-        table,
-        DensityRules(0.5, 1e-9, 0.0),
-        time=TIME,
-        step=STEP,
-        seed=SEED,
-        level_count=LEVELS,
+        table, DensityRules(0.5, 1e-9, 0.0), time=TIME, step=STEP, seed=SEED, level_count=LEVELS,
         ranks=Ranks(),
-    )
+    )  # fmt: skip
     assert len(table) == 40_000
     local = (table["means"].double() - mean) @ axes / scales
     assert local.mean(0).abs().max() < 0.02
@@ -208,11 +203,8 @@ def test_children_have_their_parents_phi_and_cull_row():
 def test_the_tightest_limit_wins_and_is_named():
     def limit(**changed):
         none = {
-            "max_gaussians": 0,
-            "pixels_per_gaussian": 0.0,
-            "gaussians_per_point": 0.0,
-            "memory_count": None,
-        }
+            "max_gaussians": 0, "pixels_per_gaussian": 0.0, "gaussians_per_point": 0.0, "memory_count": None,
+        }  # fmt: skip
         return growth_limit(**none | {"pixels": 1_000_000, "points": 3_000} | changed)
 
     by_pixels = GrowthLimit(41_666, "population.pixels_per_gaussian")

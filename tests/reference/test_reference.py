@@ -64,18 +64,9 @@ def test_depth_range_is_open_at_near_and_closed_at_far():
     means = torch.tensor([[0.0, 0, 1], [0, 0, 1.5], [0, 0, 2], [0, 0, 2.5], [0, 0, -1.5]])
     n = len(means)
     splats = render(
-        means,
-        torch.ones(n, 4),
-        torch.ones(n, 3),
-        torch.full((n,), 0.5),
-        torch.ones(n, 1),
-        torch.eye(4),
-        K,
-        8,
-        8,
-        near_plane=1.0,
-        far_plane=2.0,
-    ).splats
+        means, torch.ones(n, 4), torch.ones(n, 3), torch.full((n,), 0.5), torch.ones(n, 1), torch.eye(4), K,
+        8, 8, near_plane=1.0, far_plane=2.0,
+    ).splats  # fmt: skip
     assert splats.ids.tolist() == [1, 2]
 
 

@@ -13,12 +13,10 @@ import torch
 
 from blitzgs.cli import main
 from blitzgs.cli.report import kept_warnings
-from blitzgs.report.compare import compare, differences, labels
 from blitzgs.report.gather import MAX_POINTS
-from blitzgs.report.page import MAX_BYTES
-from blitzgs.report.report import report
+from blitzgs.report.report import MAX_BYTES, compare, differences, labels, report
+from blitzgs.runs.evaluation import PARTS, Previews, preview_file
 from blitzgs.runs.folder import open_run
-from blitzgs.runs.previews import PARTS, Previews, preview_file
 from tests.browser import Browser, needs_chromium, wait_for
 from tests.training.tiny import OVERRIDES, as_flags, at_step, events_of, train, write_tiny_capture
 
@@ -72,6 +70,8 @@ def test_a_training_writes_its_report(trained):
     assert data["curves"]["held_out"][-1][2] == pytest.approx(measured["psnr"], rel=1e-4)
     cameras = run.cameras()
     assert [p[2] for p in data["cameras"]["points"]] == [int(k in cameras.test) for k in range(8)]
+    assert all(isinstance(p[3], float) for p in data["cameras"]["points"])
+    assert data["cameras"]["trained_known"]
     assert data["config"] == (folder / "config.yaml").read_text()
     assert data["environment"]["torch"] == torch.__version__
     assert data["pictures"] and all(len(view["layers"]) == 3 for view in data["pictures"])
@@ -106,6 +106,8 @@ def test_the_plan_is_seen_from_above(trained):
 
 def test_measured_training_views_are_coloured_too(trained, tmp_path):
     folder = copied(trained, tmp_path / "run")
+    (at_the_end,) = folder.glob("evaluation/*/trained.json")
+    at_the_end.unlink()  # which colours them, too
     before = data_of(report(folder))["cameras"]
     assert [p[3] is not None for p in before["points"]] == [bool(p[2]) for p in before["points"]]
     arguments = ["eval", str(folder), "--data", str(trained[0]), "--split", "train", "--pictures", "0"]

@@ -11,22 +11,14 @@ import torch
 from safetensors.torch import load_file
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import checkpoint
+from blitzgs.runs import checkpoint, manifest
 from tests.distributed.rank_harness import CONTEXT, RankError, run_ranks
 
 ALONE = Ranks()
 POINTS = [
-    "begin",
-    "folder made",
-    "shard half written",
-    "shard written",
-    "shard synced",
-    "manifest written",
-    "manifest synced",
-    "renamed",
-    "finished",
-    "old one renamed",
-]
+    "begin", "folder made", "shard half written", "shard written", "shard synced", "manifest written",
+    "manifest synced", "renamed", "finished", "old one renamed",
+]  # fmt: skip
 
 
 def table(rows, seed=0):
@@ -300,7 +292,7 @@ def test_dealing_keeps_the_order_and_opens_only_what_it_needs(tmp_path):
     for m, columns in enumerate(four):
         file = tmp_path / f"{m}.safetensors"
         size, digest = checkpoint.write_shard(file, columns, lambda point: None)
-        shards.append(checkpoint.Shard(file.name, len(columns["id"]), size, digest))
+        shards.append(manifest.Shard(file.name, len(columns["id"]), size, digest))
     assert equal(checkpoint.read_share(tmp_path, shards, ALONE, torch.device("cpu")), whole)
     # Rows 1, 3, 5, ... are in the second and the fourth file; of the first, only the header is read.
     first = tmp_path / shards[0].file

@@ -14,9 +14,8 @@ import torch
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import log as run_log
-from blitzgs.runs.folder_checks import FolderError, check_room, check_writable, locked
+from blitzgs.runs.folder_checks import FolderError, check_room, check_writable, known_id, locked
 from blitzgs.runs.guard import LossGuard, NonFiniteError
-from blitzgs.runs.identity import known_id
 from blitzgs.runs.log import LOG, RunLog
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import RankError, run_ranks

@@ -122,14 +122,9 @@ def test_wrong_poses_are_doubtful(made, tmp_path):
     model.write(tmp_path / "0")
     photographs = Photographs.of(root / "photos")
     job = engine.Job(
-        str(root / "capture/sfm/database.db"),
-        *([""] * 4),
-        names=photographs.names,
-        sizes=photographs.sizes,
-        camera_model="auto",
-        pairs="exhaustive",
-        mapper="incremental",
-    )
+        str(root / "capture/sfm/database.db"), *([""] * 4), names=photographs.names, sizes=photographs.sizes,
+        camera_model="auto", pairs="exhaustive", mapper="incremental",
+    )  # fmt: skip
     found = examine(root / "capture", tmp_path, photographs, job, [tmp_path / "0"])
     assert list(found.doubtful) == ["view_5.jpg"] and "from the middle" in found.doubtful["view_5.jpg"]
     assert any("doubtful:      view_5.jpg" in line for line in found.lines())

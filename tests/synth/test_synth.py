@@ -17,7 +17,7 @@ import pytest
 from blitzgs.capture.colmap import quats_to_rotations, read_model
 from blitzgs_synth import add_arguments, generate_city, run
 from blitzgs_synth.city import tower_height
-from blitzgs_synth.flight import flight_height, plan_flight
+from blitzgs_synth.flight import CLIMB, flight_height, plan_flight
 from blitzgs_synth.noise import Noise, cell_random, inside, stripes
 from blitzgs_synth.options import PRESETS, CityOptions
 from blitzgs_synth.plan import Plan
@@ -286,6 +286,8 @@ def test_flights_cover_the_city_above_its_towers(name):
     views = plan_flight(options)
     assert len(views) == options.views and len({v.name for v in views}) == options.views
     assert flight_height(options) > 1.3 * tower_height(Plan(options))
+    levels = [round(np.log(view.centre[2] / flight_height(options)) / np.log(CLIMB)) for view in views]
+    assert (np.diff(np.bincount(levels)) < 0).all() and max(levels) == options.altitudes - 1
     headings = set()
     # Without oblique views, the images end a little before the edge.
     line = np.linspace(-0.5, 0.5, 9) * (1 if options.oblique > 0 else 0.9) * options.extent

@@ -24,12 +24,9 @@ def make_table(n=3000, device="cpu", seed=0):
     scales = torch.log(10 ** (4 * draw(n, 3) - 3.5))
     means[5, 1], scales[9, 0], means[11] = math.nan, math.inf, -math.inf
     rows = {
-        "means": means,
-        "quats": draw(n, 4) - 0.5,
-        "scales": scales,
-        "opacities": 6 * draw(n) - 3,
+        "means": means, "quats": draw(n, 4) - 0.5, "scales": scales, "opacities": 6 * draw(n) - 3,
         "sh": draw(n, 1, 3),
-    }
+    }  # fmt: skip
     table = GaussianTable.create({name: column.to(device) for name, column in rows.items()})
     table.permute(morton_order(table["means"]))
     return table

@@ -111,7 +111,7 @@ def test_reduced_photographs_and_their_cameras(capture, device, ahead):
                 sampler.schedule = Schedule(replace(config, pace=((22, 0.25),)))
     finally:
         loader.close()
-    assert set(seen) == {4, 2, 1} and loader.views_read == len(SIZES)
+    assert set(seen) == {4, 2, 1} and loader.views_masked[1] == len(SIZES)
 
 
 def by_squares(photo, mask, factor):

@@ -32,7 +32,7 @@ def test_train_leaves_a_summary(trained):
 
 def test_the_log_itemises_the_set_up(trained):
     (event,) = events_of(trained[1], "setup")
-    names = ("imports", "processes", "capture", "files", "checks", "gaussians", "table", "first step")
+    names = ("imports", "device", "capture", "files", "checks", "gaussians", "table", "first step")
     assert tuple(event)[-len(names) :] == names
     assert all(event[name] >= 0 for name in names) and event["capture"] > 0
 

@@ -33,12 +33,9 @@ from tests.training.tiny import (
 STATISTICS = ("grad_sum", "grad_count", "max_radii")
 # No event changes the Gaussians within the steps of a test; statistics are gathered.
 QUIET = (
-    "schedule.iterations=200",
-    "schedule.densify_from=150",
-    "schedule.densify_until=180",
-    "schedule.sh_every=2",
-    "model.antialiased=true",
-)
+    "schedule.iterations=200", "schedule.densify_from=150", "schedule.densify_until=180",
+    "schedule.sh_every=2", "model.antialiased=true",
+)  # fmt: skip
 STILL = [f"optimiser.{name}=0" for name in ("position", "sh_dc", "sh_rest", "opacity", "scale", "rotation")]
 
 
@@ -73,19 +70,10 @@ def of_one_view(trainer: Trainer, index: int, sh_degree: int, reduction: int) ->
     views = state.views.pick([index])
     model, extent = state.config.model, state.space.extent
     image = render(
-        table["means"].double().requires_grad_(),
-        table["quats"],
-        table["scales"].double().exp(),
-        table["opacities"].double().sigmoid(),
-        table["sh"],
-        views.viewmats[0],
-        views.Ks[0] * K,
-        width,
-        height,
-        sh_degree=sh_degree,
-        near_plane=model.near * extent,
-        antialiased=model.antialiased,
-    )
+        table["means"].double().requires_grad_(), table["quats"], table["scales"].double().exp(),
+        table["opacities"].double().sigmoid(), table["sh"], views.viewmats[0], views.Ks[0] * K, width, height,
+        sh_degree=sh_degree, near_plane=model.near * extent, antialiased=model.antialiased,
+    )  # fmt: skip
     target = cv2.resize(state.images.get(index).numpy(), (width, height), interpolation=cv2.INTER_AREA)
     target = torch.from_numpy(target)[None]
     loss = photometric_loss(image.image[None], target, None, state.config.loss.ssim)
@@ -181,7 +169,7 @@ def test_the_log_tells_the_resolution_and_the_measurements_have_all_of_it(whole_
     _, other = train(tmp_path, "schedule.iterations=60")
     assert not events_of(tmp_path, "resolution")
     assert summary["psnr"] == pytest.approx(other["psnr"], abs=1.5) and summary["psnr"] != other["psnr"]
-    assert list(steps_of(folder)) and trainer.loader.views_read == 7
+    assert list(steps_of(folder)) and trainer.loader.views_masked[1] == 7
 
 
 def test_a_step_renders_the_camera_of_the_reduced_photograph(tmp_path):

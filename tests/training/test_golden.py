@@ -31,25 +31,13 @@ from tests.training.tiny import events_of, read_log, steps_of, tiny_config, tiny
 GOLDEN = Path(__file__).with_name("golden.json")
 # 100 steps of 2 views: cloning, splitting, pruning by opacity and size, a reset of opacities, all SH degrees.
 OVERRIDES = (
-    "schedule.iterations=200",
-    "schedule.batch_size=2",
-    "schedule.densify_from=80",
-    "schedule.densify_until=150",
-    "schedule.densify_every=20",
-    "schedule.reset_every=120",
-    "schedule.size_prune_after=110",
-    "schedule.sh_every=40",
-    "schedule.position_decay=200",
-    "population.grad_threshold=1e-3",
-    "population.clone_scale=0.025",
-    "population.prune_screen_radius=12",
-    "population.min_opacity=0.0099",
-    "loss.scale=1.0",
-    "loss.opacity=0.2",
-    "model.antialiased=true",
-    "log.every=10",
-    "log.pictures=0",
-)
+    "schedule.iterations=200", "schedule.batch_size=2", "schedule.densify_from=80",
+    "schedule.densify_until=150", "schedule.densify_every=20", "schedule.reset_every=120",
+    "schedule.size_prune_after=110", "schedule.sh_every=40", "schedule.position_decay=200",
+    "population.grad_threshold=1e-3", "population.clone_scale=0.025", "population.prune_screen_radius=12",
+    "population.min_opacity=0.0099", "loss.scale=1.0", "loss.opacity=0.2", "model.antialiased=true",
+    "log.every=10", "log.pictures=0",
+)  # fmt: skip
 # Up to the first density event, small differences stay small. After it, rounding occasionally decides
 # whether a Gaussian near a threshold grows.
 SMOOTH_UNTIL = 80  # images

@@ -73,12 +73,9 @@ def test_how_many_gaussians_the_importance_passes_keep(whole_run):
     assert CULL not in table  # no view uses the mask, which has a bit for each Gaussian and view
     assert ((table[PHI] >= 0) & (table[PHI] < 1)).all()
     assert trainer.state.progress.milestones == {
-        "initial": 400,
-        "before_pass_1": first["before"],
-        "after_pass_1": first["gaussians"],
-        "before_pass_2": second["before"],
-        "after_pass_2": second["gaussians"],
-    }
+        "initial": 400, "before_pass_1": first["before"], "after_pass_1": first["gaussians"],
+        "before_pass_2": second["before"], "after_pass_2": second["gaussians"],
+    }  # fmt: skip
 
 
 def test_a_pass_says_how_many_views_are_done(tmp_path, monkeypatch, capsys):

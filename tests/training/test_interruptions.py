@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import sys
+import threading
 import time
 import warnings
 from pathlib import Path
@@ -29,19 +30,6 @@ from tests.distributed.rank_harness import run_ranks
 from tests.training.tiny import at_step, read_log, steps_of, tiny_config, tiny_scene
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(autouse=True)
-def signals_as_in_a_terminal():
-    # The tests may have been started with ignored signals, as by nohup or as a shell's background job.
-    numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
-    before = [
-        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
-        for number in numbers
-    ]
-    yield
-    for number, handler in zip(numbers, before, strict=True):
-        signal.signal(number, handler)
 
 
 def trainer(folder, *overrides, images=None, resume=False):
@@ -97,6 +85,36 @@ def test_a_checkpoint_is_written_by_the_clock_by_default(tmp_path, monkeypatch):
     folder = tmp_path / "checkpoints"
     states = [checkpoint.load(folder / name, Ranks(), "cpu")[1] for name in checkpoints(tmp_path)]
     assert [state["progress"]["step"] for state in states] == [33, 100]
+
+
+@pytest.mark.parametrize("room", [0, 1 << 40])
+def test_training_goes_on_while_a_checkpoint_is_written(tmp_path, monkeypatch, room):
+    """The checkpoint has the model of the step at which it began; without room for a copy, training waits."""
+    saved, may_write, then = {}, threading.Event(), []
+    save, write = run_files.save, checkpoint.write_shard
+
+    def noted(folder, table, *others):
+        saved.setdefault("columns", {name: table[name].clone() for name in table})
+        return save(folder, table, *others)
+
+    def write_late(*arguments):
+        then.append(may_write.wait(60 if room else 0))
+        return write(*arguments)
+
+    def go_on(self):
+        assert checkpoints(tmp_path) == ([] if room else ["checkpoint_000000"])
+        may_write.set()
+
+    monkeypatch.setattr(run_files, "available_bytes", lambda: room)
+    monkeypatch.setattr(run_files, "save", noted)
+    monkeypatch.setattr(checkpoint, "write_shard", write_late)
+    at_step(monkeypatch, 33, lambda self: self.state.save_clock.restart(0))
+    at_step(monkeypatch, 36, go_on)
+    trainer(tmp_path).train()
+    columns, state, _ = checkpoint.load(tmp_path / "checkpoints" / "checkpoint_000000", Ranks(), "cpu")
+    assert state["progress"]["step"] == 33 and then == [room > 0, True]
+    assert columns.keys() == saved["columns"].keys()
+    assert all(torch.equal(column, saved["columns"][name]) for name, column in columns.items())
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])

@@ -18,8 +18,7 @@ from blitzgs.capture.lens import Lens
 from blitzgs.capture.undistort import rectify
 from blitzgs.cli import main
 from blitzgs.config.fields import Config
-from blitzgs.config.files import load_config
-from blitzgs.config.recipes import recipe_path
+from blitzgs.config.files import load_config, recipe_path
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.training import inputs

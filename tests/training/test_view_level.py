@@ -42,14 +42,9 @@ from tests.training.tiny import (
 
 # The passes follow the density event at 40 and come at 70; the window ends at 60; the mask is cleared at 85.
 FLAGS = (
-    "view.lod=true",
-    "view.cull=true",
-    "population.importance=true",
-    "schedule.densify_until=60",
-    "schedule.t1=40",
-    "schedule.t2=70",
-    "log.pictures=0",
-)
+    "view.lod=true", "view.cull=true", "population.importance=true", "schedule.densify_until=60",
+    "schedule.t1=40", "schedule.t2=70", "log.pictures=0",
+)  # fmt: skip
 
 
 def train(folder, *overrides, resume=False):
@@ -182,11 +177,8 @@ def test_levels_that_follow_footprints_leave_out_what_is_small_in_the_view(tmp_p
 
     monkeypatch.setattr(view_level, "follow_footprints", watched)
     flags = (
-        "view.footprint=0.5",
-        "population.importance=false",
-        "view.cull=false",
-        "schedule.densify_every=2",
-    )
+        "view.footprint=0.5", "population.importance=false", "view.cull=false", "schedule.densify_every=2",
+    )  # fmt: skip
     whole, summary = train(tmp_path / "whole", *flags)
     assert followed == [(60, True), (80, True)] and summary is not None
     progress = whole.state.progress

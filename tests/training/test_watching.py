@@ -1,19 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
+"""What is seen of a training: a viewer on its state, glances, figures and curves."""
+
+import json
 import os
 import signal
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+import torch
 
+from blitzgs.capture.images import PhotographError
 from blitzgs.distributed.group import Ranks
+from blitzgs.runs.guard import ModelLostError
 from blitzgs.runs.watch import Wish
+from blitzgs.training.curve import FALL, WINDOW, Curve
+from blitzgs.training.events import evaluate as glances
+from blitzgs.training.events.evaluate import Glances, spread
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Look
 from blitzgs.view.views import viewmat
 from blitzgs.view.visible import VisibleFinder
 from tests.distributed.rank_harness import run_ranks
-from tests.training.tiny import assert_same_table, tiny_config, tiny_scene, train
+from tests.training.tiny import assert_same_table, events_of, tiny_config, tiny_scene, train
 
 
 class Recorder:
@@ -179,3 +189,144 @@ def test_a_model_in_host_memory_is_shown(tmp_path):
     assert watcher.pictures[-1].values.std() > 10
     _, alone = train(tmp_path / "alone", *settings)
     assert summary["psnr"] == pytest.approx(alone["psnr"], abs=1e-3)
+
+
+def test_a_fully_masked_view_counts_for_nothing(tmp_path, capsys):
+    capture, images = tiny_scene()
+    capture.train, capture.test = [1, 2, 4, 5, 6, 7], [0, 3]
+    images.masks = [None] * 8
+    config = tiny_config("schedule.iterations=20")
+    plain = Trainer(config, capture, images, tmp_path / "plain", Ranks()).train()
+    images.masks[3] = torch.zeros(32, 48, dtype=torch.uint8)
+    with pytest.warns(UserWarning, match="1 of 2 views cannot be measured, as they are masked: 03.png"):
+        summary = Trainer(config, capture, images, tmp_path / "masked", Ranks()).train()
+    views = [
+        json.loads((tmp_path / name / "evaluation" / "000020" / "metrics.json").read_text())["views"]
+        for name in ("plain", "masked")
+    ]
+    assert list(views[0]) == ["00.png", "03.png"] and list(views[1]) == ["00.png"]
+    assert summary["psnr"] == views[0]["00.png"]["psnr"] != plain["psnr"]
+    images.masks[0] = images.masks[3]
+    with pytest.warns(
+        UserWarning, match="2 of 2 views cannot be measured, as they are masked: 00.png, 03.png"
+    ):
+        summary = Trainer(config, capture, images, tmp_path / "nothing", Ranks()).train()
+    assert "psnr" not in summary and "evaluation: all pixels are masked" in capsys.readouterr().out
+
+
+def test_figures_of_training_views_are_called_so(tmp_path, capsys):
+    capture, images = tiny_scene()
+    capture.train, capture.test = list(range(8)), []
+    summary = Trainer(tiny_config("schedule.iterations=2"), capture, images, tmp_path, Ranks()).train()
+    assert summary["split"] == "train"
+    assert "evaluation of TRAINING views (none is held out)" in capsys.readouterr().out
+
+
+def test_a_model_without_gaussians_is_no_result(tmp_path):
+    config = tiny_config("population.min_opacity=0.98")
+    running = Trainer(config, *tiny_scene(), tmp_path / "a", Ranks())
+    with pytest.raises(ModelLostError, match="the density event after 20 images pruned the last Gaussian"):
+        running.train()
+    running = Trainer(tiny_config("schedule.iterations=2"), *tiny_scene(), tmp_path / "b", Ranks())
+    running.state.table.keep(torch.zeros(len(running.state.table), dtype=torch.bool))
+    running.state.stepper.reindex()
+    with pytest.raises(ModelLostError, match="no Gaussian is left"):
+        running.train()
+    assert not list(tmp_path.glob("*/checkpoints/*"))
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 37])
+def test_the_first_views_are_spread(count):
+    order = spread(list(range(100, 100 + count)))
+    assert sorted(order) == list(range(100, 100 + count))
+    for few in range(2, count + 1):
+        chosen = sorted(order[:few])
+        gaps = [b - a for a, b in zip(chosen, [*chosen[1:], chosen[0] + count], strict=True)]
+        assert max(gaps) <= 4 * count / few + 1
+
+
+def glance_at_once(monkeypatch):
+    monkeypatch.setattr(Glances, "_affordable", lambda self: 1)
+
+
+def test_glances_change_no_bit_and_are_logged(tmp_path, monkeypatch):
+    before, _ = train(tmp_path / "before")
+    glance_at_once(monkeypatch)
+    after, _ = train(tmp_path / "after")
+    assert all(torch.equal(before.state.table[name], after.state.table[name]) for name in before.state.table)
+    found = events_of(tmp_path / "after", "glance")
+    assert len(found) == glances.POINTS - 1 and not events_of(tmp_path / "before", "glance")
+    assert all(event["views"] == 1 and event["psnr"] > 5 for event in found)
+    train(tmp_path / "all", "schedule.evaluate_every=50")
+    assert not events_of(tmp_path / "all", "glance")
+
+
+@pytest.mark.parametrize("cost", [0.001, 0.1, 3.0])
+def test_the_share_of_the_time_is_small(tmp_path, monkeypatch, cost):
+    """A training of 1,000 s by a clock of its own, in which a view costs `cost` seconds."""
+    trainer, _ = train(tmp_path, "schedule.iterations=2")
+    state, now = trainer.state, [0.0]
+    state.clock = lambda: now[0]
+    state.progress = replace(state.progress, step=0, seconds=0.0)
+    state.start_clock()
+    spent = []
+
+    def measure(state, views, folder, lpips):
+        now[0] += cost * len(views)
+        spent.append(cost * len(views))
+        return {"psnr": 20.0}
+
+    monkeypatch.setattr(glances, "measure", measure)
+    state.capture.test = list(range(30))
+    state.schedule.iterations, watched = 1000, Glances(state)
+    for step in range(1000):
+        now[0] += 1.0
+        state.stepped(step, 0)
+        watched.after(step, step + 1)
+    assert sum(spent) <= max(0.01 * 1000, glances.MAX_VIEWS * cost * 0.1) and spent
+
+
+def test_a_lost_held_out_photograph_ends_the_glances_alone(tmp_path, monkeypatch):
+    glance_at_once(monkeypatch)
+
+    found = glances.measure
+
+    def measure(state, views, folder, lpips):
+        if folder is None:
+            raise PhotographError("03.png is gone")
+        return found(state, views, folder, lpips)
+
+    monkeypatch.setattr(glances, "measure", measure)
+    _, summary = train(tmp_path)
+    assert summary["images"] == 100
+    assert [event["reason"] for event in events_of(tmp_path, "glance failed")] == ["03.png is gone"]
+
+
+def followed(values, curve=None):
+    curve = Curve() if curve is None else curve
+    return curve, [text for i, value in enumerate(values) if (text := curve.add(100 * (i + 1), value))]
+
+
+def test_a_fall_is_reported_once():
+    values = [20.0] * WINDOW + [25.0] * WINDOW + [25.0 - FALL - 1] * (2 * WINDOW)
+    curve, said = followed(values)
+    assert len(said) == 1 and "3." in said[0] and "25.0 dB" in said[0]
+    assert curve.fall == FALL + 1 and len(curve.warnings()) == 1
+
+
+def test_single_batches_are_no_fall_of_the_curve():
+    curve, said = followed(([25.0] * (WINDOW - 1) + [15.0]) * 4)
+    assert not said and not curve.warnings()
+
+
+def test_a_reset_begins_the_curve_anew():
+    curve, _ = followed([25.0] * WINDOW)
+    curve.restart()
+    curve, said = followed([15.0] * (2 * WINDOW), curve)
+    assert not said and curve.fall == 0
+
+
+def test_a_curve_survives_a_resume():
+    curve, _ = followed([25.0] * 20)
+    again = Curve(**asdict(curve))
+    assert again == curve and followed([19.0] * 30, again)[1]

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is drawn of a table, and which of its blocks and rows are visible."""
 
+import math
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -9,14 +12,15 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.ops.blocks import BLOCK_ROWS
 from blitzgs.population.initialisation import _seen_by_more
 from blitzgs.runs.folder import open_run
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view import point_blocks
-from blitzgs.view.draw import Drawer, Subject, intrinsics, table_of_parameters
+from blitzgs.view.draw import LAYER_ROWS, Drawer, Subject, intrinsics, table_of_parameters
 from blitzgs.view.gate import LodGate, SceneGate
 from blitzgs.view.levels import measure_levels
-from blitzgs.view.look import Look
+from blitzgs.view.look import MODES, Look
 from blitzgs.view.point_blocks import BLOCK_POINTS, PointBlocks
 from blitzgs.view.views import render_options, viewmat
 from blitzgs.view.visible import VisibleFinder
@@ -80,6 +84,40 @@ def test_levels_have_colours_of_their_own(scene, drawer):
     levels = drawer.draw(look_of(model, camera, mode="level")).values
     assert levels.shape == plain.shape
     assert np.abs(levels.astype(int) - plain).mean() > 5
+
+
+def test_layers_of_depth_are_one_picture(scene, drawer, monkeypatch):
+    looks = {mode: look_of(*scene, mode=mode, background=(0.9, 0.2, 0.4)) for mode in MODES}
+    whole = {mode: drawer.draw(look) for mode, look in looks.items()}
+    monkeypatch.setitem(LAYER_ROWS, "cpu", BLOCK_ROWS)
+    for mode, picture in whole.items():
+        layered = drawer.draw(looks[mode])
+        assert layered.gaussians == picture.gaussians
+        if mode == "count":  # each layer counts up to the last splat that touches the pixel
+            assert (layered.values <= picture.values).all()
+            assert ((layered.values > 0) == (picture.values > 0)).all()
+            continue
+        # Pixels that one layer has ended go on in the next, with at most 1 % of the light.
+        tolerance = {"RGB": 3, "level": 3, "alpha": 0.01, "depth": 0.5}[mode]
+        assert np.abs(layered.values.astype(float) - picture.values).max() <= tolerance
+
+
+def test_depths_divide_what_a_view_sees(scene):
+    model, camera = scene
+    finder = VisibleFinder(subject_of(model).scene)
+    views = Views(
+        *(torch.from_numpy(m).float()[None] for m in (viewmat(camera, model.space), camera.K)),
+        camera.width,
+        camera.height,
+    )
+    near, *inner, far = finder.depths(views, [0.01, 100.0], 2)
+    assert (near, far) == (0.01, 100.0)
+    layers = [near, *inner, far]
+    counts = [
+        int(finder.find(*views.as_arguments(), (*planes, 0.3)).active.length) for planes in pairwise(layers)
+    ]
+    assert len(counts) >= 3
+    assert max(counts) < 6 * BLOCK_ROWS
 
 
 def test_background_degree_planes_and_crop_change_the_picture(scene, drawer):
@@ -158,9 +196,9 @@ def test_every_point_is_between_the_bounds_of_its_block(count):
         for block, own in enumerate(distances.split(BLOCK_POINTS, dim=1)):
             edge = tightest(own, dim=1)
             assert (bound[:, block] <= edge).all() if bounds == 1 else (bound[:, block] >= edge).all()
-    chosen = torch.arange(len(blocks)) % 2 == 0
-    expected = [points[rows] for rows in blocks.order.split(BLOCK_POINTS)[::2]]
-    assert torch.equal(blocks.points_of(chosen), torch.cat(expected))
+    chosen = torch.arange(len(blocks)).expand(len(centres), -1)
+    own = blocks.distances_of(centres, chosen, math.inf).flatten(1)
+    assert torch.equal(own[:, :count], distances) and own[:, count:].isinf().all()
 
 
 @pytest.mark.parametrize("pairs", [1, 200, 1 << 20])

@@ -20,7 +20,7 @@ from blitzgs.population.importance import ViewBatch, is_culled, sweep
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.layouts import CULL, sectors_in
 from blitzgs.table.table import GaussianTable
-from blitzgs.training.batch import Batch
+from blitzgs.training.batches import Batch
 from blitzgs.training.step import Stepper
 from blitzgs.view.gate import SAMPLE, LodGate, SceneGate, ViewGate, centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks

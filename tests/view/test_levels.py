@@ -1,12 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Levels of Gaussians; smooth levels agree with their definition in float64."""
+
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from blitzgs.view.gate import LodGate
+from blitzgs.distributed.group import Ranks
+from blitzgs.frame import frame as pipeline
+from blitzgs.frame.frame import Views
+from blitzgs.ops.project import differentiable_splats, gaussian_tensors, project
+from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
+from blitzgs.reference.render import render as reference_render
+from blitzgs.view.gate import LodGate, SceneGate, centres_of
 from blitzgs.view.levels import FOOTPRINT_LEVELS, Levels, footprint_levels, footprint_sizes, measure_levels
+from tests.helpers import DEVICES
+from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_views
+from tests.view.test_gate import GATE, OPTIONS, make_scene
 
 
 def cloud(count=5000, seed=0):
@@ -72,3 +84,188 @@ def test_levels_of_footprints_leave_out_only_what_is_too_small_and_most_of_that(
     inside = (levels > 0) & (levels < FOOTPRINT_LEVELS - 1)
     assert inside.double().mean() > 0.5 and (reach < kept_to * fork * (1 + 1e-9))[inside].all()
     assert reach[levels == 0].isinf().all()
+
+
+SMOOTH = replace(GATE, smooth=True)
+FADED = replace(OPTIONS, fade=SMOOTH.fade())
+
+
+def weights_by_levels(distances, level, gate):
+    """Return the weight: 1 up to a quarter level before the cut, 0 from a quarter level after it."""
+    resolved = (gate.reference_distance / distances).log() / math.log(gate.fork)
+    # 0 where the Gaussian is gone, 1 where it is whole.
+    share = ((resolved - (level.double() - 0.75)) * 2).clamp(0, 1)
+    # The squared distance, relative to that where it is whole, goes from 1 to f; the weight is linear in it.
+    squared = gate.fork ** (1 - share)
+    weight = (gate.fork - squared) / (gate.fork - 1)
+    weight[level == 0] = 1.0
+    weight[level > gate.finest] = 0.0
+    return weight
+
+
+def faint_scene(n, device="cpu", seed=0):
+    table = make_scene(n, device, seed)
+    table.keep(table["means"].isfinite().all(1) & table["scales"].isfinite().all(1))
+    table["scales"].clamp_(max=0.0)
+    return table
+
+
+@pytest.mark.parametrize("fork", [2.0, 1.3])
+def test_the_weights_fall_over_half_a_level_around_the_cut(fork):
+    gate = LodGate(45.0, fork, 6, 4, smooth=True)
+    generator = torch.Generator().manual_seed(0)
+    level = torch.randint(0, 6, (4000,), generator=generator).to(torch.uint8)
+    distances = (
+        45.0 * fork ** (5.5 - 7 * torch.rand(4000, generator=generator, dtype=torch.float64)) / fork**5
+    )
+    means = torch.zeros(4000, 3, dtype=torch.float64)
+    means[:, 0] = distances
+    found = gate.weights(means, level, torch.zeros(3, dtype=torch.float64))
+    torch.testing.assert_close(found, weights_by_levels(distances, level, gate), rtol=0, atol=1e-9)
+    between = (found > 0) & (found < 1)
+    assert 100 < between.sum() < 2000
+    reach = torch.tensor(gate.reach(), dtype=torch.float64)[level.long()]
+    assert torch.equal(found > 0, distances < reach)
+    cut = torch.tensor(replace(gate, smooth=False).reach(), dtype=torch.float64)[level.long()]
+    near = (distances / cut).log() / math.log(fork)
+    assert (near[between].abs() < 0.25).all()
+    assert replace(gate, smooth=False).fade() == ()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_images_are_those_of_faded_opacities(device, antialiased):
+    table = faint_scene(700, device)
+    viewmats, Ks = make_views(2, device)
+    options = replace(FADED, antialiased=antialiased)
+    images = pipeline.forward(table, Views(viewmats, Ks, WIDTH, HEIGHT), options).renders
+    for view, centre in enumerate(centres_of(viewmats)):
+        weights = SMOOTH.weights(table["means"], table["level"], centre)
+        assert ((weights > 0) & (weights < 1)).sum() > 15
+        expected = reference_render(
+            table["means"], table["quats"], table["scales"].double().exp(),
+            table["opacities"].double().sigmoid() * weights, table["sh"], viewmats[view], Ks[view],
+            WIDTH, HEIGHT, sh_degree=0, near_plane=NEAR, far_plane=FAR, antialiased=antialiased,
+        )  # fmt: skip
+        sure = ~expected.cut
+        assert sure.double().mean() > 0.9
+        torch.testing.assert_close(images[view].double()[sure], expected.image[sure], rtol=0, atol=2e-4)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_gate_before_the_projection_changes_nothing(device):
+    """All Gaussians that the gate leaves out have the weight 0."""
+    table = faint_scene(6000, device)
+    viewmats, Ks = make_views(device=device)
+    views = Views(viewmats, Ks, WIDTH, HEIGHT)
+    active = SceneGate(SMOOTH, math.inf, table, Ranks(device=torch.device(device))).active(table, viewmats)
+    assert (active.views != 15).double().mean() > 0.2
+    faded = pipeline.forward(table, views, FADED, active)
+    everything = pipeline.forward(table, views, FADED)
+    assert torch.equal(faded.renders, everything.renders)
+    assert torch.equal(faded.projected.gaussian_ids, everything.projected.gaussian_ids)
+    cut = SceneGate(GATE, math.inf, table, Ranks(device=torch.device(device))).active(table, viewmats)
+    assert not torch.equal(faded.renders, pipeline.forward(table, views, OPTIONS, cut).renders)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_images_change_little_where_the_gate_makes_them_jump(device):
+    """One Gaussian of level 2, seen from around its cut."""
+    table = faint_scene(100, device)
+    table.keep(torch.arange(len(table), device=device) == 0)
+    table["means"].zero_()
+    table["level"].fill_(2)
+    table["opacities"].fill_(2.0)
+    ranks = Ranks(device=torch.device(device))
+    gate = LodGate(8.0, 2.0, 3, 2)
+    K = torch.tensor([[120.0, 0, 80], [0, 120.0, 60], [0, 0, 1]], device=device)[None]
+    largest = {}
+    for smooth in (False, True):
+        scene = SceneGate(replace(gate, smooth=smooth), math.inf, table, ranks)
+        images = []
+        for step in range(80):
+            viewmat = torch.eye(4, device=device)[None]
+            viewmat[:, 2, 3] = gate.reach()[2] * 2 ** (0.5 - step / 80)
+            options = replace(OPTIONS, fade=scene.gate.fade())
+            frame = pipeline.forward(
+                table, Views(viewmat, K, 160, 120), options, scene.active(table, viewmat)
+            )
+            images.append(frame.renders)
+        stack = torch.cat(images)
+        largest[smooth] = (stack[1:] - stack[:-1]).abs().max().item()
+        assert stack[0].abs().max() == 0 and stack[-1].abs().max() > 0.1
+    assert largest[True] < 0.15 * largest[False]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gradients_are_those_of_opacities_that_faded_before(device, antialiased):
+    """The weight is a factor of the opacity's gradient, and a constant for means and poses."""
+    dtype = torch.float64 if device == "cpu" else torch.float32
+    table = faint_scene(3000, device)
+    viewmats, Ks = (tensor.to(dtype) for tensor in make_views(3, device))
+    leaves = [table[name].to(dtype) for name in ("means", "quats", "scales", "opacities", "sh")]
+    leaves[2], leaves[3] = leaves[2].exp(), leaves[3].sigmoid()
+    flags = {"near_plane": NEAR, "far_plane": FAR, "antialiased": antialiased, "raw": False}
+    generator = torch.Generator().manual_seed(1)
+    weights_of = lambda rows: [  # noqa: E731
+        torch.rand(column.shape, generator=generator, dtype=torch.float64).to(column)
+        for column in (rows.means2d, rows.conics, rows.opacities, rows.colors)
+    ]
+    columns = lambda rows: (rows.means2d, rows.conics, rows.opacities, rows.colors)  # noqa: E731
+
+    first = [leaf.clone().requires_grad_() for leaf in (*leaves, viewmats)]
+    options = ProjectionOptions(WIDTH, HEIGHT, fade=SMOOTH.fade(), **flags)
+    inputs = ProjectionInputs(gaussian_tensors(*first[:5]), (first[5], Ks), options, level=table["level"])
+    splats = differentiable_splats(inputs, False)
+    v = weights_of(splats)
+    found = torch.autograd.grad(columns(splats), first, v)
+
+    second = [leaf.clone().requires_grad_() for leaf in (*leaves, viewmats)]
+    faded_splats, expected = 0, [torch.zeros_like(leaf) for leaf in second]
+    for view, centre in enumerate(centres_of(viewmats)):
+        weights = SMOOTH.weights(table["means"], table["level"], centre).to(dtype)
+        own = (splats.camera_ids == view).nonzero()[:, 0]
+        means, quats, scales, opacities, sh, poses = second
+        alone = project(
+            means, quats, scales, opacities * weights, sh, poses[view : view + 1], Ks[view : view + 1], WIDTH,
+            HEIGHT, **flags,
+        )  # fmt: skip
+        assert torch.equal(alone.gaussian_ids, splats.gaussian_ids[own])
+        torch.testing.assert_close(alone.opacities, splats.opacities[own], rtol=1e-5, atol=1e-6)
+        faded_splats += int((weights[alone.gaussian_ids.long()] < 1).sum())
+        parts = torch.autograd.grad(columns(alone), second, [column[own] for column in v])
+        expected = [total + part for total, part in zip(expected, parts, strict=True)]
+    assert faded_splats > 20
+    tolerance = 1e-5 if dtype == torch.float64 else 2e-3
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance * b.abs().max().item())
+
+
+def test_errors_name_the_value():
+    table = faint_scene(13)
+    viewmats, Ks = make_views(1)
+    gaussians = gaussian_tensors(*table.parameters)
+
+    def call(level, fade):
+        options = ProjectionOptions(WIDTH, HEIGHT, fade=fade)
+        ProjectionInputs(gaussians, (viewmats, Ks), options, level=level).run(None)
+
+    with pytest.raises(RuntimeError, match="project_fwd: levels need a fade_slope of at least 1"):
+        call(table["level"], ())
+    with pytest.raises(RuntimeError, match=r"level must have shape \[10\], got \[9\]"):
+        call(table["level"][1:], SMOOTH.fade())
+    with pytest.raises(RuntimeError, match="level must be Byte, got Int"):
+        call(table["level"].int(), SMOOTH.fade())
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_opcheck(device):
+    table = faint_scene(50, device)
+    viewmats, Ks = make_views(2, device)
+    options = FADED.projection(Views(viewmats, Ks, WIDTH, HEIGHT))
+    arguments = (list(table.parameters), viewmats, Ks, *[None] * 5, table["level"], *options, [], None, None)
+    torch.library.opcheck(
+        torch.ops.blitzgs.project_fwd, arguments,
+        test_utils=("test_schema", "test_faketensor", "test_autograd_registration"),
+    )  # fmt: skip

@@ -31,11 +31,7 @@ def is_bundler(path: Path) -> bool:
 
 
 def read_bundler(path: Path) -> Project:
-    """Read cameras and points.
-
-    Raises:
-        ValueError: the file is damaged, or there is no list of names; names the place.
-    """
+    """Read cameras and points."""
     check_size(path)
     with open(path, "rb") as file:
         file.readline()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the project of another program in a folder, and reads it as views and points."""
+"""Finds the project of another program in a folder, and reads it and the points beside it."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from blitzgs.capture.files import ImageFinder
+import numpy as np
+
+from blitzgs.capture.cameras import Float64
 from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, unified
-from blitzgs.capture.points import SourcePoints
-from blitzgs.capture.projects.beside import points_beside
+from blitzgs.capture.names import IMAGE_SUFFIXES, ImageFinder, files_below, unified
+from blitzgs.capture.points import SUFFIXES, SourcePoints, file_points
 from blitzgs.capture.projects.bundler import is_bundler, read_bundler
 from blitzgs.capture.projects.metashape import is_metashape, read_metashape
 from blitzgs.capture.projects.opensfm import NAME, read_opensfm
-from blitzgs.capture.projects.opf import read_opf
-from blitzgs.capture.projects.pix4d import SUFFIX, read_pix4d
+from blitzgs.capture.projects.pix4d import SUFFIX, read_opf, read_pix4d
 from blitzgs.capture.projects.project import Project
 from blitzgs.capture.projects.realitycapture import is_realitycapture, read_realitycapture
-from blitzgs.capture.world import frame_beside
+from blitzgs.capture.world import WorldFrame, converted, frame_beside
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,7 @@ def find_project(root: Path) -> FoundProject | None:
     """Return the project in a folder; None: there is none.
 
     A reconstruction of Bundler beside another project has its points, and is not a project of its own.
-
-    Raises:
-        ValueError: there are several.
+    ValueError: there are several.
     """
     found = [
         FoundProject(kind, file)
@@ -97,9 +95,8 @@ def read_project(
 ) -> tuple[list[str], list[Path], list[Lens], Project, SourcePoints]:
     """Read a project: names, files, lenses, the project itself, and its points.
 
-    Raises:
-        FileNotFoundError: no photograph is there, so that the size of none is known.
-        ValueError: the project is damaged.
+    FileNotFoundError: no photograph is there, so that the size of none is known. ValueError: the project is
+    damaged.
     """
     project = found.kind.read(found.file)
     if not project.views:
@@ -174,3 +171,60 @@ def _points(root: Path, found: FoundProject, project: Project, lenses: Sequence[
     bundles = [file for file in sorted(root.glob("*.out")) if is_bundler(file) and file != found.file]
     own = [read_bundler(file).points for file in bundles[:1]]
     return points_beside(root, own[0] if own else None, project.frame, list(zip(lenses, poses, strict=True)))
+
+
+# Points and views that are compared to find out in which coordinates points are.
+_SAMPLE, _VIEWS = 2000, 100
+
+
+def points_beside(
+    root: Path, own: SourcePoints | None, frame: WorldFrame | None, cameras: Sequence[tuple[Lens, Float64]]
+) -> SourcePoints:
+    """Return the project's own points, or those of a file beside it, in the world of its cameras.
+
+    Programs export cameras in coordinates of their own and points in those of a reference system, or both in
+    one of the two: the coordinates in which the views (lenses and poses [4, 4]) see the points are taken.
+    """
+    points = own
+    if points is None:
+        files = sorted(
+            path for path in root.iterdir() if path.suffix.lower() in (".ply", *SUFFIXES) and path.is_file()
+        )
+        named = [path for path in files if path.stem.lower() in ("points3d", "sparse_pc", "points")] or files
+        if len(named) != 1:
+            if named:
+                shown = ", ".join(path.name for path in named[:5])
+                warnings.warn(
+                    f"{root} has {len(named)} files of points ({shown}), and none is used: call one of them "
+                    f"points{named[0].suffix.lower()}",
+                    stacklevel=5,
+                )
+            return SourcePoints(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
+        points = file_points(named[0])
+    choices = {"the project's own coordinates": points.positions}
+    if frame is not None:
+        choices[f"coordinates of {frame.name}"] = frame.from_world(points.positions)
+        if points.crs is not None and frame.crs:
+            moved = converted(points.positions, points.crs, frame.crs)
+            choices[f"coordinates of {points.crs.name}"] = frame.from_world(moved)
+    seen = {name: seen_share(positions, cameras) for name, positions in choices.items()}
+    best = max(seen, key=seen.__getitem__)
+    if best != next(iter(choices)):
+        warnings.warn(f"{points.path}: the points are in {best}, and are moved to the cameras'", stacklevel=5)
+    points.positions = choices[best]
+    return points
+
+
+def seen_share(positions: Float64, cameras: Sequence[tuple[Lens, Float64]]) -> float:
+    """Return the share of views that see a point, of a sample of both."""
+    sample = positions[:: max(1, len(positions) // _SAMPLE)]
+    some = cameras[:: max(1, len(cameras) // _VIEWS)]
+    return sum(_sees(lens, pose, sample) for lens, pose in some) / max(1, len(some))
+
+
+def _sees(lens: Lens, pose: Float64, positions: Float64) -> bool:
+    with np.errstate(all="ignore"):
+        x, y, depth = pose[:3, :3] @ positions.T + pose[:3, 3:]
+        front = depth > 0
+        u, v = lens.project(x[front] / depth[front], y[front] / depth[front])
+        return bool(((u >= 0) & (u < lens.width) & (v >= 0) & (v < lens.height)).any())

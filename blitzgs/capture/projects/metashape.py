@@ -44,12 +44,7 @@ def is_metashape(path: Path) -> bool:
 
 
 def read_metashape(path: Path) -> Project:
-    """Read the chunk of an export of cameras.
-
-    Raises:
-        ValueError: the file is damaged, or has a kind of camera that makes no perspective image; names the
-            element.
-    """
+    """Read the chunk of an export of cameras; kinds that make no perspective image are refused."""
     root = read_xml(path)
     chunks = [chunk for chunk in root.iter("chunk") if chunk.find("cameras") is not None]
     if not chunks:

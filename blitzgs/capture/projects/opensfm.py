@@ -50,11 +50,7 @@ _MODELS = {
 
 
 def read_opensfm(path: Path) -> Project:
-    """Read the largest reconstruction of a file.
-
-    Raises:
-        ValueError: a field is missing or makes no sense; names it.
-    """
+    """Read the largest reconstruction of a file."""
     original = path.with_name(_ORIGINAL)
     path = original if path.name == NAME and original.is_file() else path
     content = read_json(path)

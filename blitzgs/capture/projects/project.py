@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the readers of projects have in common: their result, and safe parsing of XML, JSON and numbers."""
+"""What the readers of projects have in common: their result, and safe parsing of XML, JSON and numbers.
+
+All raise ValueError for what is damaged, missing or not supported; it names the file and the place in it.
+"""
 
 from __future__ import annotations
 
@@ -49,11 +52,7 @@ class Project:
 
 
 def pose_of(camera_to_world: Float64, centre: Sequence[float] | Float64, where: str) -> Float64:
-    """Return world to camera [4, 4] of a camera's axes in the world [3, 3] (as columns) and its centre.
-
-    Raises:
-        ValueError: the axes are no rotation.
-    """
+    """Return world to camera [4, 4] of a camera's axes in the world [3, 3] (as columns) and its centre."""
     check_rotation(camera_to_world, where)
     pose = np.eye(4)
     pose[:3, :3] = camera_to_world.T
@@ -70,11 +69,7 @@ def check_rotation(matrix: Float64, where: str) -> None:
 
 
 def numbers(value: Any, count: int | None, where: str) -> Float64:
-    """Return numbers of a text or a JSON list.
-
-    Raises:
-        ValueError: they are not numbers, or not so many.
-    """
+    """Return numbers of a text or a JSON list (ValueError: they are not numbers, or not so many)."""
     words = value.split() if isinstance(value, str) else value
     try:
         if not isinstance(words, list) or any(isinstance(word, bool) for word in words):
@@ -88,11 +83,7 @@ def numbers(value: Any, count: int | None, where: str) -> Float64:
 
 
 def number(value: Any, where: str) -> float:
-    """Return a finite number of a text or of JSON.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Return a finite number of a text or of JSON (ValueError: it is none)."""
     found = float(numbers([value.strip() if isinstance(value, str) else value], 1, where)[0])
     if not np.isfinite(found):
         raise ValueError(f"{where}: expected a finite number, got {value!r:.40}")
@@ -100,11 +91,7 @@ def number(value: Any, where: str) -> float:
 
 
 def size_of(width: Any, height: Any, where: str) -> tuple[int, int]:
-    """Return the size of an image in pixels.
-
-    Raises:
-        ValueError: it is no size.
-    """
+    """Return the size of an image in pixels (ValueError: it is no size)."""
     sides = [number(side, where) for side in (width, height)]
     if not all(1 <= side <= 1 << 20 and side == int(side) for side in sides):
         raise ValueError(f"{where}: {sides[0]:g} x {sides[1]:g} is no size of an image")
@@ -132,11 +119,7 @@ def check_size(path: Path) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        ValueError: it is none; names the file and the place.
-    """
+    """Return the content of a JSON file (ValueError: it is none; names the file and the place)."""
     try:
         return json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
@@ -144,11 +127,7 @@ def read_json(path: Path) -> Any:
 
 
 def entry(content: Any, key: str, kind: type | tuple[type, ...], where: str) -> Any:
-    """Return a field of a JSON object.
-
-    Raises:
-        ValueError: it is missing, or of another kind.
-    """
+    """Return a field of a JSON object (ValueError: it is missing, or of another kind)."""
     value = content.get(key) if isinstance(content, Mapping) else None
     if not isinstance(value, kind) or isinstance(value, bool):
         found = "is missing" if value is None else f"is {value!r:.40}"
@@ -160,9 +139,6 @@ def read_xml(path: Path) -> ElementTree.Element:
     """Return the root of an XML file.
 
     Entities are refused: a few lines of them expand to gigabytes or name other files, and no project has one.
-
-    Raises:
-        ValueError: the file is no XML, or defines entities; names the file and the line.
     """
     check_size(path)
     builder = ElementTree.TreeBuilder()

@@ -42,11 +42,7 @@ def is_realitycapture(path: Path) -> bool:
 
 
 def read_realitycapture(path: Path) -> Project:
-    """Read the cameras of a CSV file.
-
-    Raises:
-        ValueError: a value is missing or no number; names the line and the column.
-    """
+    """Read the cameras of a CSV file."""
     lines = read_text(path).splitlines()
     first = next(i for i, line in enumerate(lines[:2]) if set(_NEEDED) <= set(_columns(line)))
     columns = _columns(lines[first])

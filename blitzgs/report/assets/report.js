@@ -87,12 +87,12 @@ function plan(open) {
     place = ([x, y]) => [width / 2 + (x - (box[0] + box[1]) / 2) * scale, height / 2 - (y - (box[2] + box[3]) / 2) * scale];
     const many = cameras.points.length > 1500;
     for (const held of [0, 1]) {
-      for (const point of cameras.points) {
-        if (point[2] !== held) continue;
+      // What is not measured lies below, and pale.
+      for (const point of cameras.points.filter((p) => p[2] === held).sort((a, b) => isNumber(a[3]) - isNumber(b[3]))) {
         const [x, y] = place(point), size = (held ? 5 : 3) * (many ? 0.6 : 1);
         pen.beginPath();
         if (held) pen.rect(x - size, y - size, 2 * size, 2 * size); else pen.arc(x, y, size, 0, 7);
-        pen.fillStyle = isNumber(point[3]) ? colour(point[3]) : "#8a93a3";
+        pen.fillStyle = isNumber(point[3]) ? colour(point[3]) : "#8a93a366";
         pen.fill();
         if (held) {
           pen.strokeStyle = style.getPropertyValue("--text");
@@ -134,7 +134,7 @@ function plan(open) {
   const legend = known.length ? el("p", { class: "soft" }, `${number(low, 1)} dB `, el("i", { class: "scale",
     style: `background:linear-gradient(90deg,${[0, .25, .5, .75, 1].map(ramp).join(",")})` }), ` ${number(high, 1)} dB. `,
     "Squares are held out, circles trained on", cameras.trained_known ? "." :
-      "; grey: not measured (blitzgs eval RUN --split train, then blitzgs report RUN, colours them).") : null;
+      "; grey: not measured (blitzgs eval RUN --split train and blitzgs report RUN colour all).") : null;
   return section("Plan of the cameras", "plan", legend, canvas, said);
 }
 

@@ -12,17 +12,17 @@ from dataclasses import astuple, replace
 
 from blitzgs.config.schedule import Event, EventKind
 from blitzgs.population.importance import SweepStoppedError
-from blitzgs.runs.files import Progress
 from blitzgs.table.pool import PoolError
-from blitzgs.training.events import clear_cull, densify, evaluate, importance, reset_opacities, save
+from blitzgs.training.events import densify, evaluate, importance, save
 from blitzgs.training.state import TrainingState
+from blitzgs.training.view_level import clear_cull
 
 HANDLERS: Mapping[EventKind, Callable[[TrainingState, Event], object]] = {
     "densify": densify.run,
-    "reset_opacities": reset_opacities.run,
+    "reset_opacities": densify.reset_opacities,
     "pass_1": importance.run,
     "pass_2": importance.run,
-    "clear_cull": clear_cull.run,
+    "clear_cull": clear_cull,
     "evaluate": evaluate.run,
     "checkpoint": save.run,
 }
@@ -36,12 +36,8 @@ def handle_all(state: TrainingState, events: Sequence[Event]) -> bool:
     with the next step, and would never run them.
 
     Returns:
-        Whether all events have run. If a signal stops the run before that, `progress.events_left` holds the
-        others, and the resumed run begins with them (`events_left`).
-
-    Raises:
-        PoolError: the Gaussians that an event needs do not fit into the pool; `progress.events_left`
-            holds it and the events after it.
+        Whether all events have run. If not, because a signal stops the run (or the Gaussians do not fit into
+        the pool: PoolError), `progress.events_left` holds the others, and a resumed run begins with them.
     """
     state.progress = replace(state.progress, events_left=[])
     ordered = sorted(events, key=lambda event: event.kind in ("evaluate", "checkpoint"))
@@ -55,8 +51,3 @@ def handle_all(state: TrainingState, events: Sequence[Event]) -> bool:
                 raise
             return False
     return True
-
-
-def events_left(progress: Progress) -> list[Event]:
-    """Return the events of a run's last step that a stop kept from happening."""
-    return [Event(*entry) for entry in progress.events_left]

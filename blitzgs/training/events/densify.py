@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The event that clones, splits, prunes and relocates Gaussians."""
+"""The events that clone, split, prune and relocate Gaussians, and that cap their opacities."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from blitzgs.config.fields import RESET_OPACITY
 from blitzgs.config.schedule import Event
-from blitzgs.population.density import STATISTICS, DensityReport, DensityRules, densify
+from blitzgs.population.density import STATISTICS, DensityReport, DensityRules, cap_opacities, densify
 from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit
 from blitzgs.population.redistribution import MAX_IMBALANCE, redistribute
 from blitzgs.population.relocation import relocate
@@ -26,12 +27,7 @@ MOST_SPREAD = 4.0
 
 
 def run(state: TrainingState, event: Event) -> None:
-    """Run one density event and log what it did.
-
-    Raises:
-        NonFiniteError: a parameter is not finite.
-        ModelLostError: no Gaussian is left.
-    """
+    """Run one density event and log what it did (errors: NonFiniteError, ModelLostError)."""
     state.stepper.write_back()
     # The largest column, sh, does not decide anything; it is checked with each record of the log.
     check_table(state.table, state.progress.step, PARAMETERS[:-1])
@@ -67,13 +63,9 @@ def _spread(state: TrainingState) -> Tensor:
 def _keep_sorted(state: TrainingState, event: Event, counts: dict[str, int], is_sorted: bool) -> None:
     """Sort the table if its blocks have become too large; no result depends on it. Every rank calls this.
 
-    After the last event the order stays for the rest of the run, so that sorting always pays.
-
-    Args:
-        state: state of the run.
-        event: the event.
-        counts: of the event over all ranks; "spread" goes, and "sorted" comes if this sorts the table.
-        is_sorted: whether the event has sorted it.
+    After the last event the order stays for the rest of the run, so that sorting always pays. Of the counts
+    over all ranks, "spread" goes, and "sorted" comes if this sorts the table; `is_sorted`: the event has
+    sorted it.
     """
     spread_now = counts.pop("spread")
     if not is_sorted:
@@ -166,3 +158,15 @@ def density_rules(state: TrainingState, time: int, limit: GrowthLimit | None) ->
         max_gaussians=None if limit is None else limit.count,
         min_observations=population.min_observations,
     )
+
+
+def reset_opacities(state: TrainingState, event: Event) -> None:
+    """Cap all opacities at `RESET_OPACITY` and clear their moments (Kerbl et al. 2023, section 5).
+
+    The pending optimiser steps are applied first, because they would otherwise move the opacities with
+    moments that no longer exist.
+    """
+    state.catch_up()
+    cap_opacities(state.table, RESET_OPACITY)
+    state.curve.restart()
+    state.log.event(event.time, "reset_opacities", {"opacity": RESET_OPACITY})

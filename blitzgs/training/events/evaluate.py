@@ -1,32 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The event that measures the held-out views."""
+"""Measures held-out views: all of them as an event, and a few now and then for the progress display."""
 
 from __future__ import annotations
 
+import json
+import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from blitzgs.capture.images import PhotographError
 from blitzgs.config.schedule import Event
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import files as run_files
-from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, worst_views
+from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, spread, worst_views
 from blitzgs.runs.lod import scene_gate
 from blitzgs.training.state import TrainingState
+from blitzgs.util.output import write_file
+
+# At the end of a run, as many training views as held-out ones are measured, but at least and at most:
+LEAST_TRAINED, MOST_TRAINED = 8, 64
 
 
 def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
     """Measure the held-out views, or the training views if none are held out; the training clock pauses.
 
-    Returns:
-        The mean of each metric, and under "split" which views were measured; an empty dictionary if the run
-        has to stop meanwhile.
+    Returns the mean of each metric, and under "split" which views were measured; nothing if the run has to
+    stop meanwhile.
     """
     with state.paused_clock():
         folder = state.folder / run_files.EVALUATION / f"{state.images_seen:06d}"
         capture = state.capture
         try:
             metrics = measure(state, capture.test or capture.train, folder, state.lpips)
+            if event is None and capture.test:
+                count = min(MOST_TRAINED, max(LEAST_TRAINED, len(capture.test)))
+                _write_trained(state, spread(capture.train)[:count], folder)
         except EvaluationStoppedError:
             text = "evaluation given up: the run has to stop"
             state.log.event(state.images_seen, "evaluation stopped", {}, text)
@@ -44,17 +54,22 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
     return means
 
 
+def _write_trained(state: TrainingState, indices: Sequence[int], folder: Path) -> None:
+    """Measure some training views, which the report's plan of the cameras shows beside the held-out ones."""
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".* as they are masked")  # the run has warned of its masks
+            metrics = measure(state, sorted(indices), None)
+        if state.ranks.rank == 0:
+            write_file(folder / run_files.TRAINED_VIEWS, json.dumps(metrics, indent=1) + "\n")
+    except (OSError, PhotographError) as error:
+        warnings.warn(f"the metrics of training views are not written: {error}", stacklevel=3)
+
+
 def measure(
     state: TrainingState, indices: Sequence[int], folder: Path | None, lpips: Lpips | None = None
 ) -> dict[str, Any]:
-    """Compare the model with the photographs of some cameras; see `blitzgs.runs.evaluation.evaluate`.
-
-    Args:
-        state: state of the run; every rank calls this.
-        indices: cameras of the capture.
-        folder: folder for the metrics and the pictures; None: nothing is written.
-        lpips: the perceptual metric, or None.
-    """
+    """Compare the model with photographs; see `evaluate`. Without a folder nothing is written."""
     state.catch_up()
     with state.log.work("views measured") as report:
         return evaluate(
@@ -73,3 +88,65 @@ def measure(
             lod=scene_gate(state.config, state.progress, state.table, state.ranks),
             stops=state.stops,
         )
+
+
+# The views are measured at most this often in a run, evenly.
+POINTS = 20
+# Largest share of the training time, and number of views at one point.
+MAX_SHARE = 0.008
+LEAST_VIEWS, MAX_VIEWS = 2, 16
+# Assumed before the first measurement: the time of a view is that of this number of training images.
+FIRST_COST = 1.0
+
+
+class Glances:
+    """Measures held-out views at `POINTS` points of a run, unless `schedule.evaluate_every` measures all."""
+
+    def __init__(self, state: TrainingState) -> None:
+        """Begin; time is counted from here, also in a run that is resumed."""
+        self._state = state
+        self._begin = state.progress.seconds
+        self._spent, self._cost = 0.0, 0.0  # seconds in all, and the largest so far for a view
+        self._order = spread(state.capture.test)
+        if state.config.schedule.evaluate_every > 0:
+            self._order = []
+
+    def after(self, begin: int, end: int) -> None:
+        """Measure after the step at the images [begin, end) if it ends a part of the run. Collective."""
+        state, total = self._state, self._state.schedule.iterations
+        if not self._order or end >= total or POINTS * begin // total == POINTS * end // total:
+            return
+        # Rank 0 decides, because the clocks of the ranks differ.
+        count = state.ranks.broadcast_object(self._affordable() if state.ranks.rank == 0 else 0)
+        if count > 0:
+            with state.stage("glances"):
+                self._measure(count)
+
+    def _measure(self, count: int) -> None:
+        """Measure the first views, as many as `count`."""
+        state = self._state
+        started, views = state.clock(), sorted(self._order[:count])
+        try:
+            metrics = measure(state, views, None, lpips=None)
+        except EvaluationStoppedError:
+            return
+        except PhotographError as error:  # on every rank
+            self._order = []
+            text = f"{error}: the run goes on, but this held-out view cannot be measured at the end"
+            state.log.event(state.images_seen, "glance failed", {"reason": str(error)}, text)
+            return
+        seconds = state.clock() - started
+        self._spent += seconds
+        self._cost = max(self._cost, seconds / count)
+        if "psnr" in metrics:
+            values = {"psnr": metrics["psnr"], "views": count, "seconds": seconds}
+            text = f"held-out views: {metrics['psnr']:.2f} dB ({count} of {len(self._order)})"
+            state.log.event(state.images_seen, "glance", values, text)
+
+    def _affordable(self) -> int:
+        """Return how many views may be measured now; 0 if too few."""
+        progress = self._state.progress
+        cost = self._cost or FIRST_COST * progress.seconds / max(1, self._state.images_seen)
+        left = MAX_SHARE * (progress.seconds - self._begin) - self._spent
+        count = min(MAX_VIEWS, len(self._order), math.floor(left / max(cost, 1e-9)))
+        return count if count >= min(LEAST_VIEWS, len(self._order)) else 0

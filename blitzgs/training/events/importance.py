@@ -30,10 +30,8 @@ LEAST_VIEWS = 4
 def run(state: TrainingState, event: Event) -> None:
     """Score all Gaussians, store phi and the cull mask, prune by the scores and redistribute the rows.
 
-    Raises:
-        NonFiniteError: a parameter is not finite.
-        ModelLostError: no Gaussian is left.
-        SweepStoppedError: the run has to stop; the pass has changed nothing.
+    Errors are NonFiniteError, ModelLostError, and SweepStoppedError if the run has to stop: the pass has then
+    changed nothing.
     """
     if not state.config.population.importance:
         return

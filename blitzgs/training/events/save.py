@@ -6,16 +6,15 @@ from __future__ import annotations
 import contextlib
 import shlex
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from blitzgs.config.files import save_config
 from blitzgs.config.schedule import Event
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import save_cameras
-from blitzgs.runs.checkpoint import CheckpointError
-from blitzgs.spawn.lineage import ledger_state
+from blitzgs.runs.checkpoint import CheckpointError, Saving
 from blitzgs.training.state import TrainingState
 from blitzgs.util.output import is_lack_of_space
 
@@ -31,15 +30,29 @@ STOPPING_PATIENCE_SECONDS = 15.0
 
 
 def run(state: TrainingState, event: Event | None = None) -> None:
-    """Write a checkpoint; pending optimiser steps stay pending, so that saving changes nothing.
+    """Begin to write a checkpoint while training goes on; all ranks `finish` it.
 
-    If it cannot be written, the run continues and tries again a minute later.
-
-    Raises:
-        NonFiniteError: a value is not finite; nothing is written, and earlier checkpoints are kept.
+    If it cannot be written, the run continues and tries again a minute later. If a value is not finite,
+    NonFiniteError is raised, and earlier checkpoints are kept.
     """
+    finish(state)
+    with _reported(state):
+        state.save_clock.saving = _write(state, in_background=True)
+
+
+def finish(state: TrainingState) -> None:
+    """Wait for the checkpoint that is being written, if there is one. Collective."""
+    saving, state.save_clock.saving = state.save_clock.saving, None
+    if saving is not None:
+        with _reported(state):
+            saving.finish()
+
+
+@contextlib.contextmanager
+def _reported(state: TrainingState) -> Iterator[None]:
+    """Report a checkpoint that cannot be written, and try again later."""
     try:
-        _write(state)
+        yield
     except CheckpointError as error:
         state.save_clock.restart(RETRY_SECONDS)
         _report(state, error, f"Training goes on; trying again in {RETRY_SECONDS:.0f} s.")
@@ -48,22 +61,15 @@ def run(state: TrainingState, event: Event | None = None) -> None:
 def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[], bool]) -> None:
     """Write the checkpoint at the end of a run; if there is no space for it, wait and try again.
 
-    If it cannot be written for another reason, which waiting does not change, the model is saved elsewhere.
-
-    Args:
-        state: state of the run.
-        patience_seconds: longest time to wait.
-        gives_up: asked before each wait whether to stop trying; it must return the same on every rank.
-
-    Raises:
-        NonFiniteError: as for `run`.
-        CheckpointError: it could not be written in time, or not at all; the message says whether and where
-            the model was saved instead.
+    `gives_up`, the same on every rank, is asked before each wait. If it cannot be written for another reason,
+    which waiting does not change, the model is saved elsewhere. CheckpointError: it could not be written in
+    time, or not at all; the message says whether and where the model was saved instead.
     """
+    finish(state)
     waited, pause = 0.0, FIRST_WAIT_SECONDS
     while True:
         try:
-            _write(state)
+            _write(state).finish()
             return
         except CheckpointError as error:
             if not error.lacks_space:
@@ -86,7 +92,7 @@ def _rescue(state: TrainingState) -> str:
     run, name = state.folder.resolve(), f"rescued_{state.run_id}"
     for folder in (run / name, run.with_name(f"{run.name}_{name}")):
         try:
-            _save(state, folder)
+            _save(state, folder).finish()
         except (CheckpointError, OSError):
             continue
         if state.ranks.rank == 0:
@@ -97,8 +103,8 @@ def _rescue(state: TrainingState) -> str:
     return f"The model could not be saved elsewhere ({run / name} and beside {run}): it is lost"
 
 
-def _write(state: TrainingState) -> None:
-    """Write a checkpoint, after the lineage has been written and found to add up."""
+def _write(state: TrainingState, in_background: bool = False) -> Saving:
+    """Begin to write a checkpoint, after the lineage has been written and found to add up."""
     state.stepper.write_back()
     if state.lineage is not None:
         try:
@@ -107,19 +113,20 @@ def _write(state: TrainingState) -> None:
             raise CheckpointError(
                 f"no checkpoint was written, because {error}.", is_lack_of_space(error)
             ) from error
-        state.progress = replace(state.progress, ledger=ledger_state(ledger))
-    _save(state, state.folder)
+        state.progress = replace(state.progress, ledger=asdict(ledger))
+    saving = _save(state, state.folder, in_background)
     state.save_clock.restart()
+    return saving
 
 
-def _save(state: TrainingState, folder: Path) -> None:
-    """Write a checkpoint into the folder of a run."""
-    state.progress = replace(state.progress, curve=state.curve.saved())
+def _save(state: TrainingState, folder: Path, in_background: bool = False) -> Saving:
+    """Begin to write a checkpoint into the folder of a run."""
+    state.progress = replace(state.progress, curve=asdict(state.curve))
     # The division of tiles decides the order of sums, and therefore their last bits.
     shared = state.owners.columns() if state.ranks.world_size > 1 else {}
     if state.stepper.exposures is not None:
         shared |= state.stepper.exposures.columns()
-    run_files.save(
+    return run_files.save(
         folder,
         state.table,
         state.progress,
@@ -127,7 +134,8 @@ def _save(state: TrainingState, folder: Path) -> None:
         state.config,
         state.ranks,
         state.run_id,
-        shared,
+        {name: column.clone() for name, column in shared.items()},
+        in_background,
     )
 
 
