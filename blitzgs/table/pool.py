@@ -363,10 +363,7 @@ class Pool:
     # --- Moves --------------------------------------------------------------------------------------------
 
     def _move(
-        self,
-        slots: npt.NDArray[np.int64],
-        coming: npt.NDArray[np.int64],
-        after: torch.cuda.Event | None,
+        self, slots: npt.NDArray[np.int64], coming: npt.NDArray[np.int64], after: torch.cuda.Event | None
     ) -> None:
         """Queue a swap behind an event: write the slots' blocks back and load `coming`; -1: load none."""
         if len(slots) == 0:
