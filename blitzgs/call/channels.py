@@ -10,8 +10,7 @@ from torch import Tensor
 from torch.nn.functional import embedding
 
 from blitzgs.call.arguments import Gaussians
-from blitzgs.call.pixels import Pixels
-from blitzgs.call.signals import NORMAL_CHANNELS
+from blitzgs.call.extras import NORMAL_CHANNELS, Pixels
 from blitzgs.ops.harmonics import spherical_harmonics
 from blitzgs.ops.projection_types import ProjectedSplats
 

@@ -13,11 +13,7 @@ _TRIANGLE = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
 
 
 def quat_scale_to_covar_preci(
-    quats: Tensor,
-    scales: Tensor,
-    compute_covar: bool = True,
-    compute_preci: bool = True,
-    triu: bool = False,
+    quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
 ) -> tuple[Tensor | None, Tensor | None]:
     """Return covariances R diag(s^2) R^T and their inverses, as gsplat's function of this name.
 

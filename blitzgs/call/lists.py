@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from blitzgs.call.extras import Pixels
 from blitzgs.call.groups import CUDA_TILE_SIZE
-from blitzgs.call.pixels import Pixels
 from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 

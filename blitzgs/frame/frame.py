@@ -32,13 +32,7 @@ from blitzgs.frame.transport import (
 )
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.intersect import TileGrid
-from blitzgs.ops.projection_types import (
-    ProjectedSplats,
-    ProjectionInputs,
-    ProjectionOptions,
-    Sizes,
-    Splats,
-)
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions, Sizes, Splats
 from blitzgs.ops.rasterize import RasterizeSaved
 from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients
 from blitzgs.table.table import GaussianTable

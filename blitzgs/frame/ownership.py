@@ -160,11 +160,7 @@ class TileOwners:
         return TileRanges(bounds, len(keys), width, height, tile_size, halo)
 
     def record(
-        self,
-        keys: Sequence[Hashable],
-        tile_work: Tensor,
-        ranges: TileRanges,
-        parts: Tensor | None = None,
+        self, keys: Sequence[Hashable], tile_work: Tensor, ranges: TileRanges, parts: Tensor | None = None
     ) -> HostSum:
         """Store the costs of a batch's tiles for divisions from the batch after the next on. Collective.
 

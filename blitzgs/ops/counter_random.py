@@ -72,7 +72,6 @@ def sampling_keys(weights: Tensor, ids: Tensor, seed: int, event: int) -> Tensor
     Args:
         weights: float32 [N], >= 0; zero gives an infinite key, never chosen while a positive one remains.
         ids: int64 [N], persistent.
-        seed: of the run.
         event: number that differs between draws.
 
     Returns:

@@ -43,7 +43,6 @@ def splat_contributions(
         splat_opacities: [P].
         isect_splats: int32 [I], from `blitzgs.ops.intersect.intersect`.
         tile_offsets: int64 [B * T + 1], likewise.
-        n_cameras: number of views B.
         width: of every view, pixels.
         height: of every view, pixels.
         tile_size: edge of a tile in pixels, as given to ``intersect``; 16 on CUDA.
@@ -170,7 +169,6 @@ def pixel_splats(
         splat_opacities: [P].
         isect_splats: int32 [I], from :func:`blitzgs.ops.intersect.intersect`.
         tile_offsets: int64 [B * T + 1], likewise.
-        n_cameras: number of views B.
         width: of every view, pixels.
         height: of every view, pixels.
         tile_size: edge of a tile in pixels, as given to ``intersect``; 16 on CUDA.

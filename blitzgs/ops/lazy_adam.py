@@ -82,12 +82,7 @@ class AdamSchedule(AdamTables):
     """
 
     def __init__(
-        self,
-        lr_table: Tensor,
-        beta1: float,
-        beta2: float,
-        eps: float,
-        dtype: torch.dtype = torch.float32,
+        self, lr_table: Tensor, beta1: float, beta2: float, eps: float, dtype: torch.dtype = torch.float32
     ) -> None:
         """Make the tables.
 
@@ -196,11 +191,7 @@ class GrowingSchedule(AdamTables):
 
 
 def lazy_adam_step_(
-    state: AdamState,
-    schedule: AdamTables,
-    step: int,
-    grads: Sequence[Tensor],
-    ids: Tensor | None,
+    state: AdamState, schedule: AdamTables, step: int, grads: Sequence[Tensor], ids: Tensor | None
 ) -> None:
     """Take Adam step ``step`` for the rows `ids`, in place, after the zero-gradient steps they skipped.
 
@@ -225,11 +216,7 @@ def lazy_adam_step_(
 
 
 def lazy_adam_catch_up_(
-    state: AdamState,
-    schedule: AdamTables,
-    step: int,
-    ids: Tensor | None = None,
-    count: Tensor | None = None,
+    state: AdamState, schedule: AdamTables, step: int, ids: Tensor | None = None, count: Tensor | None = None
 ) -> None:
     """Apply the missed zero-gradient steps up to ``step`` to the rows `ids` (None: all), in place.
 

@@ -108,21 +108,16 @@ def photometric_fwd_bwd(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the sums of `photometric_sums` and the gradient of their weighted total, without autograd.
 
-    The sums are returned as K partial sums; `report_` adds them up later, off the critical path of a step.
-    The gradient equals that of `photometric_sums`, but it is defined only at the owned pixels.
+    Further arguments are those of `photometric_sums`. The sums are returned as K partial sums; `report_` adds
+    them up later, off the critical path of a step. The gradient equals that of `photometric_sums`, but it is
+    defined only at the owned pixels.
 
     For the loss of `photometric_loss`, summed over views: ``l1_weights = 1 - w``, ``ssim_weights = -w`` and
     ``samples = pixel_counts(renders, masks)``.
 
     Args:
-        renders: as in `photometric_sums`.
-        targets: as in `photometric_sums`.
-        masks: as in `photometric_sums`.
         l1_weights: [B], weight of each view's L1 sum, dtype of `renders`.
         ssim_weights: [B], weight of each view's SSIM sum.
-        tile_size: as in `photometric_sums`.
-        tile_begin: as in `photometric_sums`.
-        tile_end: as in `photometric_sums`.
         samples: [B], divisors of the weights, dtype of `renders`; None: 1.
         visible: int64 [B], number of Gaussians visible in each view.
         scale_weight: weight of L_scale, a view's mean smallest axis of its visible Gaussians; only used to

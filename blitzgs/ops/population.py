@@ -90,7 +90,6 @@ def position_noise_(
         opacities: [N], logits.
         ids: int64 [N], persistent.
         visible_ids: int32 [U], the rows to move, each once.
-        seed: seed of the run.
         step: optimiser step; each step draws other numbers.
         threshold: opacity at which the noise falls to a half, in [0, 1].
         strength: inverse length in the unit of the means.

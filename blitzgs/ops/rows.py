@@ -70,10 +70,7 @@ def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
 
 
 def full_gradients(
-    ids: Tensor,
-    gradients: Sequence[Tensor | None],
-    shapes: Sequence[torch.Size],
-    sparse: Sequence[bool],
+    ids: Tensor, gradients: Sequence[Tensor | None], shapes: Sequence[torch.Size], sparse: Sequence[bool]
 ) -> list[Tensor | None]:
     """Return the gradients of whole parameters from those of their rows `ids`, as sparse or dense tensors.
 

@@ -65,7 +65,6 @@ def relocate(
         growth: share of the population that the event adds.
         time: time of the event, in images.
         step: the latest optimiser step; new rows are current up to it.
-        seed: seed of the run.
         ranks: the job, whose tables together are the population; every rank calls this.
         extent: extent of the scene, in the unit of the means; only used for the lineage's features.
         level_count: number of octree levels; only used for the lineage's features.
@@ -144,7 +143,6 @@ def draw(weights: Tensor, total: int, count: int, ids: Tensor, seed: int, time: 
         total: sum of the weights of all ranks.
         count: below 2^31.
         ids: int64 [N_rank], persistent.
-        seed: seed of the run.
         time: time of the event, in images.
         ranks: the job; every rank calls this.
 

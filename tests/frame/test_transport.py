@@ -11,9 +11,9 @@ from blitzgs.frame import frame as pipeline
 from blitzgs.frame.run import run
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.frame.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport, peer
+from blitzgs.frame.transport.collective import CollectiveWayBack
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT
 from blitzgs.frame.transport.protocol import CapacityEstimate, Traffic
-from blitzgs.frame.transport.way_back import CollectiveWayBack
 from blitzgs.ops.exchange import scatter_splats
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project_splats

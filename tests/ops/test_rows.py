@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import blitzgs.call.finite  # noqa: F401  (registers the fake kernel)
-from blitzgs.ops.arrange_splats import Places
+from blitzgs.call.layout import Places
 from blitzgs.ops.exchange import RUN, gather_splats, scatter_splats
 from blitzgs.ops.projection_types import first_rows
 from blitzgs.ops.rows import KeptMarks, distinct_rows, sparse_rows
