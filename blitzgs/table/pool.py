@@ -1,17 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training beyond the memory of a GPU: keeps the blocks that views need in a pool on the device.
 
-The whole table is in host memory. A `Pool` holds blocks of it on the device: a smaller table with the same
-columns, whose slots hold blocks of 256 rows of the host's table for a while. No result depends on a row's
-position, so the ops work on the pool as they would on the table.
-
-The order of the training views is known. Before a step begins, the bounds of all blocks, which stay on the
-device, are tested against the views of that step and of the next ones (`seen_blocks`). While the step runs, a
-second stream loads the blocks that the next step sees into the slots of the blocks that are needed last. The
-bounds of a block change only when a step moves its rows, and the blocks of the present step keep their slots
-until it has ended. The result of the test is therefore still right after the step. If the blocks of both
-steps do not fit together, the next step loads its remaining blocks when it begins. Blocks of the steps after
-the next one come early where that evens out the traffic.
+A `Pool` is a smaller table with the columns of the host's, whose slots hold blocks of 256 rows for a while
+(docs/design/training.md). The bounds of a block change only when a step moves its rows, and the blocks of the
+present step keep their slots until it has ended, so what `seen_blocks` finds before a step is still right
+after it. If the blocks of this step and the next do not fit together, the next one loads the rest when it
+begins; blocks of later steps come early where that evens out the traffic.
 """
 
 from __future__ import annotations

@@ -153,7 +153,7 @@ def return_sums(sums: Tensor, places: Tensor, traffic: Traffic, ranks: Ranks) ->
         if group.shape[0] == 0:
             continue
         # The splats of a run are consecutive. `runs` has the position of the first one, and bits that tell
-        # which splats of the run were sent (csrc/scatter).
+        # which splats of the run were sent (csrc/exchange/places.h).
         here = runs[:, None] >> (32 + lanes) & 1
         at = (runs[:, None] & 0xFFFFFFFF) + here.cumsum(1) - here
         # Splats that were not sent take any row, times zero: leaving them out would need their number, for
