@@ -125,7 +125,6 @@ def check_further(
 
     Args:
         function: name of the public function.
-        further: the arguments by name.
         defaults: the names and the only values that the function takes.
 
     Raises:
@@ -200,7 +199,6 @@ def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]
     """Check that arguments are tensors on one device, all float32 or all float64.
 
     Args:
-        required: arguments by name.
         optional: further arguments by name, which may be None.
 
     Raises:

@@ -37,7 +37,6 @@ def checked_signals(values: Tensor, sh_degree: int | None, batch: tuple[int, ...
     Args:
         values: `extra_signals` of `blitzgs.rasterization`.
         sh_degree: its `extra_signals_sh_degree`.
-        batch: the batch dimensions.
         C: number of views of each scene.
         N: number of Gaussians of each scene.
 
@@ -85,7 +84,6 @@ def checked_pixels(pixels: Tensor, image_ids: Tensor | None, images: int, width:
     Args:
         pixels: integers [M, 2], (row, column).
         image_ids: integers [M], the image of each pixel, counted through all batch dimensions; None: 0.
-        images: number of images.
         width: px.
         height: px.
 

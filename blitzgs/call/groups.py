@@ -91,7 +91,6 @@ def gathered_groups(groups: Sequence[Group], sh: ShTables) -> list[Group]:
 
     Args:
         groups: of one scene, without SH.
-        sh: the SH.
     """
     ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
     sh.before(ids, None)
@@ -118,7 +117,6 @@ def project_groups(groups: Sequence[Group], sparse_grad: bool) -> ProjectedSplat
     """Return the splats of all images, those of a group after those of the groups before.
 
     Args:
-        groups: the groups to project.
         sparse_grad: see `blitzgs.ops.project.project`.
 
     Returns:
@@ -222,7 +220,6 @@ def render_queued(
 
     Args:
         inputs: inputs of `project_splats`.
-        gaussians: the Gaussians and views.
         image: options of compositing.
         plain: whether the colours that the projection computes are all channels.
         tables: the SH, if they are not part of `inputs`.

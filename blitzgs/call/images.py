@@ -48,7 +48,6 @@ def render(
 
     Args:
         function: name of the public function, for warnings.
-        gaussians: the Gaussians and views.
         project: options of the projection.
         image: options of compositing.
         tables: the SH, if only the rows of visible Gaussians are read; only where `groups_may_be_queued`.
@@ -154,7 +153,6 @@ def _nan_or_zero(scene: Scene, valued: bool, signals: Signals | None) -> Tensor:
     """Return [N]: NaN for a Gaussian with a colour or signal, in some view, that is not finite, 0 for others.
 
     Args:
-        scene: the scene.
         valued: whether its colours are values.
         signals: describes its extra signals.
     """

@@ -156,9 +156,7 @@ def make_meta(
 
     Args:
         gaussians: the checked arguments of the call.
-        layout: arrangement of the splats.
         known: the rendered columns in this arrangement, and further images.
-        lists: the tile lists.
         lead: batch dimensions, and the number of views that are rendered here.
         arrived: the splats that `lists` refers to, if ranks have exchanged splats; None: those of `layout`.
     """

@@ -167,7 +167,6 @@ class TileOwners:
         On CUDA the host does not wait for a batch whose losses it has read.
 
         Args:
-            keys: the B views.
             tile_work: int32 [B * T], number of list entries that were composited in each tile.
             ranges: the tiles of each rank; the cost of a tile is that measured by its owner.
             parts: float64 [B, K, 2], sums of this rank's loss, which are sent together with the costs.

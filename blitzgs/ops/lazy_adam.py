@@ -322,7 +322,6 @@ def project_bwd_step_(
         views: the views that the splats were projected into, and the weights of regularisers.
         splats: the P splats that `project` returned for these parameters and views.
         options: the options of the projection; scales and opacities are taken before their activation.
-        gradients: of the splats.
         level: uint8 [N], octree levels, if opacities fade with them (`options.fade`).
         means2d_sums: [P, 2], receives the gradient of `splats.means2d` if `gradients` has a part per rank.
 

@@ -98,7 +98,6 @@ def _gradients(
     """Return the gradients of viewmats and of all gaussians, or of the tables, if they are needed.
 
     Args:
-        ctx: from `_save`.
         needed: which of means, quats, scales, opacities and the given parts of SH need a gradient.
         need_viewmats: whether viewmats need a gradient.
         sparse: which of these gradients are to be sparse.
@@ -311,11 +310,7 @@ def gaussian_tensors(
 
 
 def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
-    """Project as `project` does, with grouped arguments, without gradients. Wait for the number of splats.
-
-    Args:
-        inputs: the inputs of the projection.
-    """
+    """Project as `project` does, with grouped arguments, without gradients. Wait for the number of splats."""
     with below_autograd():
         projected = inputs.run(None)
         return splats_of(projected.splats, Sizes(*to_host(projected.totals)[:3].tolist()))
@@ -330,7 +325,6 @@ def differentiable_splats(
     """Project as `project` does, with grouped arguments.
 
     Args:
-        inputs: the inputs of the projection.
         sparse_grad: see `project`.
         splats: the result of `project_splats` for these inputs, if it is already known.
         rows: the visible rows of these inputs, if `splats` got their colours from them.

@@ -109,7 +109,6 @@ def sweep(
         batches: the views, each once, in the same batches on every rank.
         n_views: V, columns of the cull matrix.
         options: how the views are rendered.
-        ranks: the job.
         owners: divides the tiles by their costs; the result does not depend on it.
         rule: rule of the score.
         lod: leaves Gaussians out of views as rendering does; there they contribute nothing and hide nothing.

@@ -212,7 +212,6 @@ class Pool:
         """Load the blocks that the views of a step see into the pool.
 
         Args:
-            step: number of the step.
             cameras: views of this step and of the following steps, in order, at most 32.
             batch_size: views per step.
 

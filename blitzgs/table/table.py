@@ -363,7 +363,6 @@ class GaussianTable:
 
         Args:
             destination_ranks: int64 [N], the rank each row goes to.
-            ranks: the job's ranks.
         """
         order = torch.argsort(destination_ranks, stable=True)
         counts = torch.bincount(destination_ranks, minlength=ranks.world_size)

@@ -144,7 +144,6 @@ def return_sums(sums: Tensor, places: Tensor, traffic: Traffic, ranks: Ranks) ->
         sums: int64 [R, C], sums of the splats that arrived here.
         places: positions of this rank's own splats among those that it sent.
         traffic: numbers of splats sent between the ranks.
-        ranks: the job.
     """
     returned = ranks.all_to_all(sums, traffic.received, traffic.sent)
     total = sums.new_zeros(traffic.own.splats, sums.shape[1])
