@@ -205,7 +205,8 @@ def rank_rows(file: Json) -> Rows:
         for i, (phase, base) in enumerate(zip(run["phases"], one["phases"], strict=False), 1):
             rates = phase["median_images_per_second"], base["median_images_per_second"]
             row[f"median in phase {i}"] = cell(*rates)
-        row["decoded by rank 0"] = f"{run['image_memory']['decoded']:,}"
+        row["set-up, s"] = f"{run['wall']['set_up']:.1f}"
+        row["start to end, s"] = text(run["wall"].get("evaluated"), ".0f")
         rows.append(row | {"peak GB of a GPU": gb(run["population"]["peak_memory_bytes"])})
     return rows
 

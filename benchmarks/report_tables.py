@@ -28,7 +28,7 @@ class Section:
     origin: bool = True
 
 
-QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
+QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "corrected", "training PSNR / SSIM", "seconds", "Gaussians")
 ABLATION_COLUMNS = (
     "scene", "arm", "seeds", "PSNR", "corrected PSNR", "SSIM", "peak M", "final M", "peak GB"
 )  # fmt: skip
