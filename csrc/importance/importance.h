@@ -18,11 +18,23 @@
 #include <cstdint>
 
 #include "common/kernel.h"
-#include "rasterize/rasterize.h"
+#include "math/tiles.h"
 
 namespace blitzgs {
 
 inline constexpr std::int64_t kContributionScale = std::int64_t{1} << 32;  // the number of units in 1
+
+template <class T>
+struct ContributionInput {
+  const T* means2d;
+  const T* conics;
+  const T* opacities;
+  const std::int32_t* isect_splats;
+  const std::int64_t* tile_offsets;
+  std::int64_t n_splats;
+  TileGrid grid;
+  const std::int64_t* known_splats = nullptr;  // null, or the number of splats (common/kernel.h; CUDA only)
+};
 
 struct ContributionSums {
   std::int64_t* weights;
@@ -31,9 +43,8 @@ struct ContributionSums {
 };
 
 namespace BLITZGS_BACKEND {
-// The input has no colours.
 template <class T>
-void contributions(const RasterizeInput<T>& in, const ContributionSums& sums, Workspace&, CudaStream);
+void contributions(const ContributionInput<T>& in, const ContributionSums& sums, Workspace&, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -31,9 +31,12 @@ std::tuple<Tensor, Tensor, Tensor> contributions(const Tensor& means2d, const Te
   Tensor squares = make_empty(means2d, {with_squares ? splats.n_splats : 0}, ScalarType::Long);
   DeviceScope scope(means2d);
   dispatch_floating(means2d, [&]<class T>() {
+    const RasterizeInput<T> in = splats.input<T>();
     const ContributionSums sums{mutable_data<std::int64_t>(weights), mutable_data<std::int32_t>(pixels),
                                 with_squares ? mutable_data<std::int64_t>(squares) : nullptr};
-    backend::contributions(splats.input<T>(), sums, scope.workspace, scope.stream);
+    backend::contributions(ContributionInput<T>{in.means2d, in.conics, in.opacities, in.isect_splats,
+                                                in.tile_offsets, in.n_splats, in.grid, in.known_splats},
+                           sums, scope.workspace, scope.stream);
   });
   return {weights, pixels, squares};
 }

@@ -22,10 +22,9 @@ struct Pair {
 
   void survey(std::int64_t tile_begin, std::int64_t tile_end, bool with_squares = true) {
     const TileGrid grid = make_tile_grid(1, 20, 12, 16, tile_begin, tile_end);
-    cpu::contributions<T>({means2d.data(), conics.data(), opacities.data(), nullptr, nullptr, splats.data(),
-                           offsets.data(), 2, 0, grid},
-                          {weights.data(), pixels.data(), with_squares ? squares.data() : nullptr}, workspace,
-                          nullptr);
+    cpu::contributions<T>(
+        {means2d.data(), conics.data(), opacities.data(), splats.data(), offsets.data(), 2, grid},
+        {weights.data(), pixels.data(), with_squares ? squares.data() : nullptr}, workspace, nullptr);
   }
 };
 

@@ -48,6 +48,10 @@ void copy_rows(const CopyRows& copy, CudaStream) {
   });
 }
 
+void sampling_keys(const SamplingKeys& args, CudaStream) {
+  parallel_rows(args.n, 1 << 12, [&](std::int64_t i) { args.keys[i] = sampling_key(args, i); });
+}
+
 void key_histogram(const KeyHistogram& args, CudaStream) {
   std::fill_n(args.counts, std::int64_t{1} << args.width, 0);
   for (std::int64_t i = 0; i < args.n; ++i) {

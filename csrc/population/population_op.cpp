@@ -113,9 +113,9 @@ Tensor sampling_keys(const Tensor& weights_in, const Tensor& ids_in, std::int64_
                ids = checked(kOp, "ids", ids_in, ScalarType::Long, {weights.size(0)});
   Tensor keys = make_empty(weights, {weights.size(0)});
   DeviceScope scope(weights);
-  backend::for_each_row(SamplingKeys{data<float>(weights), data<std::int64_t>(ids), weights.size(0), seed,
-                                     event, mutable_data<float>(keys)},
-                        scope.stream);
+  backend::sampling_keys({data<float>(weights), data<std::int64_t>(ids), weights.size(0), seed, event,
+                          mutable_data<float>(keys)},
+                         scope.stream);
   return keys;
 }
 

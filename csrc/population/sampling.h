@@ -26,12 +26,12 @@ struct SamplingKeys {
   const std::int64_t* ids;
   std::int64_t n, seed, event;
   float* keys;
-
-  BLITZGS_HD void operator()(std::int64_t i) const {
-    const std::uint64_t hash = hash_key(hash_key(hash_key(0, seed), event), ids[i]);
-    keys[i] = static_cast<float>(-std::log(uniform_of(hash)) / static_cast<double>(weights[i]));
-  }
 };
+
+BLITZGS_HD float sampling_key(const SamplingKeys& args, std::int64_t i) {
+  const std::uint64_t hash = hash_key(hash_key(hash_key(0, args.seed), args.event), args.ids[i]);
+  return static_cast<float>(-std::log(uniform_of(hash)) / static_cast<double>(args.weights[i]));
+}
 
 constexpr int kMaxDigitBits = 11;
 
@@ -59,6 +59,7 @@ BLITZGS_HD int digit_of(const KeyHistogram& args, std::int64_t prefix, float key
 }
 
 namespace BLITZGS_BACKEND {
+void sampling_keys(const SamplingKeys&, CudaStream);
 void key_histogram(const KeyHistogram&, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
