@@ -10,7 +10,7 @@ from torch import Tensor
 
 from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.knn_distances import knn_distances
-from blitzgs.ops.voxel_keys import CELL_BITS, voxel_keys
+from blitzgs.ops.population import CELL_BITS, voxel_keys
 
 # A Gaussian is large if so few of the well-seen ones are larger.
 _LARGE = 0.99

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.knn_distances import knn_distances
-from blitzgs.ops.voxel_keys import CELL_BITS, voxel_keys
+from blitzgs.ops.population import CELL_BITS, voxel_keys
 from blitzgs.table.table import GaussianTable, opacity_logit
 from blitzgs.view.levels import Levels
 from blitzgs.view.point_blocks import BLOCK_POINTS, PAIRS_OF_POINTS, PointBlocks

@@ -24,7 +24,7 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import decimal_share, smallest
 from blitzgs.ops.counter_random import uniform
-from blitzgs.ops.tree_sums import tree_sums
+from blitzgs.ops.population import tree_sums
 from blitzgs.spawn.candidates import FEATURES, Candidates
 from blitzgs.util.output import check_replaceable, write_file
 

@@ -1,17 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training beyond the memory of a GPU: keeps the blocks that views need in a pool on the device.
 
-The whole table is in host memory. A `Pool` holds blocks of it on the device: a smaller table with the same
-columns, whose slots hold blocks of 256 rows of the host's table for a while. No result depends on a row's
-position, so the ops work on the pool as they would on the table.
-
-The order of the training views is known. Before a step begins, the bounds of all blocks, which stay on the
-device, are tested against the views of that step and of the next ones (`seen_blocks`). While the step runs, a
-second stream loads the blocks that the next step sees into the slots of the blocks that are needed last. The
-bounds of a block change only when a step moves its rows, and the blocks of the present step keep their slots
-until it has ended. The result of the test is therefore still right after the step. If the blocks of both
-steps do not fit together, the next step loads its remaining blocks when it begins. Blocks of the steps after
-the next one come early where that evens out the traffic.
+A `Pool` is a smaller table with the columns of the host's, whose slots hold blocks of 256 rows for a while
+(docs/design/training.md). The bounds of a block change only when a step moves its rows, and the blocks of the
+present step keep their slots until it has ended, so what `seen_blocks` finds before a step is still right
+after it. If the blocks of this step and the next do not fit together, the next one loads the rest when it
+begins; blocks of later steps come early where that evens out the traffic.
 """
 
 from __future__ import annotations
@@ -24,9 +18,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.ops.blocks import BLOCK_ROWS
+from blitzgs.ops.blocks import BLOCK_ROWS, swap_blocks_
 from blitzgs.ops.host import to_device
-from blitzgs.ops.pool import swap_blocks_
 from blitzgs.table.block_visibility import UNSEEN, BlockVisibility, Cameras, culled_blocks
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.host_table import HostTable
@@ -221,7 +214,6 @@ class Pool:
         """Load the blocks that the views of a step see into the pool.
 
         Args:
-            step: number of the step.
             cameras: views of this step and of the following steps, in order, at most 32.
             batch_size: views per step.
 
@@ -371,10 +363,7 @@ class Pool:
     # --- Moves --------------------------------------------------------------------------------------------
 
     def _move(
-        self,
-        slots: npt.NDArray[np.int64],
-        coming: npt.NDArray[np.int64],
-        after: torch.cuda.Event | None,
+        self, slots: npt.NDArray[np.int64], coming: npt.NDArray[np.int64], after: torch.cuda.Event | None
     ) -> None:
         """Queue a swap behind an event: write the slots' blocks back and load `coming`; -1: load none."""
         if len(slots) == 0:

@@ -5,7 +5,6 @@
 #include <vector>
 
 #include "common/catch.h"
-#include "common/test_workspace.h"
 #include "population/density_stats.h"
 #include "population/knn.h"
 

@@ -15,6 +15,7 @@ from blitzgs.frame import frame as pipeline
 from blitzgs.frame.run import run
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.frame.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport, peer
+from blitzgs.frame.transport.collective import CollectiveWayBack
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT
 from blitzgs.frame.transport.protocol import (
     CapacityEstimate,
@@ -25,11 +26,10 @@ from blitzgs.frame.transport.protocol import (
     Transport,
     unmarked,
 )
-from blitzgs.frame.transport.way_back import CollectiveWayBack
+from blitzgs.ops.exchange import scatter_splats
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Sizes
-from blitzgs.ops.scatter import scatter_splats
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.distributed.rank_harness import run_ranks
 from tests.frame.test_sharded_rendering import OPTIONS, cameras

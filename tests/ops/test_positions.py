@@ -10,8 +10,7 @@ from scipy.spatial import cKDTree
 
 from blitzgs.ops.counter_random import hash_keys, normal, uniform
 from blitzgs.ops.knn_distances import knn_distances
-from blitzgs.ops.position_noise import position_noise_
-from blitzgs.ops.voxel_keys import voxel_keys
+from blitzgs.ops.population import position_noise_, voxel_keys
 from blitzgs.population.density import rotations
 from tests.helpers import DEVICES
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs.ops.blocks import BLOCK_ROWS
-from blitzgs.ops.pool import seen_blocks
+from blitzgs.ops.blocks import BLOCK_ROWS, seen_blocks
 from blitzgs.table import block_visibility, host_table
 from blitzgs.table.block_visibility import BlockVisibility, Cameras, culled_blocks
 from blitzgs.table.blocks import BlockIndex
