@@ -28,8 +28,10 @@ from torch.distributed import PrefixStore, TCPStore  # type: ignore[attr-defined
 EXIT_STUCK = 75  # EX_TEMPFAIL: a restart may help
 # How long a rank continues to wait after another rank has reported a failure.
 GRACE_SECONDS = 4.0
-# How long a rank waits until it names those that have not arrived, and for a rank that no longer publishes.
+# How long a rank waits until it names those that have not arrived.
 PATIENCE_SECONDS = 20.0
+# How long a rank waits for one that no longer publishes, which a long call into C++ may keep it from.
+SILENCE_SECONDS = 60.0
 # Longest time that ranks wait for a rank that keeps publishing and has announced its work.
 BUSY_SECONDS = 3600.0
 
@@ -268,8 +270,8 @@ class Watchdog:
                 # A failed rank will not arrive at any collective. Gloo may still report that first.
                 if waited > GRACE_SECONDS and self._first_failure():
                     limit = min(limit, GRACE_SECONDS)
-                elif any(self._silence(rank) > PATIENCE_SECONDS for rank in self._heard):
-                    limit = min(limit, PATIENCE_SECONDS)
+                elif any(self._silence(rank) > SILENCE_SECONDS for rank in self._heard):
+                    limit = min(limit, SILENCE_SECONDS)
                 if limit < waited < BUSY_SECONDS and not self._first_failure() and self._waits_for_work():
                     self._excused = time.monotonic()
                 # A rank that has finished its work needs some time to arrive and to publish that.

@@ -116,7 +116,7 @@ def test_ranks_share_gpus_only_when_told(monkeypatch):
 
 def _fail(ranks, how):
     if how == "stop":  # a host that is gone closes no connection
-        watchdog.PATIENCE_SECONDS = 3.0
+        watchdog.PATIENCE_SECONDS = watchdog.SILENCE_SECONDS = 3.0
     ranks.barrier()
     if ranks.rank == 1:
         if how == "raise":
