@@ -29,7 +29,7 @@ class Section:
 
 
 QUALITY_COLUMNS = (
-    "recipe", "images", "seeds", "PSNR", "SSIM", "corrected", "training PSNR / SSIM", "seconds", "Gaussians",
+    "recipe", "images", "PSNR", "SSIM", "corrected", "training PSNR / SSIM", "seconds",
 )  # fmt: skip
 ABLATION_COLUMNS = (
     "scene", "arm", "seeds", "PSNR", "corrected PSNR", "SSIM", "peak M", "final M", "peak GB"
