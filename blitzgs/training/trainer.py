@@ -89,7 +89,7 @@ class Trainer:
         self._warned_of_masks = False
         self._watching: Watching | None = None
         self._watched_on = False
-        self._memory: list[int] = []  # samples of what this rank's GPU has allocated
+        self.memory: list[int] = []  # samples of what this rank's GPU has allocated
 
     def watch(self, watcher: Watcher | None, stays: bool = False) -> None:
         """Let somebody watch the training; every rank calls this before `train`, rank 0 with a watcher.
@@ -273,7 +273,7 @@ class Trainer:
         state.log.advance(end)
         if is_logged:
             if state.ranks.device.type == "cuda":
-                self._memory.append(run_files.memory_bytes(state.ranks.device))
+                self.memory.append(run_files.memory_bytes(state.ranks.device))
             if not self._writes_late:
                 self._write_record()
         if is_logged or step == schedule.steps:
@@ -370,7 +370,7 @@ class Trainer:
             raise ModelLostError("no Gaussian is left: do the poses and the points belong together?")
         with state.stage("final_checkpoint"):
             save.run_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
-        population = population_report(state, self._memory)
+        population = population_report(state, self.memory)
         state.log.event(state.images_seen, "population", population, describe(population))
         images = state.images.memory()
         state.log.event(state.images_seen, "image_memory", dataclasses.asdict(images), str(images))
