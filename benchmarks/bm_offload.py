@@ -89,7 +89,7 @@ class Survey:
         sizes, tour = [0] * len(cameras), tour_of(cameras, points)
         self.orders = {
             "random": BatchSampler(sizes, batch_size, seed=0),
-            "tour": BatchSampler(sizes, batch_size, 0, tour),
+            "tour": BatchSampler(sizes, batch_size, seed=0, tour=tour),
             "flight": FlightOrder(sizes, batch_size, seed=0),
         }
         shape = (batch_size, scene.height, scene.width, 3)

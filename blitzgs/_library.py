@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from blitzgs import _fakes
 from blitzgs._built import LIBRARY_DIR, REGISTRATION, schema_digest, source_digest
 from blitzgs._torch import below_autograd
 
@@ -55,3 +56,4 @@ def without_autograd(op: Callable[..., Any]) -> Callable[..., Any]:
 
 
 load_libraries()
+_fakes.register()

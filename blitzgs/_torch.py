@@ -31,6 +31,11 @@ def current_stream_numbers(device_index: int) -> tuple[int, int, int]:
     return numbers
 
 
+def arguments_of(op: Any) -> dict[str, Any]:
+    """Return the arguments of an overload of an op, in their order, with their defaults; None: no default."""
+    return {argument.name: argument.default_value for argument in op._schema.arguments}
+
+
 def refusing_derivatives(
     message: str, tensors: Sequence[Tensor], inputs: Sequence[Tensor]
 ) -> tuple[Tensor, ...]:

@@ -2,8 +2,8 @@
 // The signatures of all ops of BlitzGS. Letters: N Gaussians, B views, P projected splats (pairs of a
 // Gaussian and a view), U Gaussians visible in at least one view, I splat-tile intersections, D channels,
 // K = (degree + 1)^2 SH coefficients. An argument n_splats, int64 [1], says how many of the P splats are
-// valid. csrc/<op>/<op>.h defines what an op computes; blitzgs/ops/<op>.py has its Python function, fake
-// kernel and autograd.
+// valid. A header of csrc/ defines what an op computes; blitzgs/ops/ has its Python function and autograd,
+// and blitzgs/_fakes.py its fake kernel.
 #include <torch/csrc/stable/library.h>
 
 #include <cstdint>
@@ -268,7 +268,6 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def("find_non_finite(Tensor[] columns, Tensor[] nonzero) -> Tensor");
 
   // Scene initialisation.
-  m.def("voxel_keys(Tensor points, float[] origin, float voxel_size) -> Tensor");
   m.def("knn_distances(Tensor points, int k) -> Tensor");
 }
 

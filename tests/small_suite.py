@@ -93,7 +93,6 @@ TESTS = [
         "render.py::test_images_are_those_of_lists_and_compositing[True-cuda-float32]",
         "rows.py::test_columns_are_at_their_places_and_come_back[700-False-cuda]",
         "rows.py::test_entries_without_a_splat_have_the_values_of_their_gaussians[cuda]",
-        "positions.py::test_voxel_keys_matches_the_formula[cuda-dtype2]",
     )),
     *(BLOCKS + test for test in (
         "no_visible_row_is_missed_and_most_others_are_dropped[0-cuda]",

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from blitzgs._torch import func_transforms_are_active
 from blitzgs.call.covariances import Decomposed, decompose
-from blitzgs.call.signals import NORMAL_CHANNELS, Signals, checked_signals
+from blitzgs.call.extras import NORMAL_CHANNELS, Signals, checked_signals
 from blitzgs.capture.cameras import MAX_SIDE
 from blitzgs.ops.harmonics import MAX_SH_DEGREE, colors_of_views
 
@@ -27,21 +27,11 @@ DEFAULT_TILE_SIZE = 16
 _MAX_CHANNELS = 4096
 # Further arguments of gsplat's calls (1.5.3 and later) and their defaults; no other values are supported.
 GSPLAT_DEFAULTS: dict[str, Any] = {
-    "with_ut": False,
-    "with_eval3d": False,
-    "global_z_order": True,
-    "rays": None,
-    "radial_coeffs": None,
-    "tangential_coeffs": None,
-    "thin_prism_coeffs": None,
-    "ftheta_coeffs": None,
-    "lidar_coeffs": None,
-    "external_distortion_coeffs": None,
-    "rolling_shutter": None,
-    "viewmats_rs": None,
-    "ut_params": None,
+    "with_ut": False, "with_eval3d": False, "global_z_order": True, "rays": None, "radial_coeffs": None,
+    "tangential_coeffs": None, "thin_prism_coeffs": None, "ftheta_coeffs": None, "lidar_coeffs": None,
+    "external_distortion_coeffs": None, "rolling_shutter": None, "viewmats_rs": None, "ut_params": None,
     "renderer_config": None,
-}
+}  # fmt: skip
 # Whole numbers: the least, the largest, and what an error says.
 _WHOLE = {
     "width": (1, MAX_SIDE, "1 to 2^20 px"),
@@ -52,20 +42,10 @@ _WHOLE = {
 _ANY = object()  # in place of a default: no value changes the result
 # The same for `blitzgs.raw_rasterization`, which has fewer of the arguments.
 RAW_DEFAULTS: dict[str, Any] = {
-    **GSPLAT_DEFAULTS,
-    "packed": True,
-    "distributed": False,
-    "camera_model": "pinhole",
-    "covars": None,
-    "return_normals": False,
-    "extra_signals": None,
-    "extra_signals_sh_degree": None,
-    "return_median": False,
-    "pixels": None,
-    "image_ids": None,
-    "channel_chunk": _ANY,
-    "segmented": _ANY,
-}
+    **GSPLAT_DEFAULTS, "packed": True, "distributed": False, "camera_model": "pinhole", "covars": None,
+    "return_normals": False, "extra_signals": None, "extra_signals_sh_degree": None, "return_median": False,
+    "pixels": None, "image_ids": None, "channel_chunk": _ANY, "segmented": _ANY,
+}  # fmt: skip
 
 
 class Scene(NamedTuple):
@@ -145,7 +125,6 @@ def check_further(
 
     Args:
         function: name of the public function.
-        further: the arguments by name.
         defaults: the names and the only values that the function takes.
 
     Raises:
@@ -220,7 +199,6 @@ def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]
     """Check that arguments are tensors on one device, all float32 or all float64.
 
     Args:
-        required: arguments by name.
         optional: further arguments by name, which may be None.
 
     Raises:

@@ -10,8 +10,7 @@ from torch import Tensor
 from torch.nn.functional import embedding
 
 from blitzgs.call.arguments import Gaussians
-from blitzgs.call.pixels import Pixels
-from blitzgs.call.signals import NORMAL_CHANNELS
+from blitzgs.call.extras import NORMAL_CHANNELS, Pixels
 from blitzgs.ops.harmonics import spherical_harmonics
 from blitzgs.ops.projection_types import ProjectedSplats
 
@@ -75,7 +74,6 @@ def channels_of(
     """Return the channels to composite, [P, channels].
 
     Args:
-        splats: the P splats.
         gaussians: the Gaussians, with colours and extra signals.
         image: which channels are rendered.
         with_spare: whether the last splats may be spare capacity, whose ids are undefined.
@@ -120,7 +118,6 @@ def _signals(splats: ProjectedSplats, gaussians: Gaussians, with_spare: bool) ->
     sum of Y_k(direction) c_k, plus 0.5. Differentiable in the signals and, for SH, in means and viewmats.
 
     Args:
-        splats: the splats.
         gaussians: with signals.
         with_spare: whether the last splats may be spare capacity, whose ids are undefined.
     """
@@ -143,7 +140,6 @@ def _normals(splats: ProjectedSplats, gaussians: Gaussians, sparse_grad: bool, w
     Differentiable in quats.
 
     Args:
-        splats: the splats.
         gaussians: the Gaussians, with rotations of any length.
         sparse_grad: whether the gradient of quats is sparse.
         with_spare: whether the last splats may be spare capacity, whose ids are undefined.

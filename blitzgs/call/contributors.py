@@ -1,14 +1,125 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which Gaussians each pixel shows: their number, all, or the strongest; gsplat's names and results."""
+"""What each Gaussian contributes to each view, and which Gaussians each pixel shows.
+
+The functions about pixels have gsplat's names and results.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from blitzgs.call.arguments import check_tensors
-from blitzgs.call.pixels import checked_pixels
-from blitzgs.ops.pixel_splats import PixelSplats, pixel_splats
+from blitzgs.call.arguments import check_options, check_tensors, gaussians_of
+from blitzgs.call.extras import checked_pixels
+from blitzgs.call.finite import check_intrinsics, warn_of_gradient, warn_of_non_finite
+from blitzgs.call.groups import CUDA_TILE_SIZE
+from blitzgs.ops.importance import UNITS, PixelSplats, pixel_splats, splat_contributions
+from blitzgs.ops.intersect import TileGrid
+from blitzgs.ops.project import project_splats
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
+
+# Views that are projected at once.
+_VIEWS = 8
+
+
+@torch.no_grad()
+def contributions(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    eps2d: float = 0.3,
+    rasterize_mode: str = "classic",
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the weight and the number of pixels of each Gaussian in each view (BlitzGS, section 3.2).
+
+    Both are summed over the pixels p of a view at which the renderer composites the Gaussian; alpha and the
+    transmittance T are the renderer's:
+
+        weight = sum of alpha_p T_p;    pixels = their number
+
+    Each alpha T enters as an integer number of 2^-32, so the sums are exact: on one device the result has the
+    same bits in every run. The arguments are those of `blitzgs.rasterization`. Not differentiable.
+
+    Args:
+        means: [N, 3], float32, or (CPU) float64; the other tensors share its dtype and device.
+        quats: [N, 4] (w, x, y, z), of any length; zero counts as the identity.
+        scales: [N, 3] standard deviations (after the exponential).
+        opacities: [N] in [0, 1] (after the sigmoid).
+        viewmats: [C, 4, 4] world to camera, a rotation and a translation; any number of views.
+        Ks: [C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1.
+        width: of every view, px.
+        height: of every view, px.
+        near_plane: Gaussians have z > near_plane, world units.
+        far_plane: Gaussians have z <= far_plane, world units.
+        eps2d: variance added to both screen axes, px^2.
+        rasterize_mode: "classic" or "antialiased".
+
+    Returns:
+        weights float64 [C, N]; pixels int64 [C, N]; visible bool [C, N]: in depth range, and the box around
+        its alpha >= 1/255 overlaps the image (gsplat's radii > 0). A Gaussian may be visible in this sense
+        and contribute to no pixel.
+
+    Warns:
+        RuntimeWarning: an argument has values that are NaN or infinite; the Gaussians or views that have them
+            contribute nothing.
+
+    Raises:
+        TypeError: an argument is not a tensor, or not the kind of number it should be; or the tensors are
+            neither float32 nor float64.
+        ValueError: an argument has a wrong shape or value, or another dtype or device than the others; the
+            message names it.
+        RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
+    """
+    check_options(
+        width, height, near_plane, far_plane, 0.0, eps2d, None, CUDA_TILE_SIZE, "D", rasterize_mode, "pinhole"
+    )
+    tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {})
+    if Ks.requires_grad:
+        warn_of_gradient("contributions")
+    if means.dim() != 2:
+        raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
+    gaussians = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, "D")
+    warn_of_non_finite(gaussians, "contributions", stacklevel=4)  # torch.no_grad is one more call
+    check_intrinsics([Ks])
+    shape = (len(viewmats), len(means))
+    weights = torch.zeros(shape, dtype=torch.float64, device=means.device)
+    pixels = torch.zeros(shape, dtype=torch.int64, device=means.device)
+    visible = torch.zeros(shape, dtype=torch.bool, device=means.device)
+    for begin in range(0, len(viewmats), _VIEWS):
+        views = slice(begin, begin + _VIEWS)
+        n_views = len(viewmats[views])
+        options = ProjectionOptions(
+            width, height, CUDA_TILE_SIZE, near_plane=near_plane, far_plane=far_plane, eps2d=eps2d,
+            antialiased=rasterize_mode == "antialiased", raw=False,
+        )  # fmt: skip
+        cameras = viewmats[views], Ks[views]
+        splats = project_splats(ProjectionInputs((means, quats, scales, opacities), cameras, options))
+        splat_weights, splat_pixels = _contributions_of_splats(splats, n_views, width, height)
+        at = splats.camera_ids.long() + begin, splats.gaussian_ids.long()
+        weights[at] = splat_weights.double() / UNITS
+        pixels[at] = splat_pixels.long()
+        visible[at] = True
+    return weights, pixels, visible
+
+
+def _contributions_of_splats(
+    splats: ProjectedSplats, n_views: int, width: int, height: int
+) -> tuple[Tensor, Tensor]:
+    """Return the weights and pixels of all splats of a projection."""
+    geometry = splats.means2d, splats.conics, splats.opacities
+    grid = TileGrid(n_views, width, height, CUDA_TILE_SIZE)
+    lists = torch.ops.blitzgs.intersect(
+        *geometry, splats.depths, splats.camera_ids, None, *grid, int(splats.counts[2]), None, True
+    )
+    return splat_contributions(*geometry, *lists, n_cameras=n_views, width=width, height=height)[:2]
 
 
 def rasterize_num_contributing_gaussians(
@@ -72,30 +183,14 @@ def rasterize_contributing_gaussian_ids(
 ) -> tuple[Tensor, Tensor]:
     """Return all Gaussians that each pixel composites, front to back, with their weights alpha T.
 
-    The result is as long as the longest list of a pixel, so choose `pixels` where the images are large.
-
-    Args:
-        means2d: as for `rasterize_num_contributing_gaussians`.
-        conics: likewise.
-        opacities: likewise.
-        tile_offsets: likewise.
-        flatten_ids: likewise.
-        image_width: px.
-        image_height: px.
-        tile_size: px.
-        num_contributing_gaussians: what `rasterize_num_contributing_gaussians` returned for the same pixels.
-        pixels: as for `rasterize_num_contributing_gaussians`.
-        image_ids: likewise.
+    The arguments and errors are those of `rasterize_num_contributing_gaussians`, and
+    `num_contributing_gaussians` is what that function returned for the same pixels. The result is as long as
+    the longest list of a pixel, so choose `pixels` where the images are large.
 
     Returns:
         Ids int32 [..., image_height, image_width, K] with K the largest number, then -1; and weights of this
         shape, then 0; [M, K] with `pixels`. Packed, ids number the entries of `meta`, whose Gaussians
         `meta["gaussian_ids"]` has; otherwise the N Gaussians.
-
-    Raises:
-        TypeError: as `rasterize_num_contributing_gaussians`.
-        ValueError: likewise.
-        RuntimeError: likewise.
     """
     most = int(num_contributing_gaussians.max()) if num_contributing_gaussians.numel() else 0
     return rasterize_top_contributing_gaussian_ids(
@@ -120,28 +215,11 @@ def rasterize_top_contributing_gaussian_ids(
 ) -> tuple[Tensor, Tensor]:
     """Return the Gaussians of the largest weights alpha T in each pixel, front to back.
 
-    Of equal weights, the Gaussians in front are returned.
-
-    Args:
-        means2d: as for `rasterize_num_contributing_gaussians`.
-        conics: likewise.
-        opacities: likewise.
-        tile_offsets: likewise.
-        flatten_ids: likewise.
-        image_width: px.
-        image_height: px.
-        tile_size: px.
-        num_depth_samples: number K of Gaussians of each pixel.
-        pixels: as for `rasterize_num_contributing_gaussians`.
-        image_ids: likewise.
+    The arguments and errors are those of `rasterize_num_contributing_gaussians`, and `num_depth_samples` is
+    the number K of Gaussians of each pixel. Of equal weights, the Gaussians in front are returned.
 
     Returns:
         Ids and weights, as `rasterize_contributing_gaussian_ids` returns them.
-
-    Raises:
-        TypeError: as `rasterize_num_contributing_gaussians`.
-        ValueError: likewise.
-        RuntimeError: likewise.
     """
     found, lead = _splats_of_pixels(
         means2d, conics, opacities, tile_offsets, flatten_ids, image_width, image_height, tile_size,

@@ -103,8 +103,6 @@ def shaped_by(splats: ProjectedSplats, inputs: ProjectionInputs, decomposed: Dec
 
     Args:
         splats: of the decomposed covariances.
-        inputs: of the projection.
-        decomposed: the covariances.
     """
     means, _, _, opacities, *_ = inputs.gaussians
     means, opacities, viewmats, Ks = (t.double() for t in (means, opacities, *inputs.cameras))

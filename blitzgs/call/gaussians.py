@@ -7,18 +7,13 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.knn_distances import knn_distances
-from blitzgs.ops.position_noise import position_noise_
-from blitzgs.ops.relocation import MAX_COPIES, overlap
+from blitzgs.ops.population import MAX_COPIES, overlap, position_noise_
 
 _TRIANGLE = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
 
 
 def quat_scale_to_covar_preci(
-    quats: Tensor,
-    scales: Tensor,
-    compute_covar: bool = True,
-    compute_preci: bool = True,
-    triu: bool = False,
+    quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
 ) -> tuple[Tensor | None, Tensor | None]:
     """Return covariances R diag(s^2) R^T and their inverses, as gsplat's function of this name.
 
@@ -64,7 +59,7 @@ def relocate(
     """Return opacity and scales for each of n Gaussians at one position that together look like one.
 
     ``o' = max(1 - (1 - o)^(1/n), min_opacity)`` and ``s' = s o / overlap(o', n)``, computed in float64
-    (3DGS-MCMC, Kheradmand et al. 2024, eq. 9; `blitzgs.ops.relocation.overlap`): gsplat's
+    (3DGS-MCMC, Kheradmand et al. 2024, eq. 9; `blitzgs.ops.population.overlap`): gsplat's
     `compute_relocation`, whose table of binomials is not needed. Not differentiable.
 
     Args:

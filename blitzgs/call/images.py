@@ -13,17 +13,21 @@ from torch import Tensor
 
 from blitzgs.call.arguments import Gaussians, Scene
 from blitzgs.call.channels import ImageOptions, channels_of, split_channels
-from blitzgs.call.finite import watch_for_non_finite
-from blitzgs.call.groups import Group, groups_may_be_queued, groups_of, project_groups
-from blitzgs.call.intrinsics import CamerasOnHost, check_intrinsics
+from blitzgs.call.extras import Pixels, Signals
+from blitzgs.call.finite import CamerasOnHost, check_intrinsics, watch_for_non_finite
+from blitzgs.call.groups import (
+    Group,
+    ShTables,
+    groups_may_be_queued,
+    groups_of,
+    project_groups,
+    render_queued,
+)
 from blitzgs.call.layout import Layout
 from blitzgs.call.lists import Lists, lists_of, lists_of_pixels
 from blitzgs.call.meta import make_meta
-from blitzgs.call.pixels import Pixels
-from blitzgs.call.queued import ShTables, render_queued
 from blitzgs.call.ranks import Job, send_splats
-from blitzgs.call.signals import Signals
-from blitzgs.ops.pixel_splats import pixel_splats
+from blitzgs.ops.importance import pixel_splats
 from blitzgs.ops.project import differentiable_splats
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import Through, rasterize
@@ -44,7 +48,6 @@ def render(
 
     Args:
         function: name of the public function, for warnings.
-        gaussians: the Gaussians and views.
         project: options of the projection.
         image: options of compositing.
         tables: the SH, if only the rows of visible Gaussians are read; only where `groups_may_be_queued`.
@@ -79,7 +82,9 @@ def render(
             columns = layout.gather(*arranged.values())
             rendered = splats._replace(**dict(zip(arranged, columns, strict=True)))
         else:
-            through = Through(layout.places, [arranged[name] for name in ("means2d", "conics", "opacities")])
+            through = Through(
+                layout.places.arrange, [arranged[name] for name in ("means2d", "conics", "opacities")]
+            )
             if image.render_mode != "RGB" or image.median:
                 rendered = splats._replace(depths=layout.gather(arranged["depths"])[0])
     channels, lead = rendered.colors if plain else channels_of(rendered, gaussians, image), gaussians.lead
@@ -148,7 +153,6 @@ def _nan_or_zero(scene: Scene, valued: bool, signals: Signals | None) -> Tensor:
     """Return [N]: NaN for a Gaussian with a colour or signal, in some view, that is not finite, 0 for others.
 
     Args:
-        scene: the scene.
         valued: whether its colours are values.
         signals: describes its extra signals.
     """

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from blitzgs.call.extras import Pixels
 from blitzgs.call.groups import CUDA_TILE_SIZE
-from blitzgs.call.pixels import Pixels
 from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 
@@ -58,7 +58,6 @@ def lists_of(
     """Return the tile lists for meta, and those to composite.
 
     Args:
-        splats: the splats of all images.
         images: number of images I.
         project: the size of the images, and the caller's tile size.
         count: number of entries of the lists for meta; -1: unknown.
@@ -86,10 +85,8 @@ def lists_of_pixels(
     These tiles have the same lists as in the whole image, so their pixels have the same bits.
 
     Args:
-        splats: the splats of all images.
         images: number of images I.
         project: the size of the images, and the caller's tile size.
-        pixels: the pixels.
     """
     lists = _lists_by(project.tile_size, splats, images, project, pixels)
     if not splats.means2d.is_cuda or project.tile_size == CUDA_TILE_SIZE:

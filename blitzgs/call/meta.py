@@ -145,7 +145,7 @@ for _class in (LazyDict, LateMapping):
 def make_meta(
     gaussians: Gaussians,
     layout: Layout,
-    known: Mapping[str, Tensor],
+    known: Mapping[str, Any],
     lists: Lists,
     lead: tuple[int, ...],
     arrived: ProjectedSplats | None,
@@ -156,13 +156,17 @@ def make_meta(
 
     Args:
         gaussians: the checked arguments of the call.
-        layout: arrangement of the splats.
         known: the rendered columns in this arrangement, and further images.
-        lists: the tile lists.
         lead: batch dimensions, and the number of views that are rendered here.
         arrived: the splats that `lists` refers to, if ranks have exchanged splats; None: those of `layout`.
     """
     entries = _Entries(gaussians, layout, lists, lead, arrived)
+    numbers = {
+        "tile_width": lists.tiles_x, "tile_height": lists.tiles_y, "tile_size": lists.tile_size,
+        "width": lists.width, "height": lists.height, "n_batches": len(gaussians.scenes),
+        "n_cameras": lead[-1],
+    }  # fmt: skip
+    known = {**numbers, **known}
     if torch.compiler.is_compiling():
         return {**{key: known[key] if key in known else entries.of(key) for key in _KEYS}, **known}
     return LazyDict({**_NOTHING_KNOWN, **known}, entries.of)
@@ -215,27 +219,6 @@ class _Entries(NamedTuple):
 
     def isect_offsets(self) -> Tensor:
         return self.lists.offsets[:-1].reshape(*self.lead, self.lists.tiles_y, self.lists.tiles_x)
-
-    def tile_width(self) -> int:
-        return self.lists.tiles_x
-
-    def tile_height(self) -> int:
-        return self.lists.tiles_y
-
-    def width(self) -> int:
-        return self.lists.width
-
-    def height(self) -> int:
-        return self.lists.height
-
-    def tile_size(self) -> int:
-        return self.lists.tile_size
-
-    def n_batches(self) -> int:
-        return len(self.gaussians.scenes)
-
-    def n_cameras(self) -> int:
-        return self.lead[-1]
 
     def non_finite(self) -> LateMapping:
         return LateMapping(lambda: non_finite(self.gaussians))

@@ -96,7 +96,6 @@ def send_splats(splats: ProjectedSplats, channels: Tensor, job: Job) -> tuple[Pr
     Args:
         splats: of this rank's Gaussians in the views of all ranks.
         channels: channels to composite, [P, D].
-        job: the ranks.
 
     Returns:
         The splats of this rank's views, ordered by (rank, Gaussian, view), and their channels. Only the

@@ -22,22 +22,18 @@ from blitzgs.call.arguments import (
     gaussians_of,
 )
 from blitzgs.call.channels import ImageOptions, background_rows
-from blitzgs.call.groups import gathered_groups, groups_may_be_queued, groups_of
+from blitzgs.call.finite import warn_of_gradient
+from blitzgs.call.groups import ShTables, gathered_groups, groups_may_be_queued, groups_of
 from blitzgs.call.images import render
-from blitzgs.call.intrinsics import warn_of_gradient
-from blitzgs.call.queued import ShTables
 from blitzgs.ops.projection_types import ProjectionOptions
-from blitzgs.ops.sparse_rows import of_shape
+from blitzgs.ops.rows import of_shape
 
 
 class CatchesUp(Protocol):
     """An optimiser that may have pending steps, such as `blitzgs.optim.LazyAdam`."""
 
     def catch_up(
-        self,
-        params: Iterable[Tensor] | None = None,
-        rows: Tensor | None = None,
-        count: Tensor | None = None,
+        self, params: Iterable[Tensor] | None = None, rows: Tensor | None = None, count: Tensor | None = None
     ) -> None:
         """Apply the pending steps of rows of parameters, see `blitzgs.optim.LazyAdam.catch_up`."""
 

@@ -22,6 +22,7 @@ from blitzgs.capture.cameras import (
     MAX_SIDE,
     Camera,
     Float64,
+    SourceView,
     camera_centres,
     downscaled_size,
     same_shape,
@@ -29,7 +30,7 @@ from blitzgs.capture.cameras import (
 )
 from blitzgs.capture.check_files import FindDamage, damaged
 from blitzgs.capture.image_files import ImageHeader, read_header
-from blitzgs.capture.layouts import Source, SourceView, read_layout
+from blitzgs.capture.layouts import Source, read_layout
 from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_extent
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.masks import check_masks, find_masks

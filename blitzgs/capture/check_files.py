@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -54,11 +54,22 @@ class FileCheck:
     """
 
     def __init__(
-        self, cameras: Sequence[Camera], order: Sequence[int], counted: Callable[[Camera], bool]
+        self,
+        cameras: Sequence[Camera],
+        order: Sequence[int],
+        counted: Callable[[Camera], bool],
+        whole: Container[Path],
     ) -> None:
-        """Start to check files; `counted` decodes a view's mask, and tells whether some pixel counts."""
+        """Start to check files.
+
+        Args:
+            cameras: all views.
+            order: those to check, in this order.
+            counted: decodes a view's mask, and tells whether some pixel counts.
+            whole: files of opaque photographs that others have checked meanwhile.
+        """
         self.damage: str | None = None
-        self._cameras, self._order, self._counted = cameras, order, counted
+        self._cameras, self._order, self._counted, self._whole = cameras, order, counted, whole
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="blitzgs-check", daemon=True)
         self._thread.start()
@@ -79,7 +90,7 @@ class FileCheck:
                 return
             camera = self._cameras[index]
             try:
-                has_pixels = check_photograph(camera.image_path)
+                has_pixels = camera.image_path in self._whole or check_photograph(camera.image_path)
                 if camera.mask_path is not None:
                     has_pixels = self._counted(camera) and has_pixels
             except (OSError, ValueError) as error:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
-from blitzgs.capture.layouts import SourceView
+from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.names import read_lines
 
 DEFAULT_EVERY = 8

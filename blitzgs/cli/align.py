@@ -21,7 +21,7 @@ from blitzgs.capture.world import (
     gps_positions,
     pyproj_module,
 )
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_run, named_path
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_path, add_run
 from blitzgs.config.files import load_config
 from blitzgs.runs import files as run_files
 from blitzgs.runs.world import load_frame, save_frame
@@ -50,7 +50,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser = add_command(commands, "align", run, summary, HELP)
     add_run(parser)
     how = parser.add_mutually_exclusive_group()
-    how.add_argument("--gcp", type=named_path, metavar="FILE", help="ground control points and their marks")
+    add_path(how, "--gcp", "FILE", "ground control points and their marks")
     how.add_argument("--gps", action="store_true", help="use the positions in the photographs' EXIF")
     parser.add_argument("--crs", metavar="EPSG:N", help="reference system of the points, or wanted")
     add_capture(parser)

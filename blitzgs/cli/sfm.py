@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import os
 import shlex
 import sys
@@ -13,8 +12,9 @@ from pathlib import Path
 
 from blitzgs.capture.colmap import camera_models, find_models
 from blitzgs.capture.transforms import find_transforms
-from blitzgs.cli.arguments import Commands, add_command, named_path
+from blitzgs.cli.arguments import Commands, add_command, add_path
 from blitzgs.config.fields import Config
+from blitzgs.config.files import changed
 from blitzgs.runs.files import CONFIG
 from blitzgs.sfm.photographs import Photographs, estimate, has_photographs_alone, photograph_folder
 from blitzgs.sfm.reconstruct import MAPPERS, PAIRS, WORK, Settings, is_finished, reconstruct
@@ -43,8 +43,8 @@ photographs without a pose and why), and COLMAP's database and messages.
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "sfm", run, summary, HELP)
-    parser.add_argument("photos", type=named_path, metavar="PHOTOS", help="folder of the photographs")
-    parser.add_argument("capture", type=named_path, metavar="CAPTURE", help="folder to write")
+    add_path(parser, "photos", "PHOTOS", "folder of the photographs")
+    add_path(parser, "capture", "CAPTURE", "folder to write")
     parser.add_argument(
         "--pairs", choices=PAIRS, default="auto", help="which photographs are compared (default: see above)"
     )
@@ -106,8 +106,7 @@ def with_poses(config: Config, folder: Path) -> Config:
         find_poses(photographs, folder, Settings())
     while not is_finished(folder):
         time.sleep(1.0)
-    data = dataclasses.replace(config.data, path=os.path.realpath(folder), images="images")
-    return dataclasses.replace(config, data=data)
+    return changed(config, "data", path=os.path.realpath(folder), images="images")
 
 
 def understood_alone(config: Config) -> str | None:

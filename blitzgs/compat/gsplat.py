@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from blitzgs.ops.position_noise import position_noise_
-from blitzgs.ops.relocation import MAX_COPIES
+from blitzgs.ops.population import MAX_COPIES, position_noise_
 from blitzgs.population.density import CHILDREN_OF_A_SPLIT, SPLIT_SHRINK, rotations
 from blitzgs.population.relocation import shared
 

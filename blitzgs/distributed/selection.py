@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.ops.mass_cut import CHOICE_STEP, STEPS, TIES_STEP, MassCut
-from blitzgs.ops.sampling import KEY_BITS, key_histogram, key_of_bits
+from blitzgs.ops.counter_random import KEY_BITS, key_histogram, key_of_bits
+from blitzgs.ops.importance import CHOICE_STEP, STEPS, TIES_STEP, MassCut
 
 # Digits of a threshold search, most significant first. The first digit of a score is its exponent and three
 # bits of its mantissa, so all scores of a bin share one exponent and their mantissas can be summed exactly.

@@ -32,13 +32,7 @@ from blitzgs.frame.transport import (
 )
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.intersect import TileGrid
-from blitzgs.ops.projection_types import (
-    ProjectedSplats,
-    ProjectionInputs,
-    ProjectionOptions,
-    Sizes,
-    Splats,
-)
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions, Sizes, Splats
 from blitzgs.ops.rasterize import RasterizeSaved
 from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients
 from blitzgs.table.table import GaussianTable
@@ -173,7 +167,6 @@ def forward(
     """Render views of a table whose active rows have no pending optimiser steps.
 
     Args:
-        table: the Gaussians.
         views: at most 32 views.
         options: how to render.
         active: rows to consider, and the views of each; None: all rows in all views. Or a function that finds
@@ -285,7 +278,6 @@ def backward_splats(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> S
     """Compute the gradients of this rank's projected splats from the gradients of the images.
 
     Args:
-        frame: from `forward`.
         v_renders: gradient of the loss by the images, [B, H, W, 3]; only this rank's tiles are read.
         mark: called at the end of each stage: "raster back", "exchange back".
 

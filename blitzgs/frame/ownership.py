@@ -18,8 +18,8 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.tiles import TileRanges
+from blitzgs.ops.exchange import divide_tiles, tile_costs
 from blitzgs.ops.intersect import tile_counts
-from blitzgs.ops.tile_costs import divide_tiles, tile_costs
 
 # Fixed cost of a tile, in units of one list entry: its pixels are written and compared with the photograph.
 # The sums of `divide_tiles` are exact from 8 on.
@@ -160,18 +160,13 @@ class TileOwners:
         return TileRanges(bounds, len(keys), width, height, tile_size, halo)
 
     def record(
-        self,
-        keys: Sequence[Hashable],
-        tile_work: Tensor,
-        ranges: TileRanges,
-        parts: Tensor | None = None,
+        self, keys: Sequence[Hashable], tile_work: Tensor, ranges: TileRanges, parts: Tensor | None = None
     ) -> HostSum:
         """Store the costs of a batch's tiles for divisions from the batch after the next on. Collective.
 
         On CUDA the host does not wait for a batch whose losses it has read.
 
         Args:
-            keys: the B views.
             tile_work: int32 [B * T], number of list entries that were composited in each tile.
             ranges: the tiles of each rank; the cost of a tile is that measured by its owner.
             parts: float64 [B, K, 2], sums of this rank's loss, which are sent together with the costs.

@@ -45,7 +45,6 @@ def survey(
     """Measure what each Gaussian contributes to views of a table without pending optimiser steps.
 
     Args:
-        table: the Gaussians.
         views: at most 32 views.
         options: how to render; no colour is computed.
         assignment: the tiles of each rank; every rank of the job calls this with its table. None: this rank

@@ -117,8 +117,6 @@ def collect_images(renders: Tensor, ranges: TileRanges, ranks: Ranks, destinatio
 
     Args:
         renders: [B, H, W, C], contiguous; valid in this rank's tiles.
-        ranges: the tiles of each rank.
-        ranks: the job.
         destination: the rank whose `renders` is complete afterwards.
     """
     if ranks.world_size == 1:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ops of BlitzGS: one file per op with its public function, fake kernel and autograd formula."""
+"""The ops of BlitzGS: their public functions and autograd formulas."""

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finds the rows that the views of a step may see, block by block, from conservative bounds of each block.
 
-Also converts the cull mask between the layout by row, which moves with rows, and that of the kernels.
+Also converts the cull mask between the layout by row, which moves with rows, and that of the kernels, and
+moves blocks between a table on the host and a pool on the GPU.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -211,33 +213,6 @@ def _rows(means: Tensor, scales: Tensor, pending: PendingSteps | None) -> list[T
     return [means, scales, *(pending or ())]
 
 
-@torch.library.register_fake("blitzgs::morton_keys")
-def _(points: Tensor) -> Tensor:
-    return points.new_empty(points.shape[0], dtype=torch.int64)
-
-
-@torch.library.register_fake("blitzgs::update_block_bounds_")
-def _(*_args: object) -> None:
-    return None
-
-
-@torch.library.register_fake("blitzgs::cull_blocks")
-def _(bounds: Tensor, *_args: object, capacity_blocks: int | None = None) -> tuple[Tensor, ...]:
-    blocks = (
-        torch.library.get_ctx().new_dynamic_size()
-        if capacity_blocks is None
-        else min(capacity_blocks, len(bounds))
-    )
-    return tuple(
-        bounds.new_empty(n, dtype=torch.int32) for n in (blocks * BLOCK_ROWS, blocks * BLOCK_ROWS, 1, 1)
-    )
-
-
-@torch.library.register_fake("blitzgs::gate_views_")
-def _(*_args: object) -> None:
-    return None
-
-
 # Bits of a word of a mask. In the layout by row, each bit is of one column.
 WORD_BITS = 32
 SECTOR_WORDS = BLOCK_ROWS // WORD_BITS
@@ -270,11 +245,62 @@ def rows_of_sectors(sectors: Tensor, n: int) -> Tensor:
     return torch.ops.blitzgs.rows_of_sectors(sectors, n)
 
 
-@torch.library.register_fake("blitzgs::sectors_of_rows")
-def _(rows: Tensor) -> Tensor:
-    return rows.new_empty(-(-rows.shape[0] // BLOCK_ROWS), WORD_BITS * rows.shape[1], SECTOR_WORDS)
+def seen_blocks(
+    bounds: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    sizes: Tensor,
+    near_plane: float,
+    far_plane: float,
+    eps2d: float = 0.3,
+) -> Tensor:
+    """Return the views that may see a part of each block.
+
+    A block without the bit of a view has no row that `blitzgs.ops.blocks.cull_blocks` lists for that view.
+
+    Args:
+        bounds: float32 [N, 8], from `blitzgs.ops.blocks.update_block_bounds_`.
+        viewmats: float32 [V, 4, 4], world to camera, V <= 32.
+        Ks: float32 [V, 3, 3], pixels.
+        sizes: int32 [V, 2], width and height of each view, pixels.
+        near_plane: rows at z <= near_plane are not seen.
+        far_plane: rows at z > far_plane are not seen.
+        eps2d: screen-space blur, pixels squared.
+
+    Returns:
+        int32 [N], bit v set when view v may see a part of the block.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes, or more than 32 views.
+    """
+    return torch.ops.blitzgs.seen_blocks(bounds, viewmats, Ks, sizes, near_plane, far_plane, eps2d)
 
 
-@torch.library.register_fake("blitzgs::rows_of_sectors")
-def _(sectors: Tensor, n: int) -> Tensor:
-    return sectors.new_empty(n, sectors.shape[1] // WORD_BITS)
+@torch.no_grad()
+def swap_blocks_(
+    pool: Sequence[Tensor],
+    table: Sequence[Tensor],
+    n_written: int,
+    slots: Tensor,
+    leaving: Tensor,
+    coming: Tensor,
+) -> None:
+    """Move blocks of 256 rows between slots of a pool and a table in the memory of the host, in place.
+
+    The contents of slot `slots[i]` are written to block `leaving[i]` of the table, and block `coming[i]` is
+    read into the slot. One kernel does both at once, so that on CUDA it uses both directions of the bus. All
+    slots must differ, and so must all leaving and coming blocks together; none of this is checked.
+
+    Args:
+        pool: columns [P, ...].
+        table: the same columns [N, ...] in the memory of the host; pinned where the pool is on a GPU.
+        n_written: only the first `n_written` columns are written back; the others never change on the device.
+        slots: int32 [M], on the device of the pool.
+        leaving: int32 [M], on the same device; -1: the slot's contents are discarded.
+        coming: int32 [M], on the same device; -1: nothing is read into the slot.
+
+    Raises:
+        RuntimeError: columns that differ in dtype or in the shape of a row, are not contiguous or too many,
+            or a table that is not in (pinned) memory of the host.
+    """
+    torch.ops.blitzgs.swap_blocks_(list(pool), list(table), n_written, slots, leaving, coming)

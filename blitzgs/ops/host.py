@@ -87,11 +87,6 @@ class HostCopy:
             self._pinned.abandon()
 
 
-@torch.library.register_fake("blitzgs::copy_to_host_")
-def _(*_args: object) -> None:
-    return None
-
-
 def current_stream(device: torch.device) -> torch.cuda.Stream:
     """Return the current stream of a CUDA device.
 

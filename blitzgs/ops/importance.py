@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures what each splat contributes to its view, and sums this over the views of a sweep."""
+"""Measures what each splat contributes to its view and to each pixel, and selects by these weights."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -43,7 +43,6 @@ def splat_contributions(
         splat_opacities: [P].
         isect_splats: int32 [I], from `blitzgs.ops.intersect.intersect`.
         tile_offsets: int64 [B * T + 1], likewise.
-        n_cameras: number of views B.
         width: of every view, pixels.
         height: of every view, pixels.
         tile_size: edge of a tile in pixels, as given to ``intersect``; 16 on CUDA.
@@ -65,30 +64,6 @@ def splat_contributions(
         n_cameras, width, height, tile_size, tile_begin, tile_end, n_splats, squares,
     )  # fmt: skip
     return sums
-
-
-@torch.library.register_fake("blitzgs::contributions")
-def _(
-    means2d: Tensor,
-    conics: Tensor,
-    splat_opacities: Tensor,
-    isect_splats: Tensor,
-    tile_offsets: Tensor,
-    n_cameras: int,
-    width: int,
-    height: int,
-    tile_size: int,
-    tile_begin: int,
-    tile_end: int,
-    n_splats: Tensor | None = None,
-    squares: bool = False,
-) -> tuple[Tensor, Tensor, Tensor]:
-    count = means2d.shape[0]
-    return (
-        means2d.new_empty(count, dtype=torch.int64),
-        means2d.new_empty(count, dtype=torch.int32),
-        means2d.new_empty(count if squares else 0, dtype=torch.int64),
-    )
 
 
 # How many times a weight is divided by the square root of its number of pixels, for each score rule.
@@ -149,6 +124,127 @@ def view_sums_(
     )
 
 
-@torch.library.register_fake("blitzgs::view_sums_")
-def _(*_args: Any) -> None:
-    return None
+class PixelSplats(NamedTuple):
+    """What R pixels composite; see `pixel_splats`.
+
+    Attributes:
+        transmittances: [R], the share of light that passes all splats.
+        counts: int32 [R], the number of composited splats.
+        medians: int32 [R], the last composited splat with a transmittance above 0.5 in front of it, -1 for
+            none.
+        ids: int32 [R, k], the splats of the largest alpha T, front to back; then -1.
+        weights: [R, k], their alpha T; then 0.
+    """
+
+    transmittances: Tensor
+    counts: Tensor
+    medians: Tensor
+    ids: Tensor
+    weights: Tensor
+
+
+@torch.no_grad()
+def pixel_splats(
+    means2d: Tensor,
+    conics: Tensor,
+    splat_opacities: Tensor,
+    isect_splats: Tensor,
+    tile_offsets: Tensor,
+    *,
+    n_cameras: int,
+    width: int,
+    height: int,
+    tile_size: int = 16,
+    strongest: int = 0,
+    pixels: Tensor | None = None,
+) -> PixelSplats:
+    """Find which splats each pixel composites. Not differentiable.
+
+    Alpha and T have the same bits as in :func:`blitzgs.ops.rasterize.rasterize`. Of equal alpha T, the splats
+    in front are the strongest.
+
+    Args:
+        means2d: [P, 2], pixels, float32 or (CPU) float64.
+        conics: inverse 2D covariances (a, b, c) [P, 3].
+        splat_opacities: [P].
+        isect_splats: int32 [I], from :func:`blitzgs.ops.intersect.intersect`.
+        tile_offsets: int64 [B * T + 1], likewise.
+        width: of every view, pixels.
+        height: of every view, pixels.
+        tile_size: edge of a tile in pixels, as given to ``intersect``; 16 on CUDA.
+        strongest: number k of splats of each pixel to return.
+        pixels: int64 [R], numbers (b H + y) W + x of the pixels to return, each in range; None: all, in this
+            order.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes, or a tile size that CUDA lacks.
+    """
+    slots, rows, n_rows = None, None, n_cameras * height * width
+    if pixels is not None:
+        wanted, rows = pixels.unique(return_inverse=True)
+        slots = torch.full((n_rows,), -1, dtype=torch.int32, device=pixels.device)
+        slots[wanted] = torch.arange(len(wanted), dtype=torch.int32, device=pixels.device)
+        slots, n_rows = slots.view(n_cameras, height, width), len(wanted)
+    found = torch.ops.blitzgs.pixel_splats(
+        means2d, conics, splat_opacities, isect_splats, tile_offsets, slots, n_rows,
+        n_cameras, width, height, tile_size, strongest,
+    )  # fmt: skip
+    return PixelSplats(*(column if rows is None else column.index_select(0, rows) for column in found))
+
+
+# As in csrc/importance/mass_cut.h.
+DIGITS = 1 << 12
+ROUNDS = 6
+TIES_STEP, CHOICE_STEP = 2 * ROUNDS, 4 * ROUNDS
+STEPS = CHOICE_STEP + 1
+_SEARCH_NUMBERS = 8
+_MISSING_ID = 6  # index into a search's 8 numbers: how many items remain to be chosen by their ids
+
+
+class MassCut(NamedTuple):
+    """A search for the threshold weight of each of S segments; see `csrc/importance/mass_cut.h`.
+
+    A search has rounds of two steps. Step 2 r of round r scans this rank's items and fills `sums`. The caller
+    then adds up `sums` over the ranks. Step 2 r + 1 reads and clears them. Steps from `TIES_STEP` on do
+    nothing unless `has_ties` is true. The last step fills `chosen`.
+
+    Attributes:
+        items: weights int64 [P] >= 0; segments int32 [P]; owners int32 [P], the row that each weight belongs
+            to; and the rows' ids int64 [N], in [0, 2^63). The weights of a segment must add up to less than
+            2^62.
+        searches: int64 [S, 8].
+        sums: int64 [S, DIGITS].
+        listed: int32 [1 + P].
+        chosen: bool [P].
+    """
+
+    items: tuple[Tensor, Tensor, Tensor, Tensor]
+    searches: Tensor
+    sums: Tensor
+    listed: Tensor
+    chosen: Tensor
+
+    @classmethod
+    def begin(cls, weights: Tensor, segments: Tensor, owners: Tensor, ids: Tensor, count: int) -> MassCut:
+        """Allocate a search over `count` segments; the arguments are those of `items`."""
+        return cls(
+            (weights, segments, owners, ids),
+            weights.new_zeros(count, _SEARCH_NUMBERS),
+            weights.new_zeros(count, DIGITS),
+            segments.new_empty(1 + len(weights)),
+            weights.new_empty(len(weights), dtype=torch.bool),
+        )
+
+    def take_steps(self, share: tuple[int, int], first: int, last: int) -> None:
+        """Run the steps `first` to `last` - 1; `share` is a numerator and a denominator of at most 10^9.
+
+        Raises:
+            RuntimeError: wrong shapes, dtypes or numbers.
+        """
+        torch.ops.blitzgs.mass_cut_(
+            *self.items, self.searches, self.sums, self.listed, self.chosen, *share, first, last
+        )
+
+    def has_ties(self) -> bool:
+        """Tell, at `TIES_STEP`, whether ids must decide between equal weights; waits for the device."""
+        return bool(self.searches[:, _MISSING_ID].any())

@@ -93,29 +93,3 @@ def intersect(
     grid = TileGrid(n_cameras, width, height, tile_size, tile_begin, tile_end)
     lists: tuple[Tensor, Tensor] = torch.ops.blitzgs.intersect(*splats, *grid, n_isects, n_splats)
     return lists
-
-
-@torch.library.register_fake("blitzgs::intersect")
-def _(
-    means2d: Tensor,
-    conics: Tensor,
-    splat_opacities: Tensor,
-    depths: Tensor,
-    camera_ids: Tensor,
-    ids: Tensor | None,
-    n_cameras: int,
-    width: int,
-    height: int,
-    tile_size: int,
-    tile_begin: int,
-    tile_end: int,
-    n_isects: int,
-    n_splats: Tensor | None = None,
-    unchecked: bool = False,
-) -> tuple[Tensor, Tensor]:
-    tiles_x, tiles_y = tile_counts(width, height, tile_size)
-    size = n_isects if n_isects >= 0 else torch.library.get_ctx().new_dynamic_size()
-    return (
-        means2d.new_empty(size, dtype=torch.int32),
-        means2d.new_empty(n_cameras * tiles_x * tiles_y + 1, dtype=torch.int64),
-    )

@@ -6,13 +6,15 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from blitzgs._library import below_autograd
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions, WeightedViews
+from blitzgs.ops.splat_gradients import SplatGradients
 
 # Columns of the schedule's table, as in csrc/adam/lazy_adam.h: tails of 4 orders for 6 groups, powers of
 # the decay rates, bias corrections.
@@ -80,12 +82,7 @@ class AdamSchedule(AdamTables):
     """
 
     def __init__(
-        self,
-        lr_table: Tensor,
-        beta1: float,
-        beta2: float,
-        eps: float,
-        dtype: torch.dtype = torch.float32,
+        self, lr_table: Tensor, beta1: float, beta2: float, eps: float, dtype: torch.dtype = torch.float32
     ) -> None:
         """Make the tables.
 
@@ -194,11 +191,7 @@ class GrowingSchedule(AdamTables):
 
 
 def lazy_adam_step_(
-    state: AdamState,
-    schedule: AdamTables,
-    step: int,
-    grads: Sequence[Tensor],
-    ids: Tensor | None,
+    state: AdamState, schedule: AdamTables, step: int, grads: Sequence[Tensor], ids: Tensor | None
 ) -> None:
     """Take Adam step ``step`` for the rows `ids`, in place, after the zero-gradient steps they skipped.
 
@@ -223,11 +216,7 @@ def lazy_adam_step_(
 
 
 def lazy_adam_catch_up_(
-    state: AdamState,
-    schedule: AdamTables,
-    step: int,
-    ids: Tensor | None = None,
-    count: Tensor | None = None,
+    state: AdamState, schedule: AdamTables, step: int, ids: Tensor | None = None, count: Tensor | None = None
 ) -> None:
     """Apply the missed zero-gradient steps up to ``step`` to the rows `ids` (None: all), in place.
 
@@ -307,17 +296,50 @@ def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
     return table.to(lr_table.device)
 
 
-@torch.library.register_fake("blitzgs::lazy_adam_final_rules")
-def _(table: Tensor, like: Tensor, explicit_steps: int, eps: float) -> Tensor:
-    # Six rules of four numbers, two steps and a number, to a multiple of four numbers.
-    return table.new_empty(max(0, len(table) - explicit_steps), 28 * like.dtype.itemsize, dtype=torch.uint8)
+def project_bwd_step_(
+    state: AdamState,
+    schedule: AdamSchedule,
+    step: int,
+    views: WeightedViews,
+    splats: ProjectedSplats,
+    options: ProjectionOptions,
+    gradients: SplatGradients,
+    level: Tensor | None = None,
+    means2d_sums: Tensor | None = None,
+) -> None:
+    """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their splats.
 
+    The result is that of the backward pass of `blitzgs.ops.project.project` followed by
+    `blitzgs.ops.lazy_adam.lazy_adam_step_`, to rounding. On CUDA the gradients of the parameters are never
+    stored. The parameters of the visible Gaussians must be at ``step`` - 1 (`lazy_adam_catch_up_`), as when
+    they were projected.
 
-@torch.library.register_fake("blitzgs::lazy_adam_step_")
-def _(*args: Any) -> None:
-    return None
+    Args:
+        state: parameters before their activation, float32 or (CPU) float64, and their moments; `last_step`
+            and `moment_step` become `step` for the visible Gaussians.
+        schedule: of S steps, for the dtype of the parameters.
+        step: 1 <= step <= S.
+        views: the views that the splats were projected into, and the weights of regularisers.
+        splats: the P splats that `project` returned for these parameters and views.
+        options: the options of the projection; scales and opacities are taken before their activation.
+        level: uint8 [N], octree levels, if opacities fade with them (`options.fade`).
+        means2d_sums: [P, 2], receives the gradient of `splats.means2d` if `gradients` has a part per rank.
 
-
-@torch.library.register_fake("blitzgs::lazy_adam_catch_up_")
-def _(*args: Any) -> None:
-    return None
+    Raises:
+        RuntimeError: wrong shapes or dtypes, or a step outside the table.
+    """
+    with below_autograd():
+        torch.ops.blitzgs.project_bwd_step_(
+            state.tensors,
+            [schedule.table, schedule.lr_table],
+            *schedule.constants(step),
+            *views,
+            splats.camera_ids,
+            splats.visible_ids,
+            splats.splat_offsets,
+            level,
+            *options,
+            gradients.parts,
+            gradients.places,
+            means2d_sums,
+        )

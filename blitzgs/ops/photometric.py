@@ -108,21 +108,16 @@ def photometric_fwd_bwd(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the sums of `photometric_sums` and the gradient of their weighted total, without autograd.
 
-    The sums are returned as K partial sums; `report_` adds them up later, off the critical path of a step.
-    The gradient equals that of `photometric_sums`, but it is defined only at the owned pixels.
+    Further arguments are those of `photometric_sums`. The sums are returned as K partial sums; `report_` adds
+    them up later, off the critical path of a step. The gradient equals that of `photometric_sums`, but it is
+    defined only at the owned pixels.
 
     For the loss of `photometric_loss`, summed over views: ``l1_weights = 1 - w``, ``ssim_weights = -w`` and
     ``samples = pixel_counts(renders, masks)``.
 
     Args:
-        renders: as in `photometric_sums`.
-        targets: as in `photometric_sums`.
-        masks: as in `photometric_sums`.
         l1_weights: [B], weight of each view's L1 sum, dtype of `renders`.
         ssim_weights: [B], weight of each view's SSIM sum.
-        tile_size: as in `photometric_sums`.
-        tile_begin: as in `photometric_sums`.
-        tile_end: as in `photometric_sums`.
         samples: [B], divisors of the weights, dtype of `renders`; None: 1.
         visible: int64 [B], number of Gaussians visible in each view.
         scale_weight: weight of L_scale, a view's mean smallest axis of its visible Gaussians; only used to
@@ -146,46 +141,6 @@ def photometric_fwd_bwd(
 
 def _as_bytes(masks: Tensor | None) -> Tensor | None:
     return masks.view(torch.uint8) if masks is not None and masks.dtype == torch.bool else masks
-
-
-@torch.library.register_fake("blitzgs::photometric_fwd")
-def _(renders: Tensor, targets: Tensor, masks: Tensor | None, *_tiles: int) -> tuple[Tensor, Tensor]:
-    return renders.new_empty(renders.shape[0]), renders.new_empty(renders.shape[0])
-
-
-@torch.library.register_fake("blitzgs::photometric_bwd")
-def _(renders: Tensor, *_others: Any) -> Tensor:
-    return torch.empty_like(renders, memory_format=torch.contiguous_format)
-
-
-@torch.library.register_fake("blitzgs::photometric_fwd_bwd")
-def _(
-    renders: Tensor,
-    targets: Tensor,
-    masks: Tensor | None,
-    l1_weights: Tensor,
-    ssim_weights: Tensor,
-    tile_size: int,
-    tile_begin: int,
-    tile_end: int,
-    samples: Tensor | None = None,
-    visible: Tensor | None = None,
-    scale_weight: float = 0.0,
-    opacity_weight: float = 0.0,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    views, n_parts = renders.shape[0], torch.library.get_ctx().new_dynamic_size()
-    n_regs = 0 if visible is None else views
-    return (
-        renders.new_empty(views, n_parts, 2, dtype=torch.float64),
-        torch.empty_like(renders, memory_format=torch.contiguous_format),
-        renders.new_empty(n_regs),
-        renders.new_empty(n_regs),
-    )
-
-
-@torch.library.register_fake("blitzgs::l1_ssim_fwd_bwd")
-def _(renders: Tensor, *_others: Any) -> tuple[Tensor, Tensor]:
-    return renders.new_empty(()), torch.empty_like(renders, memory_format=torch.contiguous_format)
 
 
 def _save_inputs(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:

@@ -84,11 +84,6 @@ def first_rows(columns: Sequence[Tensor], lengths: Sequence[int]) -> list[Tensor
     return found
 
 
-@torch.library.register_fake("blitzgs::first_rows")
-def _(columns: Sequence[Tensor], lengths: Sequence[int]) -> list[Tensor]:
-    return [column.new_empty(n, *column.shape[1:]) for column, n in zip(columns, lengths, strict=True)]
-
-
 class Splats(NamedTuple):
     """P splats with the columns that compositing reads.
 

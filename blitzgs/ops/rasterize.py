@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,10 +13,7 @@ from torch import Tensor
 from blitzgs._library import without_autograd
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.intersect import TileGrid, pixels_of_tiles
-from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, GradientBuffer, gradient_columns
-
-if TYPE_CHECKING:
-    from blitzgs.ops.arrange_splats import Places
+from blitzgs.ops.splat_gradients import GradientBuffer, gradient_columns
 
 rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
 # For alphas = 1 - transmittances. With the number 1, torch would first make a tensor of it, which takes 5 us
@@ -43,6 +40,9 @@ class RasterizeSaved(NamedTuple):
     composited: list[Tensor]
 
 
+Arrange = Callable[[Sequence[Tensor]], Sequence[Tensor]]
+
+
 class Through(NamedTuple):
     """The geometry of splats in the arrangement of `meta`, whose tensors get the gradients.
 
@@ -50,11 +50,11 @@ class Through(NamedTuple):
     and gives them to these tensors, so that a caller finds them in `.grad` of `meta["means2d"]`.
 
     Attributes:
-        places: the arrangement.
+        arrange: arranges columns of splats.
         columns: means2d, conics and splat_opacities in it.
     """
 
-    places: Places
+    arrange: Arrange
     columns: Sequence[Tensor]
 
 
@@ -127,7 +127,7 @@ def rasterize(
         alphas = 1 - transmittances
     else:
         geometry = (means2d, conics, splat_opacities) if through is None else through.columns
-        places = None if through is None else through.places
+        arrange = None if through is None else through.arrange
         # Whether gradients will be packed, see `_gradients`.
         packed = (
             composited is None
@@ -135,75 +135,12 @@ def rasterize(
             and torch.is_grad_enabled()
             and any(x.requires_grad for x in (*geometry, colors))
         )
-        call = _Call(splats, grid, tell_absgrad, places, packed, composited)
+        call = _Call(splats, grid, tell_absgrad, arrange, packed, composited)
         renders, alphas = _Rasterize.apply(*geometry, colors, backgrounds, call)  # type: ignore[no-untyped-call]
     if (tile_begin, tile_end) != (0, -1):
         end = sys.maxsize if tile_end < 0 else tile_end
         alphas = alphas * pixels_of_tiles(n_cameras, width, height, tile_size, tile_begin, end, alphas.device)
     return renders, alphas
-
-
-@torch.library.register_fake("blitzgs::rasterize_fwd")
-def _(
-    means2d: Tensor,
-    conics: Tensor,
-    splat_opacities: Tensor,
-    colors: Tensor,
-    backgrounds: Tensor | None,
-    isect_splats: Tensor,
-    tile_offsets: Tensor,
-    n_cameras: int,
-    width: int,
-    height: int,
-    tile_size: int,
-    tile_begin: int,
-    tile_end: int,
-    clear_rest: bool = True,
-    backward_follows: bool = False,
-    n_splats: Tensor | None = None,
-) -> tuple[Tensor, ...]:
-    pixels, context = (n_cameras, height, width), torch.library.get_ctx()
-    # The layout of packed splats differs between backends.
-    splat_bytes, n_ordered = context.new_dynamic_size(), context.new_dynamic_size()
-    n_ready = context.new_dynamic_size() if backward_follows else 0
-    return (
-        means2d.new_empty(*pixels, colors.shape[1]),
-        means2d.new_empty(pixels),
-        means2d.new_empty(pixels, dtype=torch.int32),
-        means2d.new_empty(tile_offsets.shape[0] - 1, dtype=torch.int32),
-        means2d.new_empty(means2d.shape[0], splat_bytes, dtype=torch.uint8),
-        means2d.new_empty(n_ordered, 16, dtype=torch.int32),
-        means2d.new_empty(n_ready, SPLAT_GRADIENT),
-    )
-
-
-@torch.library.register_fake("blitzgs::rasterize_bwd")
-def _(
-    splats: Sequence[Tensor],
-    backgrounds: Tensor | None,
-    lists: Sequence[Tensor],
-    composited: Sequence[Tensor],
-    v_renders: Tensor,
-    v_alphas: Tensor | None,
-    n_cameras: int,
-    width: int,
-    height: int,
-    tile_size: int,
-    tile_begin: int,
-    tile_end: int,
-    absgrad: bool,
-    deterministic: bool,
-    gradients: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    means2d, _, _, colors = splats
-    n_splats = means2d.shape[0] if gradients is None else 0
-    return (
-        means2d.new_empty(n_splats, 2),
-        means2d.new_empty(n_splats, 3),
-        means2d.new_empty(n_splats),
-        means2d.new_empty(n_splats, colors.shape[1]),
-        means2d.new_empty(n_splats if absgrad else 0, 2),
-    )
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -293,7 +230,7 @@ class _Call(NamedTuple):
     splats: tuple[Any, ...]  # the tensors that the op takes
     grid: TileGrid
     tell_absgrad: Callable[[Tensor], object] | None
-    places: Places | None
+    arrange: Arrange | None
     backward_follows: bool
     composited: Sequence[Tensor] | None
 
@@ -313,7 +250,7 @@ class _Rasterize(torch.autograd.Function):
         else:
             *output, alphas = call.composited
         _save(ctx, call.splats, call.grid, output)
-        ctx.tell_absgrad, ctx.places = call.tell_absgrad, call.places
+        ctx.tell_absgrad, ctx.arrange = call.tell_absgrad, call.arrange
         return output[0], alphas
 
     @staticmethod
@@ -323,8 +260,8 @@ class _Rasterize(torch.autograd.Function):
         *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, tell is not None, may_pack=True)
         if v_abs is not None:
             tell(v_abs.detach())
-        if ctx.places is not None and splat_gradients[0] is not None:
-            splat_gradients[:3] = ctx.places.arrange(splat_gradients[:3])
+        if ctx.arrange is not None and splat_gradients[0] is not None:
+            splat_gradients[:3] = ctx.arrange(splat_gradients[:3])
         return (*splat_gradients, None)
 
 

@@ -100,7 +100,7 @@ class SplatGradients(NamedTuple):
 
         Args:
             values: [sum(group_sizes), F], the rows of each rank's `side_by_side` for this rank's splats.
-            places: from `blitzgs.ops.scatter.scatter_splats`.
+            places: from `blitzgs.ops.exchange.scatter_splats`.
             group_sizes: number of splats that this rank sent to each rank.
             splats: number P of this rank's own splats.
         """
@@ -124,7 +124,7 @@ def sum_splats(
     Args:
         values: [sum(group_sizes), F], float32 (CPU also float64), in the order in which `scatter_splats`
             packed them.
-        places: from `blitzgs.ops.scatter.scatter_splats`.
+        places: from `blitzgs.ops.exchange.scatter_splats`.
         group_sizes: as for `scatter_splats`.
         splats: P.
         widths: widths of the columns that the F values consist of; they add up to F.
@@ -161,19 +161,3 @@ class GradientBuffer:
             return zeros if zeros.shape[0] == count else zeros[:count]
         others = None if self.others is None else self.others()
         return means2d.new_zeros(count, SPLAT_GRADIENT) if others is None else others
-
-
-@torch.library.register_fake("blitzgs::splat_gradient_layout")
-def _() -> list[int]:
-    return [_MEAN2D, _CONIC, _OPACITY, _COLOR, _MEAN2D_ABS, SPLAT_GRADIENT]
-
-
-@torch.library.register_fake("blitzgs::sum_splats")
-def _(
-    values: Tensor,
-    places: Tensor,
-    group_sizes: Sequence[int],
-    splats: int,
-    widths: Sequence[int],
-) -> list[Tensor]:
-    return [values.new_empty((splats, width)) for width in widths]

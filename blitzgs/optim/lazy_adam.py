@@ -13,7 +13,7 @@ from torch.nn import Parameter
 
 from blitzgs._torch import quick_step
 from blitzgs.ops.lazy_adam import GrowingSchedule
-from blitzgs.ops.sparse_rows import KeptMarks, distinct_rows
+from blitzgs.ops.rows import KeptMarks, distinct_rows
 from blitzgs.optim.lazy_adam_checks import (
     MOMENTS,
     check_group,

@@ -67,7 +67,6 @@ def check_saved(saved: Mapping[str, Any], params: Sequence[Tensor]) -> None:
     """Check the state that `load_state_dict` takes.
 
     Args:
-        saved: the state.
         params: all parameters; `torch.optim.Optimizer` checks their number.
 
     Raises:

@@ -10,14 +10,13 @@ from torch import Tensor
 
 from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.knn_distances import knn_distances
-from blitzgs.ops.voxel_keys import voxel_keys
+from blitzgs.ops.population import CELL_BITS, voxel_keys
 
 # A Gaussian is large if so few of the well-seen ones are larger.
 _LARGE = 0.99
 # A Gaussian is far from the well-seen ones at this multiple of their distances to each other, of which so
 # few are larger. The distance is that to three neighbours.
 _FAR, _SPACING, _NEIGHBOURS = 4.0, 0.95, 3
-_CELL_BITS = 21
 
 
 def views_counting(cull: Tensor, n_views: int) -> Tensor:
@@ -55,13 +54,13 @@ def _far(points: Tensor, others: Tensor) -> Tensor:
     spacing = knn_distances(others, _NEIGHBOURS).mean(dim=1)
     low, high = others.amin(dim=0), others.amax(dim=0)
     # The grid has to hold all others; points outside are clamped into its free margin.
-    cell = max(_FAR * _share(spacing, _SPACING), float((high - low).max()) / (1 << (_CELL_BITS - 1)), 1e-12)
+    cell = max(_FAR * _share(spacing, _SPACING), float((high - low).max()) / (1 << (CELL_BITS - 1)), 1e-12)
     origin = (low - 3 * cell).tolist()
     taken = voxel_keys(others, origin, cell).unique()
     keys = voxel_keys(points, origin, cell)
     near = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for x, y, z in product((-1, 0, 1), repeat=3):
-        near |= torch.isin(keys + x + (y << _CELL_BITS) + (z << 2 * _CELL_BITS), taken)
+        near |= torch.isin(keys + x + (y << CELL_BITS) + (z << 2 * CELL_BITS), taken)
     return ~near
 
 

@@ -103,7 +103,6 @@ def densify(
         rules: thresholds.
         time: time of the event, in images.
         step: the latest optimiser step; new rows are current up to it.
-        seed: seed of the run.
         level_count: number of octree levels K; levels of children stay below it.
         ranks: the job, whose tables together are the population; every rank calls this.
         extent: extent of the scene, in the unit of the means; only used for the candidates' features.

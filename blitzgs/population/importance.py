@@ -1,20 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The importance pass: one sweep over all training views that scores every Gaussian (BlitzGS, section 3.2).
 
-For view v and Gaussian i, w is the sum of alpha T over the pixels at which the renderer composites i, a
-is their number, c_rad tells whether the box around its alpha >= 1/255 overlaps the image, and c_vis
-whether it is in the smallest set, by descending w (ties by id), that holds 99 % of the view's total.
-Then:
-
-    score_i = sum over v with a > 0 of w / (a + SCORE_EPS)^p, p = 1 for "density", 1/2 "root", 0 "weight"
-            = sum over v and these pixels of (alpha T)^2 for "energy"
-    phi_i   = (number of v with c_vis) / (number of v with c_rad + PHI_EPS)
-    cull_iv = not c_vis
-
-"density" is the paper's score. It is the contribution per pixel, however many pixels a Gaussian covers, so
-large Gaussians are pruned first. "weight" is the total contribution, which the images lose if the Gaussian
-is pruned. "energy" is proportional to the squared error of the images after it is pruned, if every Gaussian
-differs equally from the colours behind it.
+docs/guide/fewer-gaussians.md defines the scores, phi and the cull matrix. "density" is the contribution per
+pixel, however many pixels a Gaussian covers, so large Gaussians are pruned first. "weight" is the total
+contribution, which the images lose if the Gaussian is pruned. "energy" is proportional to the squared error
+of the images after it is pruned, if every Gaussian differs equally from the colours behind it.
 
 The views see the Gaussians of all ranks. All sums are integers, so every result has the same bits at any
 world size and for any division of the work.
@@ -46,7 +36,7 @@ from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import SceneGate
 from blitzgs.view.visible import Scene, VisibleFinder, VisibleScene, table_of
 
-# The constants of the formulas above. PHI_EPS and VIEW_MASS are the paper's values; the paper calls the
+# The constants of the formulas. PHI_EPS and VIEW_MASS are the paper's values; the paper calls the
 # epsilon of the score small and gives no value.
 SCORE_EPS = 1e-6
 PHI_EPS = 0.1
@@ -119,7 +109,6 @@ def sweep(
         batches: the views, each once, in the same batches on every rank.
         n_views: V, columns of the cull matrix.
         options: how the views are rendered.
-        ranks: the job.
         owners: divides the tiles by their costs; the result does not depend on it.
         rule: rule of the score.
         lod: leaves Gaussians out of views as rendering does; there they contribute nothing and hide nothing.

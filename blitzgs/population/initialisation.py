@@ -11,6 +11,7 @@ from torch import Tensor
 
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.knn_distances import knn_distances
+from blitzgs.ops.population import CELL_BITS, voxel_keys
 from blitzgs.table.table import GaussianTable, opacity_logit
 from blitzgs.view.levels import Levels
 from blitzgs.view.point_blocks import BLOCK_POINTS, PAIRS_OF_POINTS, PointBlocks
@@ -18,7 +19,6 @@ from blitzgs.view.point_blocks import BLOCK_POINTS, PAIRS_OF_POINTS, PointBlocks
 SH_C0 = 0.28209479177387814
 # Smallest size of a first Gaussian, relative to the coarsest voxel: two voxel centres may coincide.
 SMALLEST_SPACING = 1e-4
-_CELL_BITS = 21
 
 
 # Opacity of the initial Gaussians.
@@ -141,7 +141,7 @@ def _thinned(levels: Tensor, most: int, seed: int) -> Tensor:
 
 def _grid_origin(points: Tensor, levels: Levels) -> Tensor:
     """Return the lower corner of the grids: below all points, unless outliers overflow the finest grid."""
-    reach = levels.voxel_size_of(levels.count - 1) * 2 ** (_CELL_BITS - 1)
+    reach = levels.voxel_size_of(levels.count - 1) * 2 ** (CELL_BITS - 1)
     return torch.maximum(points.amin(dim=0), points.median(dim=0).values - reach)
 
 
@@ -150,17 +150,15 @@ def _voxels(points: Tensor, colors: Tensor, origin: Tensor, size: float) -> tupl
 
     Outliers beyond the grid are left out, because their clamped cells would be at another position.
     """
-    cells = ((points - origin) / size).floor()
-    inside = ((cells >= 0) & (cells < 2**_CELL_BITS)).all(dim=1)
-    x, y, z = cells[inside].long().unbind(1)
-    keys, cell_of = (x | y << _CELL_BITS | z << 2 * _CELL_BITS).unique(return_inverse=True)
+    inside = ((points >= origin) & (points < origin + size * 2**CELL_BITS)).all(dim=1)
+    keys, cell_of = voxel_keys(points[inside], origin.tolist(), size).unique(return_inverse=True)
     counts = torch.bincount(cell_of, minlength=len(keys)).double()
     # Sums of integers are exact, so that their order does not matter.
     sums = torch.zeros(len(keys), 3, dtype=torch.float64, device=points.device)
     sums.index_add_(0, cell_of, colors[inside].double())
-    mask = (1 << _CELL_BITS) - 1
-    found = torch.stack([keys >> (axis * _CELL_BITS) & mask for axis in range(3)], dim=1)
-    return origin + (found.double() + 0.5) * size, sums / counts[:, None]
+    mask = (1 << CELL_BITS) - 1
+    cells = torch.stack([keys >> (axis * CELL_BITS) & mask for axis in range(3)], dim=1)
+    return origin + (cells.double() + 0.5) * size, sums / counts[:, None]
 
 
 def _seen_by_more(means: Tensor, centres: Tensor, farthest: float, share: float) -> Tensor:

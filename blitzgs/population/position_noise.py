@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from blitzgs.ops.position_noise import position_noise_
+from blitzgs.ops.population import position_noise_
 from blitzgs.table.table import GaussianTable
 
 

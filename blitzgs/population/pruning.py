@@ -10,7 +10,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import decimal_share, mass_prefix, smallest
-from blitzgs.ops.sampling import sampling_keys
+from blitzgs.ops.counter_random import sampling_keys
 
 
 def sample_by_score(score: Tensor, ids: Tensor, keep: float, seed: int, event: int, ranks: Ranks) -> Tensor:
@@ -24,7 +24,6 @@ def sample_by_score(score: Tensor, ids: Tensor, keep: float, seed: int, event: i
         score: float32 [N_rank], >= 0.
         ids: int64 [N_rank], persistent.
         keep: share of all ranks' N Gaussians, in [0, 1]; its decimal value counts.
-        seed: seed of the run.
         event: number that differs between draws, such as the time of the pass.
         ranks: the job; every rank calls this.
 

@@ -20,7 +20,6 @@ def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = MAX_
 
     Args:
         table: this rank's shard, changed in place.
-        ranks: the job.
         max_imbalance: nothing happens up to this ratio of the largest to the smallest shard; 0: always
             redistribute.
 

@@ -11,9 +11,9 @@ from torch.nn.functional import softplus
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
-from blitzgs.ops.copy_rows import put_rows_, take_rows
-from blitzgs.ops.relocation import MAX_COPIES, overlap
-from blitzgs.ops.sampling import sampling_keys
+from blitzgs.ops.counter_random import sampling_keys
+from blitzgs.ops.population import MAX_COPIES, overlap
+from blitzgs.ops.rows import put_rows_, take_rows
 from blitzgs.optim.table_adam import Pending
 from blitzgs.population.density import (
     CHILDREN_OF_A_SPLIT,
@@ -65,7 +65,6 @@ def relocate(
         growth: share of the population that the event adds.
         time: time of the event, in images.
         step: the latest optimiser step; new rows are current up to it.
-        seed: seed of the run.
         ranks: the job, whose tables together are the population; every rank calls this.
         extent: extent of the scene, in the unit of the means; only used for the lineage's features.
         level_count: number of octree levels; only used for the lineage's features.
@@ -114,7 +113,7 @@ def shared(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, T
         o' = 1 - (1 - o)^(1/N),
         s' = s o / overlap(o', N)
 
-    (Kheradmand et al. 2024, eq. 9; `blitzgs.ops.relocation.overlap`).
+    (Kheradmand et al. 2024, eq. 9; `blitzgs.ops.population.overlap`).
 
     Args:
         opacities: logits, [M].
@@ -144,7 +143,6 @@ def draw(weights: Tensor, total: int, count: int, ids: Tensor, seed: int, time: 
         total: sum of the weights of all ranks.
         count: below 2^31.
         ids: int64 [N_rank], persistent.
-        seed: seed of the run.
         time: time of the event, in images.
         ranks: the job; every rank calls this.
 

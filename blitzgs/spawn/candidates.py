@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from operator import itemgetter
 
@@ -70,8 +70,3 @@ def spawn_features(
         return torch.ops.blitzgs.spawn_features(
             list(_COLUMNS_OF(table.columns)), rows, is_split, time, extent, level_count
         )
-
-
-@torch.library.register_fake("blitzgs::spawn_features")
-def _(columns: Sequence[Tensor], rows: Tensor, *_rest: object) -> Tensor:
-    return columns[0].new_empty(rows.shape[0], len(FEATURES))

@@ -11,8 +11,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.ops.blocks import WORD_BITS
-from blitzgs.ops.pool import seen_blocks
+from blitzgs.ops.blocks import WORD_BITS, seen_blocks
 from blitzgs.ops.projection_types import MAX_VIEWS
 
 _MAX_WORDS = 1 << 26  # words of a mask that are processed together

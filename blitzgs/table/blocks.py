@@ -88,7 +88,6 @@ class BlockIndex:
         """Compute the bounds of every block of the table.
 
         Args:
-            table: the rows.
             pending_table: `AdamSchedule.table` of the lazy optimiser, if rows may have pending steps; None:
                 they have none.
         """

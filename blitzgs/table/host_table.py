@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from blitzgs.ops.copy_rows import take_rows
+from blitzgs.ops.rows import take_rows
 from blitzgs.table.table import GROWTH, GaussianTable
 
 MEMORY_INFO = Path("/proc/meminfo")

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
 
 from torch import Tensor
 
@@ -14,32 +13,19 @@ from blitzgs.ops.blocks import BLOCK_ROWS, SECTOR_WORDS, WORD_BITS, rows_of_sect
 CULL = "cull"
 
 
-class Layout(Protocol):
-    """The stored form of a column."""
-
-    def stored(self, column: Tensor) -> Tensor:
-        """Return the stored form of a column [N, ...]."""
-
-    def rows(self, stored: Tensor, count: int) -> Tensor:
-        """Return the column [count, ...] of a stored form."""
-
-    def length(self, count: int) -> int:
-        """Return the length of the stored form of `count` rows."""
-
-
 class BitSectors:
     """Bits [N, words] by blocks of rows, as `blitzgs.ops.blocks` has them: [256 ceil(N / 256), words]."""
 
     def stored(self, column: Tensor) -> Tensor:
-        """See `Layout.stored`."""
+        """Return the stored form of a column [N, words]."""
         return sectors_of_rows(column).view(-1, column.shape[1])
 
     def rows(self, stored: Tensor, count: int) -> Tensor:
-        """See `Layout.rows`."""
+        """Return the column [count, words] of a stored form."""
         return rows_of_sectors(sectors_in(stored), count)
 
     def length(self, count: int) -> int:
-        """See `Layout.length`."""
+        """Return the length of the stored form of `count` rows."""
         return -(-count // BLOCK_ROWS) * BLOCK_ROWS
 
 
@@ -49,4 +35,4 @@ def sectors_in(stored: Tensor) -> Tensor:
 
 
 # All other columns are stored row by row.
-LAYOUTS: Mapping[str, Layout] = {CULL: BitSectors()}
+LAYOUTS: Mapping[str, BitSectors] = {CULL: BitSectors()}

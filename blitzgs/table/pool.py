@@ -1,17 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training beyond the memory of a GPU: keeps the blocks that views need in a pool on the device.
 
-The whole table is in host memory. A `Pool` holds blocks of it on the device: a smaller table with the same
-columns, whose slots hold blocks of 256 rows of the host's table for a while. No result depends on a row's
-position, so the ops work on the pool as they would on the table.
-
-The order of the training views is known. Before a step begins, the bounds of all blocks, which stay on the
-device, are tested against the views of that step and of the next ones (`seen_blocks`). While the step runs, a
-second stream loads the blocks that the next step sees into the slots of the blocks that are needed last. The
-bounds of a block change only when a step moves its rows, and the blocks of the present step keep their slots
-until it has ended. The result of the test is therefore still right after the step. If the blocks of both
-steps do not fit together, the next step loads its remaining blocks when it begins. Blocks of the steps after
-the next one come early where that evens out the traffic.
+A `Pool` is a smaller table with the columns of the host's, whose slots hold blocks of 256 rows for a while
+(docs/design/training.md). The bounds of a block change only when a step moves its rows, and the blocks of the
+present step keep their slots until it has ended, so what `seen_blocks` finds before a step is still right
+after it. If the blocks of this step and the next do not fit together, the next one loads the rest when it
+begins; blocks of later steps come early where that evens out the traffic.
 """
 
 from __future__ import annotations
@@ -24,9 +18,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.ops.blocks import BLOCK_ROWS
+from blitzgs.ops.blocks import BLOCK_ROWS, swap_blocks_
 from blitzgs.ops.host import to_device
-from blitzgs.ops.pool import swap_blocks_
 from blitzgs.table.block_visibility import UNSEEN, BlockVisibility, Cameras, culled_blocks
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.host_table import HostTable
@@ -166,6 +159,7 @@ class Pool:
         self._last_use = np.zeros(slots, dtype=np.int64)
         self._clock = 0
         self._ready_for: int | None = None
+        self._loading: int | None = None  # blocks that are being loaded for the next step, if that is all
 
     @staticmethod
     def _held_of(columns: Mapping[str, Tensor], rows: int) -> GaussianTable:
@@ -193,7 +187,8 @@ class Pool:
             self.table[name][-self._rest :].copy_(self.held[name][-self._rest :])
         if self._stream is not None:
             self._stream.synchronize()
-        self._is_open, self._rest_changed, self._ready_for = False, False, None
+        self._is_open = self._rest_changed = False
+        self._ready_for = self._loading = None
 
     def catch_up(self, function: Callable[[GaussianTable], None]) -> None:
         """Load every block of the table into the pool, one part after the other, and change its rows there.
@@ -219,7 +214,6 @@ class Pool:
         """Load the blocks that the views of a step see into the pool.
 
         Args:
-            step: number of the step.
             cameras: views of this step and of the following steps, in order, at most 32.
             batch_size: views per step.
 
@@ -235,7 +229,7 @@ class Pool:
         if self._ready_for != step:
             # `prefetch` has not loaded all of them.
             self._load(self._visibility.blocks_of_batch(0), self._begun, required=True)
-        self._ready_for = None
+        self._ready_for = self._loading = None
         self._wait()
         return self._index()
 
@@ -262,16 +256,21 @@ class Pool:
             before = self.moved.loaded
             if self._load(following, self._begun, kept=now):
                 self._ready_for = step
-                self._load_ahead(self.moved.loaded - before)
+                self._loading = self.moved.loaded - before
 
     def store_bounds(self, index: BlockIndex) -> None:
-        """Store the bounds of the index that `load_for_step` returned, after a step has moved rows."""
+        """Store the bounds of the index that `load_for_step` returned, after a step has moved rows.
+
+        All work of the step is queued then, so the host has time to choose blocks of later steps.
+        """
         self._bounds[self._table_blocks] = index.bounds
+        if self._loading is not None:
+            self._load_ahead(self._loading)
 
     def load_for_views(self, cameras: Cameras) -> BlockIndex:
         """Load the blocks that views see, to render without a training step; else as `load_for_step`."""
         self._open()
-        self._ready_for = None
+        self._ready_for = self._loading = None
         self._visibility = BlockVisibility(self._bounds[: self._blocks], cameras, len(cameras.viewmats))
         wanted = self._visibility.blocks_of_batch(0)
         self._count(needed=int(wanted.sum()))
@@ -364,10 +363,7 @@ class Pool:
     # --- Moves --------------------------------------------------------------------------------------------
 
     def _move(
-        self,
-        slots: npt.NDArray[np.int64],
-        coming: npt.NDArray[np.int64],
-        after: torch.cuda.Event | None,
+        self, slots: npt.NDArray[np.int64], coming: npt.NDArray[np.int64], after: torch.cuda.Event | None
     ) -> None:
         """Queue a swap behind an event: write the slots' blocks back and load `coming`; -1: load none."""
         if len(slots) == 0:

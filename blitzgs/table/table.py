@@ -7,12 +7,13 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from blitzgs.ops.copy_rows import put_rows_, take_rows
+from blitzgs.distributed.group import Ranks
+from blitzgs.ops.rows import put_rows_, take_rows
 from blitzgs.table.layouts import LAYOUTS
 
 # A column that has to be moved to become longer gets memory for this many times its rows.
@@ -33,18 +34,6 @@ _PARAMETERS_OF, _EXP_AVGS_OF, _EXP_AVG_SQS_OF = (
     itemgetter(*names) for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)
 )
 NO_PARENT = -1
-
-
-class RowExchange(Protocol):
-    """The methods of `blitzgs.distributed.group.Ranks` that `GaussianTable.exchange` needs."""
-
-    world_size: int
-
-    def exchange_counts(self, counts: Tensor) -> Tensor:
-        """Tell every rank how many rows it will get from this one."""
-
-    def all_to_all(self, rows: Tensor, sent: list[int], received: list[int]) -> Tensor:
-        """Send consecutive groups of rows, one to each rank, and return those received."""
 
 
 @dataclass(frozen=True)
@@ -369,12 +358,11 @@ class GaussianTable:
                 self._memory.setdefault(name, column)
                 self.columns[name] = column[: placement.total]
 
-    def exchange(self, destination_ranks: Tensor, ranks: RowExchange) -> None:
+    def exchange(self, destination_ranks: Tensor, ranks: Ranks) -> None:
         """Move every row to a rank. Collective: every rank calls it. Rows arrive ordered by source rank.
 
         Args:
             destination_ranks: int64 [N], the rank each row goes to.
-            ranks: the job's ranks.
         """
         order = torch.argsort(destination_ranks, stable=True)
         counts = torch.bincount(destination_ranks, minlength=ranks.world_size)

@@ -9,7 +9,7 @@ import os
 import socket
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import blitzgs
@@ -35,9 +35,15 @@ def read_ahead(data: DataConfig) -> Future[Capture] | None:
     if data.allow_missing or not data.path:
         return None
     pool = ThreadPoolExecutor(1, "blitzgs-capture")
-    reading = pool.submit(load_configured, data)
+    reading = pool.submit(_read, data)
     pool.shutdown(wait=False)
     return reading
+
+
+def _read(data: DataConfig) -> Capture:
+    """Load a capture, after the digest of the code that `check_alike` compares."""
+    code_fingerprint()
+    return load_configured(data)
 
 
 def open_capture(
@@ -220,6 +226,7 @@ def check_alike(config: Config, capture: Capture, ranks: Ranks, resume: bool) ->
     )
 
 
+@cache
 def code_fingerprint() -> str:
     """Return the version of the package with a digest of its sources and kernels."""
     digest = hashlib.sha256()

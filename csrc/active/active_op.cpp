@@ -22,25 +22,24 @@ struct HeldRules {
 };
 
 void set_reach(const char* op, const std::vector<double>& reach, GateRules& rules) {
-  STD_TORCH_CHECK(!reach.empty() && reach.size() <= kMaxLevels, "blitzgs::", op, ": 1 to ", kMaxLevels,
-                  " levels are supported, got ", reach.size());
+  BLITZGS_CHECK(!reach.empty() && reach.size() <= kMaxLevels, op, "1 to ", kMaxLevels,
+                " levels are supported, got ", reach.size());
   rules.n_levels = static_cast<int>(reach.size());
   for (int level = 0; level < rules.n_levels; ++level) {
-    STD_TORCH_CHECK(level == 0 || reach[level] <= reach[level - 1], "blitzgs::", op,
-                    ": finer levels reach no farther, got ", reach[level - 1], " and ", reach[level],
-                    " for the levels ", level - 1, " and ", level);
+    BLITZGS_CHECK(level == 0 || reach[level] <= reach[level - 1], op, "finer levels reach no farther, got ",
+                  reach[level - 1], " and ", reach[level], " for the levels ", level - 1, " and ", level);
     rules.table.reach2[level] = reach[level] < 0 ? -1.0f : static_cast<float>(reach[level] * reach[level]);
   }
 }
 
 void set_columns(const char* op, const std::vector<std::int64_t>& columns, bool has_cull, GateRules& rules) {
   if (columns.empty()) return;
-  STD_TORCH_CHECK(static_cast<int>(columns.size()) == rules.n_views, "blitzgs::", op, ": ", rules.n_views,
-                  " views need as many columns of the cull matrix, got ", columns.size());
-  STD_TORCH_CHECK(has_cull, "blitzgs::", op, ": columns need a cull matrix");
+  BLITZGS_CHECK(static_cast<int>(columns.size()) == rules.n_views, op, rules.n_views,
+                " views need as many columns of the cull matrix, got ", columns.size());
+  BLITZGS_CHECK(has_cull, op, "columns need a cull matrix");
   for (int view = 0; view < rules.n_views; ++view) {
-    STD_TORCH_CHECK(columns[view] < rules.cull_columns, "blitzgs::", op, ": the cull matrix has ",
-                    rules.cull_columns, " columns, got column ", columns[view]);
+    BLITZGS_CHECK(columns[view] < rules.cull_columns, op, "the cull matrix has ", rules.cull_columns,
+                  " columns, got column ", columns[view]);
     rules.table.columns[view] = static_cast<std::int32_t>(columns[view]);
     if (columns[view] >= 0) rules.cull_views |= 1u << view;
   }
@@ -71,13 +70,13 @@ struct HeldRows {
 // rows: (means, scales), and if steps may be pending also the moments (exp_avg and exp_avg_sq of the means,
 // then of the scales), last_step, moment_step and table. blitzgs/ops/blocks.py builds this group.
 HeldRows hold_rows(const char* op, const std::vector<Tensor>& rows) {
-  STD_TORCH_CHECK(rows.size() == 2 || rows.size() == 9, "blitzgs::", op,
-                  ": rows must be (means, scales) or, with pending steps, (means, scales, exp_avg_means, "
-                  "exp_avg_sq_means, exp_avg_scales, exp_avg_sq_scales, last_step, moment_step, table), got ",
-                  rows.size(), " tensors");
+  BLITZGS_CHECK(rows.size() == 2 || rows.size() == 9, op,
+                "rows must be (means, scales) or, with pending steps, (means, scales, exp_avg_means, "
+                "exp_avg_sq_means, exp_avg_scales, exp_avg_sq_scales, last_step, moment_step, table), got ",
+                rows.size(), " tensors");
   const std::int64_t n = rows[0].size(0);
-  STD_TORCH_CHECK(n < (std::int64_t{1} << 31) - kBlockRows, "blitzgs::", op, ": fewer than 2^31 - ",
-                  kBlockRows, " rows are supported, got ", n);
+  BLITZGS_CHECK(n < (std::int64_t{1} << 31) - kBlockRows, op, "fewer than 2^31 - ", kBlockRows,
+                " rows are supported, got ", n);
   HeldRows held;
   const auto hold = [&]<class T>(const T*& column, const char* name, std::size_t at, ScalarType dtype,
                                  std::initializer_list<std::int64_t> shape) {
@@ -95,6 +94,12 @@ HeldRows hold_rows(const char* op, const std::vector<Tensor>& rows) {
   hold(held.rows.moment_step, "moment_step", 7, ScalarType::Int, {n});
   hold(held.rows.table, "table", 8, ScalarType::Double, {-1, kAdamTable});
   return held;
+}
+
+Tensor checked_viewmats(const char* op, const Tensor& viewmats) {
+  const Tensor found = checked(op, "viewmats", viewmats, ScalarType::Float, {-1, 4, 4});
+  BLITZGS_CHECK(found.size(0) <= kMaxViews, op, "at most ", kMaxViews, " views at once, got ", found.size(0));
+  return found;
 }
 
 void check_bounds(const char* op, const Tensor& bounds, std::int64_t rows) {
@@ -123,17 +128,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
   const char* op = "cull_blocks";
   const HeldRows held = hold_rows(op, rows);
   check_bounds(op, bounds, held.rows.n);
-  const Tensor viewmats = checked(op, "viewmats", viewmats_in, ScalarType::Float, {-1, 4, 4});
+  const Tensor viewmats = checked_viewmats(op, viewmats_in);
   const std::int64_t views = viewmats.size(0);
-  STD_TORCH_CHECK(views <= kMaxViews, "blitzgs::", op, ": at most ", kMaxViews, " views at once, got ",
-                  views);
   const Tensor Ks = checked(op, "Ks", Ks_in, ScalarType::Float, {views, 3, 3});
   const CullCamera camera{data<float>(viewmats),          data<float>(Ks),
                           static_cast<int>(width),        static_cast<int>(height),
                           static_cast<float>(near_plane), static_cast<float>(far_plane),
                           static_cast<float>(eps2d)};
-  STD_TORCH_CHECK(level_ranges_in.has_value() == level.has_value(), "blitzgs::", op,
-                  ": a gate needs level_ranges and level");
+  BLITZGS_CHECK(level_ranges_in.has_value() == level.has_value(), op, "a gate needs level_ranges and level");
   BlockGate gate{};
   std::optional<HeldRules> rules;
   const std::optional<Tensor> level_ranges =
@@ -144,8 +146,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
   }
   DeviceScope scope(bounds);
   const CullInputs in{held.rows, data<float>(bounds), camera, static_cast<int>(views), gate};
-  STD_TORCH_CHECK(!capacity_in || *capacity_in > 0, "blitzgs::", op,
-                  ": capacity_blocks must be for 1 block or more, got ", *capacity_in);
+  BLITZGS_CHECK(!capacity_in || *capacity_in > 0, op, "capacity_blocks must be for 1 block or more, got ",
+                *capacity_in);
   const std::int64_t capacity = capacity_in ? std::min(*capacity_in, blocks_of(held.rows.n))
                                             : backend::count_active_blocks(in, scope.workspace, scope.stream);
   Tensor active_ids = make_empty(bounds, {capacity * kBlockRows}, ScalarType::Int);
@@ -159,9 +161,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
 }
 
 Tensor sectors_of_rows(const Tensor& rows_in) {
-  check_dtype("sectors_of_rows", "rows", rows_in, ScalarType::Int);
-  check_shape("sectors_of_rows", "rows", rows_in, {-1, -1});
-  Tensor rows = as_contiguous(rows_in);
+  Tensor rows = checked("sectors_of_rows", "rows", rows_in, ScalarType::Int, {-1, -1});
   const std::int64_t n = rows.size(0), words = rows.size(1);
   Tensor sectors = make_empty(rows, {blocks_of(n), 32 * words, kSectorWords});
   DeviceScope scope(rows);
@@ -172,11 +172,9 @@ Tensor sectors_of_rows(const Tensor& rows_in) {
 
 Tensor rows_of_sectors(const Tensor& sectors_in, std::int64_t n) {
   constexpr const char* kOp = "rows_of_sectors";
-  check_dtype(kOp, "sectors", sectors_in, ScalarType::Int);
-  check_shape(kOp, "sectors", sectors_in, {blocks_of(n), -1, kSectorWords});
-  STD_TORCH_CHECK(sectors_in.size(1) % 32 == 0, "blitzgs::", kOp,
-                  ": sectors must be of a multiple of 32 columns, got ", sectors_in.size(1));
-  Tensor sectors = as_contiguous(sectors_in);
+  Tensor sectors = checked(kOp, "sectors", sectors_in, ScalarType::Int, {blocks_of(n), -1, kSectorWords});
+  BLITZGS_CHECK(sectors.size(1) % 32 == 0, kOp, "sectors must be of a multiple of 32 columns, got ",
+                sectors.size(1));
   const std::int64_t words = sectors.size(1) / 32;
   Tensor rows = make_empty(sectors, {n, words});
   DeviceScope scope(sectors);
@@ -195,9 +193,7 @@ void gate_views_(const Tensor& ids_in, Tensor views, const std::optional<Tensor>
   const std::int64_t capacity = ids.size(0);
   check_in_place(kGateViews, "views", views, ScalarType::Int, {capacity});
   const Tensor means = checked(kGateViews, "means", means_in, ScalarType::Float, {-1, 3});
-  const Tensor viewmats = checked(kGateViews, "viewmats", viewmats_in, ScalarType::Float, {-1, 4, 4});
-  STD_TORCH_CHECK(viewmats.size(0) <= kMaxViews, "blitzgs::", kGateViews, ": at most ", kMaxViews,
-                  " views at once, got ", viewmats.size(0));
+  const Tensor viewmats = checked_viewmats(kGateViews, viewmats_in);
   const HeldRules held = hold_rules(kGateViews, means.size(0), static_cast<int>(viewmats.size(0)), level_in,
                                     reach, lod_views, cull_in, columns);
   if (!leaves_out_any(held.rules)) return;
@@ -215,19 +211,11 @@ void gate_views_(const Tensor& ids_in, Tensor views, const std::optional<Tensor>
 Tensor seen_blocks(const Tensor& bounds, const Tensor& viewmats_in, const Tensor& Ks_in,
                    const Tensor& sizes_in, double near_plane, double far_plane, double eps2d) {
   constexpr const char* kOp = "seen_blocks";
-  check_dtype(kOp, "bounds", bounds, ScalarType::Float);
-  check_shape(kOp, "bounds", bounds, {-1, kBlockBounds});
-  check_dtype(kOp, "viewmats", viewmats_in, ScalarType::Float);
-  check_shape(kOp, "viewmats", viewmats_in, {-1, 4, 4});
-  const std::int64_t views = viewmats_in.size(0);
-  STD_TORCH_CHECK(views <= kMaxViews, "blitzgs::", kOp, ": at most ", kMaxViews, " views at once, got ",
-                  views);
-  check_dtype(kOp, "Ks", Ks_in, ScalarType::Float);
-  check_shape(kOp, "Ks", Ks_in, {views, 3, 3});
-  check_dtype(kOp, "sizes", sizes_in, ScalarType::Int);
-  check_shape(kOp, "sizes", sizes_in, {views, 2});
-  const Tensor boxes = as_contiguous(bounds), viewmats = as_contiguous(viewmats_in);
-  const Tensor Ks = as_contiguous(Ks_in), sizes = as_contiguous(sizes_in);
+  const Tensor boxes = checked(kOp, "bounds", bounds, ScalarType::Float, {-1, kBlockBounds}),
+               viewmats = checked_viewmats(kOp, viewmats_in);
+  const std::int64_t views = viewmats.size(0);
+  const Tensor Ks = checked(kOp, "Ks", Ks_in, ScalarType::Float, {views, 3, 3}),
+               sizes = checked(kOp, "sizes", sizes_in, ScalarType::Int, {views, 2});
   Tensor seen = make_empty(boxes, {boxes.size(0)}, ScalarType::Int);
   DeviceScope scope(boxes);
   backend::seen_blocks(
@@ -240,18 +228,18 @@ Tensor seen_blocks(const Tensor& bounds, const Tensor& viewmats_in, const Tensor
 
 // Checks a column of the pool and of the table, and returns the bytes of a block of this column.
 std::int64_t check_pair(const char* op, const Tensor& pool, const Tensor& table) {
-  STD_TORCH_CHECK(pool.dim() >= 1 && pool.dim() == table.dim(), "blitzgs::", op,
-                  ": columns must have rows, and as many axes in pool and table; got ", shape_of(pool),
-                  " and ", shape_of(table));
+  BLITZGS_CHECK(pool.dim() >= 1 && pool.dim() == table.dim(), op,
+                "columns must have rows, and as many axes in pool and table; got ", shape_of(pool), " and ",
+                shape_of(table));
   check_dtype(op, "a column of the pool", pool, table.scalar_type());
   std::int64_t elements = 1;
   for (std::int64_t axis = 1; axis < pool.dim(); ++axis) {
-    STD_TORCH_CHECK(pool.size(axis) == table.size(axis), "blitzgs::", op,
-                    ": rows of pool and table must be alike, got ", shape_of(pool), " and ", shape_of(table));
+    BLITZGS_CHECK(pool.size(axis) == table.size(axis), op, "rows of pool and table must be alike, got ",
+                  shape_of(pool), " and ", shape_of(table));
     elements *= pool.size(axis);
   }
   for (const Tensor* column : {&pool, &table}) check_contiguous(op, "columns", *column);
-  STD_TORCH_CHECK(table.is_cpu(), "blitzgs::", op, ": the table must be in the memory of the host");
+  BLITZGS_CHECK(table.is_cpu(), op, "the table must be in the memory of the host");
   return kBlockRows * elements * static_cast<std::int64_t>(pool.element_size());
 }
 
@@ -259,9 +247,9 @@ void swap_blocks_(std::vector<Tensor> pool, std::vector<Tensor> table, std::int6
                   const Tensor& slots, const Tensor& leaving, const Tensor& coming) {
   constexpr const char* kOp = "swap_blocks_";
   const auto n_columns = static_cast<std::int64_t>(pool.size());
-  STD_TORCH_CHECK(n_columns <= kMaxSwapColumns && table.size() == pool.size(), "blitzgs::", kOp,
-                  ": pool and table must have the same columns, at most ", kMaxSwapColumns, "; got ",
-                  n_columns, " and ", table.size());
+  BLITZGS_CHECK(n_columns <= kMaxSwapColumns && table.size() == pool.size(), kOp,
+                "pool and table must have the same columns, at most ", kMaxSwapColumns, "; got ", n_columns,
+                " and ", table.size());
   SwapBlocks swap{};
   swap.n = slots.size(0);
   for (const auto& [name, list] :

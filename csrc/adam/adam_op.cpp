@@ -16,7 +16,7 @@ void lazy_adam_step(const std::vector<Tensor>& state, const std::vector<Tensor>&
   AdamTensors adam(kOp, state, tables, {step, explicit_steps, beta1, beta2, eps});
   if (taken) {
     check_in_place(kOp, "taken", *taken, ScalarType::Float, {});
-    STD_TORCH_CHECK(taken->is_cpu(), "blitzgs::", kOp, ": taken must be on the CPU");
+    BLITZGS_CHECK(taken->is_cpu(), kOp, "taken must be on the CPU");
   }
   adam.step_rows(grads, ids, current, rates);
   if (taken) ++*mutable_data<float>(*taken);
@@ -31,8 +31,8 @@ void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<T
   if (count) check_device(kOp, "count", *count, state.like(), state.name(0));
   const std::int64_t n = max_listed(kOp, count, list ? list->numel() : state.rows());
   DeviceScope scope(state.like());
-  dispatch_floating(state.like(), [&](auto zero) {
-    auto args = state.arguments<decltype(zero)>(list);
+  dispatch_floating(state.like(), [&]<class T>() {
+    auto args = state.arguments<T>(list);
     args.n = n;
     args.count = data_or_null<std::int32_t>(count);
     if (n > 0) backend::lazy_adam(args, scope.workspace, scope.stream);
@@ -44,13 +44,11 @@ Tensor lazy_adam_final_rules(const Tensor& table, const Tensor& like, std::int64
   constexpr const char* kOp = "lazy_adam_final_rules";
   const Tensor contiguous = checked(kOp, "table", table, ScalarType::Double, {-1, kAdamTable});
   check_floating(kOp, "like", like);
-  STD_TORCH_CHECK(explicit_steps >= 1, "blitzgs::", kOp, ": explicit_steps must be 1 or more, got ",
-                  explicit_steps);
+  BLITZGS_CHECK(explicit_steps >= 1, kOp, "explicit_steps must be 1 or more, got ", explicit_steps);
   const std::int64_t n = final_rules_of(table.size(0), explicit_steps);
   std::optional<Tensor> rules;
   DeviceScope scope(contiguous);
-  dispatch_floating(like, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(like, [&]<class T>() {
     AdamArgs<T> args{};
     args.table = data<double>(contiguous);
     args.explicit_steps = static_cast<std::int32_t>(explicit_steps);
@@ -79,8 +77,7 @@ void position_noise_(Tensor means, const Tensor& quats_in, const Tensor& scales_
   if (visible == 0 || strength == 0) return;
 
   DeviceScope scope(means);
-  dispatch_floating(means, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(means, [&]<class T>() {
     const PositionNoise<T> args{mutable_data<T>(means),
                                 data<T>(quats),
                                 data<T>(scales),

@@ -3,7 +3,6 @@
 #include <vector>
 
 #include "adam/lazy_adam_lanes.h"
-#include "adam/position_noise.h"
 #include "common/catch.h"
 
 using namespace blitzgs;
@@ -54,18 +53,6 @@ struct Schedule {
   }
 };
 
-// The drift of one element by its pending steps, one by one, in double.
-double drift_one_by_one(double m, double v, int from, int to, double eps) {
-  double drift = 0;
-  for (int t = from + 1; t <= to; ++t) {
-    m *= kBeta1;
-    v *= kBeta2;
-    drift += static_cast<double>(0.01f) * (m / (1 - std::pow(kBeta1, t))) /
-             (std::sqrt(v) / std::sqrt(1 - std::pow(kBeta2, t)) + eps);
-  }
-  return drift;
-}
-
 template <class T>
 T drift(const blitzgs::AdamArgs<T>& args, int from, int to, int group, T m, T v) {
   const blitzgs::PendingSteps<T> steps = blitzgs::pending_steps(args, from, to);
@@ -73,21 +60,6 @@ T drift(const blitzgs::AdamArgs<T>& args, int from, int to, int group, T m, T v)
 }
 
 }  // namespace
-
-TEST_CASE("catching up equals the steps one by one, whatever eps weighs") {
-  const Schedule schedule;
-  for (const double eps : {1e-15, 1e-4, 1e-2, 0.1, 1.0}) {
-    for (const int gap : {1, 2, 7, 100}) {
-      for (const int from : {1, 20, 300}) {
-        const double exact = drift_one_by_one(0.02, 1e-3, from, from + gap, eps);
-        REQUIRE(drift(schedule.args<double>(eps), from, from + gap, 0, 0.02, 1e-3) ==
-                Approx(exact).epsilon(1e-12));
-        REQUIRE(static_cast<double>(drift(schedule.args<float>(eps), from, from + gap, 0, 0.02f, 1e-3f)) ==
-                Approx(exact).epsilon(3e-6));
-      }
-    }
-  }
-}
 
 TEST_CASE("late in a schedule no element needs its steps one by one, early those that eps concerns") {
   const Schedule schedule;
@@ -121,33 +93,4 @@ TEST_CASE("rows that never had a gradient do not move, and groups split the SH c
   REQUIRE(blitzgs::adam_group(4, 2) == 4);
   REQUIRE(blitzgs::adam_group(4, 3) == 5);
   REQUIRE(blitzgs::adam_group(1, 3) == 1);
-}
-
-TEST_CASE("draws have the moments of a standard normal") {
-  double sum = 0, squares = 0, cubes = 0;
-  constexpr int kDraws = 100000;
-  for (int i = 0; i < kDraws; ++i) {
-    const double x = blitzgs::normal_of(blitzgs::hash_key(blitzgs::hash_key(0, 42), i));
-    sum += x, squares += x * x, cubes += x * x * x;
-  }
-  REQUIRE(sum / kDraws == Approx(0).margin(0.015));
-  REQUIRE(squares / kDraws == Approx(1).margin(0.02));
-  REQUIRE(cubes / kDraws == Approx(0).margin(0.05));
-}
-
-TEST_CASE("a flat, turned Gaussian moves in its plane alone, and an opaque one stays") {
-  const double half = std::sqrt(0.5);
-  double means[6] = {1, 2, 3, 1, 2, 3};
-  const double quats[8] = {half, half, 0, 0, half, half, 0, 0};  // a quarter turn about x: z becomes -y
-  const double flat[6] = {0, 0, -30, 0, 0, -30};
-  const double opacities[2] = {-9, 1};
-  const std::int64_t ids[2] = {7, 8};
-  const std::int32_t visible[2] = {0, 1};
-  const blitzgs::PositionNoise<double> args{means, quats, flat, opacities, ids, visible, 2, 3, 5, 0.005, 0.1};
-  args(0);
-  args(1);
-  REQUIRE(means[0] != 1);
-  REQUIRE(means[1] == Approx(2).margin(1e-9));
-  REQUIRE(means[2] != 3);
-  REQUIRE((means[3] == 1 && means[4] == 2 && means[5] == 3));
 }

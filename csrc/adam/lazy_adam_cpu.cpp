@@ -88,10 +88,8 @@ void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream) {
 
 template <class T>
 void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream) {
-  parallel_for(0, n, 1024, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t from = begin; from < end; ++from) {
-      rules[from] = final_pending_steps(args, static_cast<std::int32_t>(from));
-    }
+  parallel_rows(n, 1024, [&](std::int64_t from) {
+    rules[from] = final_pending_steps(args, static_cast<std::int32_t>(from));
   });
 }
 

@@ -38,11 +38,10 @@ struct AdamTensors {
   AdamTensors(const char* op_name, const std::vector<Tensor>& state, const std::vector<Tensor>& tables,
               const AdamConstants& constants_in)
       : op(op_name), alone(state.size() == kAloneState), constants(constants_in) {
-    STD_TORCH_CHECK((alone || state.size() == kAdamState) && (tables.size() == 2 || tables.size() == 3),
-                    "blitzgs::", op,
-                    ": expected state (params, exp_avgs and exp_avg_sqs of means, quats, scales, opacities ",
-                    "and sh, or of one parameter, last_step, moment_step) and tables (table, lr_table[, ",
-                    "final_rules]); got ", state.size(), " and ", tables.size(), " entries");
+    BLITZGS_CHECK((alone || state.size() == kAdamState) && (tables.size() == 2 || tables.size() == 3), op,
+                  "expected state (params, exp_avgs and exp_avg_sqs of means, quats, scales, opacities ",
+                  "and sh, or of one parameter, last_step, moment_step) and tables (table, lr_table[, ",
+                  "final_rules]); got ", state.size(), " and ", tables.size(), " entries");
     auto next = state.begin();
     for (std::vector<Tensor>* columns : {&params, &exp_avgs, &exp_avg_sqs}) {
       columns->assign(next, next + count());
@@ -110,11 +109,10 @@ struct AdamTensors {
   // step, of the first three values of SH and of all others, which enter the tables (`RatesArgs`).
   void step_rows(const std::vector<Tensor>& grads, const std::optional<Tensor>& ids, bool current,
                  const std::vector<double>& rates) {
-    STD_TORCH_CHECK(std::ssize(grads) == count(), "blitzgs::", op, ": grads must hold ",
-                    alone ? "one" : "means, quats, scales, opacities, sh", "; got ", grads.size(),
-                    " tensors");
-    STD_TORCH_CHECK(rates.empty() || (rates.size() == 2 && alone && !final_rules), "blitzgs::", op,
-                    ": rates must be empty or two numbers, for one parameter and tables without final_rules");
+    BLITZGS_CHECK(std::ssize(grads) == count(), op, "grads must hold ",
+                  alone ? "one" : "means, quats, scales, opacities, sh", "; got ", grads.size(), " tensors");
+    BLITZGS_CHECK(rates.empty() || (rates.size() == 2 && alone && !final_rules), op,
+                  "rates must be empty or two numbers, for one parameter and tables without final_rules");
     check_takes_step();
     const std::optional<Tensor> list = checked_rows(ids);
     const std::int64_t n = list ? list->numel() : rows();
@@ -122,13 +120,12 @@ struct AdamTensors {
     for (int c = 0; c < count(); ++c) {
       const Tensor& grad = held.emplace_back(as_contiguous(grads[c]));
       check_dtype(op, "grads", grad, like().scalar_type());
-      STD_TORCH_CHECK(grad.dim() >= 1 && grad.size(0) == n && grad.numel() == n * width(c), "blitzgs::", op,
-                      ": the gradient of ", name(c), " must have ", n, " rows of ", width(c), " values, got ",
-                      shape_of(grad));
+      BLITZGS_CHECK(grad.dim() >= 1 && grad.size(0) == n && grad.numel() == n * width(c), op,
+                    "the gradient of ", name(c), " must have ", n, " rows of ", width(c), " values, got ",
+                    shape_of(grad));
     }
     DeviceScope scope(like());
-    dispatch_floating(like(), [&](auto zero) {
-      using T = decltype(zero);
+    dispatch_floating(like(), [&]<class T>() {
       AdamArgs<T> args = arguments<T>(list);
       for (int c = 0; c < count(); ++c) args.columns[first() + c].grad = data<T>(held[c]);
       args.current = current;
@@ -146,7 +143,7 @@ struct AdamTensors {
   }
 
   void check_takes_step() const {
-    STD_TORCH_CHECK(constants.step >= 1, "blitzgs::", op, ": steps count from 1, got ", constants.step);
+    BLITZGS_CHECK(constants.step >= 1, op, "steps count from 1, got ", constants.step);
   }
 
   std::int64_t width(int column) const { return rows() ? params[column].numel() / rows() : 0; }
@@ -158,9 +155,8 @@ struct AdamTensors {
       for (const Tensor* tensor : {&params[c], &exp_avgs[c], &exp_avg_sqs[c]}) check_column(*tensor, c);
     }
     for (const auto& [c, values] : {std::pair{0, 3}, std::pair{1, 4}, std::pair{2, 3}, std::pair{3, 1}}) {
-      STD_TORCH_CHECK(alone || params[c].numel() == values * rows(), "blitzgs::", op, ": ", kAdamNames[c],
-                      " must have ", values, " values in each of ", rows(), " rows, got ",
-                      shape_of(params[c]));
+      BLITZGS_CHECK(alone || params[c].numel() == values * rows(), op, kAdamNames[c], " must have ", values,
+                    " values in each of ", rows(), " rows, got ", shape_of(params[c]));
     }
     for (const auto& [what, tensor] :
          {std::pair{"last_step", &last_step}, std::pair{"moment_step", &moment_step},
@@ -172,18 +168,18 @@ struct AdamTensors {
     check_in_place(op, "table", table, ScalarType::Double, {-1, kAdamTable});
     check_in_place(op, "lr_table", lr_table, ScalarType::Float, {table.size(0), kAdamGroups});
     const std::int64_t step = constants.step;
-    STD_TORCH_CHECK(step >= 0 && step < table.size(0), "blitzgs::", op, ": step ", step,
-                    " is outside the learning-rate table, which ends at step ", table.size(0) - 1);
+    BLITZGS_CHECK(step >= 0 && step < table.size(0), op, "step ", step,
+                  " is outside the learning-rate table, which ends at step ", table.size(0) - 1);
   }
 
   void check_column(const Tensor& tensor, int column) const {
     check_device(op, "a parameter or moment", tensor, like(), name(0));
     check_dtype(op, name(column), tensor, like().scalar_type());
     check_contiguous(op, name(column), tensor);
-    STD_TORCH_CHECK(tensor.dim() >= 1 && tensor.size(0) == rows(), "blitzgs::", op, ": ", name(column),
-                    " must have ", rows(), " rows, got ", shape_of(tensor));
-    STD_TORCH_CHECK(tensor.numel() == params[column].numel(), "blitzgs::", op, ": the moments of ",
-                    name(column), " must have its shape ", shape_of(params[column]));
+    BLITZGS_CHECK(tensor.dim() >= 1 && tensor.size(0) == rows(), op, name(column), " must have ", rows(),
+                  " rows, got ", shape_of(tensor));
+    BLITZGS_CHECK(tensor.numel() == params[column].numel(), op, "the moments of ", name(column),
+                  " must have its shape ", shape_of(params[column]));
   }
 };
 

@@ -47,6 +47,9 @@ inline std::string shape_of(const Tensor& tensor) {
   return text.str();
 }
 
+// Throws "blitzgs::<op>: <message>" unless a condition holds.
+#define BLITZGS_CHECK(condition, op, ...) STD_TORCH_CHECK(condition, "blitzgs::", op, ": ", __VA_ARGS__)
+
 // shape: one entry per dimension, -1 for any size. The message is built only if the check fails, because a
 // step checks some two hundred tensors while the GPU waits for its next kernel.
 inline void check_shape(const char* op, const char* name, const Tensor& tensor,
@@ -62,26 +65,24 @@ inline void check_shape(const char* op, const char* name, const Tensor& tensor,
   for (const std::int64_t size : shape) {
     wanted << (wanted.tellp() > 0 ? ", " : "") << (size < 0 ? "*" : std::to_string(size));
   }
-  STD_TORCH_CHECK(false, "blitzgs::", op, ": ", name, " must have shape [", wanted.str(), "], got ",
-                  shape_of(tensor));
+  BLITZGS_CHECK(false, op, name, " must have shape [", wanted.str(), "], got ", shape_of(tensor));
 }
 
 inline void check_dtype(const char* op, const char* name, const Tensor& tensor, ScalarType dtype) {
-  STD_TORCH_CHECK(tensor.scalar_type() == dtype, "blitzgs::", op, ": ", name, " must be ",
-                  torch::headeronly::toString(dtype), ", got ",
-                  torch::headeronly::toString(tensor.scalar_type()));
+  BLITZGS_CHECK(tensor.scalar_type() == dtype, op, name, " must be ", torch::headeronly::toString(dtype),
+                ", got ", torch::headeronly::toString(tensor.scalar_type()));
 }
 
 // Checks that a tensor is on the device of `like`, which the message calls `of`. A kernel that reads memory
 // of the host ends all further work of the process on the GPU.
 inline void check_device(const char* op, const char* name, const Tensor& tensor, const Tensor& like,
                          const char* of) {
-  STD_TORCH_CHECK(tensor.is_cpu() == like.is_cpu() && tensor.get_device_index() == like.get_device_index(),
-                  "blitzgs::", op, ": ", name, " must be on the device of ", of);
+  BLITZGS_CHECK(tensor.is_cpu() == like.is_cpu() && tensor.get_device_index() == like.get_device_index(), op,
+                "", name, " must be on the device of ", of);
 }
 
 inline void check_contiguous(const char* op, const char* name, const Tensor& tensor) {
-  STD_TORCH_CHECK(tensor.is_contiguous(), "blitzgs::", op, ": ", name, " must be contiguous");
+  BLITZGS_CHECK(tensor.is_contiguous(), op, name, " must be contiguous");
 }
 
 // Checks a tensor that kernels read or write in its own memory, so that it must be contiguous.
@@ -96,12 +97,12 @@ inline void check_in_place(const char* op, const char* name, const Tensor& tenso
 inline void check_floating(const char* op, const char* name, const Tensor& tensor) {
   const ScalarType dtype = tensor.scalar_type();
 #ifdef BLITZGS_BACKEND_CUDA
-  STD_TORCH_CHECK(dtype == ScalarType::Float, "blitzgs::", op, ": ", name,
-                  " must be float32 on CUDA (float64 runs on the CPU), got ",
-                  torch::headeronly::toString(dtype));
+  BLITZGS_CHECK(dtype == ScalarType::Float, op, name,
+                " must be float32 on CUDA (float64 runs on the CPU), got ",
+                torch::headeronly::toString(dtype));
 #else
-  STD_TORCH_CHECK(dtype == ScalarType::Float || dtype == ScalarType::Double, "blitzgs::", op, ": ", name,
-                  " must be float32 or float64, got ", torch::headeronly::toString(dtype));
+  BLITZGS_CHECK(dtype == ScalarType::Float || dtype == ScalarType::Double, op, name,
+                " must be float32 or float64, got ", torch::headeronly::toString(dtype));
 #endif
 }
 
@@ -176,8 +177,8 @@ inline std::int64_t max_listed(const char* op, const std::optional<Tensor>& coun
   return capacity;
 #else
   const std::int64_t listed = *data<std::int32_t>(*count);
-  STD_TORCH_CHECK(listed >= 0 && listed <= capacity, "blitzgs::", op, ": a list of ", capacity,
-                  " cannot have ", listed, " entries");
+  BLITZGS_CHECK(listed >= 0 && listed <= capacity, op, "a list of ", capacity, " cannot have ", listed,
+                " entries");
   return listed;
 #endif
 }
@@ -219,16 +220,16 @@ struct DeviceScope {
 #endif
 };
 
-// Calls f(T{}) with T = float or double by the tensor's dtype (CUDA: float only).
+// Calls f<T>() with T = float or double by the tensor's dtype (CUDA: float only).
 template <class F>
 void dispatch_floating([[maybe_unused]] const Tensor& tensor, const F& f) {
 #ifndef BLITZGS_BACKEND_CUDA
   if (tensor.scalar_type() == ScalarType::Double) {
-    f(double{});
+    f.template operator()<double>();
     return;
   }
 #endif
-  f(float{});
+  f.template operator()<float>();
 }
 
 // The optional argument n_splats of an op, int64 [1]: how many splats of its columns are valid (kernel.h).
@@ -240,8 +241,8 @@ struct SplatCount {
 inline SplatCount checked_splat_count(const char* op, const std::optional<Tensor>& n_splats,
                                       const Tensor& splats) {
   const std::int64_t capacity = splats.size(0);
-  STD_TORCH_CHECK(capacity <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op,
-                  ": splat indices are 32-bit, got ", capacity, " splats; render fewer views at once");
+  BLITZGS_CHECK(capacity <= std::numeric_limits<std::int32_t>::max(), op, "splat indices are 32-bit, got ",
+                capacity, " splats; render fewer views at once");
   if (!n_splats) return {capacity, nullptr};
   check_dtype(op, "n_splats", *n_splats, ScalarType::Long);
   check_shape(op, "n_splats", *n_splats, {1});
@@ -254,9 +255,9 @@ inline SplatCount checked_splat_count(const char* op, const std::optional<Tensor
 }
 
 inline void check_tile_range(const char* op, std::int64_t begin, std::int64_t end, std::int64_t tiles) {
-  STD_TORCH_CHECK(0 <= begin && begin <= end && end <= tiles, "blitzgs::", op,
-                  ": tile_begin and tile_end must be a range of the ", tiles, " tiles, got [", begin, ", ",
-                  end, ")");
+  BLITZGS_CHECK(0 <= begin && begin <= end && end <= tiles, op,
+                "tile_begin and tile_end must be a range of the ", tiles, " tiles, got [", begin, ", ", end,
+                ")");
 }
 
 // The grid of tiles of an op's arguments, checked. tile_end: -1 for all tiles.
@@ -264,12 +265,10 @@ inline TileGrid checked_tile_grid(const char* op, std::int64_t n_cameras, std::i
                                   std::int64_t height, std::int64_t tile_size, std::int64_t tile_begin,
                                   std::int64_t tile_end) {
   constexpr std::int64_t kMax = std::numeric_limits<std::int32_t>::max();
-  STD_TORCH_CHECK(n_cameras >= 0 && n_cameras <= kMax, "blitzgs::", op,
-                  ": n_cameras must be at least 0, got ", n_cameras);
-  STD_TORCH_CHECK(width > 0 && height > 0 && width <= (1 << 20) && height <= (1 << 20), "blitzgs::", op,
-                  ": width and height must be in [1, 2^20], got ", width, " x ", height);
-  STD_TORCH_CHECK(tile_size > 0 && tile_size <= 64, "blitzgs::", op, ": tile_size must be in [1, 64], got ",
-                  tile_size);
+  BLITZGS_CHECK(n_cameras >= 0 && n_cameras <= kMax, op, "n_cameras must be at least 0, got ", n_cameras);
+  BLITZGS_CHECK(width > 0 && height > 0 && width <= (1 << 20) && height <= (1 << 20), op,
+                "width and height must be in [1, 2^20], got ", width, " x ", height);
+  BLITZGS_CHECK(tile_size > 0 && tile_size <= 64, op, "tile_size must be in [1, 64], got ", tile_size);
   const TileGrid grid =
       make_tile_grid(static_cast<int>(n_cameras), static_cast<int>(width), static_cast<int>(height),
                      static_cast<int>(tile_size), tile_begin, tile_end);
@@ -280,7 +279,7 @@ inline TileGrid checked_tile_grid(const char* op, std::int64_t n_cameras, std::i
 // Checks a tensor in pinned memory of the host to which kernels write.
 inline void check_host_values(const char* op, const Tensor& host, std::initializer_list<std::int64_t> shape) {
   check_in_place(op, "host", host, ScalarType::Long, shape);
-  STD_TORCH_CHECK(host.is_cpu(), "blitzgs::", op, ": host must be in pinned memory of the host");
+  BLITZGS_CHECK(host.is_cpu(), op, "host must be in pinned memory of the host");
 }
 
 }  // namespace blitzgs

@@ -25,6 +25,14 @@ void parallel_for(std::int64_t begin, std::int64_t end, std::int64_t grain, cons
       const_cast<void*>(static_cast<const void*>(&f)));
 }
 
+// Calls f(i) for each i in [0, n), on threads that each take at least `grain` consecutive ones.
+template <class F>
+void parallel_rows(std::int64_t n, std::int64_t grain, const F& f) {
+  parallel_for(0, n, grain, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) f(i);
+  });
+}
+
 // Calls f(task, worker) once for each task in [0, n). Each worker takes one task at a time, which suits tasks
 // of uneven cost. worker < num_threads() is the index of the thread's scratch memory. f must not throw.
 template <class F>

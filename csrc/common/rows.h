@@ -14,9 +14,7 @@ void for_each_row(const Rows& work, CudaStream)
     ;
 #else
 {
-  parallel_for(0, work.n, 4096, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) work(i);
-  });
+  parallel_rows(work.n, 4096, [&](std::int64_t i) { work(i); });
 }
 #endif
 

@@ -14,14 +14,14 @@ namespace {
 
 SplatGroups checked_groups(const char* op, const char* name, const std::vector<std::int64_t>& sizes) {
   const auto count = static_cast<std::int64_t>(sizes.size());
-  STD_TORCH_CHECK(count >= 1 && count <= kMaxRanks, "blitzgs::", op, ": ", name, " must have 1 to ",
-                  kMaxRanks, " entries, got ", count);
+  BLITZGS_CHECK(count >= 1 && count <= kMaxRanks, op, name, " must have 1 to ", kMaxRanks, " entries, got ",
+                count);
   SplatGroups groups{};
   groups.count = static_cast<int>(count);
   std::int64_t splats = 0;
   for (std::int64_t m = 0; m < count; ++m) {
-    STD_TORCH_CHECK(sizes[m] >= 0 && sizes[m] <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op,
-                    ": ", name, " must be in [0, 2^31), got ", sizes[m]);
+    BLITZGS_CHECK(sizes[m] >= 0 && sizes[m] <= std::numeric_limits<std::int32_t>::max(), op, name,
+                  " must be in [0, 2^31), got ", sizes[m]);
     groups.size[m] = sizes[m];
     groups.start[m] = splats;
     splats += sizes[m];
@@ -36,10 +36,9 @@ std::int64_t total_splats(const SplatGroups& groups) {
 // Appends a column with `width` words per splat.
 template <class Word>
 void add_column(const char* op, SplatColumns<Word>& columns, Word* data, std::int64_t width) {
-  STD_TORCH_CHECK(columns.count < kMaxSplatColumns, "blitzgs::", op, ": at most ", kMaxSplatColumns,
-                  " columns");
+  BLITZGS_CHECK(columns.count < kMaxSplatColumns, op, "at most ", kMaxSplatColumns, " columns");
   const std::int64_t end = columns.begin[columns.count] + width;
-  STD_TORCH_CHECK(width >= 0 && end <= 4096, "blitzgs::", op, ": a splat may have 4096 words, got ", end);
+  BLITZGS_CHECK(width >= 0 && end <= 4096, op, "a splat may have 4096 words, got ", end);
   columns.data[columns.count] = data;
   columns.begin[++columns.count] = static_cast<int>(end);
 }
@@ -50,8 +49,8 @@ struct HeldSplats {
       : masks(checked(op, "masks", masks_in, ScalarType::Long, {-1})) {
     splats.masks = data<std::int64_t>(masks);
     splats.count = masks.size(0);
-    STD_TORCH_CHECK(splats.count <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op, ": ",
-                    splats.count, " splats exceed 2^31 - 1; project fewer views at a time");
+    BLITZGS_CHECK(splats.count <= std::numeric_limits<std::int32_t>::max(), op, splats.count,
+                  " splats exceed 2^31 - 1; project fewer views at a time");
     for (const Tensor& column : columns) {
       held.push_back(checked(op, "a column", column, ScalarType::Int, {splats.count, -1}));
       add_column(op, splats.columns, data<std::int32_t>(held.back()), column.size(1));
@@ -102,7 +101,7 @@ std::vector<Tensor> gather_splats(const Tensor& packed, const std::vector<std::i
   std::vector<Tensor> held;
   SplatColumns<std::int32_t> columns{};
   for (const std::int64_t width : widths) {
-    STD_TORCH_CHECK(width >= 0, "blitzgs::gather_splats: widths must not be negative, got ", width);
+    BLITZGS_CHECK(width >= 0, "gather_splats", "widths must not be negative, got ", width);
     held.push_back(make_empty(words, {n_splats, width}, ScalarType::Int));
     add_column(kOp, columns, mutable_data<std::int32_t>(held.back()), width);
   }
@@ -119,19 +118,18 @@ std::vector<Tensor> sum_splats(const Tensor& values, const Tensor& places,
                                const std::vector<std::int64_t>& group_sizes, std::int64_t splats,
                                const std::vector<std::int64_t>& widths) {
   constexpr const char* kOp = "sum_splats";
-  STD_TORCH_CHECK(splats >= 0, "blitzgs::sum_splats: splats must not be negative, got ", splats);
+  BLITZGS_CHECK(splats >= 0, "sum_splats", "splats must not be negative, got ", splats);
   check_floating(kOp, "values", values);
   const SplatGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
   const Tensor held = checked_places(kOp, places, splats, groups.count);
   const Tensor values_c = as_contiguous(values);
   std::vector<Tensor> sums;
   for (const std::int64_t width : widths) {
-    STD_TORCH_CHECK(width >= 0, "blitzgs::sum_splats: widths must not be negative, got ", width);
+    BLITZGS_CHECK(width >= 0, "sum_splats", "widths must not be negative, got ", width);
     sums.push_back(make_empty(values_c, {splats, width}));
   }
   DeviceScope scope(values_c);
-  dispatch_floating(values_c, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(values_c, [&]<class T>() {
     SplatColumns<T> columns{};
     for (Tensor& sum : sums) add_column(kOp, columns, mutable_data<T>(sum), sum.size(1));
     const int width = columns.begin[columns.count];
@@ -150,8 +148,8 @@ namespace {
 // Checks that there is one buffer for each rank and that all have the same length and dtype.
 void check_peers(const char* op, const std::vector<Tensor>& buffers, ScalarType dtype) {
   const auto count = static_cast<std::int64_t>(buffers.size());
-  STD_TORCH_CHECK(count >= 1 && count <= kMaxPeers, "blitzgs::", op, ": 1 to ", kMaxPeers,
-                  " peers are supported, got ", count);
+  BLITZGS_CHECK(count >= 1 && count <= kMaxPeers, op, "1 to ", kMaxPeers, " peers are supported, got ",
+                count);
   for (const Tensor& buffer : buffers) {
     check_in_place(op, "a buffer", buffer, dtype, {buffers[0].size(0)});
   }
@@ -162,12 +160,11 @@ template <class Word>
 ScatterTargets peer_targets(const char* op, std::vector<Tensor>& buffers, const SplatColumns<Word>& columns,
                             std::int64_t capacity, int n_ranks) {
   check_peers(op, buffers, ScalarType::Int);
-  STD_TORCH_CHECK(static_cast<int>(buffers.size()) == n_ranks, "blitzgs::", op, ": ", n_ranks,
-                  " ranks need as many buffers, got ", buffers.size());
-  STD_TORCH_CHECK(capacity >= 0 && capacity <= std::numeric_limits<std::int32_t>::max() &&
-                      capacity * columns.begin[columns.count] <= buffers[0].size(0),
-                  "blitzgs::", op, ": ", capacity, " splats do not fit into a buffer of ", buffers[0].size(0),
-                  " words");
+  BLITZGS_CHECK(static_cast<int>(buffers.size()) == n_ranks, op, n_ranks, " ranks need as many buffers, got ",
+                buffers.size());
+  BLITZGS_CHECK(capacity >= 0 && capacity <= std::numeric_limits<std::int32_t>::max() &&
+                    capacity * columns.begin[columns.count] <= buffers[0].size(0),
+                op, "", capacity, " splats do not fit into a buffer of ", buffers[0].size(0), " words");
   ScatterTargets targets{};
   for (int m = 0; m < n_ranks; ++m) {
     for (int c = 0; c < columns.count; ++c) {
@@ -183,16 +180,15 @@ void device_barrier(std::vector<Tensor> control, std::int64_t rank, std::int64_t
   constexpr const char* kOp = "device_barrier_";
   check_peers(kOp, control, ScalarType::Long);
   const auto count = static_cast<std::int64_t>(control.size());
-  STD_TORCH_CHECK(rank >= 0 && rank < count, "blitzgs::", kOp, ": rank must be in [0, ", count, "), got ",
-                  rank);
+  BLITZGS_CHECK(rank >= 0 && rank < count, kOp, "rank must be in [0, ", count, "), got ", rank);
   std::int64_t n_values = 0;
   if (values) {
     check_in_place(kOp, "values", *values, ScalarType::Long, {-1});
     n_values = values->size(0);
   }
-  STD_TORCH_CHECK(first >= count && first + (count + 1) * n_values <= control[0].size(0), "blitzgs::", kOp,
-                  ": ", n_values, " values of ", count, " ranks and their sums from word ", first,
-                  " on do not fit behind ", count, " words into ", control[0].size(0));
+  BLITZGS_CHECK(first >= count && first + (count + 1) * n_values <= control[0].size(0), kOp, n_values,
+                " values of ", count, " ranks and their sums from word ", first, " on do not fit behind ",
+                count, " words into ", control[0].size(0));
   if (host) check_host_values(kOp, *host, {count, n_values});
   ControlWords words{};
   words.count = static_cast<int>(count);
@@ -207,7 +203,7 @@ void device_barrier(std::vector<Tensor> control, std::int64_t rank, std::int64_t
 void copy_to_host(Tensor host, const Tensor& values) {
   constexpr const char* kOp = "copy_to_host_";
   check_in_place(kOp, "values", values, ScalarType::Long, {-1});
-  STD_TORCH_CHECK(!values.is_cpu(), "blitzgs::", kOp, ": values must be on the GPU");
+  BLITZGS_CHECK(!values.is_cpu(), kOp, "values must be on the GPU");
   check_host_values(kOp, host, {values.size(0)});
   DeviceScope scope(values);
   cuda::copy_to_host(data<std::int64_t>(values), values.size(0), mutable_data<std::int64_t>(host),
@@ -220,11 +216,11 @@ std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const
                                        std::int64_t capacity) {
   constexpr const char* kOp = "send_splats_";
   const auto n_ranks = static_cast<std::int64_t>(buffers.size());
-  STD_TORCH_CHECK(columns.size() == static_cast<std::size_t>(kSentColumns.count), "blitzgs::", kOp,
-                  ": columns must be means2d, conics, opacities, colors, depths, camera_ids and ids, got ",
-                  columns.size());
-  STD_TORCH_CHECK(columns[0].size(0) >= capacity, "blitzgs::", kOp, ": columns must have room for ", capacity,
-                  " splats, got ", columns[0].size(0));
+  BLITZGS_CHECK(columns.size() == static_cast<std::size_t>(kSentColumns.count), kOp,
+                "columns must be means2d, conics, opacities, colors, depths, camera_ids and ids, got ",
+                columns.size());
+  BLITZGS_CHECK(columns[0].size(0) >= capacity, kOp, "columns must have room for ", capacity, " splats, got ",
+                columns[0].size(0));
   SendArguments arguments{};
   arguments.targets = peer_targets(kOp, buffers, kSentColumns, capacity, static_cast<int>(n_ranks));
   arguments.splats.columns = kSentColumns;
@@ -232,19 +228,19 @@ std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const
   for (int c = 0; c < kSentColumns.count; ++c) {
     const Tensor& column = columns[c];
     const std::int64_t words = kSentColumns.begin[c + 1] - kSentColumns.begin[c];
-    STD_TORCH_CHECK(
+    BLITZGS_CHECK(
         column.is_contiguous() && column.size(0) == columns[0].size(0) &&
             column.numel() * static_cast<std::int64_t>(column.element_size()) == 4 * words * column.size(0),
-        "blitzgs::", kOp, ": column ", c, " must be contiguous, of ", words, " words a splat");
+        kOp, "column ", c, " must be contiguous, of ", words, " words a splat");
     arguments.splats.columns.data[c] = static_cast<const std::int32_t*>(column.const_data_ptr());
   }
   check_in_place(kOp, "rank_masks", rank_masks, ScalarType::Long, {columns[0].size(0)});
   arguments.splats.masks = data<std::int64_t>(rank_masks);
   check_in_place(kOp, "everyone", everyone, ScalarType::Long, {n_ranks, -1});
   const std::int64_t n_views = everyone.size(1) - project_totals(0, n_ranks);
-  STD_TORCH_CHECK(!everyone.is_cpu() && n_views >= 0 && rank >= 0 && rank < n_ranks, "blitzgs::", kOp,
-                  ": everyone must be on the GPU and the totals of ", n_ranks,
-                  " ranks, and rank one of them, got ", rank);
+  BLITZGS_CHECK(!everyone.is_cpu() && n_views >= 0 && rank >= 0 && rank < n_ranks, kOp,
+                "everyone must be on the GPU and the totals of ", n_ranks,
+                " ranks, and rank one of them, got ", rank);
   DeviceScope scope(columns[0]);
   Tensor places = make_places(columns[0], capacity, n_ranks);
   Tensor plan = make_empty(columns[0], {(sizeof(SendPlan) + 7) / 8}, ScalarType::Long);
@@ -269,12 +265,12 @@ std::vector<Tensor> tile_costs(const Tensor& sums, std::int64_t first, std::int6
                                std::int64_t grain) {
   constexpr const char* kOp = "tile_costs";
   check_in_place(kOp, "sums", sums, ScalarType::Float, {-1});
-  STD_TORCH_CHECK(first >= 0 && first <= sums.size(0), "blitzgs::", kOp, ": first must be in [0, ",
-                  sums.size(0), "], got ", first);
+  BLITZGS_CHECK(first >= 0 && first <= sums.size(0), kOp, "first must be in [0, ", sums.size(0), "], got ",
+                first);
   const std::int64_t costs = sums.size(0) - first;
-  STD_TORCH_CHECK(views > 0 && costs % views == 0, "blitzgs::", kOp, ": ", costs,
-                  " costs are not those of the tiles of ", views, " views of one size");
-  STD_TORCH_CHECK(grain > 0, "blitzgs::", kOp, ": grain must be at least 1, got ", grain);
+  BLITZGS_CHECK(views > 0 && costs % views == 0, kOp, costs, " costs are not those of the tiles of ", views,
+                " views of one size");
+  BLITZGS_CHECK(grain > 0, kOp, "grain must be at least 1, got ", grain);
   const std::int64_t tiles = costs / views, pieces = (tiles + grain - 1) / grain;
   std::vector<Tensor> stored;
   for (std::int64_t view = 0; view < views; ++view) {
@@ -302,13 +298,11 @@ std::vector<std::int64_t> divide_tiles(const std::vector<Tensor>& costs, const s
                                        std::int64_t tiles, std::int64_t grain, double tile_cost,
                                        std::int64_t parts) {
   constexpr const char* kOp = "divide_tiles";
-  STD_TORCH_CHECK(!costs.empty(), "blitzgs::", kOp, ": there must be views");
-  STD_TORCH_CHECK(tiles > 0 && grain > 0, "blitzgs::", kOp, ": tiles and grain must be at least 1, got ",
-                  tiles, " and ", grain);
-  STD_TORCH_CHECK(parts > 0 && parts <= (1 << 20), "blitzgs::", kOp, ": parts must be 1 to 2^20, got ",
-                  parts);
-  STD_TORCH_CHECK(tile_cost >= 8, "blitzgs::", kOp, ": sums are exact for a tile_cost from 8 on, got ",
-                  tile_cost);
+  BLITZGS_CHECK(!costs.empty(), kOp, "there must be views");
+  BLITZGS_CHECK(tiles > 0 && grain > 0, kOp, "tiles and grain must be at least 1, got ", tiles, " and ",
+                grain);
+  BLITZGS_CHECK(parts > 0 && parts <= (1 << 20), kOp, "parts must be 1 to 2^20, got ", parts);
+  BLITZGS_CHECK(tile_cost >= 8, kOp, "sums are exact for a tile_cost from 8 on, got ", tile_cost);
   const std::int64_t pieces = (tiles + grain - 1) / grain;
   const auto views = checked_pieces(kOp, "costs of a view", costs, pieces, true);
   const auto alike = checked_pieces(kOp, "costs of a similar view", similar, pieces, false);

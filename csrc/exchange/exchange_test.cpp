@@ -1,19 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <cstdlib>
 #include <vector>
 
 #include "common/catch.h"
-#include "common/test_workspace.h"
 #include "exchange/scatter.h"
 #include "exchange/tile_costs.h"
 
 using namespace blitzgs;
 
 namespace {
-
-struct NoWorkspace final : Workspace {
-  void* allocate_bytes(std::size_t) override { std::abort(); }
-};
 
 SplatGroups make_groups(const std::vector<std::int64_t>& sizes) {
   SplatGroups groups{};
@@ -45,7 +39,7 @@ TEST_CASE("scattered splats arrive in order, and their sums return", "[scatter]"
     targets.words[m][0] = packed.data() + 3 * groups.start[m];
     targets.words[m][1] = targets.words[m][0] + 2 * groups.size[m];
   }
-  NoWorkspace workspace;
+  TestWorkspace workspace;
   cpu::scatter({{{a.data(), b.data()}, {0, 2, 3}, 2}, masks.data(), n}, groups, targets, places.data(),
                workspace, nullptr);
 
@@ -84,7 +78,7 @@ TEST_CASE("splats beyond a group's size are dropped", "[scatter]") {
   SplatPlace place;
   ScatterTargets targets{};
   targets.words[0][0] = packed;
-  NoWorkspace workspace;
+  TestWorkspace workspace;
   cpu::scatter({{{column}, {0, 1}, 1}, masks, 4}, make_groups({2}), targets, &place, workspace, nullptr);
   REQUIRE((packed[0] == 1 && packed[1] == 2 && packed[2] == -1));
   REQUIRE((place.first == 0 && place.bits == 15));
@@ -109,47 +103,7 @@ Bounds bounds_of(const std::vector<Halves>& views, const std::vector<Halves>& si
   return bounds;
 }
 
-Halves stored(const std::vector<float>& costs, std::int64_t grain) {
-  const auto tiles = static_cast<std::int64_t>(costs.size());
-  Halves pieces((tiles + grain - 1) / grain);
-  cpu::store_tile_costs(costs.data(), tiles, grain, pieces.data());
-  return pieces;
-}
-
 }  // namespace
-
-TEST_CASE("costs are stored as float16, rounded to nearest even", "[tile_costs]") {
-  // 0, 1, 2049 (between 2048 and 2050), 2051, the largest half, more than it, the smallest half, half of it.
-  const std::vector<float> costs{0, 1, 2049, 2051, 65504, 1e9f, 0x1p-24f, 0x1p-25f, 0x1.8p-24f};
-  REQUIRE(stored(costs, 1) == Halves{0, 0x3c00, 0x6800, 0x6802, 0x7bff, 0x7bff, 1, 0, 2});
-}
-
-TEST_CASE("a stored cost is the mean over a piece, also over a short last one", "[tile_costs]") {
-  REQUIRE(stored({1, 3, 2, 2, 1}, 2) == Halves{0x4000, 0x4000, 0x3c00});
-  REQUIRE(stored({0, 0, 6}, 4) == Halves{0x4000});
-}
-
-TEST_CASE("the bound is the one nearest to the share, the later of two", "[tile_costs]") {
-  const Halves zeros(3, 0);
-  REQUIRE(bounds_of({zeros}, {}, 3, 1, 1) == Bounds{0, 3});
-  REQUIRE(bounds_of({zeros}, {}, 3, 1, 2) == Bounds{0, 2, 3});
-  REQUIRE(bounds_of({zeros}, {}, 3, 1, 8) == Bounds{0, 0, 1, 1, 2, 2, 2, 3, 3});
-  // 8 + 1024 in the first tile, then 8 each: half of the cost is inside the first tile.
-  REQUIRE(bounds_of({{0x6400, 0, 0}}, {}, 3, 1, 2) == Bounds{0, 1, 3});
-}
-
-TEST_CASE("bounds in later stretches", "[tile_costs]") {
-  const Halves zeros(1000, 0);
-  REQUIRE(bounds_of({zeros, zeros}, {}, 1000, 1, 4) == Bounds{0, 500, 1000, 1500, 2000});
-}
-
-TEST_CASE("a view without costs has the mean of similar ones, or zeros", "[tile_costs]") {
-  const Halves one(4, 0x3c00), three(4, 0x4200), two(4, 0x4000), zeros(4, 0), other{0x6400, 0, 0x4900, 0};
-  for (std::int64_t parts = 1; parts < 12; ++parts) {
-    REQUIRE(bounds_of({{}, other}, {one, three}, 4, 1, parts) == bounds_of({two, other}, {}, 4, 1, parts));
-    REQUIRE(bounds_of({other, {}}, {}, 4, 1, parts) == bounds_of({other, zeros}, {}, 4, 1, parts));
-  }
-}
 
 TEST_CASE("pieces spread over their tiles", "[tile_costs]") {
   // Two views of five tiles in pieces of two: costs 8 + 8 twice, 8 + 0 twice and 8 + 1016 once.

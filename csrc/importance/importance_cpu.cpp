@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "importance/importance.h"
-
 #include <algorithm>
+#include <numeric>
 
+#include "importance/importance.h"
+#include "importance/mass_cut.h"
 #include "rasterize/tile_jobs.h"
 
 namespace blitzgs::cpu {
@@ -29,5 +30,60 @@ template void contributions<float>(const ContributionInput<float>&, const Contri
                                    CudaStream);
 template void contributions<double>(const ContributionInput<double>&, const ContributionSums&, Workspace&,
                                     CudaStream);
+
+namespace {
+
+void scan(const MassCutArgs& args, int round) {
+  const auto add = [&](std::int64_t item) {
+    const ScanTerm term = scan_term(args, round, item);
+    if (term.adds) args.sums[args.segments[item] * kDigits + term.digit] += term.amount;
+  };
+  if (round > 1) {
+    for (std::int32_t i = 1; i <= args.listed[0]; ++i) add(args.listed[i]);
+    return;
+  }
+  args.listed[0] = 0;
+  for (std::int64_t item = 0; item < args.n_items; ++item) {
+    add(item);
+    if (round == 1 && is_listed(args, item)) args.listed[++args.listed[0]] = static_cast<std::int32_t>(item);
+  }
+}
+
+void descend(const MassCutArgs& args, int round) {
+  const bool for_ids = round >= kRounds, first = round % kRounds == 0;
+  for (std::int64_t s = 0; s < args.n_segments; ++s) {
+    SegmentSearch& both = args.searches[s];
+    MassSearch& search = for_ids ? both.id : both.weight;
+    std::int64_t* const sums = args.sums + s * kDigits;
+    if (round == 0) {
+      search = {
+          kAboveAllWeights, 0,
+          share_of(std::accumulate(sums, sums + kDigits, std::int64_t{0}), args.numerator, args.denominator),
+          0};
+    }
+    if (descends(search, first)) {
+      std::int64_t above = 0;
+      int digit = kDigits - 1;
+      while (above + sums[digit] < search.missing) above += sums[digit--];
+      take_digit(search, first, digit, above, sums[digit]);
+    }
+    if (round == kRounds - 1) both.id = search_of_ids(both.weight);
+    std::fill_n(sums, kDigits, 0);
+  }
+}
+
+}  // namespace
+
+void mass_cut(const MassCutArgs& args, int first_step, int last_step, CudaStream) {
+  for (int step = first_step; step < std::min(last_step, kChoiceStep); ++step) {
+    if (step % 2 == 0) {
+      scan(args, step / 2);
+    } else {
+      descend(args, step / 2);
+    }
+  }
+  if (last_step != kSteps) return;
+  for (std::int64_t item = 0; item < args.n_items; ++item) args.chosen[item] = is_chosen(args, item);
+}
 
 }  // namespace blitzgs::cpu

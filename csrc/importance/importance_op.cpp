@@ -5,52 +5,38 @@
 #include <limits>
 #include <tuple>
 
-#include "common/op.h"
 #include "common/rows.h"
 #include "importance/mass_cut.h"
 #include "importance/view_sums.h"
+#include "rasterize/rasterize_op.h"
 
 namespace blitzgs {
 namespace {
 
 constexpr const char* kContributions = "contributions";
 
-std::tuple<Tensor, Tensor, Tensor> contributions(const Tensor& means2d_in, const Tensor& conics_in,
-                                                 const Tensor& opacities_in, const Tensor& isect_splats_in,
-                                                 const Tensor& tile_offsets_in, std::int64_t n_cameras,
+std::tuple<Tensor, Tensor, Tensor> contributions(const Tensor& means2d, const Tensor& conics,
+                                                 const Tensor& opacities, const Tensor& isect_splats,
+                                                 const Tensor& tile_offsets, std::int64_t n_cameras,
                                                  std::int64_t width, std::int64_t height,
                                                  std::int64_t tile_size, std::int64_t tile_begin,
                                                  std::int64_t tile_end, const std::optional<Tensor>& n_splats,
                                                  bool with_squares) {
   const TileGrid grid =
       checked_tile_grid(kContributions, n_cameras, width, height, tile_size, tile_begin, tile_end);
-  const std::int64_t splats = means2d_in.size(0);
-  check_floating(kContributions, "means2d", means2d_in);
-  const ScalarType dtype = means2d_in.scalar_type();
-  const Tensor means2d = checked(kContributions, "means2d", means2d_in, dtype, {splats, 2}),
-               conics = checked(kContributions, "conics", conics_in, dtype, {splats, 3}),
-               opacities = checked(kContributions, "splat_opacities", opacities_in, dtype, {splats}),
-               isect_splats = checked(kContributions, "isect_splats", isect_splats_in, ScalarType::Int, {-1}),
-               tile_offsets = checked(kContributions, "tile_offsets", tile_offsets_in, ScalarType::Long,
-                                      {grid.count() + 1});
-  const SplatCount splat_count = checked_splat_count(kContributions, n_splats, means2d);
-  Tensor weights = make_empty(means2d, {splats}, ScalarType::Long);
-  Tensor pixels = make_empty(means2d, {splats}, ScalarType::Int);
-  Tensor squares = make_empty(means2d, {with_squares ? splats : 0}, ScalarType::Long);
+  const ListedSplats splats(kContributions, means2d, conics, opacities, isect_splats, tile_offsets, grid,
+                            n_splats);
+  Tensor weights = make_empty(means2d, {splats.n_splats}, ScalarType::Long);
+  Tensor pixels = make_empty(means2d, {splats.n_splats}, ScalarType::Int);
+  Tensor squares = make_empty(means2d, {with_squares ? splats.n_splats : 0}, ScalarType::Long);
   DeviceScope scope(means2d);
-  dispatch_floating(means2d, [&](auto zero) {
-    using T = decltype(zero);
-    const ContributionInput<T> in{data<T>(means2d),
-                                  data<T>(conics),
-                                  data<T>(opacities),
-                                  data<std::int32_t>(isect_splats),
-                                  data<std::int64_t>(tile_offsets),
-                                  splat_count.n_splats,
-                                  grid,
-                                  splat_count.known_splats};
+  dispatch_floating(means2d, [&]<class T>() {
+    const RasterizeInput<T> in = splats.input<T>();
     const ContributionSums sums{mutable_data<std::int64_t>(weights), mutable_data<std::int32_t>(pixels),
                                 with_squares ? mutable_data<std::int64_t>(squares) : nullptr};
-    backend::contributions(in, sums, scope.workspace, scope.stream);
+    backend::contributions(ContributionInput<T>{in.means2d, in.conics, in.opacities, in.isect_splats,
+                                                in.tile_offsets, in.n_splats, in.grid, in.known_splats},
+                           sums, scope.workspace, scope.stream);
   });
   return {weights, pixels, squares};
 }
@@ -61,15 +47,14 @@ void mass_cut_(const Tensor& weights, const Tensor& segments, const Tensor& owne
                Tensor searches, Tensor sums, Tensor listed, Tensor chosen, std::int64_t numerator,
                std::int64_t denominator, std::int64_t first_step, std::int64_t last_step) {
   const std::int64_t items = weights.numel(), n_segments = searches.size(0);
-  STD_TORCH_CHECK(items < std::numeric_limits<std::int32_t>::max(), "blitzgs::", kMassCut,
-                  ": items are counted in 32 bits, got ", items, "; cut fewer segments at once");
-  STD_TORCH_CHECK(n_segments > 0, "blitzgs::", kMassCut, ": there must be segments");
-  STD_TORCH_CHECK(
-      0 <= numerator && numerator <= denominator && 0 < denominator && denominator <= 1'000'000'000,
-      "blitzgs::", kMassCut, ": the share must be in [0, 1] with at most 9 decimals, got ", numerator, " / ",
-      denominator);
-  STD_TORCH_CHECK(0 <= first_step && first_step <= last_step && last_step <= kSteps, "blitzgs::", kMassCut,
-                  ": steps must be in [0, ", kSteps, "], got ", first_step, " to ", last_step);
+  BLITZGS_CHECK(items < std::numeric_limits<std::int32_t>::max(), kMassCut,
+                "items are counted in 32 bits, got ", items, "; cut fewer segments at once");
+  BLITZGS_CHECK(n_segments > 0, kMassCut, "there must be segments");
+  BLITZGS_CHECK(0 <= numerator && numerator <= denominator && 0 < denominator && denominator <= 1'000'000'000,
+                kMassCut, "the share must be in [0, 1] with at most 9 decimals, got ", numerator, " / ",
+                denominator);
+  BLITZGS_CHECK(0 <= first_step && first_step <= last_step && last_step <= kSteps, kMassCut,
+                "steps must be in [0, ", kSteps, "], got ", first_step, " to ", last_step);
   check_in_place(kMassCut, "weights", weights, ScalarType::Long, {-1});
   check_in_place(kMassCut, "segments", segments, ScalarType::Int, {items});
   check_in_place(kMassCut, "owners", owners, ScalarType::Int, {items});
@@ -100,10 +85,10 @@ constexpr const char* kViewSums = "view_sums_";
 void view_sums_(const std::vector<Tensor>& sums, const std::vector<Tensor>& splats, const Tensor& weights,
                 const Tensor& pixels, const Tensor& counts, const std::vector<std::int64_t>& columns,
                 std::int64_t rule, double eps, double unit) {
-  STD_TORCH_CHECK(sums.size() == 4 && splats.size() == 4, "blitzgs::", kViewSums,
-                  ": sums are score, seen, counted, cull; splats are visible_ids, splat_offsets, camera_ids, "
-                  "radii; got ",
-                  sums.size(), " and ", splats.size(), " tensors");
+  BLITZGS_CHECK(sums.size() == 4 && splats.size() == 4, kViewSums,
+                "sums are score, seen, counted, cull; splats are visible_ids, splat_offsets, camera_ids, "
+                "radii; got ",
+                sums.size(), " and ", splats.size(), " tensors");
   const std::int64_t n = sums[0].numel(), words = sums[3].dim() == 2 ? sums[3].size(1) : 0;
   const std::int64_t visible = splats[0].numel(), count = weights.numel();
   check_in_place(kViewSums, "score", sums[0], ScalarType::Long, {n});
@@ -117,13 +102,13 @@ void view_sums_(const std::vector<Tensor>& sums, const std::vector<Tensor>& spla
   check_in_place(kViewSums, "weights", weights, ScalarType::Long, {count});
   check_in_place(kViewSums, "pixels", pixels, ScalarType::Int, {count});
   check_in_place(kViewSums, "counts", counts, ScalarType::Bool, {count});
-  STD_TORCH_CHECK(!columns.empty() && columns.size() <= kMaxViews, "blitzgs::", kViewSums, ": 1 to ",
-                  kMaxViews, " views at once, got ", columns.size());
+  BLITZGS_CHECK(!columns.empty() && columns.size() <= kMaxViews, kViewSums, "1 to ", kMaxViews,
+                " views at once, got ", columns.size());
   for (const std::int64_t column : columns) {
-    STD_TORCH_CHECK(0 <= column && column < 32 * words, "blitzgs::", kViewSums, ": cull has ", 32 * words,
-                    " columns, got ", column);
+    BLITZGS_CHECK(0 <= column && column < 32 * words, kViewSums, "cull has ", 32 * words, " columns, got ",
+                  column);
   }
-  STD_TORCH_CHECK(0 <= rule && rule <= 2, "blitzgs::", kViewSums, ": rule must be 0, 1 or 2, got ", rule);
+  BLITZGS_CHECK(0 <= rule && rule <= 2, kViewSums, "rule must be 0, 1 or 2, got ", rule);
   DeviceScope scope(weights);
   ViewSums args{data<std::int64_t>(weights),
                 data<std::int32_t>(pixels),

@@ -1,10 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
-#include <cmath>
 #include <vector>
 
 #include "common/catch.h"
-#include "common/test_workspace.h"
 #include "importance/importance.h"
 #include "importance/mass_cut.h"
 
@@ -30,61 +28,7 @@ struct Pair {
   }
 };
 
-double alpha_at(const Pair<double>& pair, int splat, double x, double y) {
-  const double dx = x - pair.means2d[2 * splat], dy = y - pair.means2d[2 * splat + 1];
-  const double alpha =
-      std::min(0.99, pair.opacities[splat] * std::exp(-0.5 * pair.conics[3 * splat] * (dx * dx + dy * dy)));
-  return alpha >= 1.0 / 255.0 ? alpha : 0.0;
-}
-
 }  // namespace
-
-TEST_CASE("contributions are alpha T, summed over pixels in units of 2^-32") {
-  Pair<double> pair;
-  pair.survey(0, -1);
-  std::int64_t weights[2] = {0, 0};
-  std::int32_t pixels[2] = {0, 0};
-  for (int y = 0; y < 12; ++y) {
-    for (int x = 0; x < 20; ++x) {
-      const double near = alpha_at(pair, 0, x + 0.5, y + 0.5), far = alpha_at(pair, 1, x + 0.5, y + 0.5);
-      weights[0] += std::llrint(near * 4294967296.0);
-      weights[1] += std::llrint(far * (1 - near) * 4294967296.0);
-      pixels[0] += near > 0;
-      pixels[1] += far > 0;
-    }
-  }
-  for (int splat = 0; splat < 2; ++splat) {
-    REQUIRE(pair.pixels[splat] == pixels[splat]);
-    // The exponential may differ by rounding, which changes the weight of a pixel by at most one unit.
-    REQUIRE(std::abs(pair.weights[splat] - weights[splat]) <= pixels[splat]);
-  }
-}
-
-TEST_CASE("squares are rounded down for each pixel") {
-  Pair<double> pair;
-  pair.survey(0, -1);
-  std::int64_t squares = 0;
-  std::int32_t pixels = 0;
-  for (int y = 0; y < 12; ++y) {
-    for (int x = 0; x < 20; ++x) {
-      const double alpha = alpha_at(pair, 0, x + 0.5, y + 0.5);
-      squares += static_cast<std::int64_t>(std::floor(alpha * alpha * 4294967296.0));
-      pixels += alpha > 0;
-    }
-  }
-  REQUIRE(pair.pixels[0] == pixels);
-  // A weight that is one unit off changes its square by at most two.
-  REQUIRE(std::abs(pair.squares[0] - squares) <= 2 * pixels);
-}
-
-TEST_CASE("squares are optional and change no other sum") {
-  Pair<float> with, without;
-  with.survey(0, -1);
-  without.survey(0, -1, false);
-  REQUIRE(without.weights == with.weights);
-  REQUIRE(without.pixels == with.pixels);
-  REQUIRE(without.squares == std::vector<std::int64_t>{7, 7});
-}
 
 TEST_CASE("contributions of tile ranges add up") {
   Pair<float> pair;

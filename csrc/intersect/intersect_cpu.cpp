@@ -56,9 +56,7 @@ std::int64_t piece_start(std::int64_t n, int pieces, int piece) { return n * pie
 
 template <class F>
 void parallel_pieces(int pieces, const F& f) {
-  parallel_for(0, pieces, 1, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t piece = begin; piece < end; ++piece) f(static_cast<int>(piece));
-  });
+  parallel_rows(pieces, 1, [&](std::int64_t piece) { f(static_cast<int>(piece)); });
 }
 
 // One stable counting pass on 11 bits. Returns false and moves nothing when all keys have the same 11 bits.

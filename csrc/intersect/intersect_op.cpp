@@ -5,7 +5,7 @@
 #include <limits>
 #include <tuple>
 
-#include "common/op.h"
+#include "rasterize/rasterize_op.h"
 
 namespace blitzgs {
 namespace {
@@ -19,13 +19,12 @@ constexpr bool kWaitsForCounts = false;
 #endif
 
 void check_capacity(std::int64_t capacity, std::int64_t count) {
-  STD_TORCH_CHECK(count <= capacity, "blitzgs::intersect: n_isects is ", capacity, " but there are ", count,
-                  " intersections; pass the sum of tiles_touched, or -1 to have them counted");
+  BLITZGS_CHECK(count <= capacity, "intersect", "n_isects is ", capacity, " but there are ", count,
+                " intersections; pass the sum of tiles_touched, or -1 to have them counted");
 }
 
 }  // namespace
 
-// Not in the unnamed namespace, because render_op.cpp calls it, too.
 std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics,
                                      const Tensor& splat_opacities, const Tensor& depths,
                                      const Tensor& camera_ids, const std::optional<Tensor>& ids,
@@ -45,14 +44,13 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
   const std::optional<Tensor> id_splats = checked(kOp, "ids", ids, ScalarType::Long, {n_splats});
   const SplatCount splat_count = checked_splat_count(kOp, known_splats, means2d);
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
-  STD_TORCH_CHECK(grid.count() <= std::numeric_limits<std::int32_t>::max(),
-                  "blitzgs::intersect: tile numbers are 32-bit, got ", grid.count(),
-                  " tiles; use larger tiles or render fewer views at once");
+  BLITZGS_CHECK(grid.count() <= std::numeric_limits<std::int32_t>::max(), "intersect",
+                "tile numbers are 32-bit, got ", grid.count(),
+                " tiles; use larger tiles or render fewer views at once");
   Tensor offsets = make_empty(means, {grid.count() + 1}, ScalarType::Long);
   Tensor splats;
   DeviceScope scope(means);
-  dispatch_floating(means, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(means, [&]<class T>() {
     const IntersectInput<T> in{data<T>(means),
                                data<T>(shapes),
                                data<T>(opacities),
@@ -76,10 +74,9 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
     } catch (const std::exception& error) {
       // An error here means that memory ran out. The message states the length of the lists, because it
       // depends on the splats and the caller may not know it.
-      STD_TORCH_CHECK(false, "blitzgs::intersect: listing ", capacity, " intersections of ", n_splats,
-                      " splats failed; it takes about ", capacity * 20 / 1000000,
-                      " MB. Render fewer views at ",
-                      "once, in smaller images, or with a larger radius_clip. Cause: ", error.what());
+      BLITZGS_CHECK(false, "intersect", "listing ", capacity, " intersections of ", n_splats,
+                    " splats failed; it takes about ", capacity * 20 / 1000000, " MB. Render fewer views at ",
+                    "once, in smaller images, or with a larger radius_clip. Cause: ", error.what());
     }
     check_capacity(capacity, count);
   });

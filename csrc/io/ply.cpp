@@ -8,7 +8,7 @@
 #include <sstream>
 #include <string>
 
-#include "io/parse_number.h"
+#include "io/text_reader.h"
 
 namespace blitzgs::io {
 

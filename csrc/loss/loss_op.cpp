@@ -46,10 +46,9 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
   const bool bytes = targets_in.scalar_type() == ScalarType::Byte;
   if (!bytes) check_dtype(op, "targets (if not uint8)", targets_in, dtype);
   const Tensor targets = as_contiguous(targets_in);
-  STD_TORCH_CHECK(tile_size > 0 && tile_size <= 4096, "blitzgs::", op,
-                  ": tile_size must be in [1, 4096], got ", tile_size);
-  STD_TORCH_CHECK(height < (1 << 24) && width < (1 << 24), "blitzgs::", op, ": images of ", width, " x ",
-                  height, " pixels are beyond the limit of 2^24 a side");
+  BLITZGS_CHECK(tile_size > 0 && tile_size <= 4096, op, "tile_size must be in [1, 4096], got ", tile_size);
+  BLITZGS_CHECK(height < (1 << 24) && width < (1 << 24), op, "images of ", width, " x ", height,
+                " pixels are beyond the limit of 2^24 a side");
   const auto masks = checked(op, "masks", masks_in, ScalarType::Byte, {views, height, width});
   std::optional<Tensor> l1_weights, ssim_weights, samples, visible;
   PhotometricOutputs outputs;
@@ -72,8 +71,7 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
   }
 
   DeviceScope scope(renders);
-  dispatch_floating(renders, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(renders, [&]<class T>() {
     PhotometricArgs<T> args{};
     args.renders = data<T>(renders);
     args.targets = bytes ? nullptr : data<T>(targets);
@@ -118,8 +116,7 @@ std::tuple<Tensor, Tensor> photometric_fwd(const Tensor& renders, const Tensor& 
   const std::int64_t views = parts.size(0);
   Tensor l1_sums = make_empty(renders, {views}), ssim_sums = make_empty(renders, {views});
   DeviceScope scope(renders);
-  dispatch_floating(renders, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(renders, [&]<class T>() {
     Report<T> report{data<double>(parts), views, parts.size(1), nullptr, 0, 0, {}, 1};
     report.targets[0] = {mutable_data<T>(l1_sums), mutable_data<T>(ssim_sums), nullptr};
     backend::report(report, scope.workspace, scope.stream);
@@ -158,8 +155,7 @@ std::tuple<Tensor, Tensor> l1_ssim_fwd_bwd(const Tensor& renders, const Tensor& 
   const std::int64_t n = parts.size(0) * parts.size(1);
   Tensor loss = make_empty(renders, {});
   DeviceScope scope(renders);
-  dispatch_floating(renders, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(renders, [&]<class T>() {
     const LossOfSums<T> args{sums, n, l1_factor, ssim_factor, offset, mutable_data<T>(loss)};
     backend::loss_of_sums(args, scope.workspace, scope.stream);
   });
@@ -183,11 +179,10 @@ void report_(const std::optional<Tensor>& parts_in, const std::optional<Tensor>&
   check_tile_range(kOp, tile_begin, tile_end, tiles);
   report.tile_begin = tile_begin;
   report.tile_end = tile_end;
-  STD_TORCH_CHECK(rank >= 0 && rank < n_ranks, "blitzgs::", kOp, ": rank must be in [0, ", n_ranks, "), got ",
-                  rank);
+  BLITZGS_CHECK(rank >= 0 && rank < n_ranks, kOp, "rank must be in [0, ", n_ranks, "), got ", rank);
   const auto count = static_cast<std::int64_t>(targets.size());
-  STD_TORCH_CHECK(count > 0 && count <= kMaxReportTargets, "blitzgs::", kOp, ": 1 to ", kMaxReportTargets,
-                  " targets are supported, got ", count);
+  BLITZGS_CHECK(count > 0 && count <= kMaxReportTargets, kOp, "1 to ", kMaxReportTargets,
+                " targets are supported, got ", count);
   for (Tensor& target : targets) {
     check_in_place(kOp, "a target", target, ScalarType::Float, {2 * report.views * n_ranks + tiles});
     float* sums = mutable_data<float>(target);

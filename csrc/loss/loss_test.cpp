@@ -3,7 +3,6 @@
 #include <vector>
 
 #include "common/catch.h"
-#include "common/test_workspace.h"
 #include "loss/photometric.h"
 #include "loss/report.h"
 

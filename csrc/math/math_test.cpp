@@ -91,19 +91,6 @@ TEST_CASE("rotation of a quaternion: derivative, zero, very long and very short"
   }
 }
 
-TEST_CASE("scaled axes: derivative") {
-  const Values rotation = random_values(9, 11), scale = random_values(3, 12), weights = random_values(9, 13);
-  Vec3<double> v_scale;
-  Columns3<double> v_rotation;
-  scaled_axes_vjp(columns(rotation.data()), load3(scale.data()), columns(weights.data()), &v_scale,
-                  &v_rotation);
-  require_gradient(
-      [&](const Values& s) { return flat(scaled_axes(columns(rotation.data()), load3(s.data()))); }, scale,
-      weights, {v_scale.x, v_scale.y, v_scale.z});
-  require_gradient([&](const Values& r) { return flat(scaled_axes(columns(r.data()), load3(scale.data()))); },
-                   rotation, weights, flat(v_rotation));
-}
-
 TEST_CASE("spherical harmonics: derivative at every degree") {
   for (int degree = 0; degree <= kMaxShDegree; ++degree) {
     const Values direction = random_values(3, 20), weights = random_values(kMaxShBasis, 21);
@@ -115,27 +102,6 @@ TEST_CASE("spherical harmonics: derivative at every degree") {
           return basis;
         },
         direction, weights, {v.x, v.y, v.z});
-  }
-}
-
-TEST_CASE("conic and compensation: derivative") {
-  for (unsigned seed = 30; seed < 34; ++seed) {
-    const Values rows = random_values(6, seed, 3.0), weights = random_values(4, seed + 10, 10.0);
-    const auto footprint_of = [](const Values& m) {
-      const Columns3<double> axes{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
-      PixelGradients<double> g{};
-      g.gx = load3(m.data());
-      g.gy = load3(m.data() + 3);
-      return make_footprint(g, axes, 0.3);
-    };
-    Vec3<double> v0, v1;
-    footprint_vjp(footprint_of(rows), weights.data(), weights[3], &v0, &v1);
-    require_gradient(
-        [&](const Values& m) {
-          const Footprint<double> s = footprint_of(m);
-          return Values{s.conic[0], s.conic[1], s.conic[2], compensation(s)};
-        },
-        rows, weights, {v0.x, v0.y, v0.z, v1.x, v1.y, v1.z});
   }
 }
 
@@ -312,24 +278,6 @@ TEST_CASE("a camera with a skew or another scale than 1 sees nothing") {
     REQUIRE_FALSE(is_seen(entry, 0.01f));
     REQUIRE_FALSE(is_seen(entry, -0.01f));
     REQUIRE_FALSE(is_seen(entry, std::numeric_limits<float>::quiet_NaN()));
-  }
-}
-
-TEST_CASE("nothing that is not finite becomes a splat") {
-  const float bad[] = {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()};
-  const Camera<float> camera = test_camera<float>();
-  const ProjectOptions<float> options{64, 48, 16, 0, 1, 0.01f, 1e10f, 0.3f, 0.0f, false, false};
-  for (const float value : bad) {
-    for (int slot = 0; slot < 11; ++slot) {
-      float p[11] = {0.1f, 0.2f, -0.3f, 1, 0, 0, 0, 0.1f, 0.1f, 0.1f, 0.5f};
-      Splat<float> splat{};
-      REQUIRE(
-          project_splat(camera, activate_gaussian(load3(p), p + 3, load3(p + 7), p[10]), options, &splat));
-      p[slot] = value;
-      INFO("slot " << slot);
-      const auto gaussian = activate_gaussian(load3(p), p + 3, load3(p + 7), p[10]);
-      REQUIRE_FALSE(project_splat(camera, gaussian, options, &splat));
-    }
   }
 }
 

@@ -15,10 +15,8 @@ void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspa
   using Entry = std::pair<std::uint64_t, std::int32_t>;
   Entry* entries = workspace.allocate<Entry>(n);
   const MortonFrame frame = morton_frame_of(points, n);
-  parallel_for(0, n, 1 << 14, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) {
-      entries[i] = {morton_code(points + 3 * i, frame), static_cast<std::int32_t>(i)};
-    }
+  parallel_rows(n, 1 << 14, [&](std::int64_t i) {
+    entries[i] = {morton_code(points + 3 * i, frame), static_cast<std::int32_t>(i)};
   });
   std::sort(entries, entries + n);
 
@@ -29,29 +27,22 @@ void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspa
   if (tree.n == 0) return;
   T* sorted = workspace.allocate<T>(3 * std::int64_t{tree.n});
   std::int32_t* order = workspace.allocate<std::int32_t>(tree.n);
-  parallel_for(0, tree.n, 1 << 14, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) {
-      order[i] = entries[i].second;
-      std::copy_n(points + 3 * std::int64_t{order[i]}, 3, sorted + 3 * i);
-    }
+  parallel_rows(tree.n, 1 << 14, [&](std::int64_t i) {
+    order[i] = entries[i].second;
+    std::copy_n(points + 3 * std::int64_t{order[i]}, 3, sorted + 3 * i);
   });
   tree.points = sorted;
   tree.order = order;
   KnnBox<T>* boxes = workspace.allocate<KnnBox<T>>(plan_knn_levels(tree.n, tree));
   tree.boxes = boxes;
   for (int level = 0; level < tree.levels; ++level) {
-    parallel_for(0, tree.count[level], 1 << 12, [&](std::int64_t begin, std::int64_t end) {
-      for (std::int64_t i = begin; i < end; ++i) {
-        boxes[tree.offset[level] + i] = make_knn_box(tree, level, static_cast<std::int32_t>(i));
-      }
+    parallel_rows(tree.count[level], 1 << 12, [&](std::int64_t i) {
+      boxes[tree.offset[level] + i] = make_knn_box(tree, level, static_cast<std::int32_t>(i));
     });
   }
   with_knn_length(k, [&]<int K>() {
-    parallel_for(0, tree.n, 1 << 10, [&](std::int64_t begin, std::int64_t end) {
-      for (std::int64_t i = begin; i < end; ++i) {
-        knn_row<T, K>(tree, static_cast<std::int32_t>(i), k, distances);
-      }
-    });
+    parallel_rows(tree.n, 1 << 10,
+                  [&](std::int64_t i) { knn_row<T, K>(tree, static_cast<std::int32_t>(i), k, distances); });
   });
 }
 

@@ -5,7 +5,6 @@
 #include "population/find_non_finite.h"
 #include "population/spawn_features.h"
 #include "population/tree_sums.h"
-#include "population/voxel_keys.h"
 
 namespace blitzgs::cuda {
 
@@ -71,6 +70,5 @@ void tree_sums(const TreeSumsArgs& args, CudaStream stream) {
 
 template void for_each_row(const DensityStats<float>&, CudaStream);
 template void for_each_row(const SpawnFeatures&, CudaStream);
-template void for_each_row(const VoxelKeys<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda

@@ -9,7 +9,6 @@
 #include "population/sampling.h"
 #include "population/spawn_features.h"
 #include "population/tree_sums.h"
-#include "population/voxel_keys.h"
 
 namespace blitzgs {
 namespace {
@@ -39,8 +38,7 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
   const Tensor v_means2d = v_means2d_in.stride(1) == 1 ? v_means2d_in : as_contiguous(v_means2d_in);
 
   DeviceScope scope(grad_sum);
-  dispatch_floating(grad_sum, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(grad_sum, [&]<class T>() {
     const DensityStats<T> args{mutable_data<T>(grad_sum),
                                mutable_data<std::int32_t>(grad_count),
                                mutable_data<T>(max_radii),
@@ -68,8 +66,7 @@ std::int64_t row_elements(const Tensor& column) {
 void copy_rows(const char* op, Tensor& out, const std::optional<Tensor>& to, const Tensor* column,
                const std::optional<Tensor>& from, std::int64_t n) {
   const std::int64_t row_bytes = row_elements(out) * static_cast<std::int64_t>(out.element_size());
-  STD_TORCH_CHECK(row_bytes < (1 << 16), "blitzgs::", op, ": rows must be shorter than 64 KiB, got ",
-                  row_bytes, " bytes");
+  BLITZGS_CHECK(row_bytes < (1 << 16), op, "rows must be shorter than 64 KiB, got ", row_bytes, " bytes");
   DeviceScope scope(out);
   backend::copy_rows({column ? static_cast<const std::byte*>(column->const_data_ptr()) : nullptr,
                       data_or_null<std::int64_t>(from), static_cast<std::byte*>(out.mutable_data_ptr()),
@@ -79,34 +76,32 @@ void copy_rows(const char* op, Tensor& out, const std::optional<Tensor>& to, con
 
 void check_rows_alike(const char* op, const char* name, const Tensor& rows, const Tensor& column) {
   check_dtype(op, name, rows, column.scalar_type());
-  STD_TORCH_CHECK(rows.dim() == column.dim() && row_elements(rows) == row_elements(column), "blitzgs::", op,
-                  ": rows of ", name, " must be like those of column, got ", shape_of(rows), " for ",
-                  shape_of(column));
+  BLITZGS_CHECK(rows.dim() == column.dim() && row_elements(rows) == row_elements(column), op, "rows of ",
+                name, " must be like those of column, got ", shape_of(rows), " for ", shape_of(column));
 }
 
 void take_rows_(Tensor out, const Tensor& column_in, const Tensor& rows_in) {
   constexpr const char* kOp = "take_rows";
-  STD_TORCH_CHECK(column_in.dim() >= 1, "blitzgs::take_rows: column must have rows, got ",
-                  shape_of(column_in));
+  BLITZGS_CHECK(column_in.dim() >= 1, "take_rows", "column must have rows, got ", shape_of(column_in));
   const std::optional<Tensor> rows = checked(kOp, "rows", rows_in, ScalarType::Long, {-1});
   check_rows_alike(kOp, "out", out, column_in);
   check_contiguous(kOp, "out", out);
   const std::int64_t n = rows->size(0);
-  STD_TORCH_CHECK(out.size(0) == n, "blitzgs::take_rows: out must have ", n, " rows, got ", shape_of(out));
+  BLITZGS_CHECK(out.size(0) == n, "take_rows", "out must have ", n, " rows, got ", shape_of(out));
   const Tensor column = as_contiguous(column_in);
   copy_rows(kOp, out, std::nullopt, &column, rows, n);
 }
 
 void put_rows_(Tensor column, const Tensor& rows_in, const std::optional<Tensor>& fresh_in) {
   constexpr const char* kOp = "put_rows_";
-  STD_TORCH_CHECK(column.dim() >= 1, "blitzgs::put_rows_: column must have rows, got ", shape_of(column));
+  BLITZGS_CHECK(column.dim() >= 1, "put_rows_", "column must have rows, got ", shape_of(column));
   check_contiguous(kOp, "column", column);
   const std::optional<Tensor> rows = checked(kOp, "rows", rows_in, ScalarType::Long, {-1});
   const std::int64_t n = rows->size(0);
   if (!fresh_in) return copy_rows(kOp, column, rows, nullptr, std::nullopt, n);
   check_rows_alike(kOp, "fresh", *fresh_in, column);
-  STD_TORCH_CHECK(fresh_in->size(0) == n, "blitzgs::put_rows_: fresh must have ", n, " rows, got ",
-                  shape_of(*fresh_in));
+  BLITZGS_CHECK(fresh_in->size(0) == n, "put_rows_", "fresh must have ", n, " rows, got ",
+                shape_of(*fresh_in));
   const Tensor fresh = as_contiguous(*fresh_in);
   copy_rows(kOp, column, rows, &fresh, std::nullopt, n);
 }
@@ -127,8 +122,8 @@ Tensor key_histogram(const Tensor& keys_in, const Tensor& prefix_in, std::int64_
   constexpr const char* kOp = "key_histogram";
   const Tensor keys = checked(kOp, "keys", keys_in, ScalarType::Float, {-1}),
                prefix = checked(kOp, "prefix", prefix_in, ScalarType::Long, {1});
-  STD_TORCH_CHECK(width >= 1 && width <= kMaxDigitBits && shift >= 0 && shift + width <= 32, "blitzgs::", kOp,
-                  ": a digit must have 1 to ", kMaxDigitBits, " of 32 bits, got ", width, " after ", shift);
+  BLITZGS_CHECK(width >= 1 && width <= kMaxDigitBits && shift >= 0 && shift + width <= 32, kOp,
+                "a digit must have 1 to ", kMaxDigitBits, " of 32 bits, got ", width, " after ", shift);
   Tensor counts = make_empty(keys, {std::int64_t{1} << width}, ScalarType::Long);
   DeviceScope scope(keys);
   backend::key_histogram(
@@ -140,7 +135,7 @@ Tensor key_histogram(const Tensor& keys_in, const Tensor& prefix_in, std::int64_
 
 Tensor find_non_finite(const std::vector<Tensor>& columns_in, const std::vector<Tensor>& nonzero_in) {
   constexpr const char* kOp = "find_non_finite";
-  STD_TORCH_CHECK(!columns_in.empty(), "blitzgs::", kOp, ": there must be columns");
+  BLITZGS_CHECK(!columns_in.empty(), kOp, "there must be columns");
   std::vector<Tensor> columns;
   for (const std::vector<Tensor>* list : {&columns_in, &nonzero_in}) {
     for (const Tensor& column : *list) {
@@ -152,8 +147,7 @@ Tensor find_non_finite(const std::vector<Tensor>& columns_in, const std::vector<
   Tensor bad = make_empty(columns[0], {}, ScalarType::Int);
   DeviceScope scope(columns[0]);
   backend::clear_flag(mutable_data<std::int32_t>(bad), scope.stream);
-  dispatch_floating(columns[0], [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(columns[0], [&]<class T>() {
     for (std::size_t first = 0; first < columns.size(); first += kMaxCheckedColumns) {
       CheckedColumns<T> checked{{}, 0, mutable_data<std::int32_t>(bad)};
       for (std::size_t c = first; c < columns.size() && checked.n < kMaxCheckedColumns; ++c) {
@@ -170,20 +164,14 @@ constexpr std::int64_t kMaxFeatures = 32;  // the features of a block's rows are
 
 Tensor tree_sums(const Tensor& features_in, const Tensor& roots_in, const Tensor& nodes_in,
                  const Tensor& leaves_in, std::int64_t depth) {
-  check_dtype(kTreeSums, "features", features_in, ScalarType::Float);
-  check_shape(kTreeSums, "features", features_in, {-1, -1});
-  check_dtype(kTreeSums, "roots", roots_in, ScalarType::Int);
-  check_shape(kTreeSums, "roots", roots_in, {-1});
-  check_dtype(kTreeSums, "nodes", nodes_in, ScalarType::Int);
-  check_shape(kTreeSums, "nodes", nodes_in, {-1, 4});
-  check_dtype(kTreeSums, "leaves", leaves_in, ScalarType::Long);
-  check_shape(kTreeSums, "leaves", leaves_in, {nodes_in.size(0)});
-  const std::int64_t rows = features_in.size(0), n_features = features_in.size(1);
-  STD_TORCH_CHECK(n_features <= kMaxFeatures, "blitzgs::", kTreeSums, ": at most ", kMaxFeatures,
-                  " features, got ", n_features);
-  STD_TORCH_CHECK(depth >= 0, "blitzgs::", kTreeSums, ": depth must not be negative, got ", depth);
-  const Tensor features = as_contiguous(features_in), roots = as_contiguous(roots_in);
-  const Tensor nodes = as_contiguous(nodes_in), leaves = as_contiguous(leaves_in);
+  const Tensor features = checked(kTreeSums, "features", features_in, ScalarType::Float, {-1, -1}),
+               roots = checked(kTreeSums, "roots", roots_in, ScalarType::Int, {-1}),
+               nodes = checked(kTreeSums, "nodes", nodes_in, ScalarType::Int, {-1, 4}),
+               leaves = checked(kTreeSums, "leaves", leaves_in, ScalarType::Long, {nodes.size(0)});
+  const std::int64_t rows = features.size(0), n_features = features.size(1);
+  BLITZGS_CHECK(n_features <= kMaxFeatures, kTreeSums, "at most ", kMaxFeatures, " features, got ",
+                n_features);
+  BLITZGS_CHECK(depth >= 0, kTreeSums, "depth must not be negative, got ", depth);
   Tensor sums = make_empty(features, {rows}, ScalarType::Long);
   DeviceScope scope(features);
   const TreeSumsArgs args{data<float>(features),
@@ -203,10 +191,10 @@ constexpr const char* kSpawnOp = "spawn_features";
 
 Tensor spawn_features(const std::vector<Tensor>& columns, const Tensor& rows_in, const Tensor& is_split_in,
                       std::int64_t time, double extent, std::int64_t level_count) {
-  STD_TORCH_CHECK(columns.size() == 7, "blitzgs::", kSpawnOp,
-                  ": columns must be (grad_sum, grad_count, opacities, scales, birth, level, "
-                  "exp_avg_sq.sh), got ",
-                  columns.size(), " tensors");
+  BLITZGS_CHECK(columns.size() == 7, kSpawnOp,
+                "columns must be (grad_sum, grad_count, opacities, scales, birth, level, "
+                "exp_avg_sq.sh), got ",
+                columns.size(), " tensors");
   const std::int64_t n = columns[0].size(0);
   const auto column = [&](int i, const char* name, ScalarType dtype,
                           std::initializer_list<std::int64_t> shape) {
@@ -219,10 +207,9 @@ Tensor spawn_features(const std::vector<Tensor>& columns, const Tensor& rows_in,
                birth = column(4, "birth", ScalarType::Int, {n}),
                level = column(5, "level", ScalarType::Byte, {n}),
                moments = column(6, "exp_avg_sq.sh", ScalarType::Float, {n, -1, 3});
-  STD_TORCH_CHECK(moments.size(1) > 0, "blitzgs::", kSpawnOp, ": exp_avg_sq.sh must have coefficients");
-  STD_TORCH_CHECK(extent > 0, "blitzgs::", kSpawnOp, ": extent must be positive, got ", extent);
-  STD_TORCH_CHECK(level_count > 0, "blitzgs::", kSpawnOp, ": level_count must be positive, got ",
-                  level_count);
+  BLITZGS_CHECK(moments.size(1) > 0, kSpawnOp, "exp_avg_sq.sh must have coefficients");
+  BLITZGS_CHECK(extent > 0, kSpawnOp, "extent must be positive, got ", extent);
+  BLITZGS_CHECK(level_count > 0, kSpawnOp, "level_count must be positive, got ", level_count);
   const Tensor rows = checked(kSpawnOp, "rows", rows_in, ScalarType::Long, {-1}),
                is_split = checked(kSpawnOp, "is_split", is_split_in, ScalarType::Bool, {rows.size(0)});
   Tensor features = make_empty(grad_sum, {rows.size(0), kSpawnFeatures});
@@ -249,37 +236,17 @@ Tensor spawn_features(const std::vector<Tensor>& columns, const Tensor& rows_in,
 Tensor knn_distances(const Tensor& points, std::int64_t k) {
   check_floating("knn_distances", "points", points);
   check_shape("knn_distances", "points", points, {-1, 3});
-  STD_TORCH_CHECK(k >= 1 && k <= kKnnMaxK, "blitzgs::knn_distances: k must be in [1, ", kKnnMaxK, "], got ",
-                  k);
+  BLITZGS_CHECK(k >= 1 && k <= kKnnMaxK, "knn_distances", "k must be in [1, ", kKnnMaxK, "], got ", k);
   const std::int64_t n = points.size(0);
-  STD_TORCH_CHECK(n < (std::int64_t{1} << 31) - kKnnFan, "blitzgs::knn_distances: at most 2^31 points, got ",
-                  n);
+  BLITZGS_CHECK(n < (std::int64_t{1} << 31) - kKnnFan, "knn_distances", "at most 2^31 points, got ", n);
   const Tensor rows = as_contiguous(points);
   Tensor distances = make_empty(rows, {n, k});
   DeviceScope scope(rows);
-  dispatch_floating(rows, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(rows, [&]<class T>() {
     backend::knn_distances(data<T>(rows), static_cast<std::int32_t>(n), static_cast<int>(k),
                            mutable_data<T>(distances), scope.workspace, scope.stream);
   });
   return distances;
-}
-
-Tensor voxel_keys(const Tensor& points, const std::vector<double>& origin, double voxel_size) {
-  check_floating("voxel_keys", "points", points);
-  check_shape("voxel_keys", "points", points, {-1, 3});
-  STD_TORCH_CHECK(origin.size() == 3, "blitzgs::voxel_keys: origin must have 3 values, got ", origin.size());
-  STD_TORCH_CHECK(voxel_size > 0, "blitzgs::voxel_keys: voxel_size must be positive, got ", voxel_size);
-  const Tensor rows = as_contiguous(points);
-  Tensor keys = make_empty(rows, {rows.size(0)}, ScalarType::Long);
-  DeviceScope scope(rows);
-  const VoxelGrid grid{{origin[0], origin[1], origin[2]}, voxel_size};
-  dispatch_floating(rows, [&](auto zero) {
-    using T = decltype(zero);
-    backend::for_each_row(VoxelKeys<T>{data<T>(rows), grid, mutable_data<std::int64_t>(keys), rows.size(0)},
-                          scope.stream);
-  });
-  return keys;
 }
 
 }  // namespace
@@ -295,5 +262,4 @@ BLITZGS_REGISTER(m) {
   m.impl("tree_sums", TORCH_BOX(&blitzgs::tree_sums));
   m.impl("spawn_features", TORCH_BOX(&blitzgs::spawn_features));
   m.impl("knn_distances", TORCH_BOX(&blitzgs::knn_distances));
-  m.impl("voxel_keys", TORCH_BOX(&blitzgs::voxel_keys));
 }

@@ -5,10 +5,8 @@
 #include <vector>
 
 #include "common/catch.h"
-#include "common/test_workspace.h"
 #include "population/density_stats.h"
 #include "population/knn.h"
-#include "population/voxel_keys.h"
 
 using namespace blitzgs;
 
@@ -64,14 +62,4 @@ TEST_CASE("nearest neighbours match brute force, around duplicates and a point t
       }
     }
   }
-}
-
-TEST_CASE("voxel keys pack x, y, z into 21 bits each and clamp") {
-  const VoxelGrid grid{{-1.0, 0.0, 2.0}, 0.5};
-  const double inside[3] = {0.25, 0.75, 4.0};
-  REQUIRE(voxel_key(inside, grid) == (2 | (std::int64_t{1} << 21) | (std::int64_t{4} << 42)));
-  const double below[3] = {-100.0, -100.0, -100.0};
-  REQUIRE(voxel_key(below, grid) == 0);
-  const double nan[3] = {std::numeric_limits<double>::quiet_NaN(), 0.0, 0.0};
-  REQUIRE(voxel_key(nan, grid) == -1);
 }

@@ -177,10 +177,8 @@ void reduce_poses(const double* sums, std::int64_t n_blocks, int n_views, T* v_v
 // Calls f(block, its first candidate, one past its last) for all blocks, in parallel.
 template <class T, class F>
 void for_each_block(std::vector<CountedBlock<T>>& blocks, std::int64_t n_candidates, const F& f) {
-  parallel_for(0, static_cast<std::int64_t>(blocks.size()), 1, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t block = begin; block < end; ++block) {
-      f(blocks[block], block * kProjectBlock, std::min(n_candidates, (block + 1) * kProjectBlock));
-    }
+  parallel_rows(static_cast<std::int64_t>(blocks.size()), 1, [&](std::int64_t block) {
+    f(blocks[block], block * kProjectBlock, std::min(n_candidates, (block + 1) * kProjectBlock));
   });
 }
 
@@ -238,16 +236,14 @@ void color_splats(const ProjectInputs<T>& in, const ProjectCapacity& capacity,
                   const ProjectColumns<T>& columns, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   const ProjectOutputs<T>& out = columns.values;
-  parallel_for(0, capacity.sizes.splats, 1 << 10, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) {
-      const std::int64_t id = columns.ids.gaussian_ids[i];
-      if (splat_color(cameras[columns.ids.camera_ids[i]], load3(in.means + 3 * id),
-                      in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree, out.colors + 3 * i)) {
-        continue;
-      }
-      out.opacities[i] = T(0);
-      out.radii[2 * i] = out.radii[2 * i + 1] = out.tiles_touched[i] = 0;
+  parallel_rows(capacity.sizes.splats, 1 << 10, [&](std::int64_t i) {
+    const std::int64_t id = columns.ids.gaussian_ids[i];
+    if (splat_color(cameras[columns.ids.camera_ids[i]], load3(in.means + 3 * id),
+                    in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree, out.colors + 3 * i)) {
+      return;
     }
+    out.opacities[i] = T(0);
+    out.radii[2 * i] = out.radii[2 * i + 1] = out.tiles_touched[i] = 0;
   });
 }
 
@@ -258,15 +254,13 @@ void project_bwd(const ProjectInputs<T>& in, const SplatIndex& splats, const Spl
   const std::vector<Camera<T>> cameras = make_cameras(in);
   const std::int64_t blocks = project_blocks(splats.n_visible);
   std::vector<double> pose_sums(out.viewmats ? blocks * in.n_views * 12 : 0, 0.0);
-  parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t block = begin; block < end; ++block) {
-      std::vector<PoseGradient<T>> poses(out.viewmats ? in.n_views : 0);
-      const std::int64_t last = std::min(splats.n_visible, (block + 1) * kProjectBlock);
-      for (std::int64_t u = block * kProjectBlock; u < last; ++u) {
-        gaussian_bwd(in, cameras, splats, v, regularisers, u, poses.empty() ? nullptr : poses.data(), out);
-      }
-      if (out.viewmats) store_poses(poses, &pose_sums[block * in.n_views * 12]);
+  parallel_rows(blocks, 1, [&](std::int64_t block) {
+    std::vector<PoseGradient<T>> poses(out.viewmats ? in.n_views : 0);
+    const std::int64_t last = std::min(splats.n_visible, (block + 1) * kProjectBlock);
+    for (std::int64_t u = block * kProjectBlock; u < last; ++u) {
+      gaussian_bwd(in, cameras, splats, v, regularisers, u, poses.empty() ? nullptr : poses.data(), out);
     }
+    if (out.viewmats) store_poses(poses, &pose_sums[block * in.n_views * 12]);
   });
   if (out.viewmats) reduce_poses(pose_sums.data(), blocks, in.n_views, out.viewmats);
 }

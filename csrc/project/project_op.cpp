@@ -23,8 +23,8 @@ struct Candidates {
   Candidates(const char* op, const OptionalTensor& active_ids, const OptionalTensor& active_views,
              const OptionalTensor& n_active, const OptionalTensor& n_blocks, std::int64_t n_gaussians)
       : count(n_gaussians) {
-    STD_TORCH_CHECK(active_ids || (!active_views && !n_active && !n_blocks), "blitzgs::", op,
-                    ": active_views, n_active and n_blocks need active_ids");
+    BLITZGS_CHECK(active_ids || (!active_views && !n_active && !n_blocks), op,
+                  "active_views, n_active and n_blocks need active_ids");
     if (!active_ids) return;
     ids = checked(op, "active_ids", active_ids, ScalarType::Int, {-1});
     const std::int64_t length = ids->numel();
@@ -37,9 +37,9 @@ struct Candidates {
 
 RankTiles checked_rank_tiles(const char* op, const IntList& begins_and_ends) {
   const std::size_t n_ranks = begins_and_ends.size() / 2;
-  STD_TORCH_CHECK(begins_and_ends.size() == 2 * n_ranks && n_ranks <= kMaxRanks, "blitzgs::", op,
-                  ": rank_tiles must have a begin and an end for each of at most ", kMaxRanks, " ranks, got ",
-                  begins_and_ends.size(), " numbers");
+  BLITZGS_CHECK(begins_and_ends.size() == 2 * n_ranks && n_ranks <= kMaxRanks, op,
+                "rank_tiles must have a begin and an end for each of at most ", kMaxRanks, " ranks, got ",
+                begins_and_ends.size(), " numbers");
   RankTiles ranks{};
   ranks.n_ranks = static_cast<int>(n_ranks);
   for (std::size_t m = 0; m < n_ranks; ++m) {
@@ -72,8 +72,8 @@ class TorchSplats final : public SplatMemory<T> {
 
   ProjectColumns<T> allocate(const ProjectSizes& sizes) override {
     const std::int64_t U = sizes.visible, P = sizes.splats;
-    STD_TORCH_CHECK(
-        P <= std::numeric_limits<std::int32_t>::max(), "blitzgs::project_fwd: ", P,
+    BLITZGS_CHECK(
+        P <= std::numeric_limits<std::int32_t>::max(), "project_fwd", "", P,
         " splats (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
     // The braces guarantee that memory is allocated in this order.
     return {{ints(t_.gaussian_ids, {P}), ints(t_.camera_ids, {P}), ints(t_.visible_ids, {U}),
@@ -109,10 +109,9 @@ class TorchSplats final : public SplatMemory<T> {
 
 std::optional<ProjectSizes> checked_capacity(const char* op, std::optional<std::int64_t> visible,
                                              std::optional<std::int64_t> splats) {
-  STD_TORCH_CHECK(
-      visible.has_value() == splats.has_value() && visible.value_or(1) > 0 && splats.value_or(1) > 0,
-      "blitzgs::", op,
-      ": capacity must be how many visible Gaussians and splats there is room for, at least 1 each");
+  BLITZGS_CHECK(
+      visible.has_value() == splats.has_value() && visible.value_or(1) > 0 && splats.value_or(1) > 0, op,
+      "capacity must be how many visible Gaussians and splats there is room for, at least 1 each");
   if (!visible) return std::nullopt;
   return ProjectSizes{*visible, *splats};
 }
@@ -141,8 +140,7 @@ Projected project_fwd(const TensorList& gaussians, const Tensor& viewmats, const
   Tensor totals = make_empty(p.means, {project_totals(p.n_views, ranks.n_ranks)}, ScalarType::Long);
   SplatTensors t;
   DeviceScope scope(p.means);
-  dispatch_floating(p.means, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(p.means, [&]<class T>() {
     ProjectInputs<T> in = p.inputs<T>();
     in.active_ids = data_or_null<std::int32_t>(candidates.ids);
     in.active_views = data_or_null<std::int32_t>(candidates.views);
@@ -166,19 +164,19 @@ class HeldSplatGradients {
                      const std::optional<Tensor>& places, const std::optional<Tensor>& sums)
       : held_(v_splats), depths_(v_depths), in_tables_(places || v_splats.size() == 1) {
 #ifndef BLITZGS_BACKEND_CUDA
-    STD_TORCH_CHECK(!in_tables_, "blitzgs::", op, ": tables of gradients need CUDA; give columns");
+    BLITZGS_CHECK(!in_tables_, op, "tables of gradients need CUDA; give columns");
 #endif
-    STD_TORCH_CHECK(places || !sums, "blitzgs::", op, ": means2d_sums needs gradients at ranks");
+    BLITZGS_CHECK(places || !sums, op, "means2d_sums needs gradients at ranks");
     if (in_tables_) {
-      STD_TORCH_CHECK(!v_depths, "blitzgs::", op, ": v_depths needs gradients in columns");
+      BLITZGS_CHECK(!v_depths, op, "v_depths needs gradients in columns");
       for (const Tensor& table : held_) check_table(op, table);
       if (!places) check_shape(op, "v_splats[0]", held_[0], {splats, kSplatGradient});
       if (places) hold_ranks(op, splats, *places, sums);
       return;
     }
-    STD_TORCH_CHECK(v_splats.size() == 3 || v_splats.size() == 4, "blitzgs::", op,
-                    ": v_splats must be v_means2d, v_conics, v_opacities[, v_colors] or one table, got ",
-                    v_splats.size(), " tensors");
+    BLITZGS_CHECK(v_splats.size() == 3 || v_splats.size() == 4, op,
+                  "v_splats must be v_means2d, v_conics, v_opacities[, v_colors] or one table, got ",
+                  v_splats.size(), " tensors");
     held_[0] = checked(op, "v_means2d", held_[0], dtype, {splats, 2});
     held_[1] = checked(op, "v_conics", held_[1], dtype, {splats, 3});
     held_[2] = checked(op, "v_opacities", held_[2], dtype, {splats});
@@ -204,15 +202,15 @@ class HeldSplatGradients {
 
   static void check_table(const char* op, const Tensor& tensor) {
     check_in_place(op, "a table of v_splats", tensor, ScalarType::Float, {-1, kSplatGradient});
-    STD_TORCH_CHECK(reinterpret_cast<std::uintptr_t>(tensor.const_data_ptr()) % alignof(SplatGradient) == 0,
-                    "blitzgs::", op, ": a table of v_splats must begin at a multiple of 16 bytes");
+    BLITZGS_CHECK(reinterpret_cast<std::uintptr_t>(tensor.const_data_ptr()) % alignof(SplatGradient) == 0, op,
+                  "a table of v_splats must begin at a multiple of 16 bytes");
   }
 
   void hold_ranks(const char* op, std::int64_t splats, const Tensor& places,
                   const std::optional<Tensor>& sums) {
     const auto n_ranks = static_cast<std::int64_t>(held_.size());
-    STD_TORCH_CHECK(n_ranks >= 1 && n_ranks <= kMaxPeers, "blitzgs::", op, ": 1 to ", kMaxPeers,
-                    " ranks can hold gradients, got ", n_ranks);
+    BLITZGS_CHECK(n_ranks >= 1 && n_ranks <= kMaxPeers, op, "1 to ", kMaxPeers,
+                  " ranks can hold gradients, got ", n_ranks);
     places_ = checked_places(op, places, splats, n_ranks);
     ranks_.places = places_in(*places_);
     ranks_.n_ranks = static_cast<int>(n_ranks);
@@ -286,8 +284,7 @@ BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats,
          v_sh = make_empty(p.means, {length, p.sh_stride, 3}),
          v_viewmats = make_empty(p.means, {need_viewmats ? p.n_views : 0, 4, 4});
   DeviceScope scope(p.means);
-  dispatch_floating(p.means, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(p.means, [&]<class T>() {
     if (dense) {
       backend::zero_arrays(
           ZeroedArrays<T>{{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),
@@ -326,8 +323,7 @@ void project_bwd_step(const TensorList& state_in, const TensorList& tables, std:
                              means2d_sums);
   if (b.visible() == 0) return;
   DeviceScope scope(p.means);
-  dispatch_floating(p.means, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(p.means, [&]<class T>() {
     backend::project_bwd_step(p.inputs<T>(), b.pointers(), v.source<T>(), b.regularisers<T>(),
                               state.arguments<T>(b.visible_ids), scope.workspace, scope.stream);
   });

@@ -20,8 +20,8 @@ using FloatList = std::vector<double>;
 // Checks the number of entries of a group of arguments. names: those of the entries, for the message.
 template <class List>
 void check_group(const char* op, const char* names, const List& list, std::size_t least, std::size_t most) {
-  STD_TORCH_CHECK(list.size() >= least && list.size() <= most, "blitzgs::", op, ": expected ", names,
-                  ", got ", list.size(), " entries");
+  BLITZGS_CHECK(list.size() >= least && list.size() <= most, op, "expected ", names, ", got ", list.size(),
+                " entries");
 }
 
 // fade: empty, or the floats of set_fade.
@@ -30,16 +30,16 @@ inline ProjectOptions<double> checked_options(const char* op, std::int64_t width
                                               double near_plane, double far_plane, double eps2d,
                                               double radius_clip, bool antialiased, bool raw,
                                               const FloatList& fade) {
-  STD_TORCH_CHECK(width > 0 && height > 0 && width < (1 << 24) && height < (1 << 24), "blitzgs::", op,
-                  ": width and height must be in [1, 2^24), got ", width, " x ", height);
-  STD_TORCH_CHECK(tile_size > 0 && tile_size < (1 << 24), "blitzgs::", op,
-                  ": tile_size must be in [1, 2^24), got ", tile_size);
+  BLITZGS_CHECK(width > 0 && height > 0 && width < (1 << 24) && height < (1 << 24), op,
+                "width and height must be in [1, 2^24), got ", width, " x ", height);
+  BLITZGS_CHECK(tile_size > 0 && tile_size < (1 << 24), op, "tile_size must be in [1, 2^24), got ",
+                tile_size);
   // NaN fails each of these comparisons.
-  STD_TORCH_CHECK(near_plane < far_plane, "blitzgs::", op, ": near_plane must be less than far_plane, got ",
-                  near_plane, " and ", far_plane);
-  STD_TORCH_CHECK(eps2d >= 0 && eps2d <= FLT_MAX && radius_clip >= 0, "blitzgs::", op,
-                  ": eps2d must be finite, and eps2d and radius_clip at least 0, got ", eps2d, " and ",
-                  radius_clip);
+  BLITZGS_CHECK(near_plane < far_plane, op, "near_plane must be less than far_plane, got ", near_plane,
+                " and ", far_plane);
+  BLITZGS_CHECK(eps2d >= 0 && eps2d <= FLT_MAX && radius_clip >= 0, op,
+                "eps2d must be finite, and eps2d and radius_clip at least 0, got ", eps2d, " and ",
+                radius_clip);
   check_group(op, "(fade_slope, reach of each level)", fade, 0, 1 + kMaxLevels);
   ProjectOptions<double> options{};
   options.width = static_cast<int>(width);
@@ -59,9 +59,9 @@ inline ProjectOptions<double> checked_options(const char* op, std::int64_t width
 // Sets the parameters of smooth levels. The numbers are f / (f - 1), then for each level the distance from
 // which on its weight is 0 (infinite: the level never fades; negative: its weight is 0 everywhere).
 inline void set_fade(const char* op, const Tensor& level, const FloatList& numbers, LevelFade& fade) {
-  STD_TORCH_CHECK(numbers.size() > 1 && numbers[0] >= 1, "blitzgs::", op,
-                  ": levels need a fade_slope of at least 1 and a reach for each level in fade, got ",
-                  numbers.size(), " floats");
+  BLITZGS_CHECK(numbers.size() > 1 && numbers[0] >= 1, op,
+                "levels need a fade_slope of at least 1 and a reach for each level in fade, got ",
+                numbers.size(), " floats");
   fade.level = data<std::uint8_t>(level);
   fade.n_levels = static_cast<int>(numbers.size()) - 1;
   for (int i = 0; i < fade.n_levels; ++i) {
@@ -95,10 +95,10 @@ struct ProjectArguments {
     viewmats = checked(op, "viewmats", viewmats_in, dtype, {-1, 4, 4});
     n_views = viewmats.size(0);
     Ks = checked(op, "Ks", Ks_in, dtype, {n_views, 3, 3});
-    STD_TORCH_CHECK(n_views <= kMaxViews, "blitzgs::", op, ": at most ", kMaxViews,
-                    " views in one launch, got ", n_views, "; call it for fewer views at a time");
-    STD_TORCH_CHECK(count <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op,
-                    ": at most 2^31 - 1 Gaussians on one device, got ", count);
+    BLITZGS_CHECK(n_views <= kMaxViews, op, "at most ", kMaxViews, " views in one launch, got ", n_views,
+                  "; call it for fewer views at a time");
+    BLITZGS_CHECK(count <= std::numeric_limits<std::int32_t>::max(), op,
+                  "at most 2^31 - 1 Gaussians on one device, got ", count);
     if (gaussians.size() == 5) set_sh(op, gaussians[4]);
     level = checked(op, "level", level_in, ScalarType::Byte, {count});
     if (level) set_fade(op, *level, numbers, fade);
@@ -130,11 +130,11 @@ struct ProjectArguments {
     sh = checked(op, "sh", sh_in, means.scalar_type(), {count, -1, 3});
     sh_stride = sh->size(1);
     options.sh_stride = static_cast<int>(sh_stride);
-    STD_TORCH_CHECK(options.sh_degree >= 0 && options.sh_degree <= kMaxShDegree, "blitzgs::", op,
-                    ": sh_degree must be 0 to 3, got ", options.sh_degree);
-    STD_TORCH_CHECK(sh_basis_count(options.sh_degree) <= sh_stride, "blitzgs::", op, ": sh has ", sh_stride,
-                    " coefficients, sh_degree ", options.sh_degree, " needs ",
-                    sh_basis_count(options.sh_degree));
+    BLITZGS_CHECK(options.sh_degree >= 0 && options.sh_degree <= kMaxShDegree, op,
+                  "sh_degree must be 0 to 3, got ", options.sh_degree);
+    BLITZGS_CHECK(sh_basis_count(options.sh_degree) <= sh_stride, op, "sh has ", sh_stride,
+                  " coefficients, sh_degree ", options.sh_degree, " needs ",
+                  sh_basis_count(options.sh_degree));
   }
 };
 

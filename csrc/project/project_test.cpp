@@ -2,12 +2,10 @@
 #include "project/project.h"
 
 #include <algorithm>
-#include <limits>
 #include <random>
 #include <vector>
 
 #include "common/catch.h"
-#include "common/test_workspace.h"
 
 using namespace blitzgs;
 
@@ -141,34 +139,6 @@ TEST_CASE("splats are ordered by Gaussian and view, and the totals count them") 
   }
 }
 
-TEST_CASE("candidates and their views select splats and change no bit of them") {
-  const World world;
-  const Projected all = project(world.inputs());
-  std::vector<std::int32_t> ids, views;
-  for (int id = 0; id < World::kCount; id += 3) {
-    ids.push_back(id);
-    views.push_back(id % 8);
-  }
-  ProjectInputs<double> in = world.inputs();
-  in.active_ids = ids.data();
-  in.active_views = views.data();
-  in.n_candidates = static_cast<std::int64_t>(ids.size());
-  const Projected some = project(in);
-  std::size_t next = 0;
-  for (std::int64_t splat = 0; splat < all.sizes.splats; ++splat) {
-    const int id = all.gaussian_ids[splat];
-    if (id % 3 != 0 || !(id % 8 >> all.camera_ids[splat] & 1)) continue;
-    REQUIRE(next < some.gaussian_ids.size());
-    REQUIRE(some.gaussian_ids[next] == id);
-    REQUIRE(some.camera_ids[next] == all.camera_ids[splat]);
-    REQUIRE(some.conics[3 * next] == all.conics[3 * splat]);
-    REQUIRE(some.colors[3 * next + 2] == all.colors[3 * splat + 2]);
-    ++next;
-  }
-  REQUIRE(next == some.gaussian_ids.size());
-  REQUIRE(next > 100);
-}
-
 TEST_CASE("each splat knows the ranks that composite its tiles, and the totals count them") {
   const World world;
   // Views of 3 x 2 tiles. Rank 1 has none; ranks 0 and 2 overlap.
@@ -243,60 +213,6 @@ TEST_CASE("the backward pass is the derivative of the splats") {
     REQUIRE(slope(&world.viewmats[i]) == Approx(v_viewmats[i]).epsilon(1e-4));
   }
   REQUIRE(v_viewmats[15] == 0.0);
-}
-
-TEST_CASE("opacities fade with the distance by their levels, and a level beyond the last is the last") {
-  const World world;
-  std::vector<std::uint8_t> level(World::kCount);
-  for (int i = 0; i < World::kCount; ++i) level[i] = static_cast<std::uint8_t>(i % 3);
-  const double reach = 4.0, fork = 2.0;
-  ProjectInputs<double> in = world.inputs();
-  const Projected plain = project(in);
-  in.options.fade_slope = fork / (fork - 1);
-  in.fade = {level.data(), 2, {0.0f, static_cast<float>(1 / (reach * reach))}};
-  const Projected faded = project(in);
-  std::size_t at = 0, whole = 0, fainter = 0, gone = 0;
-  for (std::size_t i = 0; i < plain.opacities.size(); ++i) {
-    const std::int32_t id = plain.gaussian_ids[i], view = plain.camera_ids[i];
-    const double* mean = &world.means[3 * id];
-    const double x = mean[0] + 0.1 * view, z = mean[2] + 2.0 + view;  // relative to the camera
-    const double relative = (x * x + mean[1] * mean[1] + z * z) / (reach * reach);
-    const double weight = level[id] == 0 ? 1 : std::clamp((1 - relative) * fork / (fork - 1), 0.0, 1.0);
-    const bool there =
-        at < faded.opacities.size() && faded.gaussian_ids[at] == id && faded.camera_ids[at] == view;
-    if (!there) {
-      // The splat faded below 1/255 everywhere, or its smaller box no longer overlaps the image.
-      REQUIRE(weight < 1);
-      ++gone;
-      continue;
-    }
-    REQUIRE(faded.opacities[at++] == Approx(weight * plain.opacities[i]).epsilon(1e-9));
-    ++(weight == 1 ? whole : fainter);
-  }
-  REQUIRE(at == faded.opacities.size());
-  REQUIRE(std::min({whole, fainter, gone}) > 50);
-}
-
-TEST_CASE("no Gaussians, no views, and Gaussians of NaN give no splats") {
-  World world;
-  ProjectInputs<double> in = world.inputs();
-  in.n_candidates = 0;
-  REQUIRE(project(in).splat_offsets == std::vector<std::int32_t>{0});
-  in = world.inputs();
-  in.n_views = 0;
-  REQUIRE(project(in).sizes.splats == 0);
-  const double nan = std::numeric_limits<double>::quiet_NaN();
-  for (auto* values : {&world.means, &world.quats, &world.scales, &world.opacities}) {
-    const std::vector<double> before = *values;
-    std::fill(values->begin(), values->end(), nan);
-    REQUIRE(project(world.inputs()).sizes.splats == 0);
-    *values = before;
-  }
-  world.sh[3 * World::kBasis * 7 + 4] = nan;
-  const Projected p = project(world.inputs());
-  const auto hidden = std::find(p.gaussian_ids.begin(), p.gaussian_ids.end(), 7) - p.gaussian_ids.begin();
-  REQUIRE(hidden < p.sizes.splats);
-  REQUIRE((p.opacities[hidden] == 0 && p.colors[3 * hidden] == 0 && p.tiles[hidden] == 0));
 }
 
 TEST_CASE("arrays are zeroed to their ends") {

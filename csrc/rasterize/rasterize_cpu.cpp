@@ -4,10 +4,12 @@
 #include <vector>
 
 #include "common/parallel.h"
+#include "rasterize/pixel_splats.h"
 #include "rasterize/rasterize.h"
 #include "rasterize/tile_jobs.h"
 
 namespace blitzgs::cpu {
+
 namespace {
 
 // The number of partial gradients (one per splat and tile) in memory at a time: a few megabytes, so that they
@@ -89,16 +91,14 @@ void add_partials(const RasterizeInput<T>& in, const Chunk& chunk, const std::in
 template <class T>
 void write_gradients(const RasterizeInput<T>& in, const T* sums, int width,
                      const RasterizeGradients<T>& gradients) {
-  parallel_for(0, in.n_splats, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t splat = begin; splat < end; ++splat) {
-      const T* sum = sums + splat * width;
-      std::copy_n(sum + kMeanX, 2, gradients.v_means2d + 2 * splat);
-      std::copy_n(sum + kConicA, 3, gradients.v_conics + 3 * splat);
-      gradients.v_opacities[splat] = sum[kOpacity];
-      std::copy_n(sum + kColor, in.n_channels, gradients.v_colors + splat * in.n_channels);
-      if (gradients.v_means2d_abs) {
-        std::copy_n(sum + kColor + in.n_channels, 2, gradients.v_means2d_abs + 2 * splat);
-      }
+  parallel_rows(in.n_splats, 1 << 12, [&](std::int64_t splat) {
+    const T* sum = sums + splat * width;
+    std::copy_n(sum + kMeanX, 2, gradients.v_means2d + 2 * splat);
+    std::copy_n(sum + kConicA, 3, gradients.v_conics + 3 * splat);
+    gradients.v_opacities[splat] = sum[kOpacity];
+    std::copy_n(sum + kColor, in.n_channels, gradients.v_colors + splat * in.n_channels);
+    if (gradients.v_means2d_abs) {
+      std::copy_n(sum + kColor + in.n_channels, 2, gradients.v_means2d_abs + 2 * splat);
     }
   });
 }
@@ -176,5 +176,22 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
 BLITZGS_INSTANTIATE(float)
 BLITZGS_INSTANTIATE(double)
 #undef BLITZGS_INSTANTIATE
+
+template <class T>
+void pixel_splats(const RasterizeInput<T>& in, const PixelSplats<T>& out, Workspace& workspace, CudaStream) {
+  const PreparedSplat<T>* splats = pack_splats(in, allocate_splats<T>(in.n_splats, workspace));
+  const TileKernels<T> kernels = tile_kernels<T>(0, false);
+  const TileMemory<T> memory(in, workspace);
+  parallel_tasks(in.grid.count(), [&](std::int64_t tile, int worker) {
+    TileJob<T> job = make_job(in, splats, tile);
+    memory.lend(worker, &job);
+    kernels.list_splats(job, out);
+  });
+}
+
+template void pixel_splats<float>(const RasterizeInput<float>&, const PixelSplats<float>&, Workspace&,
+                                  CudaStream);
+template void pixel_splats<double>(const RasterizeInput<double>&, const PixelSplats<double>&, Workspace&,
+                                   CudaStream);
 
 }  // namespace blitzgs::cpu

@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "rasterize/rasterize.h"
+#include "rasterize/rasterize_op.h"
 
 #include <tuple>
 
-#include "common/op.h"
 #include "rasterize/pixel_splats.h"
 
 namespace blitzgs {
@@ -17,47 +16,32 @@ constexpr bool kPacked = false;
 #endif
 
 // The arguments that forward and backward share, checked and contiguous.
-struct Splats {
+struct Splats : ListedSplats {
   Splats(const char* op, const Tensor& means2d_in, const Tensor& conics_in, const Tensor& opacities_in,
          const Tensor& colors_in, const std::optional<Tensor>& backgrounds_in, const Tensor& isect_splats_in,
          const Tensor& tile_offsets_in, const TileGrid& grid_in,
          const std::optional<Tensor>& known_splats = std::nullopt)
-      : grid(grid_in),
-        n_splats(means2d_in.size(0)),
-        splat_count(checked_splat_count(op, known_splats, means2d_in)) {
-    check_floating(op, "means2d", means2d_in);
-    const ScalarType dtype = means2d_in.scalar_type();
-    means2d = checked(op, "means2d", means2d_in, dtype, {n_splats, 2});
-    conics = checked(op, "conics", conics_in, dtype, {n_splats, 3});
-    opacities = checked(op, "splat_opacities", opacities_in, dtype, {n_splats});
-    colors = checked(op, "colors", colors_in, dtype, {n_splats, -1});
+      : ListedSplats(op, means2d_in, conics_in, opacities_in, isect_splats_in, tile_offsets_in, grid_in,
+                     known_splats) {
+    colors = checked(op, "colors", colors_in, means2d.scalar_type(), {n_splats, -1});
     n_channels = colors.size(1);
-    STD_TORCH_CHECK(n_channels > 0 && n_channels <= 4096, "blitzgs::", op,
-                    ": colors must have 1 to 4096 channels, got ", n_channels);
-    backgrounds = checked(op, "backgrounds", backgrounds_in, dtype, {grid.n_cameras, n_channels});
-    isect_splats = checked(op, "isect_splats", isect_splats_in, ScalarType::Int, {-1});
-    tile_offsets = checked(op, "tile_offsets", tile_offsets_in, ScalarType::Long, {grid.count() + 1});
+    BLITZGS_CHECK(n_channels > 0 && n_channels <= 4096, op, "colors must have 1 to 4096 channels, got ",
+                  n_channels);
+    backgrounds =
+        checked(op, "backgrounds", backgrounds_in, colors.scalar_type(), {grid.n_cameras, n_channels});
   }
 
   template <class T>
   RasterizeInput<T> input() const {
-    return {data<T>(means2d),
-            data<T>(conics),
-            data<T>(opacities),
-            data<T>(colors),
-            data_or_null<T>(backgrounds),
-            data<std::int32_t>(isect_splats),
-            data<std::int64_t>(tile_offsets),
-            splat_count.n_splats,
-            static_cast<int>(n_channels),
-            grid,
-            splat_count.known_splats};
+    RasterizeInput<T> in = ListedSplats::input<T>();
+    in.colors = data<T>(colors);
+    in.backgrounds = data_or_null<T>(backgrounds);
+    in.n_channels = static_cast<int>(n_channels);
+    return in;
   }
 
-  TileGrid grid;
-  std::int64_t n_splats, n_channels = 0;  // n_splats: the length of the columns
-  SplatCount splat_count;
-  Tensor means2d, conics, opacities, colors, isect_splats, tile_offsets;
+  std::int64_t n_channels = 0;
+  Tensor colors;
   std::optional<Tensor> backgrounds;
 };
 
@@ -80,8 +64,7 @@ CompositedTensors composite(const Splats& splats, std::optional<Tensor> splat_gr
   const RasterizeAux aux{mutable_data<void>(packed), splats.n_splats,
                          order.size(0) > 0 ? mutable_data<std::int32_t>(order) : nullptr, composited};
   DeviceScope scope(splats.means2d);
-  dispatch_floating(splats.means2d, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(splats.means2d, [&]<class T>() {
     const RasterizeOutput<T> out{mutable_data<T>(renders),
                                  mutable_data<T>(transmittances),
                                  mutable_data<std::int32_t>(last_ids),
@@ -95,7 +78,6 @@ CompositedTensors composite(const Splats& splats, std::optional<Tensor> splat_gr
 
 }  // namespace
 
-// Not in the unnamed namespace, because render_op.cpp calls it, too.
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
     const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities, const Tensor& colors,
     const std::optional<Tensor>& backgrounds, const Tensor& isect_splats, const Tensor& tile_offsets,
@@ -119,10 +101,10 @@ namespace {
 Splats backward_splats(const char* op, const std::vector<Tensor>& splats,
                        const std::optional<Tensor>& backgrounds, const std::vector<Tensor>& lists,
                        const TileGrid& grid) {
-  STD_TORCH_CHECK(splats.size() == 4 && lists.size() == 2, "blitzgs::", op,
-                  ": splats must be (means2d, conics, splat_opacities, colors) and lists (isect_splats, "
-                  "tile_offsets), got ",
-                  splats.size(), " and ", lists.size(), " tensors");
+  BLITZGS_CHECK(splats.size() == 4 && lists.size() == 2, op,
+                "splats must be (means2d, conics, splat_opacities, colors) and lists (isect_splats, "
+                "tile_offsets), got ",
+                splats.size(), " and ", lists.size(), " tensors");
   return {op, splats[0], splats[1], splats[2], splats[3], backgrounds, lists[0], lists[1], grid};
 }
 
@@ -132,9 +114,9 @@ struct Composited {
   Composited(const char* op, const Splats& splats, const std::vector<Tensor>& composited,
              const Tensor& v_renders_in, const std::optional<Tensor>& v_alphas_in)
       : grid_count(splats.grid.count()) {
-    STD_TORCH_CHECK(composited.size() == 4, "blitzgs::", op,
-                    ": composited must be (transmittances, last_ids, packed_splats, tile_order), got ",
-                    composited.size(), " tensors");
+    BLITZGS_CHECK(composited.size() == 4, op,
+                  "composited must be (transmittances, last_ids, packed_splats, tile_order), got ",
+                  composited.size(), " tensors");
     packed = composited[2];
     order = composited[3];
     const TileGrid& grid = splats.grid;
@@ -147,12 +129,11 @@ struct Composited {
     check_in_place(op, "packed_splats", packed, ScalarType::Byte,
                    {-1, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
     check_in_place(op, "tile_order", order, ScalarType::Int, {-1, kTileOrderClasses});
-    STD_TORCH_CHECK(packed.size(0) >= splats.n_splats && tiles() >= grid.tile_end - grid.tile_begin &&
-                        reinterpret_cast<std::uintptr_t>(packed.const_data_ptr()) % 64 == 0,
-                    "blitzgs::", op,
-                    ": packed_splats and tile_order must be as rasterize_fwd returned them, ", "for ",
-                    splats.n_splats, " splats and ", grid.tile_end - grid.tile_begin, " tiles or more, got ",
-                    packed.size(0), " and ", tiles());
+    BLITZGS_CHECK(packed.size(0) >= splats.n_splats && tiles() >= grid.tile_end - grid.tile_begin &&
+                      reinterpret_cast<std::uintptr_t>(packed.const_data_ptr()) % 64 == 0,
+                  op, "packed_splats and tile_order must be as rasterize_fwd returned them, ", "for ",
+                  splats.n_splats, " splats and ", grid.tile_end - grid.tile_begin, " tiles or more, got ",
+                  packed.size(0), " and ", tiles());
   }
 
   RasterizeAux aux() const {
@@ -177,12 +158,11 @@ struct Composited {
 
 // Checks a table of splat gradients that a caller gives (CUDA).
 void check_gradients(const char* op, const Splats& splats, const Tensor& gradients) {
-  STD_TORCH_CHECK(kPacked, "blitzgs::", op, ": tables of gradients need CUDA");
-  STD_TORCH_CHECK(splats.n_channels <= 4, "blitzgs::", op, ": colors must have 1 to 4 channels, got ",
-                  splats.n_channels);
+  BLITZGS_CHECK(kPacked, op, "tables of gradients need CUDA");
+  BLITZGS_CHECK(splats.n_channels <= 4, op, "colors must have 1 to 4 channels, got ", splats.n_channels);
   check_in_place(op, "gradients", gradients, ScalarType::Float, {-1, kSplatGradient});
-  STD_TORCH_CHECK(gradients.size(0) >= splats.n_splats, "blitzgs::", op, ": gradients must have ",
-                  splats.n_splats, " splats or more, got ", gradients.size(0));
+  BLITZGS_CHECK(gradients.size(0) >= splats.n_splats, op, "gradients must have ", splats.n_splats,
+                " splats or more, got ", gradients.size(0));
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
@@ -195,7 +175,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   const Splats splats = backward_splats(kOp, splats_in, backgrounds, lists, grid);
   if (gradients) check_gradients(kOp, splats, *gradients);
-  STD_TORCH_CHECK(!gradients || !v_alphas, "blitzgs::", kOp, ": v_alphas needs gradients in columns");
+  BLITZGS_CHECK(!gradients || !v_alphas, kOp, "v_alphas needs gradients in columns");
   const Composited composited(kOp, splats, composited_in, v_renders, v_alphas);
   const std::int64_t n_splats = gradients ? 0 : splats.n_splats;
   Tensor v_means2d = make_empty(splats.means2d, {n_splats, 2});
@@ -212,8 +192,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
     return {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs};
   }
 #endif
-  dispatch_floating(splats.means2d, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(splats.means2d, [&]<class T>() {
     const RasterizeGradients<T> columns{mutable_data<T>(v_means2d), mutable_data<T>(v_conics),
                                         mutable_data<T>(v_opacities), mutable_data<T>(v_colors),
                                         absgrad ? mutable_data<T>(v_means2d_abs) : nullptr};
@@ -243,51 +222,33 @@ CompositedTensors rasterize_fwd_into(const Tensor& means2d, const Tensor& conics
 constexpr const char* kPixelSplats = "pixel_splats";
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> pixel_splats(
-    const Tensor& means2d_in, const Tensor& conics_in, const Tensor& opacities_in,
-    const Tensor& isect_splats_in, const Tensor& tile_offsets_in, const std::optional<Tensor>& slots_in,
-    std::int64_t n_rows, std::int64_t n_cameras, std::int64_t width, std::int64_t height,
-    std::int64_t tile_size, std::int64_t strongest) {
+    const Tensor& means2d, const Tensor& conics, const Tensor& opacities, const Tensor& isect_splats,
+    const Tensor& tile_offsets, const std::optional<Tensor>& slots_in, std::int64_t n_rows,
+    std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
+    std::int64_t strongest) {
   const TileGrid grid = checked_tile_grid(kPixelSplats, n_cameras, width, height, tile_size, 0, -1);
-  const std::int64_t splats = means2d_in.size(0), pixels = n_cameras * width * height;
-  check_floating(kPixelSplats, "means2d", means2d_in);
-  const ScalarType dtype = means2d_in.scalar_type();
-  const Tensor means2d = checked(kPixelSplats, "means2d", means2d_in, dtype, {splats, 2}),
-               conics = checked(kPixelSplats, "conics", conics_in, dtype, {splats, 3}),
-               opacities = checked(kPixelSplats, "splat_opacities", opacities_in, dtype, {splats}),
-               isect_splats = checked(kPixelSplats, "isect_splats", isect_splats_in, ScalarType::Int, {-1}),
-               tile_offsets = checked(kPixelSplats, "tile_offsets", tile_offsets_in, ScalarType::Long,
-                                      {grid.count() + 1});
+  const ListedSplats splats(kPixelSplats, means2d, conics, opacities, isect_splats, tile_offsets, grid);
+  const std::int64_t pixels = n_cameras * width * height;
   const std::optional<Tensor> slots =
       checked(kPixelSplats, "slots", slots_in, ScalarType::Int, {n_cameras, height, width});
-  STD_TORCH_CHECK(strongest >= 0 && strongest < (1 << 24), "blitzgs::", kPixelSplats,
-                  ": strongest must be 0 to 2^24 - 1, got ", strongest);
-  STD_TORCH_CHECK(slots ? n_rows >= 0 : n_rows == pixels, "blitzgs::", kPixelSplats,
-                  ": n_rows must be the number of rows that slots name, and without slots the number of "
-                  "pixels, got ",
-                  n_rows);
+  BLITZGS_CHECK(strongest >= 0 && strongest < (1 << 24), kPixelSplats,
+                "strongest must be 0 to 2^24 - 1, got ", strongest);
+  BLITZGS_CHECK(slots ? n_rows >= 0 : n_rows == pixels, kPixelSplats,
+                "n_rows must be the number of rows that slots name, and without slots the number of "
+                "pixels, got ",
+                n_rows);
   Tensor transmittances = make_empty(means2d, {n_rows}),
          counts = make_empty(means2d, {n_rows}, ScalarType::Int),
          medians = make_empty(means2d, {n_rows}, ScalarType::Int),
          ids = make_empty(means2d, {n_rows, strongest}, ScalarType::Int),
          weights = make_empty(means2d, {n_rows, strongest});
   DeviceScope scope(means2d);
-  dispatch_floating(means2d, [&](auto zero) {
-    using T = decltype(zero);
-    const RasterizeInput<T> in{data<T>(means2d),
-                               data<T>(conics),
-                               data<T>(opacities),
-                               nullptr,
-                               nullptr,
-                               data<std::int32_t>(isect_splats),
-                               data<std::int64_t>(tile_offsets),
-                               splats,
-                               0,
-                               grid};
+  dispatch_floating(means2d, [&]<class T>() {
     const PixelSplats<T> out{data_or_null<std::int32_t>(slots),  n_rows,
                              static_cast<int>(strongest),        mutable_data<T>(transmittances),
                              mutable_data<std::int32_t>(counts), mutable_data<std::int32_t>(medians),
                              mutable_data<std::int32_t>(ids),    mutable_data<T>(weights)};
-    backend::pixel_splats(in, out, scope.workspace, scope.stream);
+    backend::pixel_splats(splats.input<T>(), out, scope.workspace, scope.stream);
   });
   return {transmittances, counts, medians, ids, weights};
 }

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "rasterize/rasterize.h"
 
-#include <memory>
 #include <vector>
 
 #include "common/catch.h"
@@ -10,17 +9,6 @@
 namespace {
 
 using namespace blitzgs;
-
-class HeapWorkspace final : public Workspace {
- public:
-  void* allocate_bytes(std::size_t bytes) override {
-    held_.push_back(std::make_unique<char[]>(bytes));
-    return held_.back().get();
-  }
-
- private:
-  std::vector<std::unique_ptr<char[]>> held_;
-};
 
 // Two splats on a 40 x 20 image: splat 0 is wide and far, splat 1 is round and near.
 template <class T>
@@ -33,7 +21,7 @@ struct Scene {
   std::vector<std::int64_t> offsets = std::vector<std::int64_t>(7);
   std::vector<T> renders = std::vector<T>(2400), rest = std::vector<T>(800);
   std::vector<std::int32_t> last = std::vector<std::int32_t>(800), work = std::vector<std::int32_t>(6);
-  HeapWorkspace workspace;
+  TestWorkspace workspace;
 
   void intersect_splats() {
     const IntersectInput<T> in{

@@ -55,9 +55,7 @@ PreparedSplat<T> pack_splat(const RasterizeInput<T>& in, std::int64_t index) {
 
 template <class T>
 const PreparedSplat<T>* pack_splats(const RasterizeInput<T>& in, PreparedSplat<T>* splats) {
-  parallel_for(0, in.n_splats, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t index = begin; index < end; ++index) splats[index] = pack_splat(in, index);
-  });
+  parallel_rows(in.n_splats, 1 << 12, [&](std::int64_t index) { splats[index] = pack_splat(in, index); });
   return splats;
 }
 

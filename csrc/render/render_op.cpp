@@ -7,28 +7,13 @@
 #include <tuple>
 #include <vector>
 
-#include "common/op.h"
 #include "common/rows.h"
 #include "project/project_op.h"
+#include "rasterize/rasterize_op.h"
 
 namespace blitzgs {
 // Colours, tile lists, compositing and alphas in one op, because each call of an op takes the host
 // microseconds.
-// Defined in intersect_op.cpp and rasterize_op.cpp.
-std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics,
-                                     const Tensor& splat_opacities, const Tensor& depths,
-                                     const Tensor& camera_ids, const std::optional<Tensor>& ids,
-                                     std::int64_t n_cameras, std::int64_t width, std::int64_t height,
-                                     std::int64_t tile_size, std::int64_t tile_begin, std::int64_t tile_end,
-                                     std::int64_t n_isects, const std::optional<Tensor>& known_splats,
-                                     bool unchecked);
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
-    const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities, const Tensor& colors,
-    const std::optional<Tensor>& backgrounds, const Tensor& isect_splats, const Tensor& tile_offsets,
-    std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
-    std::int64_t tile_begin, std::int64_t tile_end, bool clear_rest, bool backward_follows,
-    const std::optional<Tensor>& known_splats);
-
 namespace {
 
 constexpr const char* kRender = "render";
@@ -52,11 +37,11 @@ std::int64_t words_behind(const Tensor& column, std::int64_t axis) {
 }
 
 void check_column(const char* op, const Tensor& column) {
-  STD_TORCH_CHECK(column.dim() >= 1 && column.element_size() % 4 == 0, "blitzgs::", op,
-                  ": columns must have rows and elements of 4 or 8 bytes, got ", shape_of(column), " of ",
-                  column.element_size(), " bytes");
-  STD_TORCH_CHECK(words_behind(column, 1) < (1 << 16), "blitzgs::", op,
-                  ": rows must be shorter than 256 KiB, got ", shape_of(column));
+  BLITZGS_CHECK(column.dim() >= 1 && column.element_size() % 4 == 0, op,
+                "columns must have rows and elements of 4 or 8 bytes, got ", shape_of(column), " of ",
+                column.element_size(), " bytes");
+  BLITZGS_CHECK(words_behind(column, 1) < (1 << 16), op, "rows must be shorter than 256 KiB, got ",
+                shape_of(column));
 }
 
 std::vector<std::int64_t> shape_with(const Tensor& column, std::int64_t rows) {
@@ -70,8 +55,8 @@ std::vector<std::int64_t> shape_with(const Tensor& column, std::int64_t rows) {
 std::vector<Tensor> gathered_rows(const char* op, const std::vector<Tensor>& columns,
                                   const std::vector<Tensor>& joined, const Tensor& ids,
                                   const std::int64_t* known) {
-  STD_TORCH_CHECK(columns.size() + joined.size() <= kMaxGatheredColumns, "blitzgs::", op, ": at most ",
-                  kMaxGatheredColumns, " columns, got ", columns.size() + joined.size());
+  BLITZGS_CHECK(columns.size() + joined.size() <= kMaxGatheredColumns, op, "at most ", kMaxGatheredColumns,
+                " columns, got ", columns.size() + joined.size());
   const std::int64_t n = ids.size(0);
   GatherRows gather{data<std::int32_t>(ids), n, known, 0, {}};
   std::vector<Tensor> held, found;
@@ -92,10 +77,10 @@ std::vector<Tensor> gathered_rows(const char* op, const std::vector<Tensor>& col
     for (const Tensor& part : joined) {
       check_column(op, part);
       check_dtype(op, "joined columns", part, joined[0].scalar_type());
-      STD_TORCH_CHECK(part.dim() >= 2 && part.dim() == joined[0].dim() &&
-                          words_behind(part, 2) == words_behind(joined[0], 2),
-                      "blitzgs::", op, ": joined columns must be alike behind their second dimension, got ",
-                      shape_of(part), " beside ", shape_of(joined[0]));
+      BLITZGS_CHECK(part.dim() >= 2 && part.dim() == joined[0].dim() &&
+                        words_behind(part, 2) == words_behind(joined[0], 2),
+                    op, "joined columns must be alike behind their second dimension, got ", shape_of(part),
+                    " beside ", shape_of(joined[0]));
       length += part.size(1);
       stride += words_behind(part, 1);
     }
@@ -112,13 +97,13 @@ std::vector<Tensor> gathered_rows(const char* op, const std::vector<Tensor>& col
 
 std::vector<Tensor> first_rows(const std::vector<Tensor>& columns, const std::vector<std::int64_t>& lengths) {
   constexpr const char* kOp = "first_rows";
-  STD_TORCH_CHECK(columns.size() == lengths.size(), "blitzgs::", kOp, ": ", columns.size(),
-                  " columns need a length each, got ", lengths.size());
+  BLITZGS_CHECK(columns.size() == lengths.size(), kOp, columns.size(), " columns need a length each, got ",
+                lengths.size());
   std::vector<Tensor> found;
   for (std::size_t c = 0; c < columns.size(); ++c) {
-    STD_TORCH_CHECK(columns[c].dim() >= 1 && lengths[c] >= 0, "blitzgs::", kOp,
-                    ": columns must have rows, and lengths be at least 0, got ", shape_of(columns[c]),
-                    " and ", lengths[c]);
+    BLITZGS_CHECK(columns[c].dim() >= 1 && lengths[c] >= 0, kOp,
+                  "columns must have rows, and lengths be at least 0, got ", shape_of(columns[c]), " and ",
+                  lengths[c]);
     found.push_back(rows_of(columns[c], lengths[c]));
   }
   return found;
@@ -128,11 +113,10 @@ std::vector<Tensor> first_rows(const std::vector<Tensor>& columns, const std::ve
 const std::int64_t* checked_totals(const OptionalTensor& totals) {
   if (!totals) return nullptr;
   check_in_place(kRender, "totals", *totals, ScalarType::Long, {-1});
-  STD_TORCH_CHECK(totals->size(0) > kTotalSplats, "blitzgs::", kRender,
-                  ": totals must be those of project_fwd, got ", shape_of(*totals));
+  BLITZGS_CHECK(totals->size(0) > kTotalSplats, kRender, "totals must be those of project_fwd, got ",
+                shape_of(*totals));
 #ifndef BLITZGS_BACKEND_CUDA
-  STD_TORCH_CHECK(false, "blitzgs::", kRender,
-                  ": on the CPU splats have no spare capacity, so give no totals");
+  BLITZGS_CHECK(false, kRender, "on the CPU splats have no spare capacity, so give no totals");
 #endif
   return data<std::int64_t>(*totals);
 }
@@ -170,8 +154,7 @@ TensorList color_rows(const TensorList& gaussians, const TensorList& sh, const T
        mutable_data<std::int32_t>(numbers), mutable_data<std::int64_t>(indices), row_of_splat},
       capacity, scope.stream);
   if (p.sh) {
-    dispatch_floating(p.means, [&](auto zero) {
-      using T = decltype(zero);
+    dispatch_floating(p.means, [&]<class T>() {
       ProjectColumns<T> columns{};
       columns.ids.gaussian_ids = row_of_splat;
       // The kernels of project_fwd write the ids; those of this op only read them.
@@ -215,7 +198,7 @@ TensorList render(const Tensor& means2d, const Tensor& conics, Tensor splat_opac
         color_rows(gaussians, sh, viewmats, Ks, options,
                    {visible_ids, splat_offsets, camera_ids, splat_opacities, radii, tiles_touched}, totals);
   }
-  STD_TORCH_CHECK(channels_in || !sh.empty(), "blitzgs::", kRender, ": splats without sh need channels");
+  BLITZGS_CHECK(channels_in || !sh.empty(), kRender, "splats without sh need channels");
   const Tensor channels = channels_in ? *channels_in : with_depth ? joined(rows[0], depths) : rows[0];
   const std::int64_t views = viewmats.size(0);
   const auto lists = intersect(means2d, conics, splat_opacities, depths, camera_ids, std::nullopt, views,
@@ -226,8 +209,7 @@ TensorList render(const Tensor& means2d, const Tensor& conics, Tensor splat_opac
   const Tensor& transmittances = std::get<1>(outputs);
   Tensor alphas = make_empty(transmittances, {views, height, width});
   DeviceScope scope(alphas);
-  dispatch_floating(alphas, [&](auto zero) {
-    using T = decltype(zero);
+  dispatch_floating(alphas, [&]<class T>() {
     backend::for_each_row(Alphas<T>{data<T>(transmittances), mutable_data<T>(alphas), alphas.numel()},
                           scope.stream);
   });
@@ -246,11 +228,10 @@ struct Places {
   ArrangeSplats moves{};
 
   Places(const std::vector<Tensor>& places, const std::vector<std::int64_t>& dimensions) : shape(dimensions) {
-    STD_TORCH_CHECK(places.size() == 1 || places.size() == 2, "blitzgs::", kArrangeSplats,
-                    ": places must be (order) or (images, gaussians), got ", places.size(), " tensors");
+    BLITZGS_CHECK(places.size() == 1 || places.size() == 2, kArrangeSplats,
+                  "places must be (order) or (images, gaussians), got ", places.size(), " tensors");
     const bool ordered = places.size() == 1;
-    STD_TORCH_CHECK(shape.size() >= (ordered ? 1u : 2u), "blitzgs::", kArrangeSplats,
-                    ": shape has too few dimensions");
+    BLITZGS_CHECK(shape.size() >= (ordered ? 1u : 2u), kArrangeSplats, "shape has too few dimensions");
     for (const Tensor& tensor : places) {
       check_dtype(kArrangeSplats, ordered ? "order" : "images and gaussians", tensor,
                   ordered ? ScalarType::Long : ScalarType::Int);
@@ -259,8 +240,8 @@ struct Places {
     }
     moves.n = index[0].size(0);
     moves.count = shape.back();
-    STD_TORCH_CHECK(!ordered || entries() == moves.n, "blitzgs::", kArrangeSplats, ": an arrangement of ",
-                    entries(), " entries cannot be an order of ", moves.n, " splats");
+    BLITZGS_CHECK(!ordered || entries() == moves.n, kArrangeSplats, "an arrangement of ", entries(),
+                  " entries cannot be an order of ", moves.n, " splats");
     moves.order = ordered ? data<std::int64_t>(index[0]) : nullptr;
     moves.images = ordered ? nullptr : data<std::int32_t>(index[0]);
     moves.gaussians = ordered ? nullptr : data<std::int32_t>(index[1]);
@@ -287,17 +268,17 @@ bool rows_are_contiguous(const Tensor& column, std::int64_t row_axis) {
 std::vector<Tensor> make_targets(const std::vector<Tensor>& columns, std::size_t from,
                                  const std::vector<std::int64_t>& to, std::vector<Tensor>& held,
                                  ArrangeSplats& moves) {
-  STD_TORCH_CHECK(columns.size() <= kMaxArranged, "blitzgs::", kArrangeSplats, ": at most ", kMaxArranged,
-                  " columns, got ", columns.size());
+  BLITZGS_CHECK(columns.size() <= kMaxArranged, kArrangeSplats, "at most ", kMaxArranged, " columns, got ",
+                columns.size());
   std::vector<Tensor> targets;
   for (const Tensor& column : columns) {
     // Rows of a splat's gradient lie in a longer table: a column of it is read as it is.
     const bool strided = from == 1 && rows_are_contiguous(column, 1);
     held.push_back(strided ? column : as_contiguous(column));
     const auto element_words = static_cast<std::int64_t>(column.element_size()) / 4;
-    STD_TORCH_CHECK(column.element_size() % 4 == 0, "blitzgs::", kArrangeSplats,
-                    ": columns must have elements of 4 or 8 bytes, got ",
-                    torch::headeronly::toString(column.scalar_type()));
+    BLITZGS_CHECK(column.element_size() % 4 == 0, kArrangeSplats,
+                  "columns must have elements of 4 or 8 bytes, got ",
+                  torch::headeronly::toString(column.scalar_type()));
     std::vector<std::int64_t> shape = to;
     std::int64_t words = element_words;
     for (auto axis = static_cast<std::int64_t>(from); axis < column.dim(); ++axis) {
@@ -319,20 +300,19 @@ std::vector<Tensor> arrange_splats(const std::vector<Tensor>& columns, const std
   std::vector<Tensor> held;
   if (columns.empty()) return {};
   for (const Tensor& column : columns) {
-    STD_TORCH_CHECK(column.dim() >= 1 && column.size(0) == places.moves.n, "blitzgs::", kArrangeSplats,
-                    ": columns must have ", places.moves.n, " rows, got ", shape_of(column));
+    BLITZGS_CHECK(column.dim() >= 1 && column.size(0) == places.moves.n, kArrangeSplats, "columns must have ",
+                  places.moves.n, " rows, got ", shape_of(column));
   }
   std::vector<Tensor> arranged = make_targets(columns, 1, shape, held, places.moves);
   std::optional<Tensor> below;
   const std::int64_t views = places.has_empty_entries() ? shape[shape.size() - 2] : 1;
   if (under) {
     const Tensor& last = columns.back();
-    STD_TORCH_CHECK(places.has_empty_entries() && last.dim() == 1, "blitzgs::", kArrangeSplats,
-                    ": `under` is for a last column of numbers and an arrangement of all Gaussians");
+    BLITZGS_CHECK(places.has_empty_entries() && last.dim() == 1, kArrangeSplats,
+                  "`under` is for a last column of numbers and an arrangement of all Gaussians");
     check_dtype(kArrangeSplats, "under", *under, last.scalar_type());
-    STD_TORCH_CHECK(under->numel() * views == places.entries(), "blitzgs::", kArrangeSplats,
-                    ": under must have ", places.entries() / std::max<std::int64_t>(views, 1),
-                    " values, got ", shape_of(*under));
+    BLITZGS_CHECK(under->numel() * views == places.entries(), kArrangeSplats, "under must have ",
+                  places.entries() / std::max<std::int64_t>(views, 1), " values, got ", shape_of(*under));
     below = as_contiguous(*under);
   }
   DeviceScope scope(columns[0]);
@@ -357,8 +337,8 @@ std::vector<Tensor> splats_of_arranged(const std::vector<Tensor>& arranged,
     for (std::size_t axis = 0; fits && axis < shape.size(); ++axis) {
       fits = column.size(static_cast<std::int64_t>(axis)) == shape[axis];
     }
-    STD_TORCH_CHECK(fits, "blitzgs::", kArrangeSplats,
-                    ": columns must begin with the dimensions of the arrangement, got ", shape_of(column));
+    BLITZGS_CHECK(fits, kArrangeSplats, "columns must begin with the dimensions of the arrangement, got ",
+                  shape_of(column));
   }
   std::vector<Tensor> splats = make_targets(arranged, shape.size(), {places.moves.n}, held, places.moves);
   DeviceScope scope(arranged[0]);

@@ -9,7 +9,7 @@ import torch
 import torch.utils.checkpoint
 
 import blitzgs
-from blitzgs.call.intrinsics import _warn_of_gradient
+from blitzgs.call.finite import _warn_of_gradient
 from blitzgs.ops.photometric import photometric_loss
 from blitzgs.reference.gaussians import covariance_factors
 from tests.call.test_raw_rasterization import raw, raw_parameters

@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
+from blitzgs.capture import check_files
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.check_files import read_mask_file
 from blitzgs.capture.image_files import (
@@ -226,3 +227,14 @@ def test_bytes_after_the_last_block_of_a_jpeg_change_no_pixel(tmp_path, progress
     (tmp_path / "a.jpg").write_bytes(data[:-2] + more + data[-2:])
     shown = decode_rgb(read_whole(tmp_path / "a.jpg"), "a.jpg")
     np.testing.assert_array_equal(shown, decode_rgb(data, "a.jpg"))
+
+
+def test_a_photograph_that_was_read_is_not_checked_again(tmp_path, monkeypatch):
+    names = [name.replace(".png", ".jpg") for name in NAMES]
+    store = ImageStore(load_capture(write_capture(tmp_path, names)))
+    store.get(3), store.get(4)
+    checked = []
+    monkeypatch.setattr(check_files, "check_photograph", lambda path: not checked.append(path.name))
+    store.check_files(range(9)).wait()
+    assert checked == [names[index] for index in (0, 8, 1, 2, 5, 6, 7)]
+    store.close()

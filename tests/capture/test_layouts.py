@@ -203,16 +203,6 @@ def test_transforms_that_are_damaged_are_named(tmp_path, text):
         load_capture(tmp_path)
 
 
-def test_an_angle_of_zero_is_named(tmp_path):
-    write_image(tmp_path / "a.png", smooth_image(48, 64))
-    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "camera_angle_x": 0}
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
-    with pytest.raises(
-        ValueError, match="frame 0: camera_angle_x must be an angle of view in radians, above 0"
-    ):
-        load_capture(tmp_path)
-
-
 def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
     frames = []
     (tmp_path / "own").mkdir()

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from blitzgs.ops.blocks import ActiveRows, gate_views_
-from blitzgs.ops.mass_cut import STEPS, MassCut
+from blitzgs.ops.importance import STEPS, MassCut
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import ViewGate
 from tests.cuda.scenes import Scene, ops, relative_error

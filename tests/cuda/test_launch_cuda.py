@@ -10,10 +10,10 @@ import torch
 from blitzgs import _library
 from blitzgs.frame.transport import Traffic
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, PeerBuffers
+from blitzgs.ops.exchange import runs_of
 from blitzgs.ops.host import HostCopy, PinnedNumbers, current_stream
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, splats_of
-from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.cuda.scenes import Scene, ops
 from tests.helpers import sum_of_ranks

@@ -10,7 +10,7 @@ import blitzgs
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.transport import LocalTransport
 from blitzgs.frame.transport.protocol import CapacityEstimate
-from blitzgs.ops import project_gradient, splat_gradients
+from blitzgs.ops import project, splat_gradients
 from blitzgs.ops.projection_types import Sizes, WeightedViews
 from blitzgs.ops.splat_gradients import gradient_columns
 from blitzgs.table.blocks import BlockIndex, morton_order
@@ -145,7 +145,7 @@ def test_gradients_of_splats_stay_in_their_table(monkeypatch):
         found.append(splat_gradients.packed_table(columns))
         return found[-1]
 
-    monkeypatch.setattr(project_gradient, "packed_table", packed_table)
+    monkeypatch.setattr(project, "packed_table", packed_table)
     for _ in range(3):
         leaves = scene.leaves()
         renders, _, meta = blitzgs.rasterization(*leaves.arguments(), sh_degree=scene.sh_degree)

@@ -18,14 +18,13 @@ from blitzgs.frame import frame as pipeline
 from blitzgs.frame.survey import survey
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.frame.transport import PeerTransport, peer
-from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, room_for
+from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, PeerWayBack, room_for
 from blitzgs.frame.transport.protocol import CapacityEstimate
-from blitzgs.frame.transport.way_back import PeerWayBack
+from blitzgs.ops.exchange import gather_splats, scatter_splats, words_of
 from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes
-from blitzgs.ops.scatter import gather_splats, scatter_splats, words_of
 from blitzgs.table.table import GaussianTable
 from tests.frame.test_sharded_rendering import OPTIONS, cameras
-from tests.frame.transports import IdleEvent, rasterize_into
+from tests.frame.test_transport import IdleEvent, rasterize_into
 from tests.helpers import sum_of_ranks
 from tests.training.tiny import random_gaussians
 

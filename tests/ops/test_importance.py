@@ -8,9 +8,8 @@ import pytest
 import torch
 
 import blitzgs
-from blitzgs.ops.importance import UNITS, splat_contributions
+from blitzgs.ops.importance import CHOICE_STEP, ROUNDS, STEPS, TIES_STEP, UNITS, MassCut, splat_contributions
 from blitzgs.ops.intersect import intersect
-from blitzgs.ops.mass_cut import CHOICE_STEP, ROUNDS, STEPS, TIES_STEP, MassCut
 from blitzgs.ops.project import project
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.reference.importance import contributions as by_definition

@@ -7,12 +7,10 @@ import pytest
 import torch
 
 from blitzgs.ops import host
-from blitzgs.ops.blocks import BLOCK_ROWS, rows_of_sectors, sectors_of_rows
-from blitzgs.ops.copy_rows import put_rows_, take_rows
-from blitzgs.ops.counter_random import uniform
+from blitzgs.ops.blocks import BLOCK_ROWS, rows_of_sectors, sectors_of_rows, seen_blocks, swap_blocks_
+from blitzgs.ops.counter_random import KEY_BITS, key_histogram, key_of_bits, sampling_keys, uniform
 from blitzgs.ops.host import PinnedNumbers
-from blitzgs.ops.pool import seen_blocks, swap_blocks_
-from blitzgs.ops.sampling import KEY_BITS, key_histogram, key_of_bits, sampling_keys
+from blitzgs.ops.rows import put_rows_, take_rows
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.layouts import CULL, sectors_in
 from blitzgs.table.placement import place

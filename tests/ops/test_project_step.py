@@ -4,11 +4,16 @@ import math
 import pytest
 import torch
 
-from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, lazy_adam_step_
+from blitzgs.ops.exchange import scatter_splats
+from blitzgs.ops.lazy_adam import (
+    AdamSchedule,
+    AdamState,
+    lazy_adam_catch_up_,
+    lazy_adam_step_,
+    project_bwd_step_,
+)
 from blitzgs.ops.project import project
-from blitzgs.ops.project_step import project_bwd_step_
 from blitzgs.ops.projection_types import ProjectionOptions, WeightedViews
-from blitzgs.ops.scatter import scatter_splats
 from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
 from tests.helpers import DEVICES, needs_cuda, sum_of_ranks
 

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs.ops.exchange import divide_tiles, tile_costs
+from blitzgs.ops.importance import pixel_splats
 from blitzgs.ops.intersect import TileGrid
-from blitzgs.ops.pixel_splats import pixel_splats
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Sizes, splats_of
 from blitzgs.ops.rasterize import rasterize
-from blitzgs.ops.tile_costs import divide_tiles, tile_costs
 from blitzgs.reference.compositing import composited_weights, median_splats, strongest_splats
 from tests.helpers import BACKENDS, DEVICES, needs_cuda, random_scene
 from tests.ops.test_importance import crowded, lists_of

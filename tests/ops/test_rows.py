@@ -5,10 +5,10 @@ import pytest
 import torch
 
 import blitzgs.call.finite  # noqa: F401  (registers the fake kernel)
-from blitzgs.ops.arrange_splats import Places
+from blitzgs.call.layout import Places
+from blitzgs.ops.exchange import RUN, gather_splats, scatter_splats
 from blitzgs.ops.projection_types import first_rows
-from blitzgs.ops.scatter import RUN, gather_splats, scatter_splats
-from blitzgs.ops.sparse_rows import KeptMarks, distinct_rows, sparse_rows
+from blitzgs.ops.rows import KeptMarks, distinct_rows, sparse_rows
 from blitzgs.ops.splat_gradients import sum_splats
 from tests.helpers import BACKENDS, DEVICES
 

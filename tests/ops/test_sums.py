@@ -6,10 +6,9 @@ import math
 import pytest
 import torch
 
-from blitzgs.ops.density_stats import density_stats_
 from blitzgs.ops.importance import DIVISIONS, ViewSums, view_sums_
 from blitzgs.ops.photometric import report_
-from blitzgs.ops.tree_sums import tree_sums
+from blitzgs.ops.population import density_stats_, tree_sums
 from tests.helpers import DEVICES, sum_parts
 
 DEPTH, FEATURES, TREES = 5, 3, 9

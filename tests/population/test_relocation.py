@@ -12,7 +12,7 @@ from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.counter_random import hash_keys
-from blitzgs.ops.relocation import MAX_COPIES
+from blitzgs.ops.population import MAX_COPIES
 from blitzgs.optim import table_adam
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.density import DensityRules

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs.ops.blocks import BLOCK_ROWS
-from blitzgs.ops.pool import seen_blocks
+from blitzgs.ops.blocks import BLOCK_ROWS, seen_blocks
 from blitzgs.table import block_visibility, host_table
 from blitzgs.table.block_visibility import BlockVisibility, Cameras, culled_blocks
 from blitzgs.table.blocks import BlockIndex
@@ -141,8 +140,9 @@ def loads(pool, views):
     counts = []
     for step in range(len(views.viewmats)):
         before = pool.moved.loaded
-        pool.load_for_step(step, first(views, step), 1)
+        index = pool.load_for_step(step, first(views, step), 1)
         pool.prefetch(step + 1)
+        pool.store_bounds(index)
         counts.append(pool.moved.loaded - before)
     return counts
 

@@ -19,19 +19,9 @@ from blitzgs.frame.transport.protocol import (
 )
 
 __all__ = [
-    "Arrived",
-    "CollectiveTransport",
-    "Exchange",
-    "ExchangeResult",
-    "LocalTransport",
-    "Mark",
-    "PeerTransport",
-    "Traffic",
-    "Transport",
-    "WayBack",
-    "open_transport",
-    "unmarked",
-]
+    "Arrived", "CollectiveTransport", "Exchange", "ExchangeResult", "LocalTransport", "Mark", "PeerTransport",
+    "Traffic", "Transport", "WayBack", "open_transport", "unmarked",
+]  # fmt: skip
 
 
 def open_transport(ranks: Ranks) -> Transport:

@@ -39,12 +39,15 @@ process.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.shared_memory import SharedMemory
 from blitzgs.frame.tiles import TileAssignment
+from blitzgs.frame.transport.collective import return_sums
 from blitzgs.frame.transport.protocol import (
     Arrived,
     CapacityEstimate,
@@ -53,11 +56,10 @@ from blitzgs.frame.transport.protocol import (
     Traffic,
     unmarked,
 )
-from blitzgs.frame.transport.way_back import PeerWayBack
+from blitzgs.ops.exchange import runs_of
 from blitzgs.ops.host import current_stream
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of
-from blitzgs.ops.scatter import runs_of
-from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
+from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, SplatGradients
 
 # The columns of `Splats` in the order in which ranks write them (kSentColumns of csrc/exchange/transport.h):
 # dtype, words and shape of an element.
@@ -209,3 +211,46 @@ class PeerExchange:
                 self._counted.synchronize()
             self._traffic = Traffic.of(self._shared.host.tolist(), self._n_views, self._ranks.rank)
         return self._traffic
+
+
+class PeerWayBack(NamedTuple):
+    """Lets owners read gradients in the memory of the ranks that added them up.
+
+    Attributes:
+        ranks: the job.
+        memory: the memory that the ranks share.
+        generation: number of the frame, `SharedMemory.generation`.
+        tables: table of splat gradients of each rank, float32 [length, 12], mapped here.
+        traffic: numbers of splats sent between the ranks.
+        places: positions of this rank's own splats among those that it sent, as from `scatter_splats`.
+    """
+
+    ranks: Ranks
+    memory: SharedMemory
+    generation: int
+    tables: Sequence[Tensor]
+    traffic: Traffic
+    places: Tensor
+
+    def check_still_valid(self) -> None:
+        """See `WayBack.check_still_valid`."""
+        if self.generation != self.memory.generation:
+            raise RuntimeError(
+                "a later exchange has overwritten this one's splats: run the backward pass of a frame before "
+                "the next forward pass"
+            )
+
+    def cleared_table(self) -> Tensor:
+        """See `WayBack.cleared_table`."""
+        self.memory.barrier()
+        return self.tables[self.ranks.rank][: sum(self.traffic.received)].zero_()
+
+    def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
+        """See `WayBack.return_gradients`; the result refers to the tables, in which the owner reads."""
+        self.memory.barrier()  # C
+        mine = zip(self.tables, self.traffic.starts, self.traffic.sent, strict=True)
+        return SplatGradients([table[start : start + n] for table, start, n in mine], self.places)
+
+    def return_sums(self, sums: Tensor) -> Tensor:
+        """See `WayBack.return_sums`."""
+        return return_sums(sums, self.places, self.traffic, self.ranks)

@@ -12,7 +12,7 @@ frame, on every rank:
     gradients = result.way_back.return_gradients(gradients)  # gradients of this rank's own splats
 
 `blitzgs.frame.run` makes the first three, and the last two may be repeated. `local`, `collective` and `peer`
-each have one transport; `way_back` returns the gradients for the latter two.
+each have one transport.
 """
 
 from __future__ import annotations

@@ -1,0 +1,67 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the ops that composite splats share: the checked splats, and the ops that others call.
+#pragma once
+#include <optional>
+#include <tuple>
+
+#include "common/op.h"
+#include "rasterize/rasterize.h"
+
+namespace blitzgs {
+
+// The geometry of P splats and the tiles' lists, checked and contiguous. The object holds the tensors, so
+// that the raw pointers stay valid.
+struct ListedSplats {
+  ListedSplats(const char* op, const Tensor& means2d_in, const Tensor& conics_in, const Tensor& opacities_in,
+               const Tensor& isect_splats_in, const Tensor& tile_offsets_in, const TileGrid& grid_in,
+               const std::optional<Tensor>& known_splats = std::nullopt)
+      : grid(grid_in),
+        n_splats(means2d_in.size(0)),
+        splat_count(checked_splat_count(op, known_splats, means2d_in)) {
+    check_floating(op, "means2d", means2d_in);
+    const ScalarType dtype = means2d_in.scalar_type();
+    means2d = checked(op, "means2d", means2d_in, dtype, {n_splats, 2});
+    conics = checked(op, "conics", conics_in, dtype, {n_splats, 3});
+    opacities = checked(op, "splat_opacities", opacities_in, dtype, {n_splats});
+    isect_splats = checked(op, "isect_splats", isect_splats_in, ScalarType::Int, {-1});
+    tile_offsets = checked(op, "tile_offsets", tile_offsets_in, ScalarType::Long, {grid.count() + 1});
+  }
+
+  // The input of kernels that need no colours.
+  template <class T>
+  RasterizeInput<T> input() const {
+    return {data<T>(means2d),
+            data<T>(conics),
+            data<T>(opacities),
+            nullptr,
+            nullptr,
+            data<std::int32_t>(isect_splats),
+            data<std::int64_t>(tile_offsets),
+            splat_count.n_splats,
+            0,
+            grid,
+            splat_count.known_splats};
+  }
+
+  TileGrid grid;
+  std::int64_t n_splats;  // the length of the columns
+  SplatCount splat_count;
+  Tensor means2d, conics, opacities, isect_splats, tile_offsets;
+};
+
+std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics,
+                                     const Tensor& splat_opacities, const Tensor& depths,
+                                     const Tensor& camera_ids, const std::optional<Tensor>& ids,
+                                     std::int64_t n_cameras, std::int64_t width, std::int64_t height,
+                                     std::int64_t tile_size, std::int64_t tile_begin, std::int64_t tile_end,
+                                     std::int64_t n_isects, const std::optional<Tensor>& known_splats,
+                                     bool unchecked);
+
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
+    const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities, const Tensor& colors,
+    const std::optional<Tensor>& backgrounds, const Tensor& isect_splats, const Tensor& tile_offsets,
+    std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
+    std::int64_t tile_begin, std::int64_t tile_end, bool clear_rest, bool backward_follows,
+    const std::optional<Tensor>& known_splats);
+
+}  // namespace blitzgs
