@@ -226,7 +226,8 @@ def run_and_checkpoint(path: Path) -> tuple[Path, str | None]:
 def check_is_run(folder: Path) -> None:
     """Refuse a folder that has neither a configuration nor checkpoints (FileNotFoundError)."""
     if not (folder / CONFIG).exists() and not (folder / CHECKPOINTS).exists():
-        raise FileNotFoundError(f"{folder} is not a run: it has no {CONFIG} and no {CHECKPOINTS}")
+        lacks = f"it has no {CONFIG} and no {CHECKPOINTS}" if folder.exists() else "there is no such path"
+        raise FileNotFoundError(f"{folder} is not a run: {lacks}")
 
 
 def open_model(
