@@ -72,7 +72,7 @@ class CityTrainer(Trainer):
         """Do nothing."""
         return {}
 
-    def _stop(self, reason: str) -> None:
+    def _stop(self, reason: str, saves: bool = True) -> None:
         """Write no checkpoint of a stopped run: it takes longer than the time that is left."""
         self._write_record()
 
