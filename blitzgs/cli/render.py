@@ -185,7 +185,7 @@ def _render_pictures(args: argparse.Namespace, opened: Rendered, ranks: Ranks) -
     step = _depth_step(opened)
     if "depth" in modes and not args.raw and ranks.rank == 0:
         output.write(args.out / "depth.json", _explained(step))
-    drawer = Drawer(opened.subject, TileOwners(ranks)) if modes else None
+    drawer = Drawer(opened.subject, TileOwners(ranks), in_layers=False) if modes else None
     with image_progress("Rendering", ranks.rank == 0) as report:
         turns = _renders(opened, ranks, lambda position: position % ranks.world_size)
         for position, (index, render) in enumerate(turns, 1):

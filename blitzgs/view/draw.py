@@ -90,9 +90,16 @@ class DrawingError(RuntimeError):
 class Drawer:
     """Draws one `Subject`; every rank of the job has one."""
 
-    def __init__(self, subject: Subject, owners: TileOwners) -> None:
-        """Prepare; `owners` divides the tiles among the ranks."""
-        self._subject, self._owners = subject, owners
+    def __init__(self, subject: Subject, owners: TileOwners, in_layers: bool = True) -> None:
+        """Prepare.
+
+        Args:
+            subject: what is drawn.
+            owners: divides the tiles among the ranks.
+            in_layers: on one rank, composite large models layer by layer, which takes less memory. A pixel
+                may then get up to a hundredth of light that a whole pass would have left out.
+        """
+        self._subject, self._owners, self._in_layers = subject, owners, in_layers
         self._transport = LocalTransport() if owners.ranks.world_size == 1 else None
         self._finders: dict[tuple[bool, bool | None], VisibleFinder] = {}
 
@@ -117,7 +124,7 @@ class Drawer:
             ranges = self._owners.divide([None], look.width, look.height, options.tile_size)
             assignment = TileAssignment(ranks, ranges)
         depths = [options.near_plane, options.far_plane]
-        if assignment is None:
+        if assignment is None and self._in_layers:
             blocks = LAYER_ROWS[device.type] // BLOCK_ROWS
             depths = self._together(lambda: self._finder(look).depths(views, depths, blocks))
         seen, layered = torch.zeros((), dtype=torch.int64, device=device), None

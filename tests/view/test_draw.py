@@ -89,13 +89,15 @@ def test_levels_have_colours_of_their_own(scene, drawer):
 @pytest.mark.parametrize("device", DEVICES)
 def test_layers_of_depth_are_one_picture(scene, trained, device, monkeypatch):
     model = open_run(trained[1]).model(device)
-    drawer = Drawer(subject_of(model), TileOwners(Ranks(device=torch.device(device))))
+    subject, owners = subject_of(model), TileOwners(Ranks(device=torch.device(device)))
+    drawer, in_one = Drawer(subject, owners), Drawer(subject, owners, in_layers=False)
     looks = {mode: look_of(*scene, mode=mode, background=(0.9, 0.2, 0.4)) for mode in MODES}
     whole = {mode: drawer.draw(look) for mode, look in looks.items()}
     monkeypatch.setitem(LAYER_ROWS, device, BLOCK_ROWS)
     for mode, picture in whole.items():
         layered = drawer.draw(looks[mode])
         assert layered.gaussians == picture.gaussians
+        assert (in_one.draw(looks[mode]).values == picture.values).all()
         if mode == "count":  # each layer counts up to the last splat that touches the pixel
             assert (layered.values <= picture.values).all()
             assert ((layered.values > 0) == (picture.values > 0)).all()
