@@ -7,6 +7,7 @@ A command's file is imported when the command is used: `blitzgs --help` needs no
 from __future__ import annotations
 
 import argparse
+import ctypes
 import os
 import signal
 import sys
@@ -21,7 +22,6 @@ from typing import cast
 
 from blitzgs import __version__
 from blitzgs.cli.arguments import Parser, check_given_once, flag_meant, split_fields
-from blitzgs.util.driver import initialise_nvml, make_context
 from blitzgs.util.terminal import Output, printable, surviving_output
 
 HELP = """\
@@ -97,7 +97,7 @@ def _run(given: list[str]) -> int:
     warnings.formatwarning = lambda message, *_, **__: printable(f"{name}: warning: {message}\n")
     try:
         if chosen == "train" and any(text.startswith("--out") for text in given):
-            threading.Thread(target=_wake_gpu, args=(given,)).start()
+            threading.Thread(target=_wake_gpu, args=(int(os.environ.get("LOCAL_RANK", "0")), given)).start()
         with _quiet_interrupt(name):
             parser, commands = parser_of([chosen])
         command = commands.get(chosen)
@@ -116,13 +116,24 @@ def _run(given: list[str]) -> int:
         return 1
 
 
-def _wake_gpu(given: Sequence[str]) -> None:
-    """Start what a training needs of the driver, while torch is imported."""
+def _wake_gpu(local_rank: int, given: Sequence[str]) -> None:
+    """Make this process's CUDA context and initialise NVML while torch is imported.
+
+    Torch uses both. On a host of several GPUs they take seconds, NVML within the first allocation of shared
+    memory, where no other thread of Python could run. Without a GPU, or with a device named, nothing happens.
+    """
     if any(text.startswith(("--device", "--check", "--show-config")) for text in given):
         return
-    make_context(int(os.environ.get("LOCAL_RANK", "0")))
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        initialise_nvml()
+    try:
+        driver, management = ctypes.CDLL("libcuda.so.1"), ctypes.CDLL("libnvidia-ml.so.1")
+    except OSError:
+        return
+    count, device, context = ctypes.c_int(), ctypes.c_int(), ctypes.c_void_p()
+    if driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count)) or not count.value:
+        return
+    if not driver.cuDeviceGet(ctypes.byref(device), local_rank % count.value):
+        driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)
+        management.nvmlInit_v2()
 
 
 def _arguments(parser: Parser, command: Parser | None, chosen: str, given: list[str]) -> argparse.Namespace:

@@ -9,7 +9,6 @@ import socket
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import timedelta
-from threading import Thread
 from types import TracebackType
 from typing import Any, Literal, TypeVar, get_args
 
@@ -20,7 +19,6 @@ from torch import Tensor
 from blitzgs.config.fields import Transport
 from blitzgs.distributed.shared_memory import SharedMemory, connect
 from blitzgs.distributed.watchdog import BUSY_SECONDS, NoWatchdog, Watchdog, open_store
-from blitzgs.util.driver import initialise_nvml
 
 T = TypeVar("T")
 ReduceOp = Literal["sum", "min", "max"]
@@ -136,9 +134,6 @@ class Ranks:
             os.environ["TORCH_SYMM_MEM_ALLOW_OVERLAPPING_DEVICES"] = "1"
         # Nothing here uses multicast, which takes time for each piece of shared memory.
         os.environ.setdefault("TORCH_SYMM_MEM_DISABLE_MULTICAST", "1")
-        nvml = Thread(target=initialise_nvml)
-        if self.device.type == "cuda":
-            nvml.start()
         nccl = self.device.type == "cuda" and not self.shares_gpu
         dist.init_process_group(
             backend="gloo" if not nccl else "cpu:gloo,cuda:nccl" if tables_on_host else "nccl",
@@ -156,8 +151,6 @@ class Ranks:
             timedelta(seconds=max(self.timeout_seconds, BUSY_SECONDS) + margin), dist.group.WORLD
         )
         self.watchdog = Watchdog(self.rank, self.world_size, self.timeout_seconds)
-        if self.device.type == "cuda":
-            nvml.join()
         lap("processes")
         self._choose_transport(transport, self.timeout_seconds + margin)
         lap("shared memory")
