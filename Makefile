@@ -54,8 +54,11 @@ wheel: venv
 	  --wheel-dir dist build/wheel/*.whl
 	@ls -l dist/*.whl
 
-# The wheel and the archive in dist/, in fresh environments with two versions of torch and of Python.
+# The wheel and the archive in dist/, in fresh environments with two versions of torch and of Python. What is not in
+# dist/ is built first.
 test-wheel: venv-test
+	ls dist/blitzgs-*.whl >/dev/null 2>&1 || $(MAKE) wheel
+	ls dist/blitzgs-*.tar.gz >/dev/null 2>&1 || $(MAKE) sdist
 	$(PYTHON) -m pip install --quiet uv
 	$(RUN) $(PYTHON) -m pytest -q -m slow --timeout 3600 tests/packaging
 

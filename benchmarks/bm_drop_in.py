@@ -15,9 +15,9 @@ The loop, learning rates and density strategy are those of gsplat's `simple_trai
 Times are of the whole training, of the two steps around each time at which the strategy may change the
 population, and of the steps between two such times at the end; PSNR is the mean over held-out views.
 `--one-thread` calls `torch.autograd.set_multithreading_enabled(False)` for all arms, as the guide recommends:
-autograd then runs the backward pass in the loop's own thread. `--profile` also prints the times of each part
-of the training. Then it times the parts of a step of each arm, on the host and on the device, counts their
-ops, launches and waits, and prints the ops and kernels that take most time.
+autograd then runs the backward pass in the loop's own thread. `--profile` also times the parts of a step of
+each arm, on the host and on the device, counts their ops, launches and waits, and prints the ops and kernels
+that take most time.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from harness import Parts, TracedParts, make_parser, report, trace
@@ -172,52 +172,16 @@ def seconds_of(trainer: GsplatTrainer, until: int) -> float:
     return time.perf_counter() - start
 
 
-class Interval(NamedTuple):
-    """Steps of a training up to a change of the population, and the two around the change.
+def seconds_by_kind(trainer: GsplatTrainer, until: int) -> tuple[float, float]:
+    """Continue the training; return the seconds of ordinary steps, and of those around a change.
 
     The step after a change counts as well, because estimates of sizes begin anew in it.
-
-    Attributes:
-        begin: the first step.
-        count: number of steps up to the change.
-        seconds: of these.
-        change: seconds of the two steps around the change.
-        gaussians: their number after the change.
     """
-
-    begin: int
-    count: int
-    seconds: float
-    change: float
-    gaussians: int
-
-
-def intervals_of(trainer: GsplatTrainer, until: int) -> list[Interval]:
-    """Continue the training; return the times between changes of the population, and around them."""
-    every, found = trainer._strategy.refine_every, []
+    every, ordinary, around = trainer._strategy.refine_every, 0.0, 0.0
     while trainer.step < until:
-        begin, end = trainer.step, min(-(-trainer.step // every) * every, until)
-        seconds = seconds_of(trainer, end)
-        change = seconds_of(trainer, min(end + 2, until))
-        found.append(Interval(begin, end - begin, seconds, change, len(trainer.params["means"])))
-    return found
-
-
-def by_part(intervals: list[Interval]) -> list[dict[str, Any]]:
-    """Return a row for each ten intervals."""
-    rows = []
-    for first in range(0, len(intervals), 10):
-        own = intervals[first : first + 10]
-        steps = sum(interval.count for interval in own)
-        rows.append(
-            {
-                "from step": own[0].begin,
-                "Gaussians at the end": own[-1].gaussians,
-                "ms each": 1e3 * sum(interval.seconds for interval in own) / max(1, steps),
-                "around a refinement, ms": 1e3 * sum(interval.change for interval in own) / len(own),
-            }
-        )
-    return rows
+        ordinary += seconds_of(trainer, min(-(-trainer.step // every) * every, until))
+        around += seconds_of(trainer, min(trainer.step + 2, until))
+    return ordinary, around
 
 
 @torch.no_grad()
@@ -240,20 +204,18 @@ def measure(name: str, capture: Any, images: ImageStore, options: argparse.Names
     choices = {"steps": options.steps, "packed": issubclass(ARMS[name], FourSwaps)}
     trainer = ARMS[name]("default", GsplatOptions.of("default", choices), capture, images, device, 0)
     last = min(99, options.steps // 10)  # between two densifications
-    intervals = intervals_of(trainer, options.steps - last)
+    ordinary, changes = seconds_by_kind(trainer, options.steps - last)
     rest = seconds_of(trainer, options.steps)
-    changes = sum(interval.change for interval in intervals)
     found = {
         "arm": name,
         "loss": trainer.loss_name,
-        "training, s": sum(interval.seconds for interval in intervals) + changes + rest,
+        "training, s": ordinary + changes + rest,
         "of it around refinements, s": changes,
         "last steps, ms each": rest / last * 1e3,
         "Gaussians": len(trainer.params["means"]),
         "PSNR, dB": psnr(trainer, capture, images),
     }
     if options.profile:
-        report(f"{name}: steps by part of the training", by_part(intervals), None, options.device)
         profile(name, trainer, options)
     return found
 

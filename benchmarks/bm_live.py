@@ -45,7 +45,7 @@ def train(kind: str, options) -> dict[str, float]:  # noqa: ANN001
         serving = [0.0]
         live = None
         if kind != KINDS[0]:
-            from blitzgs.cli.live import live_page
+            from blitzgs.cli.train import live_page
 
             live = live_page(trainer.state, 0, "127.0.0.1")
             trainer.watch(live)

@@ -3,17 +3,16 @@
 
 from __future__ import annotations
 
-import ctypes
 import multiprocessing
-import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, TypeVar
 
 import cv2
 
+from blitzgs.util.processes import follow_parent
+
 T = TypeVar("T")
-_PR_SET_PDEATHSIG = 1  # of prctl(2)
 _task: Callable[[int], Any]  # the task of the forked processes, which share this memory
 
 
@@ -47,7 +46,7 @@ def _forked(task: Callable[[int], T], count: int, processes: int) -> Iterator[T]
     global _task
     _task = task
     context = multiprocessing.get_context("fork")
-    with ProcessPoolExecutor(min(processes, count), context, _prepare) as pool:
+    with ProcessPoolExecutor(min(processes, count), context, follow_parent) as pool:
         try:
             yield from pool.map(_call, range(count))
         except BaseException:
@@ -57,10 +56,3 @@ def _forked(task: Callable[[int], T], count: int, processes: int) -> Iterator[T]
 
 def _call(index: int) -> Any:
     return _task(index)
-
-
-def _prepare() -> None:
-    """Make a forked process leave interrupts to its parent, and end with it."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)

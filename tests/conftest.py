@@ -41,10 +41,17 @@ def one_thread(request):
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+def capture(tmp_path_factory):
+    """The folder of the tiny capture."""
+    folder = tmp_path_factory.mktemp("capture")
+    write_tiny_capture(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(capture, tmp_path_factory):
     """A capture and a short run of it, made by the command line."""
-    data, folder = tmp_path_factory.mktemp("capture"), tmp_path_factory.mktemp("runs") / "run"
-    write_tiny_capture(data)
+    data, folder = capture, tmp_path_factory.mktemp("runs") / "run"
     flags = as_flags("config=defaults", *OVERRIDES)
     assert main(["train", "--data", str(data), "--out", str(folder), "--schedule.scale=0.4", *flags]) == 0
     return data, folder

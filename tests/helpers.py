@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,6 +17,7 @@ from benchmarks.gradients import parameter_gradients as parameter_gradients
 from benchmarks.gradients import sum_of_ranks as sum_of_ranks
 from blitzgs.ops.photometric import report_
 from blitzgs.reference import ReferenceImage, render
+from blitzgs.runs.checkpoint import Saving
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
 
@@ -171,3 +174,12 @@ def sum_parts(parts: Tensor) -> tuple[Tensor, Tensor]:
     report_(parts, None, (0, 0), 0, 1, [target])
     l1, ssim = target.view(2, -1)
     return l1, ssim
+
+
+def save_checkpoint(*arguments: Any, **options: Any) -> Path:
+    """Write a checkpoint and delete older ones, as `Saving` and with its arguments; return its folder."""
+    saving = Saving(*arguments, **options)
+    path = saving.finish()
+    if saving.deleting is not None:
+        saving.deleting.join()
+    return path

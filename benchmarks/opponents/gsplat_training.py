@@ -26,7 +26,7 @@ from torch import Tensor
 
 from blitzgs import rasterization, relocate
 from blitzgs.capture.capture import Capture
-from blitzgs.capture.images import Images
+from blitzgs.capture.images import ImageStore
 from blitzgs.frame.frame import RenderOptions
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.photometric import photometric_loss
@@ -209,7 +209,7 @@ class GsplatTrainer:
         strategy: str,
         options: GsplatOptions,
         capture: Capture,
-        images: Images,
+        images: ImageStore,
         device: torch.device,
         seed: int,
     ) -> None:

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.capture import Capture
-from blitzgs.capture.images import Images
+from blitzgs.capture.images import ImageStore
 from blitzgs.config.fields import Config
 from blitzgs.distributed.group import Ranks
 from blitzgs.table.table import REQUIRED, GaussianTable
@@ -159,7 +159,7 @@ class _BlockTrainer(Trainer):
 
 
 def train(
-    config: Config, capture: Capture, images: Images, ranks: Ranks, grid: Grid, blocks: list[Block]
+    config: Config, capture: Capture, images: ImageStore, ranks: Ranks, grid: Grid, blocks: list[Block]
 ) -> Merged:
     """Train every block that has cameras and points, and merge the models.
 
@@ -207,7 +207,7 @@ def train(
     return Merged(table, degree, records, merge_seconds)
 
 
-def _train_block(config: Config, capture: Capture, images: Images, ranks: Ranks, block: Block) -> Trainer:
+def _train_block(config: Config, capture: Capture, images: ImageStore, ranks: Ranks, block: Block) -> Trainer:
     chosen = {
         name: None if (column := getattr(capture, name)) is None else column[block.points]
         for name in ("points", "colors", "track_lengths", "errors")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from blitzgs.capture.lens import Lens
 from blitzgs.capture.undistort import Rectification
 
 # Longest side of an image in pixels, of which the kernels make tiles (checked_tile_grid of csrc/common/op.h).
@@ -34,6 +35,20 @@ class Camera:
     """EXIF orientation (1 to 8) to apply to the decoded file; 1: do not turn it."""
     rectification: Rectification
     """Maps the file's pixels to a pinhole image, before downscaling."""
+
+
+@dataclass(frozen=True, eq=False)
+class SourceView:
+    """A view as the capture's file describes it: lens at the size that the file states, pose [4, 4]."""
+
+    name: str
+    path: Path
+    mask_path: Path | None
+    lens: Lens
+    world_to_camera: Float64
+    # "train" or "test" (held out) by the files, "unused" if it is in none of their lists, "both" if it is in
+    # two that exclude each other; None if they do not say.
+    part: str | None = None
 
 
 def camera_centres(world_to_camera: Float64) -> Float64:

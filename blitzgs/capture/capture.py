@@ -22,6 +22,7 @@ from blitzgs.capture.cameras import (
     MAX_SIDE,
     Camera,
     Float64,
+    SourceView,
     camera_centres,
     downscaled_size,
     same_shape,
@@ -29,7 +30,7 @@ from blitzgs.capture.cameras import (
 )
 from blitzgs.capture.check_files import FindDamage, damaged
 from blitzgs.capture.image_files import ImageHeader, read_header
-from blitzgs.capture.layouts import Source, SourceView, read_layout
+from blitzgs.capture.layouts import Source, read_layout
 from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_extent
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.masks import check_masks, find_masks
@@ -188,7 +189,7 @@ def load_capture(
     train, test = ([place[index] for index in part if index in place] for part in (train, test))
     apart_left = [place[index] for index in kept if apart[index]]
     if not train:
-        raise MissingImagesError(f"{root}: no image of a training view is on disk")
+        raise MissingImagesError(f"{root}: no image of a training view is on disk and whole")
     with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # the files may be on a slow network disk
         headers = list(pool.map(lambda view: read_header(view.path), views))
     extra_bands = [view for view, header in zip(views, headers, strict=True) if header.extra_bands]

@@ -29,8 +29,6 @@ _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _HEADERS_WITH_SIZE = ("JPEG", "PNG", "TIFF")
 _LFS_START = b"version https://git-lfs.github.com/spec/"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
-_TURNS: dict[int, tuple[int, ...]] = {3: (cv2.ROTATE_180,), 6: (cv2.ROTATE_90_CLOCKWISE,)}
-_TURNS[8] = (cv2.ROTATE_90_COUNTERCLOCKWISE,)
 # Formats without a mark by which their content would tell them.
 _FORMATS_BY_SUFFIX = {".tga": "TGA", ".pcx": "PCX", ".svg": "SVG", ".eps": "EPS", ".psd": "Photoshop"}
 _FORMATS_BY_SUFFIX |= {".ico": "ICO", ".sgi": "SGI", ".xbm": "XBM", ".xcf": "GIMP"}
@@ -304,14 +302,10 @@ def _black(pixels: npt.NDArray[Any], full: float, is_lossy: bool) -> float:
 
 def apply_orientation(pixels: UInt8, orientation: int) -> UInt8:
     """Turn stored pixels [H, W, ...] upright by the EXIF orientation (1 to 8)."""
-    if orientation in (2, 5, 7):
-        pixels = np.asarray(cv2.flip(pixels, 1))
-        orientation = {2: 1, 5: 8, 7: 6}[orientation]
-    elif orientation == 4:
-        return np.asarray(cv2.flip(pixels, 0))
-    for turn in _TURNS.get(orientation, ()):
-        pixels = np.asarray(cv2.rotate(pixels, turn))
-    return pixels
+    if orientation >= 5:
+        pixels = np.asarray(cv2.transpose(pixels))
+    axis = {2: 1, 3: -1, 4: 0, 6: 1, 7: -1, 8: 0}.get(orientation)
+    return pixels if axis is None else np.asarray(cv2.flip(pixels, axis))
 
 
 def reduced(pixels: UInt8, mask: UInt8 | None, factor: int) -> UInt8:

@@ -16,12 +16,11 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -50,6 +49,8 @@ DEFAULT_BUDGET = 4 << 30
 _MAPS_KEPT = 4
 # "image" or "mask", the camera, and the factor by which it is reduced.
 _Key: TypeAlias = tuple[str, int, int]
+# Columns and rows of `Rectification.maps`, and which pixels the lens has seen.
+_Maps: TypeAlias = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], UInt8]
 
 
 @dataclass(frozen=True)
@@ -77,29 +78,6 @@ class PhotographError(RuntimeError):
     """A photograph cannot be read; the message names the file."""
 
 
-class Images(Protocol):
-    """What training reads of an image store (`blitzgs.capture.images.ImageStore`)."""
-
-    def get(self, index: int, factor: int = 1) -> Tensor:
-        """Return an image, uint8 [H / factor, W / factor, 3], sizes rounded down."""
-
-    def mask(self, index: int, factor: int = 1) -> Tensor | None:
-        """Return the image's mask, uint8 [H / factor, W / factor] with 0 = excluded, or None."""
-
-    def prefetch(self, indices: Sequence[int], masks: Sequence[int] = (), factor: int = 1) -> None:
-        """Decode images and masks in the background, and reduce them by a factor."""
-
-    def memory(self) -> ImageMemory:
-        """Return how much host memory the images have taken."""
-
-
-@dataclass(frozen=True)
-class _Maps:
-    columns: npt.NDArray[np.float32]
-    rows: npt.NDArray[np.float32]
-    seen: UInt8
-
-
 def has_mask(camera: Camera) -> bool:
     """Tell whether some pixels of a camera's image may not count."""
     return camera.mask_path is not None or camera.rectification.has_invalid
@@ -118,13 +96,7 @@ def decoded_shapes(capture: Capture, factors: Iterable[int] = ()) -> dict[Hashab
 
 
 class ImageStore:
-    """Decoded images and masks of a capture's cameras, by index; any thread may call any method.
-
-    Attributes:
-        capture: the capture that has the images.
-        compressed: the compressed images in memory.
-        decoded: the decoded images and masks in memory.
-    """
+    """Decoded images and masks of a capture's cameras, by index; any thread may call any method."""
 
     def __init__(
         self,
@@ -334,9 +306,9 @@ class ImageStore:
     def _prepare(self, camera: Camera, pixels: UInt8) -> UInt8:
         """Undistort and downscale."""
         if not camera.rectification.is_identity:
-            maps = self._maps_of(camera.rectification)
-            remap = partial(cv2.remap, pixels, maps.columns, maps.rows, cv2.INTER_LINEAR)
-            pixels = _uint8(remap(borderMode=cv2.BORDER_REPLICATE))
+            columns, rows, _ = self._maps_of(camera.rectification)
+            border = cv2.BORDER_REPLICATE
+            pixels = _uint8(cv2.remap(pixels, columns, rows, cv2.INTER_LINEAR, borderMode=border))
         return _shrunk(pixels, camera)
 
     def _make_mask(self, index: int) -> UInt8:
@@ -346,8 +318,8 @@ class ImageStore:
         if camera.mask_path is not None:
             mask = self._file_mask(camera, camera.mask_path)
         if not camera.rectification.is_identity:
-            maps = self._maps_of(camera.rectification)
-            mask = _uint8(cv2.remap(mask, maps.columns, maps.rows, cv2.INTER_NEAREST)) * maps.seen
+            columns, rows, seen = self._maps_of(camera.rectification)
+            mask = _uint8(cv2.remap(mask, columns, rows, cv2.INTER_NEAREST)) * seen
         return _uint8(_shrunk(mask * np.uint8(255), camera) == 255)
 
     def _file_mask(self, camera: Camera, path: Path) -> UInt8:
@@ -384,7 +356,7 @@ class ImageStore:
         with self._maps_lock:
             if plan not in self._maps:
                 columns, rows, seen = plan.maps()
-                self._maps[plan] = _Maps(columns, rows, seen.astype(np.uint8))
+                self._maps[plan] = columns, rows, seen.astype(np.uint8)
                 if len(self._maps) > _MAPS_KEPT:
                     self._maps.popitem(last=False)
             self._maps.move_to_end(plan)

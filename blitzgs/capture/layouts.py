@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from blitzgs.capture import colmap, transforms
-from blitzgs.capture.cameras import Float64
+from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.names import ImageFinder
 from blitzgs.capture.points import SourcePoints, file_points, transforms_points
@@ -23,18 +23,6 @@ from blitzgs.capture.world import WorldFrame, frame_beside
 _PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 # What programs write beside the images of a synthetic capture.
 _BY_PRODUCT = re.compile(r"(?i)(depth|normal|disp|mask|alpha|segmentation)s?(_?\d+)?$")
-
-
-@dataclass(frozen=True, eq=False)
-class SourceView:
-    """A view as the capture's file describes it."""
-
-    name: str
-    path: Path
-    mask_path: Path | None
-    lens: Lens
-    world_to_camera: Float64
-    part: str | None = None  # see `transforms.Frame.part`
 
 
 @dataclass(frozen=True)
@@ -113,7 +101,8 @@ def _no_capture(root: Path) -> FileNotFoundError:
 
 def _hint(root: Path) -> str:
     """Return what a folder without a capture has instead, and what to do."""
-    models = [path.parent for depth in ("*", "*/*", "*/*/*") for path in root.glob(f"{depth}/cameras.*")]
+    files = [path for depth in ("*", "*/*", "*/*/*") for path in root.glob(f"{depth}/cameras.*")]
+    models = [path.parent for path in files if path.suffix in (".bin", ".txt")]
     if models:
         return (
             f"; there is a COLMAP model in {min(models)}: name the folder above its sparse/0 with --data, or "
@@ -187,7 +176,10 @@ def _with_photographs(root: Path, source: Source, views: Sequence[SourceView]) -
         file
         for folder in folders
         for file in (folder.iterdir() if folder.is_dir() else ())
-        if file.suffix.lower() in suffixes and file not in known and not _BY_PRODUCT.search(file.stem)
+        if file.suffix.lower() in suffixes
+        and file not in known
+        and not file.name.startswith(".")
+        and not _BY_PRODUCT.search(file.stem)
     )
     if without:
         warnings.warn(
@@ -200,9 +192,6 @@ def _with_photographs(root: Path, source: Source, views: Sequence[SourceView]) -
 
 def _read_transforms(root: Path, model: Path | None) -> tuple[list[SourceView], SourcePoints, Source]:
     content = transforms.read_transforms(root)
-    views = [
-        SourceView(f.name, f.path, f.mask_path, f.lens, f.world_to_camera, f.part) for f in content.frames
-    ]
     notes = list(content.notes)
     if content.files[0].name == "transforms.json":
         others = [f"transforms_{part}.json" for part in ("train", "val", "test")]
@@ -212,7 +201,7 @@ def _read_transforms(root: Path, model: Path | None) -> tuple[list[SourceView], 
         if not note.startswith("fields without effect"):
             warnings.warn(f"{content.files[0]}: {note}", stacklevel=4)
     source = Source(" and ".join(path.name for path in content.files), content.split, tuple(notes))
-    return views, transforms_points(root, content, model), source
+    return content.frames, transforms_points(root, content, model), source
 
 
 def _read_colmap(

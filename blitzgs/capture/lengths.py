@@ -10,15 +10,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.capture.cameras import Camera, Float64, camera_centres
-
-if TYPE_CHECKING:
-    from blitzgs.capture.layouts import SourceView
+from blitzgs.capture.cameras import Camera, Float64, SourceView, camera_centres
 
 # Cameras whose distance is below this share of the points' distance count as being in one place: the parallax
 # between them is far below a pixel.

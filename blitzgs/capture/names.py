@@ -20,6 +20,8 @@ from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".avif", ".jp2", ".gif")
+# Of photographs that have to be converted; the cameras may have been found before that.
+_CONVERTED_SUFFIXES = (".heic", ".heif", ".dng", ".arw", ".cr2", ".cr3", ".nef", ".orf", ".rw2", ".jxl")
 # Folders of what belongs to photographs and has their names, but shows something else.
 _BY_PRODUCT = re.compile(r"(?i)(^|/)(depth|normal|disp|mask|alpha|segmentation|semantic)[^/]*/")
 # Of folders in each other.
@@ -37,7 +39,7 @@ def _any_case(name: str) -> str:
 
 def _without_suffix(name: str) -> str:
     path = PurePosixPath(_any_case(name))
-    return str(path.with_suffix("")) if path.suffix in IMAGE_SUFFIXES else str(path)
+    return str(path.with_suffix("")) if path.suffix in IMAGE_SUFFIXES + _CONVERTED_SUFFIXES else str(path)
 
 
 def _last(name: str) -> str:
@@ -76,7 +78,8 @@ def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dic
     for ignored, key, is_last_resort in _RULES:
         files, claims = defaultdict(list), defaultdict(list)
         for file in free:
-            files[key(file)].append(file)
+            if not (is_last_resort and file.lower().endswith(_CONVERTED_SUFFIXES)):
+                files[key(file)].append(file)
         for name in wanted:
             if not (is_last_resort and PurePosixPath(unified(name)).suffix.lower() in suffixes):
                 claims[key(name)].append(name)
@@ -115,14 +118,21 @@ def _say(new: dict[str, str], count: int, folder: Path, ignored: str) -> None:
 
 
 def files_below(folder: Path) -> list[str]:
-    """Return the files of a folder and its subfolders, sorted, as paths relative to it with slashes."""
+    """Return the files of a folder and its subfolders, sorted, as paths relative to it with slashes.
+
+    Hidden ones are left out, as macOS writes them beside photographs. Links are followed, but none to a
+    folder that has the link inside, which would repeat all.
+    """
     out = []
     for place, folders, files in os.walk(folder, followlinks=True):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        if len(Path(place).relative_to(folder).parts) > _DEEPEST:  # a link to a folder above itself
+        inside = f"{os.path.realpath(place)}/"
+        shown = (name for name in folders if not name.startswith("."))
+        folders[:] = sorted(n for n in shown if not inside.startswith(f"{os.path.realpath(f'{place}/{n}')}/"))
+        if len(Path(place).relative_to(folder).parts) > _DEEPEST:  # links that lead to each other
             folders.clear()
         base = Path(place).relative_to(folder).as_posix()
-        out += [name if base == "." else f"{base}/{name}" for name in files]
+        visible = (name for name in files if not name.startswith("."))
+        out += [name if base == "." else f"{base}/{name}" for name in visible]
     return sorted(out)
 
 

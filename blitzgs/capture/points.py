@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture import colmap
-from blitzgs.capture.cameras import Float64, camera_centres
+from blitzgs.capture.cameras import Float64, SourceView, camera_centres
 from blitzgs.capture.names import unified
-from blitzgs.capture.transforms import Frame, Transforms
+from blitzgs.capture.transforms import Transforms
 from blitzgs.formats.ply import read_point_cloud
 
 SUFFIXES = (".las", ".laz", ".e57")
@@ -210,7 +210,7 @@ def _differs(model: colmap.ColmapModel, content: Transforms) -> str | None:
     return None
 
 
-def _centres(frames: Sequence[Frame]) -> Float64:
+def _centres(frames: Sequence[SourceView]) -> Float64:
     return camera_centres(np.stack([frame.world_to_camera for frame in frames]))
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
-from blitzgs.capture.layouts import SourceView
+from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.names import read_lines
 
 DEFAULT_EVERY = 8
@@ -28,7 +28,7 @@ def from_list(names: Sequence[str], path: Path) -> list[int]:
             lookup.setdefault(key, set()).add(index)
     test: set[int] = set()
     for number, line in enumerate(read_lines(path), start=1):
-        entry = line.split("#")[0].strip()
+        entry = line.split("#")[0].strip().replace("\\", "/")
         if not entry:
             continue
         found = lookup.get(entry, set())
@@ -40,6 +40,8 @@ def from_list(names: Sequence[str], path: Path) -> list[int]:
                 f"{path}: line {number}: '{entry}' {problem} (views are called like '{names[0]}')"
             )
         test |= found
+    if not test:
+        raise ValueError(f"{path} names no view: list the held-out ones, or set --data.split=0 for none")
     return sorted(test)
 
 

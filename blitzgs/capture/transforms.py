@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from blitzgs.capture.cameras import Float64
-from blitzgs.capture.lens import Lens
+from blitzgs.capture.cameras import Float64, SourceView
 from blitzgs.capture.names import match_names
 from blitzgs.capture.transforms_lens import FIELDS, read_lens
 
@@ -36,24 +35,10 @@ _OF_OTHERS = {
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One frame: its lens at the size that the file states, and its world-to-camera pose, float64 [4, 4]."""
-
-    name: str
-    path: Path
-    mask_path: Path | None
-    lens: Lens
-    world_to_camera: Float64
-    # "train" or "test" (held out) by the files, "unused" if it is in none of their lists, "both" if it is in
-    # two that exclude each other; None if they do not say.
-    part: str | None
-
-
-@dataclass(frozen=True)
 class Transforms:
     """The combined content of a capture's files."""
 
-    frames: list[Frame]
+    frames: list[SourceView]
     points_path: Path | None
     files: list[Path]
     split: str  # what in the files decides on the split, as text; empty if nothing does
@@ -80,7 +65,7 @@ def read_transforms(root: Path, files: Sequence[Path] | None = None) -> Transfor
 
     ValueError: a field is missing or makes no sense; names the file, the frame and the field.
     """
-    frames: list[Frame] = []
+    frames: list[SourceView] = []
     points_path, applied = None, None
     files = find_transforms(root) if files is None else list(files)
     notes: dict[str, None] = {}
@@ -89,13 +74,13 @@ def read_transforms(root: Path, files: Sequence[Path] | None = None) -> Transfor
     for path in files:
         content, entries = _read_file(path)
         if "ply_file_path" in content:
-            if not isinstance(content["ply_file_path"], str):
-                raise ValueError(f"{path}: ply_file_path must be text, got {content['ply_file_path']!r}")
+            if not _names_file(content, "ply_file_path"):
+                raise ValueError(f"{path}: ply_file_path must name a file, got {content['ply_file_path']!r}")
             points_path = _found(root, [content["ply_file_path"]]).popitem()[1]
         applied = _applied(path, content) if applied is None else applied
         lists = _lists(path, content)
         split += [f"{key}_filenames" for key in lists] if path.name == "transforms.json" else [path.name]
-        own: list[Frame] = []
+        own: list[SourceView] = []
         named = [
             entry[key] for key in ("file_path", "mask_path") for entry in entries if _names_file(entry, key)
         ]
@@ -186,7 +171,7 @@ def _lists(file: Path, content: Mapping[str, Any]) -> dict[str, set[str]]:
     return lists
 
 
-def _check_lists(file: Path, lists: Mapping[str, set[str]], frames: Sequence[Frame]) -> None:
+def _check_lists(file: Path, lists: Mapping[str, set[str]], frames: Sequence[SourceView]) -> None:
     names = {frame.name for frame in frames}
     lost = set().union(*lists.values()) - names
     if lost:
@@ -195,7 +180,7 @@ def _check_lists(file: Path, lists: Mapping[str, set[str]], frames: Sequence[Fra
 
 
 def _part(file: Path, lists: Mapping[str, set[str]], name: str) -> str | None:
-    """Return the part of a frame, see `Frame.part`."""
+    """Return the part of a frame, see `SourceView.part`."""
     if file.name != "transforms.json":
         return "train" if file.name == "transforms_train.json" else "test"
     if not lists:
@@ -224,7 +209,7 @@ def _read_frame(
     lists: Mapping[str, set[str]],
     notes: dict[str, None],
     paths: Mapping[str, Path],
-) -> Frame:
+) -> SourceView:
     relative = entry["file_path"]
     if not _names_file(entry, "file_path"):
         raise ValueError(f"file_path must name an image, got {relative!r}")
@@ -233,7 +218,7 @@ def _read_frame(
     if mask is not None and not _names_file(entry, "mask_path"):
         raise ValueError(f"mask_path must name an image or be null, got {mask!r}")
     name = _name(relative)
-    return Frame(
+    return SourceView(
         name=name,
         path=path,
         mask_path=None if mask is None else paths[mask],

@@ -5,14 +5,15 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture import transforms
-from blitzgs.capture.cameras import Camera, Float64
-from blitzgs.capture.layouts import SourceView, read_layout
+from blitzgs.capture.cameras import Camera, Float64, SourceView
+from blitzgs.capture.layouts import read_layout
 from blitzgs.capture.lengths import StrayCamera, random_points
 from blitzgs.capture.lens import Lens, check_lens
 from blitzgs.capture.points import SourcePoints
@@ -89,14 +90,12 @@ def finite_points(points: SourcePoints) -> SourcePoints:
     warnings.warn(
         f"{int((~finite).sum())} of {finite.size} points are not finite and were dropped", stacklevel=3
     )
-    return SourcePoints(
-        points.positions[finite],
-        points.colors[finite],
-        points.track_lengths[finite] if points.track_lengths is not None else None,
-        points.errors[finite] if points.errors is not None else None,
-        points.path,
-        points.colors_from,
-        points.crs,
+    return replace(
+        points,
+        positions=points.positions[finite],
+        colors=points.colors[finite],
+        track_lengths=points.track_lengths[finite] if points.track_lengths is not None else None,
+        errors=points.errors[finite] if points.errors is not None else None,
     )
 
 
@@ -121,8 +120,7 @@ def read_cameras(path: Path, offset: Float64) -> list[Camera]:
     damaged, or has no camera.
     """
     if path.is_file():
-        read = transforms.read_transforms(path.parent, [path])
-        views = [SourceView(f.name, f.path, None, f.lens, f.world_to_camera) for f in read.frames]
+        views = transforms.read_transforms(path.parent, [path]).frames
     elif path.is_dir():
         views, _, _ = read_layout(path, "images", 1)
     else:

@@ -259,15 +259,8 @@ def frame_in(frame: WorldFrame, crs: str, places: Float64) -> tuple[WorldFrame, 
 
 
 # Tags of EXIF 2.32, section 4.6.6.
-_GPS, _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = (
-    0x8825,
-    1,
-    2,
-    3,
-    4,
-    5,
-    6,
-)
+_GPS = 0x8825
+_LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
 
 
 def gps_positions(paths: Sequence[Path]) -> list[tuple[float, float, float] | None]:

@@ -221,16 +221,8 @@ def _message(error: BaseException) -> str:
 
 # Commands whose result is what they print.
 _PRINTING = (
-    "eval",
-    "completion",
-    "--json",
-    "--show-config",
-    "--check",
-    "--help",
-    "--help-fields",
-    "-h",
-    "--version",
-)
+    "eval", "completion", "--json", "--show-config", "--check", "--help", "--help-fields", "-h", "--version"
+)  # fmt: skip
 
 
 def _report_lost(given: list[str], outputs: dict[str, Output]) -> int:
@@ -240,14 +232,14 @@ def _report_lost(given: list[str], outputs: dict[str, Output]) -> int:
     """
     for name in outputs:
         getattr(sys, name).flush()
-    lost = [output for output in outputs.values() if output.lost and not output.closed]
+    lost = [output for output in outputs.values() if output.lost and output.has_reader]
     for output in lost:
         print(
-            f"blitzgs: {output.name} cannot be written ({output.lost}): what was printed there is "
+            f"blitzgs: {output.title} cannot be written ({output.lost}): what was printed there is "
             "incomplete; files are complete",
             file=sys.stderr,
         )
     return int(
-        any(output.name == "standard output" for output in lost)
+        any(output.title == "standard output" for output in lost)
         and any(text.partition("=")[0] in _PRINTING for text in given)
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import warnings
 
 import numpy as np
 
@@ -20,12 +21,15 @@ from blitzgs.capture.world import (
     gps_positions,
     pyproj_module,
 )
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_run, named_path
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_path, add_run
 from blitzgs.config.files import load_config
 from blitzgs.runs import files as run_files
 from blitzgs.runs.world import load_frame, save_frame
 from blitzgs.training.inputs import load_configured
 from blitzgs.util.terminal import printable
+
+# -1 for photographs that look straight down, or level; -1.4 between the two.
+_TURNED_OVER = 0.3
 
 HELP = """\
 Find out where the model of a run lies in the world, and write that to RUN/geo.json, which `blitzgs view` and
@@ -46,7 +50,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser = add_command(commands, "align", run, summary, HELP)
     add_run(parser)
     how = parser.add_mutually_exclusive_group()
-    how.add_argument("--gcp", type=named_path, metavar="FILE", help="ground control points and their marks")
+    add_path(how, "--gcp", "FILE", "ground control points and their marks")
     how.add_argument("--gps", action="store_true", help="use the positions in the photographs' EXIF")
     parser.add_argument("--crs", metavar="EPSG:N", help="reference system of the points, or wanted")
     add_capture(parser)
@@ -64,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
         frame = _by_gps(args, capture)
     else:
         frame = _converted(args, capture)
+    _warn_if_turned_over(frame, capture)
     path = save_frame(args.folder, frame)
     print(f"{path}: {printable(frame.name)}, scale {frame.scale:.9g}")
     return 0
@@ -100,6 +105,17 @@ def _check_lengths(crs: str) -> None:
         raise ValueError(f"{crs!r:.60} is no reference system: name one such as EPSG:32633") from error
     if angles:
         raise ValueError(f"{crs} has angles: convert the points to a projected system, such as a UTM zone")
+
+
+def _warn_if_turned_over(frame: WorldFrame, capture: Capture) -> None:
+    """Warn of a world in which the photographs are upside down, or look up at what they show from above."""
+    poses = np.stack([camera.world_to_camera for camera in capture.cameras])
+    down, forward = (poses[:, 1:3, :3] @ frame.rotation[2]).mean(axis=0)  # by how much they point up
+    if frame.crs != GEOCENTRIC and down + forward > _TURNED_OVER:
+        warnings.warn(
+            "the photographs are upside down in this world: are E and N exchanged, or are heights depths?",
+            stacklevel=2,
+        )
 
 
 def _print_residuals(placed: list[Placed]) -> None:

@@ -7,7 +7,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from blitzgs.config.ranges import RANGES
 
@@ -61,28 +61,24 @@ def named_path(text: str) -> Path:
     return Path(text)
 
 
+def add_path(parser: argparse._ActionsContainer, name: str, metavar: str, text: str, **more: Any) -> None:
+    """Add an argument that is a path, and no empty one; `text` is its help."""
+    parser.add_argument(name, type=named_path, metavar=metavar, help=text, **more)
+
+
 def add_run(parser: argparse.ArgumentParser) -> None:
     """Add the argument RUN, the folder of a run."""
-    parser.add_argument(
-        "folder", type=named_path, metavar="RUN", help="folder that blitzgs train wrote (its --out)"
-    )
+    add_path(parser, "folder", "RUN", "folder that blitzgs train wrote (its --out)")
 
 
 def add_model(parser: argparse.ArgumentParser) -> None:
     """Add the argument MODEL: the folder of a run, a checkpoint in it, or a file of Gaussians."""
-    parser.add_argument(
-        "model", type=named_path, metavar="MODEL", help="run, checkpoint, or file of Gaussians"
-    )
+    add_path(parser, "model", "MODEL", "run, checkpoint, or file of Gaussians")
 
 
 def add_capture(parser: argparse.ArgumentParser) -> None:
     """Add the flag --data, the present folder of a run's capture."""
-    parser.add_argument(
-        "--data",
-        type=named_path,
-        metavar="DIR",
-        help="folder of the capture, if it has moved since the training",
-    )
+    add_path(parser, "--data", "DIR", "folder of the capture, if it has moved since the training")
 
 
 def add_pool(parser: argparse.ArgumentParser) -> None:

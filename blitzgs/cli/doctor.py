@@ -27,7 +27,7 @@ from typing import Any, Literal
 
 from blitzgs import __version__
 from blitzgs._built import LIBRARY_DIR
-from blitzgs.cli.arguments import Commands, add_command, named_path
+from blitzgs.cli.arguments import Commands, add_command, add_path
 
 HELP = """\
 Check this installation: torch, the GPUs, the libraries, optional packages, and small renderings that are
@@ -72,11 +72,8 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "doctor", run, summary, HELP)
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
-    parser.add_argument(
-        "--folder",
-        type=named_path,
-        metavar="DIR",
-        help="measure the disk of this folder too, with a file of 64 MB that is removed",
+    add_path(
+        parser, "--folder", "DIR", "measure the disk of this folder too, with a file of 64 MB that is removed"
     )
     parser.add_argument(
         "--timeout",

@@ -4,24 +4,14 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import math
 import sys
 from pathlib import Path
 
-from blitzgs.cli.arguments import (
-    Commands,
-    add_capture,
-    add_command,
-    add_device,
-    add_model,
-    add_pool,
-    add_split,
-    chosen_views,
-    named_path,
-)
+from blitzgs.cli import arguments
 from blitzgs.config.fields import Config, DataConfig, ModelConfig
+from blitzgs.config.files import changed
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians, is_antialiased
 from blitzgs.formats.models import read_gaussians
@@ -50,17 +40,15 @@ photograph.
 """
 
 
-def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
+def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "eval", run, summary, HELP)
-    add_model(parser)
-    add_capture(parser)
-    add_device(parser, shares_gpus=True)
-    add_pool(parser)
-    add_split(parser, "measure")
-    parser.add_argument(
-        "--out", type=named_path, metavar="DIR", help="folder for the results (default: RUN/evaluation/SPLIT)"
-    )
+    parser = arguments.add_command(commands, "eval", run, summary, HELP)
+    arguments.add_model(parser)
+    arguments.add_capture(parser)
+    arguments.add_device(parser, shares_gpus=True)
+    arguments.add_pool(parser)
+    arguments.add_split(parser, "measure")
+    arguments.add_path(parser, "--out", "DIR", "folder for the results (default: RUN/evaluation/SPLIT)")
     parser.add_argument(
         "--pictures",
         type=int,
@@ -93,8 +81,7 @@ def run(args: argparse.Namespace) -> int:
             model = run_files.open_model(run_folder, ranks, args.data, args.resident_gb, checkpoint)
             config = model.config
         if args.allow_missing:
-            data = dataclasses.replace(config.data, allow_missing=True)
-            config = dataclasses.replace(config, data=data)
+            config = changed(config, "data", allow_missing=True)
         capture, images = open_capture(config, ranks, "--allow-missing")
         if path.is_file():
             model = model_of_file(
@@ -108,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
             gate = lod_gate(config, model.progress)
             lod = scene_gate(config, model.progress, model.table, ranks)
             folder = args.out or run_folder / run_files.EVALUATION / args.split
-        indices = chosen_views(args.split, capture, path)
+        indices = arguments.chosen_views(args.split, capture, path)
         with image_progress("Comparing", ranks.rank == 0) as report:
             result = evaluate(
                 model.scene(ranks.device),

@@ -7,25 +7,17 @@ import argparse
 import os
 import re
 import sys
+import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from blitzgs.cli.arguments import (
-    Commands,
-    add_capture,
-    add_command,
-    add_device,
-    add_model,
-    named_path,
-    number,
-)
-from blitzgs.cli.export_tiles import HELP as TILES_HELP
-from blitzgs.cli.export_tiles import add_flags, add_kinds, check_flags, export_tiles, is_tiles
+from blitzgs.cli import arguments
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.gaussians import GaussianSource, is_antialiased
+from blitzgs.formats.gaussians import GaussianSource, check_memory, is_antialiased
 from blitzgs.formats.models import FORMATS, Format, check_replaces, offset_of, open_gaussians
 from blitzgs.formats.selection import Selected, Selection, read_polygon
 from blitzgs.formats.web_page import check_replaces_page
@@ -69,23 +61,38 @@ held-out PSNR before and after where the photographs are at hand.
 
 An HTML file larger than --max-mb is made smaller: first the SH degree is reduced, then the Gaussians that
 contribute least are left out; the page and the output of this command say how many.
+
+A city that no browser holds at once is written as a folder that viewers load piece by piece:
+
+  blitzgs export RUN|CHECKPOINT|FILE.ply --tiles CITY       # 3D Tiles 1.1; then blitzgs view CITY
+  blitzgs export RUN|CHECKPOINT|FILE.ply --streamed-sog CITY  # for SuperSplat
+
+Memory does not grow with the model; the disk needs twice the size of the model. See docs/guide/tiles.md.
 """
+_TILES = "--tiles and --streamed-sog"
+_COUNT = arguments.number(int, lambda value: value >= 1, "a whole number from 1 on")
 
 
-def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
+def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "export", run, summary, HELP + "\n" + TILES_HELP)
-    add_model(parser)
-    add_device(parser)
-    add_capture(parser)
+    parser = arguments.add_command(commands, "export", run, summary, HELP)
+    arguments.add_model(parser)
+    arguments.add_device(parser)
+    arguments.add_capture(parser)
     kind = parser.add_mutually_exclusive_group(required=True)
     for name, found in FORMATS.items():
-        kind.add_argument(f"--{name}", type=named_path, metavar="FILE", help=f"{found.title} file to write")
-    kind.add_argument("--html", type=named_path, metavar="FILE", help="HTML file to write")
-    add_kinds(kind)
+        arguments.add_path(kind, f"--{name}", "FILE", f"{found.title} file to write")
+    arguments.add_path(kind, "--html", "FILE", "HTML file to write")
+    for name, title in (
+        ("tiles", "3D Tiles (tileset.json)"),
+        ("streamed-sog", "streamed SOG (lod-meta.json)"),
+    ):
+        arguments.add_path(kind, f"--{name}", "DIR", f"folder to make for {title}")
     parser.add_argument(
         "--max-mb",
-        type=number(float, lambda mb: 0 < mb <= LARGEST_MB, f"a number of megabytes up to {LARGEST_MB}"),
+        type=arguments.number(
+            float, lambda mb: 0 < mb <= LARGEST_MB, f"a number of megabytes up to {LARGEST_MB}"
+        ),
         metavar="MB",
         help=f"with --html: largest size of the file in megabytes (default: {MAX_MB})",
     )
@@ -116,11 +123,11 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         metavar=tuple("xyzXYZ"),
         help="keep this box of the capture's coordinates",
     )
-    parser.add_argument(
+    arguments.add_path(
+        parser,
         "--crop-polygon",
-        type=named_path,
-        metavar="FILE",
-        help='keep this region: a GeoJSON polygon, or lines "x y", in the capture\'s coordinates',
+        "FILE",
+        'keep this region: a GeoJSON polygon, or lines "x y", in the capture\'s coordinates',
     )
     parser.add_argument(
         "--crop-axes", choices=("xy", "xz", "yz"), help="axes of the polygon's corners (default: xy)"
@@ -139,26 +146,64 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser.add_argument(
         "--levels", type=_levels, metavar="FIRST-LAST", help="keep these octree levels, for example 0-3"
     )
-    add_flags(parser)
+    for name, help_text in (
+        ("tile-gaussians", "Gaussians of a tile (default: 32768)"),
+        ("processes", "processes that write tiles (default: as many as CPU cores)"),
+    ):
+        parser.add_argument(f"--{name}", type=_COUNT, metavar="N", help=f"with {_TILES}: {help_text}")
 
 
 def run(args: argparse.Namespace) -> int:
     """Export a model; returns the exit status."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise ValueError("export writes one file from one process: run it without torchrun")
-    check_flags(args)
-    if is_tiles(args):
-        return export_tiles(args, _selection(args))
+    if args.tiles or args.streamed_sog:
+        return _export_tiles(args, _selection(args))
+    _refuse(args, ("tile_gaussians", "processes"), f"is for {_TILES}")
     return _export_html(args) if args.html else _export_file(args)
+
+
+def _refuse(args: argparse.Namespace, flags: Iterable[str], reason: str) -> None:
+    """Raise an error if one of some flags is given."""
+    for flag in flags:
+        if getattr(args, flag):
+            raise ValueError(f"--{flag.replace('_', '-')} {reason}")
+
+
+def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
+    """Write the Gaussians that meet a selection as tiles; returns the exit status."""
+    _refuse(args, ("max_mb", "coordinates", "classic", "clean"), f"is not for {_TILES}")
+    from blitzgs.formats.streamed_sog import write_streamed_sog
+    from blitzgs.formats.tiles import TILE, write_tiles
+    from blitzgs.viewer.tileset import open_city
+
+    start, city = time.monotonic(), open_city(args.model)
+    source, path = city.source, args.tiles or args.streamed_sog
+    if selection is not None:
+        source = Selected(source, selection, tuple(city.offset.tolist()))
+    sizes = {
+        "most": args.tile_gaussians or TILE,
+        "processes": args.processes or len(os.sched_getaffinity(0)),
+    }
+    if args.tiles:
+        written = write_tiles(path, source, city.transform(), city.scene, city.title, **sizes)
+    else:
+        written = write_streamed_sog(path, source, **sizes)
+    print(
+        f"{path}: {written.gaussians:,} Gaussians in {written.tiles:,} tiles, {written.bytes / 1e6:.1f} MB, "
+        f"{time.monotonic() - start:.0f} s"
+    )
+    if args.tiles:
+        print(f"look at it: blitzgs view {path}")
+    return 0
 
 
 def _export_html(args: argparse.Namespace) -> int:
     from blitzgs.viewer.studio import open_model
     from blitzgs.viewer.web import web_file
 
-    for flag in (*_CHOICES, "coordinates", "classic", "clean"):
-        if getattr(args, flag):
-            raise ValueError(f"--{flag.replace('_', '-')} is not for --html: an HTML file has its own choice")
+    flags = (*_CHOICES, "coordinates", "classic", "clean")
+    _refuse(args, flags, "is not for --html: an HTML file has its own choice")
     path: Path = args.html
     if path.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"{path}: choose a --html that ends in .html")
@@ -175,17 +220,15 @@ def _export_html(args: argparse.Namespace) -> int:
 
 
 def _export_file(args: argparse.Namespace) -> int:
-    if args.max_mb:
-        raise ValueError("--max-mb is for --html; --most N limits other files")
+    _refuse(args, ("max_mb",), "is for --html; --most N limits other files")
     name = next(name for name in FORMATS if getattr(args, name.replace("-", "_")))
     kind, path = FORMATS[name], getattr(args, name.replace("-", "_"))
     check_replaces(path, kind)
     selection = _selection(args)
     path.parent.mkdir(parents=True, exist_ok=True)
     if args.model.is_file():
-        for flag in ("classic", "clean", "coordinates"):
-            if getattr(args, flag):
-                raise ValueError(f"--{flag} needs the folder of a run, and {args.model} is a file")
+        flags = ("classic", "clean", "coordinates")
+        _refuse(args, flags, f"needs the folder of a run, and {args.model} is a file")
         source = open_gaussians(args.model)
         if selection is not None:
             source = Selected(source, selection, offset_of(source.comments))
@@ -207,12 +250,14 @@ def _export_run(
     run_folder, checkpoint = run_and_checkpoint(args.model)
     coordinates = args.coordinates or "auto"
     in_memory = args.classic or args.clean is not None or args.most is not None or coordinates == "world"
+    opened = open_source(run_folder, checkpoint)
     if not in_memory:
-        opened = open_source(run_folder, checkpoint)
         source: GaussianSource = (
             opened if selection is None else Selected(opened, selection, opened.space.offset)
         )
         return source, export(source, opened.space, kind, path, coordinates)
+    flags = "--classic, --clean, --most and --coordinates world need the model in memory"
+    check_memory(f"{flags}; {run_folder} holds", len(opened), opened.degree)
     from blitzgs.viewer.studio import open_model
     from blitzgs.viewer.web import contributions
 

@@ -4,15 +4,14 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, named_path
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_path
 from blitzgs.config.fields import ScheduleConfig
-from blitzgs.config.files import ConfigError, load_config
+from blitzgs.config.files import ConfigError, changed, load_config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
@@ -44,10 +43,8 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser = add_command(commands, "gate", lambda _: 2, summary, HELP)
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     fit = add_command(actions, "fit", run_fit, "fit a gate on the lineage of runs")
-    fit.add_argument(
-        "runs", type=named_path, nargs="+", metavar="RUN", help="folder of a run with lineage, or a sample"
-    )
-    fit.add_argument("--out", type=named_path, required=True, metavar="FILE", help="file for the gate, .json")
+    add_path(fit, "runs", "RUN", "folder of a run with lineage, or a sample", nargs="+")
+    add_path(fit, "--out", "FILE", "file for the gate, .json", required=True)
     fit.add_argument(
         "--gate-from",
         type=float,
@@ -57,10 +54,8 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         "schedule.gate_from times schedule.scale of the runs that will use the gate (default: %(default)s)",
     )
     sample = add_command(actions, "sample", run_sample, "reduce the lineage of a run to one file")
-    sample.add_argument("folder", type=named_path, metavar="RUN", help="folder of a run with lineage")
-    sample.add_argument(
-        "--out", type=named_path, required=True, metavar="FILE", help="file for the sample, .parquet"
-    )
+    add_path(sample, "folder", "RUN", "folder of a run with lineage")
+    add_path(sample, "--out", "FILE", "file for the sample, .parquet", required=True)
     sample.add_argument(
         "--rows",
         type=int,
@@ -72,10 +67,8 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     judge.add_argument(
         "gate", type=gate_file, metavar="GATE", help='file of a gate, or "default" (the included one)'
     )
-    judge.add_argument("runs", type=named_path, nargs="+", metavar="RUN", help="folder of a run with lineage")
-    judge.add_argument(
-        "--out", type=named_path, required=True, metavar="DIR", help="folder for figures and maps"
-    )
+    add_path(judge, "runs", "RUN", "folder of a run with lineage", nargs="+")
+    add_path(judge, "--out", "DIR", "folder for figures and maps", required=True)
     again = add_command(
         actions,
         "replay",
@@ -85,10 +78,8 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     again.add_argument(
         "gate", type=gate_file, metavar="GATE", help='file of a gate, or "default" (the included one)'
     )
-    again.add_argument("folder", type=named_path, metavar="RUN", help="folder of a run with lineage")
-    again.add_argument(
-        "--out", type=named_path, required=True, metavar="DIR", help="folder for these runs and their figures"
-    )
+    add_path(again, "folder", "RUN", "folder of a run with lineage")
+    add_path(again, "--out", "DIR", "folder for these runs and their figures", required=True)
     again.add_argument(
         "--rate", type=float, default=0.6, help="share of the candidates to withhold (default: %(default)s)"
     )
@@ -154,7 +145,7 @@ def run_replay(args: argparse.Namespace) -> int:
         raise ConfigError(f"{args.folder} is not a run: it has no {run_files.CONFIG}")
     config = load_config(args.folder / run_files.CONFIG)
     if args.data is not None:
-        config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(args.data)))
+        config = changed(config, "data", path=str(args.data))
     results: list[dict[str, Any]] = []
     with Ranks.from_environment(
         args.device,

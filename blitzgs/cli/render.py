@@ -19,16 +19,7 @@ from torch import Tensor
 
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.pictures import encode_image, to_uint8
-from blitzgs.cli.arguments import (
-    Commands,
-    add_command,
-    add_device,
-    add_model,
-    add_pool,
-    add_split,
-    named_path,
-    number,
-)
+from blitzgs.cli import arguments
 from blitzgs.cli.rendered import Rendered, open_rendered
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.film import SUFFIX, check_film, new_film
@@ -45,7 +36,7 @@ from blitzgs.viewer.film import Film, read_film
 # What may be written beside the colours.
 MEASURED: tuple[Mode, ...] = ("depth", "alpha")
 
-_POSITIVE = number(float, lambda value: 0 < value < 1e6, "a positive number")
+_POSITIVE = arguments.number(float, lambda value: 0 < value < 1e6, "a positive number")
 
 HELP = """\
 Render views of a model to pictures, or a camera path to a film:
@@ -61,21 +52,19 @@ pip install "blitzgs[film]".
 """
 
 
-def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
+def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "render", run, summary, HELP)
-    add_model(parser)
-    parser.add_argument(
-        "--data", type=named_path, metavar="DIR", help="take the cameras from this capture, not from the run"
-    )
-    add_device(parser, shares_gpus=True)
-    add_pool(parser)
-    add_split(parser, "render")
-    parser.add_argument(
+    parser = arguments.add_command(commands, "render", run, summary, HELP)
+    arguments.add_model(parser)
+    arguments.add_path(parser, "--data", "DIR", "take the cameras from this capture, not from the run")
+    arguments.add_device(parser, shares_gpus=True)
+    arguments.add_pool(parser)
+    arguments.add_split(parser, "render")
+    arguments.add_path(
+        parser,
         "--cameras",
-        type=named_path,
-        metavar="FILE",
-        help="render the cameras of this transforms file or folder of a COLMAP model, in the capture's "
+        "FILE",
+        "render the cameras of this transforms file or folder of a COLMAP model, in the capture's "
         "coordinates; no photographs are needed",
     )
     parser.add_argument(
@@ -93,15 +82,13 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser.add_argument(
         "--seconds", type=_POSITIVE, help="with --path: duration (default: the file's, else 10)"
     )
-    parser.add_argument(
+    arguments.add_path(
+        parser,
         "--dataparser",
-        type=named_path,
-        metavar="FILE",
-        help="with --path: dataparser_transforms.json of the nerfstudio training that the path was made for",
+        "FILE",
+        "with --path: dataparser_transforms.json of the nerfstudio training that the path was made for",
     )
-    parser.add_argument(
-        "--out", type=named_path, required=True, metavar="OUT", help=f"folder for pictures, or FILE{SUFFIX}"
-    )
+    arguments.add_path(parser, "--out", "OUT", f"folder for pictures, or FILE{SUFFIX}", required=True)
     parser.add_argument(
         "--exposure",
         action="store_true",

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TextIO
 
-from blitzgs.cli.arguments import Commands, add_command, add_run, named_path
+from blitzgs.cli.arguments import Commands, add_command, add_path, add_run
 from blitzgs.runs.files import check_is_run
 from blitzgs.util.terminal import printable
 
@@ -27,7 +27,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "report", run, summary, HELP)
     add_run(parser)
-    parser.add_argument("--out", type=named_path, metavar="FILE", help="the file (default: RUN/report.html)")
+    add_path(parser, "--out", "FILE", "the file (default: RUN/report.html)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -97,16 +97,8 @@ metrics of each view, curves, and pictures of the same views. The others are com
 def add_compare(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "compare", run_compare, summary, COMPARE_HELP)
-    parser.add_argument(
-        "folders", nargs="+", type=named_path, metavar="RUN", help="folders of two runs or more"
-    )
-    parser.add_argument(
-        "--out",
-        type=named_path,
-        metavar="FILE",
-        default=Path("compare.html"),
-        help="the file (default: %(default)s)",
-    )
+    add_path(parser, "folders", "RUN", "folders of two runs or more", nargs="+")
+    add_path(parser, "--out", "FILE", "the file (default: %(default)s)", default=Path("compare.html"))
 
 
 def run_compare(args: argparse.Namespace) -> int:

@@ -4,16 +4,18 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import os
 import shlex
 import sys
 import time
 from pathlib import Path
 
-from blitzgs.capture.colmap import camera_models
-from blitzgs.cli.arguments import Commands, add_command, named_path
+from blitzgs.capture.colmap import camera_models, find_models
+from blitzgs.capture.transforms import find_transforms
+from blitzgs.cli.arguments import Commands, add_command, add_path
 from blitzgs.config.fields import Config
+from blitzgs.config.files import changed
+from blitzgs.runs.files import CONFIG
 from blitzgs.sfm.photographs import Photographs, estimate, has_photographs_alone, photograph_folder
 from blitzgs.sfm.reconstruct import MAPPERS, PAIRS, WORK, Settings, is_finished, reconstruct
 from blitzgs.util.terminal import printable
@@ -41,8 +43,8 @@ photographs without a pose and why), and COLMAP's database and messages.
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "sfm", run, summary, HELP)
-    parser.add_argument("photos", type=named_path, metavar="PHOTOS", help="folder of the photographs")
-    parser.add_argument("capture", type=named_path, metavar="CAPTURE", help="folder to write")
+    add_path(parser, "photos", "PHOTOS", "folder of the photographs")
+    add_path(parser, "capture", "CAPTURE", "folder to write")
     parser.add_argument(
         "--pairs", choices=PAIRS, default="auto", help="which photographs are compared (default: see above)"
     )
@@ -89,29 +91,52 @@ def with_poses(config: Config, folder: Path) -> Config:
     They go into `folder`, which is used as it is if it is finished. Under torchrun rank 0 finds them and the
     others, which have not joined yet, wait for its report; where rank 0 fails, torchrun ends them.
     """
-    root = Path(config.data.path)
-    if not config.data.path or not has_photographs_alone(root, config.data.images):
+    photographs = _photographs_alone(config)
+    if photographs is None:
         return config
     first = os.environ.get("RANK", "0") == "0"
     if is_finished(folder):
         if first:
             print(f"poses: those of {folder}, found before (blitzgs sfm adds photographs)", file=sys.stderr)
     elif first:
-        print(f"{root} has photographs without poses: they are found first, into {folder}", file=sys.stderr)
-        find_poses(photograph_folder(root, config.data.images), folder, Settings())
+        print(
+            f"{config.data.path} has photographs without poses: they are found first, into {folder}",
+            file=sys.stderr,
+        )
+        find_poses(photographs, folder, Settings())
     while not is_finished(folder):
         time.sleep(1.0)
-    data = dataclasses.replace(config.data, path=os.path.realpath(folder), images="images")
-    return dataclasses.replace(config, data=data)
+    return changed(config, "data", path=os.path.realpath(folder), images="images")
 
 
 def understood_alone(config: Config) -> str | None:
     """Return what a training would do first with photographs that have no poses; None: they have."""
-    root = Path(config.data.path)
-    if not config.data.path or not has_photographs_alone(root, config.data.images):
+    folder = _photographs_alone(config)
+    if folder is None:
         return None
-    photographs = Photographs.of(photograph_folder(root, config.data.images))
+    photographs = Photographs.of(folder)
     return (
         f"{len(photographs.names):,} photographs without poses: a training finds them first, in about "
         f"{estimate(photographs.sizes)}; then this command says more (blitzgs sfm finds poses alone)"
     )
+
+
+def _photographs_alone(config: Config) -> Path | None:
+    """Return the folder of photographs that have no poses; None: they have.
+
+    Raises:
+        FileNotFoundError: the folder is a run or a part of a capture, whose pictures need no poses.
+    """
+    root = Path(config.data.path)
+    if not config.data.path or not has_photographs_alone(root, config.data.images):
+        return None
+    if (root / CONFIG).is_file():
+        raise FileNotFoundError(
+            f"{root} is a run and no capture: name the capture that its {CONFIG} has as data.path"
+        )
+    if find_models(root.parent) or find_transforms(root.parent):
+        raise FileNotFoundError(
+            f"{root} lies in a capture that has its cameras: --data={shlex.quote(str(root.parent))} (or find "
+            "others with blitzgs sfm)"
+        )
+    return photograph_folder(root, config.data.images)

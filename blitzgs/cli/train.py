@@ -4,36 +4,39 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import os
 import shlex
 import sys
 from contextlib import nullcontext
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
 
-from blitzgs.cli.arguments import Commands, add_command, add_device, named_path, number
-from blitzgs.cli.live import add_live_page, check_live_page, live_page, say_where_to_look
+from blitzgs.cli.arguments import Commands, add_command, add_device, add_path, number
 from blitzgs.cli.report import kept_warnings, write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
 from blitzgs.config.describe import describe, describe_all, describe_page
 from blitzgs.config.fields import Config, Transport
-from blitzgs.config.files import ConfigError, default_recipe, load_config, recipe_path, to_dict
+from blitzgs.config.files import ConfigError, changed, default_recipe, load_config, recipe_path, to_dict
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.folder_checks import locked
 from blitzgs.training.budget import LEAST_IMAGES
 from blitzgs.training.estimate import estimate
 from blitzgs.training.inputs import open_capture, read_ahead
+from blitzgs.training.state import TrainingState
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import check_worlds, understood
 from blitzgs.util.progress import Laps
 from blitzgs.util.terminal import printable
+
+if TYPE_CHECKING:
+    from blitzgs.viewer.live import Live
 
 # See `blitzgs.training.budget.extended`.
 _EXTENSION = number(
@@ -95,15 +98,13 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         metavar="RECIPE",
         help="name of a recipe, or a YAML file (default: aerial on a GPU, aerial_cpu on a CPU)",
     )
-    parser.add_argument(
-        "--data", type=named_path, metavar="DIR", help="folder of the capture, or another program's project"
-    )
-    parser.add_argument("--out", type=named_path, metavar="RUN", help="folder for the results")
-    parser.add_argument(
+    add_path(parser, "--data", "DIR", "folder of the capture, or another program's project")
+    add_path(parser, "--out", "RUN", "folder for the results")
+    add_path(
+        parser,
         "--start",
-        type=named_path,
-        metavar="FILE",
-        help="begin with the Gaussians of a file (PLY, SPZ, SOG, .splat) in the capture's coordinates",
+        "FILE",
+        "begin with the Gaussians of a file (PLY, SPZ, SOG, .splat) in the capture's coordinates",
     )
     parser.add_argument(
         "--resume", action="store_true", help="continue from the newest checkpoint in RUN, if any"
@@ -130,11 +131,11 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         help="read the capture, print what was understood and roughly what the training will take, and stop; "
         "needs no GPU and no --out",
     )
-    parser.add_argument(
+    add_path(
+        parser,
         "--sfm",
-        type=named_path,
-        metavar="DIR",
-        help="folder for the capture that is made of photographs without poses (default: RUN_capture)",
+        "DIR",
+        "folder for the capture that is made of photographs without poses (default: RUN_capture)",
     )
     parser.add_argument("--no-sfm", action="store_true", help="refuse photographs without poses")
     add_live_page(parser)
@@ -174,7 +175,10 @@ def run(args: argparse.Namespace) -> int:
     if args.show_config:
         print(json.dumps(to_dict(config), indent=1))
         return 0
-    check_live_page(args.viewer)
+    if args.viewer is not None:
+        from blitzgs.viewer.page import require_viser
+
+        require_viser()
     if args.resume and not config.data.path and not (args.out / run_files.CONFIG).exists():
         raise FileNotFoundError(
             f"{args.out} holds no run to continue (it has no config.yaml): check --out, or name the capture "
@@ -206,7 +210,7 @@ def run(args: argparse.Namespace) -> int:
         images.check_files(range(ranks.rank, len(capture.cameras), ranks.world_size))
         laps.lap("files")
         if ranks.rank == 0:
-            _print_block(understood(config, capture, images))
+            print("\n".join(understood(config, capture, images)), flush=True)
         with locked(args.out, ranks):
             trainer = Trainer(config, capture, images, args.out, ranks, args.resume, args.extend, laps)
             trainer.warned = warned
@@ -231,13 +235,14 @@ def _check(args: argparse.Namespace, config: Config) -> int:
     check_worlds(capture)
     lines = understood(config, capture, images)
     images.close()
-    on_gpu = args.device.startswith("cuda") or (args.device == "auto" and torch.cuda.is_available())
-    _print_block([*lines, f"{'training:':15}{estimate(config, capture, on_gpu, torch.get_num_threads())}"])
+    rough = estimate(config, capture, _on_gpu(args), torch.get_num_threads())
+    lines.append(f"{'training:':15}{rough}")
+    print("\n".join(lines), flush=True)
     return 0
 
 
-def _print_block(lines: list[str]) -> None:
-    print("\n".join(lines), flush=True)
+def _on_gpu(args: argparse.Namespace) -> bool:
+    return bool(args.device.startswith("cuda") or (args.device == "auto" and torch.cuda.is_available()))
 
 
 def _config(args: argparse.Namespace) -> Config:
@@ -247,8 +252,7 @@ def _config(args: argparse.Namespace) -> Config:
     elif args.resume and own is not None and own.exists():
         source = own
     else:
-        on_gpu = args.device.startswith("cuda") or (args.device == "auto" and torch.cuda.is_available())
-        recipe = default_recipe(on_gpu)
+        recipe = default_recipe(_on_gpu(args))
         source = recipe_path(recipe)
         if os.environ.get("RANK", "0") == "0":  # torchrun's number of the process
             print(f"recipe: {recipe} (choose another one with --config)", file=sys.stderr)
@@ -256,18 +260,13 @@ def _config(args: argparse.Namespace) -> Config:
         raise ConfigError(
             f"{source} would be overwritten by the new run's resolved configuration: choose another --out"
         )
-    overrides = (
-        args.overrides if args.minutes is None else [*args.overrides, f"schedule.minutes={args.minutes}"]
-    )
-    config = load_config(source, overrides)
+    minutes = [] if args.minutes is None else [f"schedule.minutes={args.minutes}"]
+    config = load_config(source, [*args.overrides, *minutes])
     if args.data is not None:
         # Set the path directly: YAML does not allow all characters that a path may have.
-        config = dataclasses.replace(
-            config, data=dataclasses.replace(config.data, path=os.path.realpath(args.data))
-        )
+        config = changed(config, "data", path=os.path.realpath(args.data))
     if args.start is not None:
-        start = os.path.realpath(args.start)
-        config = dataclasses.replace(config, model=dataclasses.replace(config.model, start=start))
+        config = changed(config, "model", start=os.path.realpath(args.start))
     return config
 
 
@@ -293,3 +292,75 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
         f"  blitzgs train --out {name} --extend 1.5   train half as long again",
     ):
         console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
+
+
+_PORT = 8080
+
+
+def add_live_page(parser: argparse.ArgumentParser) -> None:
+    """Add the flags."""
+    parser.add_argument(
+        "--viewer",
+        type=int,
+        nargs="?",
+        const=_PORT,
+        metavar="PORT",
+        help=f"show the training in the browser (default port: {_PORT}); needs the extra view",
+    )
+    parser.add_argument(
+        "--viewer-host",
+        default="127.0.0.1",
+        metavar="HOST",
+        help="address to listen on (default: %(default)s, this machine only)",
+    )
+    parser.add_argument(
+        "--viewer-stay",
+        action="store_true",
+        help="after the training, keep the page open until Ctrl-C (default: it closes)",
+    )
+
+
+def say_where_to_look(args: argparse.Namespace) -> None:
+    """Print whether the page of a finished training stays open."""
+    if args.viewer is not None and args.viewer_stay:
+        print("the viewer's page stays open (Ctrl-C ends)", flush=True)
+    elif args.viewer is not None:
+        print("the viewer's page is closed: see above, or train with --viewer-stay to keep it open")
+
+
+def live_page(state: TrainingState, port: int, host: str) -> Live | None:
+    """Open the page of a training on rank 0, and print its address; None on other ranks.
+
+    A page that cannot be opened is a message: the training goes on without it.
+    """
+    if state.ranks.rank != 0:
+        return None
+    from blitzgs.viewer.exhibit import Exhibit
+    from blitzgs.viewer.live import Live
+    from blitzgs.viewer.studio import box_of
+
+    capture, images, options = state.capture, state.images, state.render_options
+    exhibit = Exhibit(
+        title=f"{state.folder.resolve().name} (training)",
+        space=state.space,
+        sh_degree=state.config.model.sh_degree,
+        near=options.near_plane,
+        far=options.far_plane,
+        background=options.background,
+        levels=state.progress.level_count > 1,
+        lod=state.progress.level_count > 1,
+        smooth=state.config.view.smooth,
+        box=box_of(state.table["means"]),
+        cameras=capture.cameras,
+        test=capture.test,
+        photograph=lambda index: np.asarray(images.get(index).numpy()),
+        paths=state.folder / "paths",
+        frame=capture.about.source.frame,
+    )
+    try:
+        page = Live(exhibit, state.schedule.iterations, host, port)
+    except OSError as error:
+        print(f"{error}; training goes on without the viewer", flush=True)
+        return None
+    print(f"viewer: open {page.page.url}", flush=True)
+    return page

@@ -15,7 +15,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_model, named_path
+from blitzgs.cli.arguments import (
+    Commands,
+    add_capture,
+    add_command,
+    add_device,
+    add_model,
+    add_path,
+)
 from blitzgs.distributed.group import Ranks, extend_memory_in_place, resolve_device
 from blitzgs.formats.tiles import PAGE, TILESET
 from blitzgs.runs import files as run_files
@@ -41,11 +48,11 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     add_model(parser)
     add_address(parser)
     add_capture(parser)
-    parser.add_argument(
+    add_path(
+        parser,
         "--paths",
-        type=named_path,
-        metavar="DIR",
-        help="folder for camera paths and screenshots (default: RUN/paths, or the folder of the file)",
+        "DIR",
+        "folder for camera paths and screenshots (default: RUN/paths, or the folder of the file)",
     )
     add_device(parser)
 
@@ -73,7 +80,11 @@ def run(args: argparse.Namespace) -> int:
     device, _ = resolve_device(args.device, local_rank=0, local_world_size=1, share_gpus=False)
     ranks = Ranks(device=device)
     model: Path = args.model
-    photograph = None if model.is_file() else photographs(run_files.run_and_checkpoint(model)[0], args.data)
+    photograph = None
+    if not model.is_file():
+        folder, _ = run_files.run_and_checkpoint(model)
+        run_files.check_is_run(folder)
+        photograph = photographs(folder, args.data)
     studio = Studio(open_model(model, ranks, photograph, args.paths), args.host, args.port)
     print(f"{model}: open {studio.page.url} (Ctrl-C ends)", flush=True)
     try:
@@ -88,14 +99,12 @@ def run(args: argparse.Namespace) -> int:
 
 def photographs(folder: Path, data: Path | None) -> Callable[[int], npt.NDArray[np.uint8]] | None:
     """Return a function that reads the photographs of a run's cameras; None if the capture is not there."""
-    import dataclasses
-
-    from blitzgs.config.files import load_config
+    from blitzgs.config.files import changed, load_config
 
     try:
         config = load_config(folder / run_files.CONFIG)
         if data is not None:
-            config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
+            config = changed(config, "data", path=str(data))
         _, images = open_capture(config, Ranks(), "--data DIR")
     except (OSError, ValueError) as error:
         print(f"no photographs to compare with: {error}")

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
+import psutil
 import torch
 from torch import Tensor
 
@@ -113,6 +114,26 @@ class Gaussians:
         for name, tensor in given.items():
             if tuple(tensor.shape) != shapes[name]:
                 raise ValueError(f"{name} has the shape {list(tensor.shape)}, expected {list(shapes[name])}")
+
+
+def check_memory(holds: str, count: int, degree: int) -> None:
+    """Refuse a number of Gaussians that the free memory cannot hold twice, as readers need it.
+
+    Args:
+        holds: what has them, as the beginning of the sentence, for example "FILE holds".
+        count: number of Gaussians.
+        degree: their spherical-harmonics degree.
+
+    Raises:
+        ValueError: it cannot; names both amounts.
+    """
+    needed = 2 * 4 * count * (11 + 3 * (degree + 1) ** 2)
+    free = psutil.virtual_memory().available
+    if needed > free:
+        raise ValueError(
+            f"{holds} {count:,} Gaussians: reading them takes {needed / 1e9:,.1f} GB of memory or more, and "
+            f"{free / 1e9:,.1f} GB are free"
+        )
 
 
 def is_antialiased(source: GaussianSource) -> bool:

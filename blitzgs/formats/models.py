@@ -13,7 +13,7 @@ from blitzgs.formats import packed
 from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased
 from blitzgs.formats.glb import write_glb
 from blitzgs.formats.ply import PlySource, read_ply, save_ply
-from blitzgs.formats.sog import write_sog
+from blitzgs.formats.sog import read_sog, write_sog
 from blitzgs.util.output import check_replaceable
 
 _HEADER = 1 << 16
@@ -114,7 +114,7 @@ def read_gaussians(path: Path | str) -> Gaussians:
     elif start.startswith((b"\x1f\x8b", b"NGSP")):
         found = packed.read_spz(path)
     elif start.startswith(b"PK"):
-        found = packed.read_sog(path)
+        found = read_sog(path)
     elif path.suffix.lower() == ".splat":
         found = packed.read_splat(path)
     else:

@@ -1,21 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compressed formats, through the packages gsply and gaussforge.
+"""Compressed formats: compressed PLY, .splat and SPZ, some of it through the package gsply.
 
-The packages trust what a file says about itself, so counts and sizes are compared with the file and with the
-free memory before they see it. gsply writes, and gaussforge reads all but SPZ, because gaussforge 0.6 orders
-the SH coefficients of compressed PLY files wrongly, and gsply reads files without looking at bounds.
+The package trusts what a file says about itself, so counts and sizes are compared with the file and with the
+free memory before it sees it. It writes, and reads SPZ.
 """
 
 from __future__ import annotations
 
 import gzip
 import importlib
-import json
 import re
 import shutil
 import struct
 import tempfile
-import zipfile
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -25,11 +22,17 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
-import psutil
 import torch
 
-from blitzgs.formats.gaussians import BLOCK, MIP, Gaussians, GaussianSource, is_antialiased, unit_quats
-from blitzgs.formats.ply import read_ply
+from blitzgs.formats.gaussians import (
+    BLOCK,
+    MIP,
+    Gaussians,
+    GaussianSource,
+    check_memory,
+    is_antialiased,
+    unit_quats,
+)
 from blitzgs.util.output import new_file
 
 # Deflate compresses by at most this factor.
@@ -38,15 +41,15 @@ _SPZ_MAGIC = 0x5053474E
 _SPZ_ANTIALIASED, _SPZ_HEADER = 1, 16
 # An SPZ file may end with extensions.
 _SPZ_EXTENSIONS = 1 << 20
-_META_BYTES = 64 << 20
-# Largest palette of SH coefficients, in pixels.
-_PALETTE = 1 << 20
 # Gaussians of a chunk of compressed PLY, and bytes of its bounds.
 _CHUNK, _CHUNK_BYTES = 256, 72
+_BOUNDS, _WORDS = ("x y z", "scale_x scale_y scale_z", "r g b"), ("position", "rotation", "scale", "color")
 _SH_C0 = 0.28209479177387814
 _COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
 # Signs of the SH coefficients after half a turn about x, in the order of INRIA's basis.
 _HALF_TURN = torch.tensor([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=torch.float32)
+
+Floats = npt.NDArray[np.float32]
 
 
 def _package(name: str) -> ModuleType:
@@ -56,17 +59,6 @@ def _package(name: str) -> ModuleType:
         raise ImportError(
             f'this format needs the package {name} ({error}): pip install "blitzgs[formats]"'
         ) from error
-
-
-def _check_room(path: Path, count: int, degree: int) -> None:
-    """Refuse a number of Gaussians that memory cannot hold, twice, as the packages and torch do."""
-    needed = 2 * 4 * count * (14 + 3 * _COEFFICIENTS[degree])
-    free = psutil.virtual_memory().available
-    if needed > free:
-        raise ValueError(
-            f"{path} says that it holds {count:,} Gaussians: reading them takes {needed / 1e9:,.1f} GB of "
-            f"memory, and {free / 1e9:,.1f} GB are free"
-        )
 
 
 def unit_blocks(source: GaussianSource) -> Iterator[Gaussians]:
@@ -98,24 +90,6 @@ def _joined(parts: list[Gaussians]) -> Gaussians:
         opacities=torch.cat([part.opacities for part in parts]),
         sh=torch.cat([part.sh for part in parts]),
     )
-
-
-# --- gaussforge ---
-
-
-def _unforged(path: Path, kind: str) -> Gaussians:
-    """Read a file as the PLY file that gaussforge makes of it; its own columns lack those of SH degree 0."""
-    try:
-        result = _package("gaussforge").GaussForge().convert(path.read_bytes(), kind, "ply")
-        if "error" in result:
-            raise ValueError(result["error"])
-        with tempfile.NamedTemporaryFile(suffix=".ply") as file:
-            file.write(result["data"])
-            file.flush()
-            found = read_ply(file.name)
-    except (RuntimeError, ValueError, TypeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    return replace(found, normals=None, comments=[])
 
 
 # --- gsply ---
@@ -178,7 +152,7 @@ def _write_columns(
 
 
 def read_compressed_ply(path: Path) -> Gaussians:
-    """Read a compressed PLY file.
+    """Read a compressed PLY file in the layout of SuperSplat.
 
     Raises:
         ValueError: the file is damaged; names the file and the reason.
@@ -188,25 +162,96 @@ def read_compressed_ply(path: Path) -> Gaussians:
     header, found, _ = start.partition(b"end_header\n")
     if not found:
         raise ValueError(f"{path}: the header of the PLY file does not end")
-    text = header.decode("ascii", "replace")
-    elements = {name: int(count) for name, count in re.findall(r"^element (\w+) (\d{1,18})\s*$", text, re.M)}
+    lines = header.decode("ascii", "replace").splitlines()
+    comments = [line for line in lines if line.startswith(("comment ", "obj_info "))]
+    layout = [line.strip() for line in lines if line not in comments]
+    elements = {
+        name: int(count) for name, count in re.findall(r"^element (\w+) (\d{1,18})$", "\n".join(layout), re.M)
+    }
     count, chunks = elements.get("vertex", 0), elements.get("chunk", 0)
-    rest = len(re.findall(r"^property uchar f_rest_\d+\s*$", text, re.M)) if "sh" in elements else 0
+    rest = sum(line.startswith("property uchar f_rest_") for line in layout)
     degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(rest)
     if degree is None:
         raise ValueError(f"{path}: {rest} f_rest properties fit no SH degree (0, 9, 24 or 45 do)")
-    columns = len(re.findall(r"^property float (?:min|max)_\w+\s*$", text, re.M))
-    if columns not in (12, 18) or chunks != -(-count // 256) or elements.get("sh", count) != count:
+    columns = sum(line.startswith(("property float min_", "property float max_")) for line in layout)
+    if columns not in (12, 18) or chunks != -(-count // _CHUNK) or elements.get("sh", count) != count:
         raise ValueError(
             f"{path}: {chunks:,} chunks of {columns} numbers and {elements.get('sh', count):,} rows of SH do "
             f"not fit {count:,} Gaussians"
         )
-    size = len(header) + len(found) + chunks * columns * 4 + count * (16 + rest)
+    groups = _BOUNDS[: columns // 6]
+    names = [f"{end}_{name}" for group in groups for end in ("min", "max") for name in group.split()]
+    expected = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
+    expected += [f"property float {name}" for name in names]
+    expected += [f"element vertex {count}", *(f"property uint packed_{name}" for name in _WORDS)]
+    if rest:
+        expected += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(rest))]
+    if layout != expected:
+        raise ValueError(f"{path}: the header is not that of a compressed PLY file, whose order is fixed")
+    begin = len(header) + len(found)
+    size = begin + chunks * columns * 4 + count * (16 + rest)
     if path.stat().st_size < size:
         raise ValueError(f"{path} is cut off: {path.stat().st_size:,} of {size:,} bytes")
-    _check_room(path, count, degree)
-    comments = [line for line in text.splitlines() if line.startswith(("comment ", "obj_info "))]
-    return replace(_unforged(path, "compressed.ply"), comments=comments)
+    check_memory(f"{path} says that it holds", count, degree)
+    bounds = np.fromfile(path, "<f4", chunks * columns, offset=begin).reshape(chunks, -1, 2, 3)
+    words = np.fromfile(path, "<u4", 4 * count, offset=begin + bounds.nbytes).reshape(count, 4)
+    codes = np.fromfile(path, "u1", rest * count, offset=begin + bounds.nbytes + words.nbytes)
+    model = Gaussians(
+        means=torch.empty(count, 3),
+        quats=torch.empty(count, 4),
+        scales=torch.empty(count, 3),
+        opacities=torch.empty(count),
+        sh=torch.empty(count, _COEFFICIENTS[degree], 3),
+        comments=comments,
+    )
+    for first in range(0, count, BLOCK):
+        rows = slice(first, min(first + BLOCK, count))
+        _unpack(model.rows(rows), bounds[first // _CHUNK :], words[rows], codes.reshape(count, -1)[rows])
+    return model
+
+
+@np.errstate(invalid="ignore", over="ignore")  # `Gaussians.check` refuses what cannot be shown
+def _unpack(
+    to: Gaussians, bounds: Floats, words: npt.NDArray[np.uint32], codes: npt.NDArray[np.uint8]
+) -> None:
+    """Write the values of a block of a compressed PLY file into its Gaussians.
+
+    Args:
+        to: views of N Gaussians.
+        bounds: least and largest x y z, scales and perhaps colours of its chunks, [C, 2 or 3, 2, 3].
+        words: packed position, rotation, scale and colour, [N, 4].
+        codes: f_rest, [N, 3 (K - 1)].
+    """
+    chunks = np.arange(len(words)) // _CHUNK
+
+    def shares(column: int, *bits: int) -> Floats:
+        """Split a word into numbers of so many bits, the highest first, as shares of their largest values."""
+        shifts = np.cumsum((0, *bits[:0:-1]), dtype=np.uint32)[::-1]
+        most = np.array([(1 << n) - 1 for n in bits], np.uint32)
+        return np.asarray((words[:, column, None] >> shifts & most) / most, np.float32)
+
+    def between(group: int, found: Floats) -> Floats:
+        least, most = bounds[chunks, group].transpose(1, 0, 2)
+        return least + found * (most - least)
+
+    colors = shares(3, 8, 8, 8, 8)
+    tints = between(2, colors[:, :3]) if bounds.shape[1] > 2 else colors[:, :3]
+    to.means[:] = torch.from_numpy(between(0, shares(0, 11, 10, 11)))
+    to.scales[:] = torch.from_numpy(between(1, shares(2, 11, 10, 11)))
+    to.opacities[:] = torch.from_numpy(colors[:, 3].clip(1e-6, 1 - 1e-6)).logit()
+    to.sh[:, 0] = torch.from_numpy((tints - 0.5) / _SH_C0)
+    steps = (codes + np.float32(0.5)) / 256
+    steps[codes == 0], steps[codes == 255] = 0, 1
+    to.sh[:, 1:] = torch.from_numpy(steps * 8 - 4).reshape(len(words), 3, -1).transpose(1, 2)
+    to.quats[:] = quats_without_largest((shares(1, 2, 10, 10, 10)[:, 1:] - 0.5) * 2**0.5, words[:, 1] >> 30)
+
+
+def quats_without_largest(others: Floats, largest: npt.NDArray[Any]) -> torch.Tensor:
+    """Return unit quaternions [N, 4] from all components but the largest, [N, 3], and its place [N]."""
+    quats = np.empty((len(others), 4), np.float32)
+    quats[np.arange(4) != largest[:, None]] = others.ravel()
+    quats[np.arange(len(quats)), largest] = np.sqrt(np.maximum(0, 1 - (others**2).sum(axis=1)))
+    return torch.from_numpy(quats)
 
 
 # --- .splat: 32 bytes a Gaussian, without header ---
@@ -235,7 +280,7 @@ def read_splat(path: Path) -> Gaussians:
     size = path.stat().st_size
     if size % _SPLAT.itemsize:
         raise ValueError(f"{path} is cut off: {size:,} bytes are no multiple of {_SPLAT.itemsize}")
-    _check_room(path, size // _SPLAT.itemsize, 0)
+    check_memory(f"{path} says that it holds", size // _SPLAT.itemsize, 0)
     rows = np.fromfile(path, dtype=_SPLAT)
     if not (rows["scale"] >= 0).all():
         first = int(np.argmin((rows["scale"] >= 0).all(axis=1)))
@@ -305,7 +350,7 @@ def read_spz(path: Path) -> Gaussians:
     if degree not in _COEFFICIENTS:
         raise ValueError(f"{path}: SH degree {degree} is not supported, 0 to 3 are")
     size = 16 + count * (16 + (4 if version >= 3 else 3) + 3 * (_COEFFICIENTS[degree] - 1))
-    _check_room(path, count, degree)
+    check_memory(f"{path} says that it holds", count, degree)
     if deflated:
         if size > _DEFLATE * path.stat().st_size:
             raise ValueError(f"{path}: {path.stat().st_size:,} bytes cannot hold {count:,} Gaussians")
@@ -357,68 +402,3 @@ def _half_turn(model: Gaussians) -> Gaussians:
     signs = torch.tensor([1.0, 1.0, -1.0, -1.0])
     sh = model.sh * _HALF_TURN[: model.sh.shape[1], None]
     return replace(model, means=model.means * signs[1:], quats=model.quats * signs, sh=sh)
-
-
-# --- SOG: WebP pictures of quantised columns in a ZIP archive ---
-
-
-def read_sog(path: Path) -> Gaussians:
-    """Read an SOG file (a ZIP archive).
-
-    Raises:
-        ValueError: the file is damaged, or inflates to more than its pictures can need.
-    """
-    try:
-        antialiased = _check_sog(path)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    except (LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged: meta.json lacks a field or has one of another kind") from error
-    return replace(_unforged(path, "sog"), comments=[MIP] if antialiased else [])
-
-
-def _check_sog(path: Path) -> bool:
-    """Compare the parts of an SOG file with its count; return whether the model is antialiased."""
-    with zipfile.ZipFile(path) as archive:
-        entries = {entry.filename: entry for entry in archive.infolist()}
-        if "meta.json" not in entries:
-            raise ValueError(f"{path}: the archive has no meta.json")
-        if entries["meta.json"].file_size > _META_BYTES:
-            raise ValueError(f"{path}: meta.json has {entries['meta.json'].file_size:,} bytes")
-        try:
-            meta = json.loads(archive.read("meta.json"))
-        except ValueError as error:
-            raise ValueError(f"{path}: meta.json is no JSON: {error}") from error
-        count = meta["count"] if "version" in meta else meta["means"]["shape"][0]
-        if type(count) is not int or count < 1:
-            raise ValueError(f"{path}: meta.json names {count!r} Gaussians")
-        _check_room(path, count, 3)
-        for part in ("means", "scales", "quats", "sh0", "shN"):
-            if part not in meta and part == "shN":
-                continue
-            for book in [meta[part]["codebook"]] if "codebook" in meta[part] else []:
-                if len(book) != 256 or not np.isfinite(np.array(book, dtype=np.float64)).all():
-                    raise ValueError(f"{path}: the codebook of {part} is not 256 finite numbers")
-            for name in meta[part]["files"]:
-                if name not in entries:
-                    raise ValueError(f"{path}: the archive has no {name}")
-                largest = max(2 * count, _PALETTE) + (1 << 16)
-                if entries[name].file_size > 8 * largest:
-                    raise ValueError(f"{path}: {name} inflates to {entries[name].file_size:,} bytes")
-                width, height = _webp_size(archive.read(name), f"{path}: {name}")
-                least = 1 if "centroids" in name else count
-                if not least <= width * height <= largest:
-                    raise ValueError(f"{path}: {name} has {width} x {height} pixels for {count:,} Gaussians")
-        return bool(meta.get("antialias", False))
-
-
-def _webp_size(data: bytes, where: str) -> tuple[int, int]:
-    """Return width and height of a WebP picture from its first chunk."""
-    head: npt.NDArray[np.uint8] = np.frombuffer(data[:30].ljust(30, b"\0"), np.uint8)
-    kind = data[12:16]
-    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or kind not in (b"VP8L", b"VP8X"):
-        raise ValueError(f"{where} is no lossless WebP picture")
-    if kind == b"VP8L":
-        bits = int.from_bytes(head[21:25].tobytes(), "little")
-        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-    return tuple(int.from_bytes(head[i : i + 3].tobytes(), "little") + 1 for i in (24, 27))  # type: ignore[return-value]

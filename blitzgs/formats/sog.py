@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes SOG files (PlayCanvas, version 2): lossless WebP pictures of quantised columns in a ZIP archive.
+"""SOG files (PlayCanvas, version 1 and 2): lossless WebP pictures of quantised columns in a ZIP archive.
 
-gaussforge writes this format too, but compares every Gaussian with every entry of its palette on one core:
-for 97,000 Gaussians of SH degree 3 it had not finished after nine minutes.
+gaussforge reads and writes this format too, but damaged pictures end the process, and it compares every
+Gaussian with every entry of its palette on one core: for 97,000 Gaussians of SH degree 3 it had not finished
+after nine minutes.
 """
 
 from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,13 +20,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased
-from blitzgs.formats.packed import unit_blocks
+from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource, check_memory, is_antialiased
+from blitzgs.formats.packed import quats_without_largest, unit_blocks
 from blitzgs.util.output import new_file
 
 Bytes = npt.NDArray[np.uint8]
 
 _BOOK = 256
+_META_BYTES = 1 << 20
 # Entries of the palette of SH coefficients: at most, and one for so many Gaussians.
 # A model of fewer Gaussians than `_EXACT` has an entry for each.
 _PALETTE, _SHARED, _EXACT = 65536, 16, 4096
@@ -181,3 +184,136 @@ def _quats(quats: Tensor) -> Bytes:
     others = turned[torch.arange(4)[None] != largest].reshape(-1, 3)
     codes = ((others * 2**0.5 + 1) / 2 * 255).round().clamp(0, 255)
     return torch.cat([codes, 252.0 + largest], dim=1).to(torch.uint8).numpy()
+
+
+def read_sog(path: Path) -> Gaussians:
+    """Read an SOG file (a ZIP archive).
+
+    Raises:
+        ValueError: the file is damaged, or inflates to more than its pictures can need.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            meta, count = _checked_meta(path, archive)
+            return _decoded(path, archive, meta, count)
+    except _DAMAGED as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    except (LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged: meta.json lacks a field or has one of another kind") from error
+
+
+# Numbers of the least and the largest values of a part.
+_WIDTHS = {"means": 3, "scales": 3, "quats": 3, "sh0": 4, "shN": 1}
+# What zipfile and OpenCV raise; OSError: of a place before the file's begin.
+_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, OSError, RuntimeError, cv2.error)
+
+
+def _checked_meta(path: Path, archive: zipfile.ZipFile) -> tuple[dict[str, Any], int]:
+    """Return meta.json and the number of Gaussians, which fits the other parts of the archive."""
+    entries = {entry.filename: entry for entry in archive.infolist()}
+    if "meta.json" not in entries:
+        raise ValueError(f"{path}: the archive has no meta.json")
+    if entries["meta.json"].file_size > _META_BYTES:
+        raise ValueError(f"{path}: meta.json has {entries['meta.json'].file_size:,} bytes")
+    try:
+        meta = json.loads(archive.read("meta.json"))
+    except ValueError as error:
+        raise ValueError(f"{path}: meta.json is no JSON: {error}") from error
+    count = meta["count"] if "version" in meta else meta["means"]["shape"][0]
+    if type(count) is not int or count < 1:
+        raise ValueError(f"{path}: meta.json names {count!r} Gaussians")
+    check_memory(f"{path} says that it holds", count, 3)
+    for part in ("means", "scales", "quats", "sh0", *(["shN"] if "shN" in meta else [])):
+        for name in ("codebook", "mins", "maxs"):
+            if name not in meta[part]:
+                continue
+            numbers, size = _numbers(meta[part][name]), _BOOK if name == "codebook" else _WIDTHS[part]
+            if len(numbers) != size or not np.isfinite(numbers).all():
+                raise ValueError(f"{path}: the {name} of {part} is not {size} finite numbers")
+        for name in meta[part]["files"]:
+            if name not in entries:
+                raise ValueError(f"{path}: the archive has no {name}")
+            largest = max(2 * count, 16 * _PALETTE) + (1 << 16)
+            if entries[name].file_size > 8 * largest:
+                raise ValueError(f"{path}: {name} inflates to {entries[name].file_size:,} bytes")
+            width, height = _webp_size(archive.read(name), f"{path}: {name}")
+            least = 1 if "centroids" in name else count
+            if not least <= width * height <= largest:
+                raise ValueError(f"{path}: {name} has {width} x {height} pixels for {count:,} Gaussians")
+    return meta, count
+
+
+def _numbers(values: Any) -> npt.NDArray[np.float32]:
+    """Return numbers of meta.json; a value that is none is not a number."""
+    flat = values if isinstance(values, list) else [values]
+    with np.errstate(over="ignore"):
+        return np.array([v if isinstance(v, (int, float)) else np.nan for v in flat], dtype=np.float32)
+
+
+def _decoded(path: Path, archive: zipfile.ZipFile, meta: dict[str, Any], count: int) -> Gaussians:
+    """Return the Gaussians of an archive whose parts have been checked."""
+
+    def picture(part: str, index: int = 0) -> Bytes:
+        """Return a picture, [H, W, 4], red first."""
+        name = meta[part]["files"][index]
+        found = cv2.imdecode(np.frombuffer(archive.read(name), np.uint8), cv2.IMREAD_UNCHANGED)
+        if found is None or found.ndim != 3 or found.shape[2] < 3 or found.dtype != np.uint8:
+            raise ValueError(f"{path}: {name} is no WebP picture of colours")
+        alpha = found[..., 3] if found.shape[2] == 4 else np.full(found.shape[:2], 255, np.uint8)
+        return np.dstack([found[..., 2::-1], alpha])
+
+    def codes(part: str, index: int = 0) -> Bytes:
+        """Return the bytes of each Gaussian, [N, 4]."""
+        found = picture(part, index).reshape(-1, 4)[:count]
+        if len(found) < count:
+            raise ValueError(f"{path}: a picture of {part} has {len(found):,} pixels for {count:,} Gaussians")
+        return found
+
+    def values(part: str, of: Bytes) -> npt.NDArray[np.float32]:
+        """Return the numbers that bytes stand for; version 1 has no codebooks."""
+        if "codebook" in meta[part]:
+            return _numbers(meta[part]["codebook"])[of]
+        least, most = (_numbers(meta[part][end])[: of.shape[1]] for end in ("mins", "maxs"))
+        return least + of.astype(np.float32) / 255 * (most - least)
+
+    places = codes("means")[:, :3] + codes("means", 1)[:, :3].astype(np.uint16) * 256
+    least, most = (_numbers(meta["means"][end]).astype(np.float64) for end in ("mins", "maxs"))
+    logs = least + places / 65535 * (most - least)
+    with np.errstate(over="ignore"):
+        means = (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
+    turns, shades = codes("quats"), codes("sh0")
+    if turns[:, 3].min() < 252:
+        raise ValueError(f"{path}: a pixel of quats names no largest component")
+    if "codebook" in meta["sh0"]:
+        opacities = torch.from_numpy((shades[:, 3] / np.float32(255)).clip(1e-6, 1 - 1e-6)).logit()
+    else:
+        opacities = torch.from_numpy(values("sh0", shades)[:, 3])
+    sh = values("sh0", shades[:, :3])[:, None]
+    if "shN" in meta:
+        entries, labels = picture("shN"), codes("shN", 1)
+        named = labels[:, 0] + labels[:, 1].astype(np.int64) * 256
+        size, k = 64 * len(entries), entries.shape[1] // 64
+        if entries.shape[1] not in (64 * 3, 64 * 8, 64 * 15) or named.max() >= size:
+            raise ValueError(f"{path}: the palette of shN has {entries.shape[1]} x {len(entries)} pixels")
+        palette = values("shN", entries[..., :3].reshape(-1, 3)).reshape(size, k, 3)
+        sh = np.concatenate([sh, palette[named]], axis=1)
+    return Gaussians(
+        means=torch.from_numpy(means),
+        quats=quats_without_largest((turns[:, :3] / np.float32(255) - 0.5) * 2**0.5, turns[:, 3] - 252),
+        scales=torch.from_numpy(values("scales", codes("scales")[:, :3])),
+        opacities=opacities,
+        sh=torch.from_numpy(sh),
+        comments=[MIP] if meta.get("antialias", False) else [],
+    )
+
+
+def _webp_size(data: bytes, where: str) -> tuple[int, int]:
+    """Return width and height of a WebP picture from its first chunk."""
+    head: npt.NDArray[np.uint8] = np.frombuffer(data[:30].ljust(30, b"\0"), np.uint8)
+    kind = data[12:16]
+    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or kind not in (b"VP8L", b"VP8X"):
+        raise ValueError(f"{where} is no lossless WebP picture")
+    if kind == b"VP8L":
+        bits = int.from_bytes(head[21:25].tobytes(), "little")
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    return tuple(int.from_bytes(head[i : i + 3].tobytes(), "little") + 1 for i in (24, 27))  # type: ignore[return-value]

@@ -9,6 +9,8 @@ EPSG:4978 where the model is georeferenced, else it turns the model's up to +Z.
 
 from __future__ import annotations
 
+import fcntl
+import glob
 import json
 import math
 import multiprocessing
@@ -17,7 +19,7 @@ import secrets
 import shutil
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,7 @@ from blitzgs.formats.glb import write_glb
 from blitzgs.formats.partition import BITS, Counts, Partition, Parts, extents
 from blitzgs.formats.web_page import WebScene, tiles_page
 from blitzgs.util.output import sync_to_disk, write_file
+from blitzgs.util.processes import follow_parent
 
 TILESET, PAGE = "tileset.json", "index.html"
 # Gaussians of a tile: 8 MB at SH degree 3.
@@ -130,6 +133,8 @@ def write_tiles(
 def new_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary folder, which gets its final name when the context ends without an error.
 
+    What a process left here that was killed is removed.
+
     Raises:
         FileExistsError: `path` is a file or a link, or a folder with files.
         OSError: the folder cannot be written.
@@ -137,8 +142,14 @@ def new_folder(path: Path) -> Iterator[Path]:
     if path.is_symlink() or (path.exists() and not path.is_dir()) or (path.is_dir() and any(path.iterdir())):
         raise FileExistsError(f"{path} exists and is not an empty folder: remove it or choose another name")
     path.parent.mkdir(parents=True, exist_ok=True)
+    for left in path.parent.glob(f".{glob.escape(path.name)}.{'[0-9a-f]' * 8}.partial"):
+        with suppress(OSError), _locked(left):
+            shutil.rmtree(left)
     partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
     partial.mkdir()
+    held = ExitStack()
+    with suppress(OSError):  # some file systems of networks have no locks
+        held.enter_context(_locked(partial))
     try:
         yield partial
         sync_to_disk(partial)
@@ -151,6 +162,18 @@ def new_folder(path: Path) -> Iterator[Path]:
         raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+        held.close()
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder; BlockingIOError: another process has it."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def tree(counts: Counts, most: int) -> tuple[Tile, npt.NDArray[np.int64]]:
@@ -209,11 +232,16 @@ def each_part(
             yield work(parts, folder, number)
         return
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, initializer=torch.set_num_threads, initargs=(1,))
+    pool = ProcessPoolExecutor(processes, context, _prepare)
     try:
         yield from pool.map(work, [parts] * len(chosen), [folder] * len(chosen), chosen)
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _prepare() -> None:
+    follow_parent()
+    torch.set_num_threads(1)
 
 
 def _encode(parts: Parts, folder: Path, part: int) -> tuple[Array, int, int]:

@@ -96,8 +96,8 @@ class TableAdam:
 
         Args:
             table: the table that was rendered, unchanged since.
-            frame: of `pipeline.forward`.
-            gradients: gradients of the frame's splats, from `pipeline.backward_splats`.
+            frame: of `frame.forward`.
+            gradients: gradients of the frame's splats, from `frame.backward_splats`.
             scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no
                 such term.
             opacity_reg: weight per view, [B], of the opacity of each Gaussian visible in it; None: no such

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.cameras import camera_centres
-from blitzgs.runs import exposure
 from blitzgs.runs import files as run_files
-from blitzgs.runs.cameras import CAMERAS, RunCameras, load_cameras
+from blitzgs.runs.cameras import CAMERAS, EXPOSURES, RunCameras, load_cameras
 from blitzgs.runs.evaluation import FOLDER, INDEX, METRICS, PARTS, preview_file
 from blitzgs.runs.folder import RunFolder, open_run
 from blitzgs.viewer.world import horizontal, up_direction
@@ -192,7 +191,7 @@ def _other_views(data: RunData) -> dict[str, dict[str, float]]:
 
 def exposures(data: RunData) -> list[list[Any]]:
     """Return [name, gain R, G, B, bias R, G, B] of the training photographs; empty without exposures."""
-    path = data.folder.path / exposure.FILE
+    path = data.folder.path / EXPOSURES
     if not path.exists():
         return []
     try:

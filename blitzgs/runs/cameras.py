@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stores the cameras of a run in its folder, so that rendering does not need the capture."""
+"""Stores a run's cameras in its folder, so that rendering needs no capture, and photographs' exposures."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
 from blitzgs.capture.cameras import MAX_SIDE, Float64
 from blitzgs.capture.capture import Capture
@@ -191,3 +193,29 @@ def _indices(values: Sequence[int], count: int) -> list[int]:
     if any(not 0 <= index < count for index in indices):
         raise ValueError("a view of the split does not exist")
     return indices
+
+
+# Photographs whose gains differ by less than this, as a standard deviation, have the same exposure.
+LEAST_SPREAD = 0.02
+# File in the folder of a finished run: gain and bias, [2, 3], by the name of the photograph.
+EXPOSURES = "exposures.json"
+# Name of the tensor among those of a checkpoint that are the same on all ranks.
+SHARED_EXPOSURES = "exposures"
+
+
+def effective_exposures(measured: Tensor) -> Tensor:
+    """Return gain and bias of each training view as they are used, float64 [T, 2, 3], from the measured ones.
+
+    Their means over the views are 1 and 0. Photographs that agree all have 1 and 0. Does not wait.
+    """
+    mean = measured.mean(0)
+    same = torch.zeros_like(mean)
+    same[0] = 1
+    differs = measured[:, 0].std(0, correction=0).mean() >= LEAST_SPREAD
+    return torch.where(differs, measured - mean + same, same)
+
+
+def stored_exposures(shared: Mapping[str, Tensor]) -> Tensor | None:
+    """Return `effective_exposures` of a checkpoint's exposures; None if the run has none."""
+    found = shared.get(SHARED_EXPOSURES)
+    return None if found is None else effective_exposures(found[:, :-1].reshape(-1, 2, 3))

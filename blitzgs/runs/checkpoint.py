@@ -48,23 +48,6 @@ class CheckpointError(RuntimeError):
         self.lacks_space = lacks_space
 
 
-def save(
-    directory: str | os.PathLike[str],
-    columns: Mapping[str, Tensor],
-    state: Mapping[str, Any],
-    ranks: Ranks,
-    keep: int = 3,
-    shared: Mapping[str, Tensor] | None = None,
-    reached: Callable[[str], None] = lambda point: None,
-) -> Path:
-    """Write a checkpoint and delete older ones; return its folder. Else as for `Saving`."""
-    saving = Saving(directory, columns, state, ranks, keep, shared, reached)
-    path = saving.finish()
-    if saving.deleting is not None:
-        saving.deleting.join()
-    return path
-
-
 class Saving:
     """A checkpoint that a thread of each rank writes; there is none until `finish` has returned.
 
@@ -235,7 +218,7 @@ def load_latest(
     the reasons, and the checkpoint that is used.
 
     Args:
-        directory: folder given to `save`.
+        directory: folder given to `Saving`.
         ranks: the job, of any world size.
         device: where the columns go.
         problem: returns what is wrong with a shard's columns, or None.
@@ -276,7 +259,7 @@ def load(
     (`sharding.global_positions`), and opens only the files that hold some of these rows.
 
     Args:
-        path: folder returned by `save`.
+        path: folder returned by `Saving.finish`.
         ranks: the job, of any world size.
         device: where the columns go.
 

@@ -8,7 +8,6 @@ the camera among all of the run, and `views.json`, the list of these numbers.
 
 from __future__ import annotations
 
-import heapq
 import json
 import math
 import warnings
@@ -22,7 +21,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.capture.images import Images, PhotographError
+from blitzgs.capture.images import ImageStore, PhotographError
 from blitzgs.capture.pictures import comparison, encode_image, error_map, to_uint8
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
@@ -46,23 +45,28 @@ class EvaluationStoppedError(Exception):
     """An evaluation was given up because the run has to stop."""
 
 
-def image_metrics(render: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, float]:
-    """Return PSNR in dB, SSIM, and the PSNR after `correct_colours` ("psnr_corrected") of one view.
+def image_metrics(
+    render: Tensor, target: Tensor, mask: Tensor | None, lpips: Lpips | None = None
+) -> dict[str, float]:
+    """Return PSNR in dB, SSIM, the PSNR after `correct_colours` ("psnr_corrected"), and LPIPS of one view.
 
-    Args:
-        render: float [H, W, 3]; clamped to [0, 1] and not quantised.
-        target: uint8 [H, W, 3].
-        mask: uint8 [H, W]; pixels with 0 are left out of all metrics; None: no mask.
+    The render, float [H, W, 3], is clamped to [0, 1] and not quantised; the target is uint8 [H, W, 3]. Pixels
+    with 0 in the mask, uint8 [H, W], are left out of all metrics but LPIPS.
     """
     render = render.clamp(0.0, 1.0)
+    mask = None if mask is None else mask.to(target.device)
     counted = torch.ones_like(target[..., 0]) if mask is None else mask
     pixels, wanted = render[counted != 0].double(), target[counted != 0].double() / 255.0
     similarity = ssim(render[None], target[None], None if mask is None else mask[None])
-    return {
+    metrics = {
         "psnr": _psnr(pixels, wanted),
         "ssim": similarity.item(),
         "psnr_corrected": _psnr(correct_colours(pixels, wanted), wanted),
     }
+    if lpips is not None:
+        pair = (image.permute(2, 0, 1)[None].cpu() * 2 - 1 for image in (render, target.float() / 255))
+        metrics["lpips"] = float(lpips(*pair))
+    return metrics
 
 
 def correct_colours(pixels: Tensor, wanted: Tensor) -> Tensor:
@@ -127,22 +131,11 @@ def render_view(
     return frame.renders[0] if ranks.rank == destination else None
 
 
-def _compare(render: Tensor, target: Tensor, mask: Tensor | None, lpips: Lpips | None) -> dict[str, float]:
-    """Return all metrics of one view; arguments as for `image_metrics`."""
-    metrics = image_metrics(render, target, None if mask is None else mask.to(target.device))
-    if lpips is not None:
-        pair = [
-            image.permute(2, 0, 1)[None].cpu() * 2 - 1 for image in (render.clamp(0, 1), target.float() / 255)
-        ]
-        metrics["lpips"] = float(lpips(pair[0], pair[1]))
-    return metrics
-
-
 def evaluate(
     scene: Scene,
     views: ViewSet,
     cameras: Sequence[CameraLike],
-    images: Images,
+    images: ImageStore,
     indices: Sequence[int],
     options: RenderOptions,
     folder: Path | None,
@@ -205,7 +198,7 @@ def evaluate(
                 continue
             if mask is not None and not bool(mask.any()):
                 continue  # nothing to compare
-            per_view[cameras[index].name] = _compare(render, target, mask, lpips)
+            per_view[cameras[index].name] = image_metrics(render, target, mask, lpips)
             if files is not None and index in chosen:
                 picture = comparison(render, target, mask)
                 files.write(chosen[index], encode_image(picture, ".jpg"))
@@ -306,28 +299,23 @@ class Previews:
         """Begin; `fixed` are cameras whose pictures are kept whatever their PSNR."""
         self._folder, self._fixed = folder / FOLDER, fixed
         self._kept: dict[int, dict[str, bytes]] = {}
-        # The smallest entry of each is the next to be dropped: (PSNR, camera) and (-PSNR, camera).
-        self._best: list[tuple[float, int]] = []
-        self._worst: list[tuple[float, int]] = []
+        self._psnr: dict[int, float] = {}  # of this rank's views so far
 
     def add(self, index: int, psnr: float, render: Tensor, target: Tensor, mask: Tensor | None) -> None:
         """Take a measured view; arguments are those of `blitzgs.capture.pictures.comparison`."""
-        dropped = _push(self._best, (psnr, index)) | _push(self._worst, (-psnr, index))
-        if index in self._needed():
+        self._psnr[index] = psnr
+        needed = _extremes(self._psnr) | self._fixed
+        if index in needed:
             pictures = (to_uint8(render), to_uint8(target), to_uint8(error_map(render, target, mask)))
             self._kept[index] = {
                 part: _encoded(picture) for part, picture in zip(PARTS, pictures, strict=True)
             }
-        for other in dropped - self._needed():
-            self._kept.pop(other, None)
-
-    def _needed(self) -> set[int]:
-        return {index for _, index in (*self._best, *self._worst)} | self._fixed
+        for other in self._kept.keys() - needed:
+            del self._kept[other]
 
     def files(self, psnr: Mapping[int, float], lists: bool) -> Iterator[tuple[Path, bytes]]:
         """Return this rank's files, given the PSNR of all ranks' views; one rank also `lists` the cameras."""
-        ordered = sorted(psnr, key=lambda index: (psnr[index], index))
-        chosen = {*ordered[:_EXTREMES], *ordered[-_EXTREMES:]} | (self._fixed & psnr.keys())
+        chosen = _extremes(psnr) | (self._fixed & psnr.keys())
         for index in sorted(chosen & self._kept.keys()):
             for part, content in self._kept[index].items():
                 yield preview_file(self._folder, index, part), content
@@ -340,12 +328,10 @@ def preview_file(folder: Path, index: int, part: str) -> Path:
     return folder / f"{index:06d}_{part}.webp"
 
 
-def _push(heap: list[tuple[float, int]], entry: tuple[float, int]) -> set[int]:
-    """Add an entry; return the camera of the one that no longer fits, if any."""
-    if len(heap) < _EXTREMES:
-        heapq.heappush(heap, entry)
-        return set()
-    return {heapq.heappushpop(heap, entry)[1]}
+def _extremes(psnr: Mapping[int, float]) -> set[int]:
+    """Return the cameras of the best and the worst views."""
+    ordered = sorted(psnr, key=lambda index: (psnr[index], index))
+    return {*ordered[:_EXTREMES], *ordered[-_EXTREMES:]}
 
 
 def _encoded(picture: npt.NDArray[np.uint8]) -> bytes:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,10 +14,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from blitzgs.formats.gaussians import Gaussians, GaussianSource
+from blitzgs.config.files import changed
+from blitzgs.formats.gaussians import GaussianSource
 from blitzgs.formats.models import FORMATS, Format, check_replaces
 from blitzgs.runs.folder import Model
-from blitzgs.runs.source import source_of
+from blitzgs.runs.source import Changed, source_of
 from blitzgs.util.output import write_file
 from blitzgs.view.views import CameraLike, Space
 
@@ -77,43 +78,21 @@ def export(
                 f"{sidecar} exists and is not the offset of an exported model: choose another name"
             )
         x, y, z = space.offset
-        kind.write(path, _Moved(source, None, [*source.comments, f"comment offset {x!r} {y!r} {z!r}"]))
+        lines = [*source.comments, f"comment offset {x!r} {y!r} {z!r}"]
+        kind.write(path, Changed(source, lambda block: block, lines))
         meaning = "capture coordinates = coordinates in the file + offset"
         content = {"file": path.name, "offset": space.offset, "meaning": meaning}
         write_file(sidecar, json.dumps(content | ({"crs": crs} if crs else {}), indent=1))
         return Exported(space.offset, sidecar, _spacing(reach[0]))
-    kind.write(path, _Moved(source, offset, source.comments))
+    shift = torch.from_numpy(offset)
+    moved = Changed(
+        source, lambda block: replace(block, means=(block.means.double() + shift).float()), source.comments
+    )
+    kind.write(path, moved)
     # The offset of an earlier export to this name would move the model once more.
     if _has_offset(sidecar):
         sidecar.unlink()
     return Exported(None, None, rounding)
-
-
-@dataclass
-class _Moved:
-    """A source at another place, with other header lines."""
-
-    source: GaussianSource
-    offset: npt.NDArray[np.float64] | None
-    comments: list[str]
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    @property
-    def degree(self) -> int:
-        return self.source.degree
-
-    @property
-    def has_levels(self) -> bool:
-        return self.source.has_levels
-
-    def blocks(self) -> Iterator[Gaussians]:
-        for block in self.source.blocks():
-            means = block.means
-            if self.offset is not None:
-                means = (means.double() + torch.from_numpy(self.offset)).float()
-            yield replace(block, means=means, comments=self.comments)
 
 
 def _measured(source: GaussianSource, offset: npt.NDArray[np.float64]) -> tuple[tuple[float, float], float]:
@@ -164,5 +143,5 @@ def without_antialiasing(model: Model, cameras: Sequence[CameraLike]) -> Model:
     # A Gaussian that no view sees stays as it is.
     factor = torch.where(areas > 0, compensated / areas.clamp_min(1e-300), 1.0)
     baked = (opacities.double() * factor).clamp(1e-6, 1 - 1e-6)
-    config = replace(model.config, model=replace(model.config.model, antialiased=False))
+    config = changed(model.config, "model", antialiased=False)
     return replace(model, opacities=baked.logit().float(), config=config)

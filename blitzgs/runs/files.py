@@ -17,11 +17,12 @@ import torch
 
 import blitzgs
 from blitzgs.config.fields import Config
-from blitzgs.config.files import ConfigError, flat, from_dict, load_config, to_dict
+from blitzgs.config.files import ConfigError, changed, flat, from_dict, load_config, to_dict
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs import checkpoint, exposure
+from blitzgs.runs import checkpoint
+from blitzgs.runs.cameras import stored_exposures
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.folder_checks import check_own
 from blitzgs.runs.guard import bad_column, check_before_saving
@@ -251,10 +252,12 @@ def open_model(
     if ranks.rank == 0:
         compare_with_file(config, folder / CONFIG)
     if data is not None:
-        config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
+        config = changed(config, "data", path=str(data))
     optimiser = TableAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
     optimiser.catch_up(table, None, progress.step)
-    return TrainedModel(config, progress, restored.space, table, pool_bytes, exposure.stored(restored.shared))
+    return TrainedModel(
+        config, progress, restored.space, table, pool_bytes, stored_exposures(restored.shared)
+    )
 
 
 def _resident_gb(path: Path) -> float:
@@ -269,7 +272,8 @@ def compare_with_file(config: Config, path: Path) -> None:
     """Warn if a run's configuration file differs from the configuration in its checkpoint."""
     try:
         # The file has the pace of the run's beginning or, after its end, the final one.
-        fields = _changed_fields(config, with_pace_of(load_config(path), config))
+        found = with_pace_of(load_config(path), config)
+        fields = [name for name, *_ in _differences(config, found) if not _is_free(name)]
         what = f"differs in {', '.join(fields)}" if fields else ""
     except ConfigError as error:
         what = f"cannot be read ({error})"
@@ -307,10 +311,6 @@ def with_pace_of(config: Config, saved: Config | None) -> Config:
 
 def _is_free(name: str) -> bool:
     return any(name == free or name.startswith(free + ".") for free in FREE_FIELDS)
-
-
-def _changed_fields(saved: Config, found: Config) -> list[str]:
-    return [name for name, *_ in _differences(saved, found) if not _is_free(name)]
 
 
 def _differences(saved: Config, found: Config) -> list[tuple[str, Any, Any]]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from blitzgs.config.fields import Config
+from blitzgs.config.files import changed
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.models import offset_of
@@ -58,5 +58,4 @@ def model_of_file(found: Gaussians, config: Config, space: Space, near: float, r
     table = table_of_parameters({name: column.to(ranks.device) for name, column in columns.items()})
     progress = Progress(step=0, sh_degree=found.degree, level_count=1, peak_gaussians=len(found), seconds=0.0)
     near /= space.unit * space.extent
-    config = replace(config, model=replace(config.model, near=near))
-    return TrainedModel(config, progress, space, table)
+    return TrainedModel(changed(config, "model", near=near), progress, space, table)

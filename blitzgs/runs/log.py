@@ -182,7 +182,7 @@ class RunLog:
         if self._board is not None:
             self._board.close()
         if self._file is not None:
-            self._file.close()
+            self._file.flush()
             self._file = None
 
     def _write(self, t: int, values: Mapping[str, Any]) -> None:
@@ -205,26 +205,22 @@ class _JsonLines:
 
     def add(self, record: Mapping[str, Any]) -> None:
         self._waiting.append(json.dumps(record).encode() + b"\n")
-        with self._failures.tolerated("log file"):
-            self._flush()
+        self.flush()
 
-    def close(self) -> None:
+    def flush(self) -> None:
         with self._failures.tolerated("log file"):
-            self._flush()
-
-    def _flush(self) -> None:
-        if not self._waiting:
-            return
-        # Open the file each time, because its disk may have been detached and attached again.
-        with open(self._path, "ab", buffering=0) as file:
-            while self._waiting:
-                line = self._waiting[0]
-                written = file.write(line)
-                if written < len(line):
-                    # Write the rest when there is space again; readers skip lines that stay incomplete.
-                    self._waiting[0] = line[written:]
-                    raise OSError("the disk is full")
-                self._waiting.popleft()
+            if not self._waiting:
+                return
+            # Open the file each time, because its disk may have been detached and attached again.
+            with open(self._path, "ab", buffering=0) as file:
+                while self._waiting:
+                    line = self._waiting[0]
+                    written = file.write(line)
+                    if written < len(line):
+                        # Write the rest when there is space again; readers skip lines that stay incomplete.
+                        self._waiting[0] = line[written:]
+                        raise OSError("the disk is full")
+                    self._waiting.popleft()
 
 
 class _Board:

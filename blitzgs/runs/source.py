@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -31,35 +31,34 @@ from blitzgs.view.gate import LodGate
 from blitzgs.view.views import Space
 
 
-@dataclass
-class RunSource:
-    """Gaussians of a run, a `GaussianSource`."""
+class Changed:
+    """A `GaussianSource` whose blocks are changed one by one, with header lines of its own."""
 
-    trained: GaussianSource  # the Gaussians in the trained world
-    space: Space  # maps between the trained world and the capture's world
-    comments: list[str]  # header lines
-    config: Config
+    def __init__(
+        self, source: GaussianSource, change: Callable[[Gaussians], Gaussians], comments: list[str]
+    ) -> None:
+        self._source, self._change, self.comments = source, change, comments
+        self.degree, self.has_levels = source.degree, source.has_levels
 
     def __len__(self) -> int:
-        return len(self.trained)
-
-    @property
-    def degree(self) -> int:
-        """The spherical-harmonics degree."""
-        return self.trained.degree
-
-    @property
-    def has_levels(self) -> bool:
-        """Whether views leave out Gaussians by their octree levels."""
-        return self.trained.has_levels
+        return len(self._source)
 
     def blocks(self) -> Iterator[Gaussians]:
-        """Yield all Gaussians, scaled; the unit is a power of two, so that positions keep their bits."""
+        """Yield all Gaussians, changed."""
+        for block in self._source.blocks():
+            yield dataclasses.replace(self._change(block), comments=self.comments)
+
+
+class RunSource(Changed):
+    """The Gaussians of a run; the unit is a power of two, so that positions keep their bits."""
+
+    def __init__(self, trained: GaussianSource, space: Space, comments: list[str], config: Config) -> None:
+        self.space, self.config = space, config
+        super().__init__(trained, self._scaled, comments)
+
+    def _scaled(self, block: Gaussians) -> Gaussians:
         unit = self.space.unit
-        for block in self.trained.blocks():
-            yield dataclasses.replace(
-                block, means=block.means * unit, scales=block.scales + math.log(unit), comments=self.comments
-            )
+        return dataclasses.replace(block, means=block.means * unit, scales=block.scales + math.log(unit))
 
 
 def source_of(model: Model) -> RunSource:

@@ -12,9 +12,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.capture.cameras import camera_centres
+from blitzgs.capture.cameras import SourceView, camera_centres
 from blitzgs.capture.colmap import ColmapModel, Float64, count_images, read_model, world_to_camera
-from blitzgs.capture.layouts import SourceView
 from blitzgs.capture.lengths import find_apart
 from blitzgs.capture.lens import Lens
 from blitzgs.sfm.engine import Found, Job, read_found, read_positions

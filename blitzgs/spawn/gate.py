@@ -151,18 +151,19 @@ class SpawnGate:
         return tree_sums(features, trees.roots, trees.nodes, trees.leaves, trees.depth)
 
 
+@dataclass(frozen=True)
 class RankVeto:
     """Vetoes the share of clones, and of splits, with the lowest scores over all ranks."""
 
-    def __init__(self, gate: SpawnGate, rate: float) -> None:
-        """Veto by a gate's scores; `rate` is the vetoed share, in [0, 1]."""
-        self._gate, self._rate = gate, rate
+    gate: SpawnGate
+    rate: float  # in [0, 1]
 
     def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
         """Tell which candidates are vetoed, bool [M]; ties go to the smaller id. Collective."""
-        return veto_lowest(self._gate.scores(candidates.features).float(), candidates, self._rate, ranks)
+        return veto_lowest(self.gate.scores(candidates.features).float(), candidates, self.rate, ranks)
 
 
+@dataclass(frozen=True)
 class SampledVeto:
     """Vetoes a share of clones, and of splits, at random, the likelier the lower a gate's scores.
 
@@ -170,29 +171,29 @@ class SampledVeto:
     candidate of low rank, which `RankVeto` would withhold at event after event, is thus kept now and then.
     """
 
-    def __init__(self, gate: SpawnGate, rate: float, seed: int) -> None:
-        """Veto by a gate's scores; `rate` is the vetoed share, in [0, 1]."""
-        self._gate, self._rate, self._seed = gate, rate, seed
+    gate: SpawnGate
+    rate: float  # in [0, 1]
+    seed: int
 
     def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
         """Tell which candidates are vetoed, bool [M], the same ones at every world size. Collective."""
-        log_odds = self._gate.scores(candidates.features).double() * 2.0**-_LEAF_BITS
+        log_odds = self.gate.scores(candidates.features).double() * 2.0**-_LEAF_BITS
         # The order of exponential races, whose keys are -log(u) / odds, by the logarithms of the keys: the
         # odds themselves may exceed the range of numbers.
-        races = (-veto_draws(candidates, self._seed).log()).log() - log_odds
-        return veto_lowest((-races).float(), candidates, self._rate, ranks)
+        races = (-veto_draws(candidates, self.seed).log()).log() - log_odds
+        return veto_lowest((-races).float(), candidates, self.rate, ranks)
 
 
+@dataclass(frozen=True)
 class RandomVeto:
     """Vetoes a share of clones, and of splits, at random, the same ones at every world size."""
 
-    def __init__(self, rate: float, seed: int) -> None:
-        """Veto a share `rate` of the candidates."""
-        self._rate, self._seed = rate, seed
+    rate: float  # in [0, 1]
+    seed: int
 
     def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
         """Tell which candidates are vetoed, bool [M]. Collective."""
-        return veto_lowest(veto_draws(candidates, self._seed).float(), candidates, self._rate, ranks)
+        return veto_lowest(veto_draws(candidates, self.seed).float(), candidates, self.rate, ranks)
 
 
 def veto_draws(candidates: Candidates, seed: int) -> Tensor:

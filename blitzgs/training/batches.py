@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from blitzgs.capture.images import Images
+from blitzgs.capture.images import ImageStore
 from blitzgs.frame.frame import Views
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
@@ -141,7 +141,7 @@ class BatchLoader:
 
     def __init__(
         self,
-        images: Images,
+        images: ImageStore,
         views: ViewSet,
         train: list[int],
         sampler: BatchSampler,

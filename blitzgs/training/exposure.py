@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.exposure import FILE, SHARED, effective
+from blitzgs.runs.cameras import EXPOSURES, SHARED_EXPOSURES, effective_exposures
 from blitzgs.training.batches import Batch
 from blitzgs.util.output import write_file
 
@@ -51,7 +51,7 @@ class Exposures:
 
     def effective(self) -> Tensor:
         """Return gain and bias of each training view as they are used, float64 [T, 2, 3]; does not wait."""
-        return effective(self.measured)
+        return effective_exposures(self.measured)
 
     def of(self, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Return gains and biases, float32 [B, 1, 1, 3] each; of views without any, 1 and 0."""
@@ -94,11 +94,11 @@ class Exposures:
 
     def columns(self) -> dict[str, Tensor]:
         """Return what a resumed run needs; the same on every rank."""
-        return {SHARED: torch.cat([self.measured.flatten(1), self.counts[:, None]], dim=1)}
+        return {SHARED_EXPOSURES: torch.cat([self.measured.flatten(1), self.counts[:, None]], dim=1)}
 
     def restore(self, columns: Mapping[str, Tensor]) -> None:
         """Restore the state from `columns`; those of other training views are ignored."""
-        found = columns.get(SHARED)
+        found = columns.get(SHARED_EXPOSURES)
         if found is not None and len(found) == len(self.counts):
             found = found.to(self.measured.device)
             self.measured, self.counts = found[:, :-1].reshape(-1, 2, 3).clone(), found[:, -1].clone()
@@ -106,7 +106,7 @@ class Exposures:
     def write(self, folder: Path, names: Sequence[str]) -> None:
         """Write `effective` into the folder of a run, by the names of the training views."""
         found = self.effective().cpu().numpy().round(5).tolist()
-        write_file(folder / FILE, json.dumps(dict(zip(names, found, strict=True))))
+        write_file(folder / EXPOSURES, json.dumps(dict(zip(names, found, strict=True))))
 
     def describe(self) -> dict[str, float]:
         """Return figures for the summary: spread and range of the gains in use, mean of the channels."""

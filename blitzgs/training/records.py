@@ -6,16 +6,18 @@ from __future__ import annotations
 import contextlib
 import math
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any, NamedTuple
 
 import torch
 
+from blitzgs.config.files import config_hash
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.frame import Frame
 from blitzgs.ops.host import HostCopy
-from blitzgs.runs.files import memory_bytes, peak_memory_bytes
+from blitzgs.runs.files import memory_bytes, peak_memory_bytes, versions
 from blitzgs.runs.guard import check_table, find_bad
 from blitzgs.runs.log import LOG, records
 from blitzgs.training.batches import Batch
@@ -25,28 +27,10 @@ from blitzgs.util.charts import line_chart
 from blitzgs.util.output import write_file
 
 PICTURE = "trajectory.svg"
-_STAGES = ("before_pass_1", "after_pass_1", "peak", "before_pass_2", "after_pass_2", "final")
+_STAGES = ("initial", "before_pass_1", "after_pass_1", "peak", "before_pass_2", "after_pass_2", "final")
 
 
-@dataclass
-class MemoryMeter:
-    """Samples the memory that this rank's GPU has allocated; does nothing on the CPU."""
-
-    total: float = 0.0
-    samples: int = 0
-
-    def sample(self, device: torch.device) -> None:
-        """Add a sample of the memory that is allocated now."""
-        if device.type == "cuda":
-            self.total += memory_bytes(device)
-            self.samples += 1
-
-    def mean(self) -> int | None:
-        """Return the mean of the samples in bytes; None if there are none."""
-        return round(self.total / self.samples) if self.samples else None
-
-
-def population_report(state: TrainingState, meter: MemoryMeter) -> dict[str, Any]:
+def population_report(state: TrainingState, memory_samples: Sequence[int]) -> dict[str, Any]:
     """Return the population at its stages and the memory of each rank; every rank calls this.
 
     "initial", "before_pass_1" and so on (only passes that happened), "peak" and "final" are numbers of
@@ -55,8 +39,9 @@ def population_report(state: TrainingState, meter: MemoryMeter) -> dict[str, Any
     """
     progress = state.progress
     counts = progress.milestones | {"peak": progress.peak_gaussians, "final": state.population()}
-    memory = state.ranks.all_gather_object((peak_memory_bytes(state.ranks.device), meter.mean()))
-    report: dict[str, Any] = {name: counts[name] for name in ("initial", *_STAGES) if name in counts}
+    mean = round(fmean(memory_samples)) if memory_samples else None
+    memory = state.ranks.all_gather_object((peak_memory_bytes(state.ranks.device), mean))
+    report: dict[str, Any] = {name: counts[name] for name in _STAGES if name in counts}
     report["peak_memory_bytes"] = [peak for peak, _ in memory]
     if all(mean is not None for _, mean in memory):
         report["mean_memory_bytes"] = [mean for _, mean in memory]
@@ -65,10 +50,35 @@ def population_report(state: TrainingState, meter: MemoryMeter) -> dict[str, Any
 
 def describe(report: dict[str, Any]) -> str:
     """Return the report in one line of text."""
-    stages = [
-        f"{name.replace('_', ' ')} {report[name]:,}" for name in ("initial", *_STAGES) if name in report
-    ]
+    stages = [f"{name.replace('_', ' ')} {report[name]:,}" for name in _STAGES if name in report]
     return "population: " + ", ".join(stages)
+
+
+def run_figures(state: TrainingState, population: dict[str, Any]) -> dict[str, Any]:
+    """Return the figures of a run for its summary, besides its metrics. Collective."""
+    figures = {
+        "images": state.images_seen,
+        "seconds": state.progress.seconds,
+        "stages": state.stages(),
+        "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
+        "gaussians": state.population(),
+        "peak_gaussians": state.progress.peak_gaussians,
+        "population": population,
+        "peak_memory_bytes": peak_memory_bytes(state.ranks.device),
+        "config_hash": config_hash(state.config),
+        "run": state.run_id,
+        "versions": versions(state.ranks.device),
+        "largest_fall": state.curve.fall,
+        "warnings": state.curve.warnings(),
+    }
+    if state.config.schedule.minutes > 0:
+        figures |= {
+            "budget_seconds": 60 * state.config.schedule.minutes,
+            "scale": state.images_seen / state.config.schedule.iterations,
+        }
+    if state.stepper.exposures is not None:
+        figures["exposure"] = state.stepper.exposures.describe()
+    return figures
 
 
 def write_picture(state: TrainingState, report: dict[str, Any]) -> None:

@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.capture.capture import Capture
-from blitzgs.capture.images import Images
+from blitzgs.capture.images import ImageStore
 from blitzgs.config.fields import Config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
@@ -162,7 +162,7 @@ def branch_point(folder: Path, config: Config) -> Path:
 def replay(
     config: Config,
     capture: Capture,
-    images: Images,
+    images: ImageStore,
     source: Path,
     out: Path,
     gate: SpawnGate,
@@ -262,7 +262,7 @@ def _branch(point: Path, folder: Path) -> None:
     shutil.copytree(point, checkpoints / point.name)
 
 
-def _check_comparable(config: Config, capture: Capture, images: Images, source: Path) -> None:
+def _check_comparable(config: Config, capture: Capture, images: ImageStore, source: Path) -> None:
     """Check that arms can be branched from a run and that their results can be compared."""
     if not config.population.lineage:
         raise ValueError(

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from blitzgs.capture.capture import Capture, train_views_fingerprint
-from blitzgs.capture.images import Images
+from blitzgs.capture.images import ImageStore
 from blitzgs.config.fields import Config
 from blitzgs.config.files import save_config
 from blitzgs.config.schedule import Schedule, stretched
@@ -21,11 +21,9 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY, octree_gaussians
 from blitzgs.population.position_noise import PositionNoise
-from blitzgs.runs import exposure
 from blitzgs.runs import files as run_files
-from blitzgs.runs.cameras import CAMERAS, save_cameras
+from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_cameras
 from blitzgs.runs.evaluation import load_lpips
-from blitzgs.runs.exposure import SHARED
 from blitzgs.runs.files import Progress
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
 from blitzgs.runs.from_file import trained_columns
@@ -57,7 +55,7 @@ from blitzgs.view.views import Space, ViewSet, trained_centres
 def set_up(
     config: Config,
     capture: Capture,
-    images: Images,
+    images: ImageStore,
     folder: Path,
     ranks: Ranks,
     resume: bool,
@@ -69,7 +67,7 @@ def set_up(
     Args:
         folder: folder of the run, for configuration, log, checkpoints, evaluation and summary.
         resume: continue from the newest checkpoint in `folder`, if there is one.
-        extend: with `resume`, train a finished run longer, see `extension.extended`.
+        extend: with `resume`, train a finished run longer, see `budget.extended`.
         lap: called with the name of each part of this work at its end (`Laps.lap`).
 
     Raises:
@@ -164,7 +162,7 @@ def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
     """Check that a run may write to its folder, and that it replaces nothing there."""
     written = (
         run_files.CONFIG, CAMERAS, LOG, run_files.SUMMARY, PICTURE, run_files.LINEAGE, run_files.REPORT,
-        exposure.FILE,
+        EXPOSURES,
     )  # fmt: skip
     check_unclaimed(folder / run_files.CHECKPOINTS, written, ranks)
     check_writable(folder / run_files.CHECKPOINTS, ranks)
@@ -222,7 +220,7 @@ def _tile_owners(ranks: Ranks, progress: Progress, restored: run_files.Restored 
 
 def _exposures(
     capture: Capture,
-    images: Images,
+    images: ImageStore,
     ranks: Ranks,
     progress: Progress,
     restored: run_files.Restored | None,
@@ -230,7 +228,7 @@ def _exposures(
     """Return the photographs' exposures, from the checkpoint or the tracks; None if they are equal."""
     exposures = Exposures(capture.train, ranks)
     if restored is not None:
-        if SHARED not in restored.shared:
+        if SHARED_EXPOSURES not in restored.shared:
             return None
         # As with the tiles, rows are those of the same training views.
         if restored.progress.train_views in ("", progress.train_views):

@@ -13,8 +13,9 @@ from pathlib import Path
 import torch
 
 from blitzgs.capture.capture import Capture
-from blitzgs.capture.images import Images
+from blitzgs.capture.images import ImageStore
 from blitzgs.config.fields import Config
+from blitzgs.config.files import changed
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.frame import RenderOptions
@@ -49,7 +50,7 @@ class TrainingState:
 
     config: Config
     capture: Capture  # cameras and points
-    images: Images  # the capture's photographs
+    images: ImageStore  # the capture's photographs
     folder: Path  # folder of the run; rank 0 writes most of its files
     ranks: Ranks
     schedule: Schedule  # tells which events happen at which step
@@ -136,7 +137,7 @@ class TrainingState:
         """Multiply `schedule.scale` by `factor` from now on; every rank calls this."""
         schedule = self.config.schedule
         pace = (*schedule.pace, (self.images_seen, factor))
-        self.config = replace(self.config, schedule=replace(schedule, pace=pace))
+        self.config = changed(self.config, "schedule", pace=pace)
         self.schedule = Schedule(self.config.schedule)
         self.optimiser.follow(self.schedule)
         self.sampler.schedule = self.schedule

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from blitzgs.capture import colmap
 from blitzgs.capture.capture import Capture
-from blitzgs.capture.images import Images
+from blitzgs.capture.images import ImageStore
 from blitzgs.distributed.group import Ranks
 
 # Photographs whose gains differ by less than this, as a standard deviation of their logarithms, have the same
@@ -33,7 +33,7 @@ _TURNS = 10
 Rows = tuple[NDArray[np.int64], NDArray[np.float64]]
 
 
-def track_gains(capture: Capture, images: Images, ranks: Ranks) -> Tensor | None:
+def track_gains(capture: Capture, images: ImageStore, ranks: Ranks) -> Tensor | None:
     """Return the gain of each training photograph's channels, float64 [T, 3] with mean 1. Collective.
 
     The logarithm of a photograph's gain is the median, over its points, of the logarithm of the colour that
@@ -82,7 +82,7 @@ def _observed_points(capture: Capture) -> tuple[NDArray[np.float64], list[NDArra
 
 
 def _colors(
-    capture: Capture, images: Images, index: int, points: NDArray[np.float64], seen: NDArray[np.int64]
+    capture: Capture, images: ImageStore, index: int, points: NDArray[np.float64], seen: NDArray[np.int64]
 ) -> Rows:
     """Return the points of a photograph that can be compared, and the logarithms of their colours."""
     camera = capture.cameras[index]

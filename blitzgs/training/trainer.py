@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from blitzgs.capture.capture import Capture
-from blitzgs.capture.images import Images, PhotographError
+from blitzgs.capture.images import ImageStore, PhotographError
 from blitzgs.config.fields import Config
-from blitzgs.config.files import config_hash, save_config
+from blitzgs.config.files import save_config
 from blitzgs.config.schedule import Event
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.frame import Frame
@@ -36,12 +36,12 @@ from blitzgs.training.budget import Budget
 from blitzgs.training.events import evaluate, handle_all, save
 from blitzgs.training.events.evaluate import Glances
 from blitzgs.training.records import (
-    MemoryMeter,
     StepRecord,
     describe,
     log_step,
     measure_step,
     population_report,
+    run_figures,
     write_picture,
 )
 from blitzgs.training.setup import set_up
@@ -60,7 +60,7 @@ class Trainer:
         self,
         config: Config,
         capture: Capture,
-        images: Images,
+        images: ImageStore,
         folder: Path,
         ranks: Ranks,
         resume: bool = False,
@@ -89,7 +89,7 @@ class Trainer:
         self._warned_of_masks = False
         self._watching: Watching | None = None
         self._watched_on = False
-        self.memory = MemoryMeter()
+        self._memory: list[int] = []  # samples of what this rank's GPU has allocated
 
     def watch(self, watcher: Watcher | None, stays: bool = False) -> None:
         """Let somebody watch the training; every rank calls this before `train`, rank 0 with a watcher.
@@ -146,7 +146,7 @@ class Trainer:
                 budget, glances = Budget(state), Glances(state)
                 # What a stop kept from happening after the last step comes first.
                 if not handle_all(state, [Event(*entry) for entry in state.progress.events_left]):
-                    self._stop(_stopped_by(agreement.now(done).signal))
+                    self._stop_by(agreement.now(done).signal)
                     return None
                 # The budget may change the number of steps.
                 while (step := state.progress.step + 1) <= state.schedule.steps:
@@ -165,7 +165,7 @@ class Trainer:
                         except PoolError as error:
                             self._save_without_room(error, "an event")
                         if not all_ran:
-                            self._stop(_stopped_by(agreement.now(step).signal))
+                            self._stop_by(agreement.now(step).signal)
                             return None
                     budget.after(step)
                     glances.after((step - 1) * size, step * size)
@@ -173,7 +173,7 @@ class Trainer:
                         break
                     decision = agreement.after(step, self.loader.lost is not None)
                     if decision.signal is not None:
-                        self._stop(_stopped_by(decision.signal))
+                        self._stop_by(decision.signal)
                         return None
                     if decision.lost:
                         break
@@ -218,6 +218,9 @@ class Trainer:
             raise PhotographError(
                 f"{'; '.join(lost)}. The last steps, {MAX_STEPS + 1} at most, went without it"
             )
+
+    def _stop_by(self, signal: str | None, saves: bool = True) -> None:
+        self._stop(f"stopped by {signal}; continue with --resume", saves)
 
     def _stop(self, reason: str, saves: bool = True) -> None:
         """Write the log record of the last step, save a checkpoint, and log why the run stops."""
@@ -269,7 +272,8 @@ class Trainer:
         state.stepped(step, degree)
         state.log.advance(end)
         if is_logged:
-            self.memory.sample(state.ranks.device)
+            if state.ranks.device.type == "cuda":
+                self._memory.append(run_files.memory_bytes(state.ranks.device))
             if not self._writes_late:
                 self._write_record()
         if is_logged or step == schedule.steps:
@@ -366,16 +370,16 @@ class Trainer:
             raise ModelLostError("no Gaussian is left: do the poses and the points belong together?")
         with state.stage("final_checkpoint"):
             save.run_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
-        population = population_report(state, self.memory)
+        population = population_report(state, self._memory)
         state.log.event(state.images_seen, "population", population, describe(population))
         images = state.images.memory()
         state.log.event(state.images_seen, "image_memory", dataclasses.asdict(images), str(images))
         with state.stage("evaluate"):
             metrics = evaluate.run(state)
         if not metrics:
-            self._stop(_stopped_by(agreement.now(step).signal), saves=False)
+            self._stop_by(agreement.now(step).signal, saves=False)
             return None
-        summary = metrics | self._figures(population) | residency
+        summary = metrics | run_figures(state, population) | residency
         if state.ranks.rank == 0:
             write_picture(state, population)
             try:
@@ -390,35 +394,3 @@ class Trainer:
             except OSError as error:
                 warnings.warn(f"the model is saved, its summary is not: {error}", stacklevel=2)
         return summary
-
-    def _figures(self, population: dict[str, Any]) -> dict[str, Any]:
-        """Return the figures of the run for the summary, besides its metrics. Collective."""
-        state = self.state
-        figures = {
-            "images": state.images_seen,
-            "seconds": state.progress.seconds,
-            "stages": state.stages(),
-            "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
-            "gaussians": state.population(),
-            "peak_gaussians": state.progress.peak_gaussians,
-            "population": population,
-            "peak_memory_bytes": run_files.peak_memory_bytes(state.ranks.device),
-            "config_hash": config_hash(state.config),
-            "run": state.run_id,
-            "versions": run_files.versions(state.ranks.device),
-            "largest_fall": state.curve.fall,
-            "warnings": state.curve.warnings(),
-        }
-        if state.config.schedule.minutes > 0:
-            figures |= {
-                "budget_seconds": 60 * state.config.schedule.minutes,
-                "scale": state.images_seen / state.config.schedule.iterations,
-            }
-        if state.stepper.exposures is not None:
-            figures["exposure"] = state.stepper.exposures.describe()
-        return figures
-
-
-def _stopped_by(signal: str | None) -> str:
-    """Return the reason to log for a run that a signal stops."""
-    return f"stopped by {signal}; continue with --resume"

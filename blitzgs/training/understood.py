@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from blitzgs.capture.capture import Capture
-from blitzgs.capture.images import Images
+from blitzgs.capture.images import ImageStore
 from blitzgs.capture.lengths import NEAR_OF_EXTENT, depths_seen, sampled
 from blitzgs.config.fields import Config
 from blitzgs.training.inputs import sharing_hint
@@ -54,7 +54,7 @@ def check_worlds(capture: Capture) -> None:
         )
 
 
-def understood(config: Config, capture: Capture, images: Images) -> list[str]:
+def understood(config: Config, capture: Capture, images: ImageStore) -> list[str]:
     """Return the lines of the block, and warn of what predicts a bad model."""
     pictures = _look(capture, images)
     near = config.model.near * capture.extent or capture.near
@@ -76,7 +76,7 @@ def understood(config: Config, capture: Capture, images: Images) -> list[str]:
     return [f"{name + ':':15}{printable(text)}" for name, text in lines]
 
 
-def _look(capture: Capture, images: Images) -> Pictures:
+def _look(capture: Capture, images: ImageStore) -> Pictures:
     """Decode some photographs, evenly chosen; a damaged one is left to the reader that needs it."""
     some = capture.train[:: -(-len(capture.train) // _DECODED)]
     images.prefetch(some)

@@ -10,7 +10,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator
-from typing import Any, TextIO, cast
+from typing import Any, TextIO
 
 # Control characters except line feed and tab, and the marks that change the direction of text.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
@@ -21,53 +21,34 @@ def printable(text: str) -> str:
     return _CONTROLS.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
-class Output:
+class Output(io.FileIO):
     """One of the process's output streams, which keeps the program running when it cannot be written.
 
     Attributes:
-        name: "standard output" or "standard error".
+        title: "standard output" or "standard error".
         lost: why text was lost; None: all was written.
-        closed: whether the reader has gone (a pipe that `head` closed, a terminal that hung up).
+        has_reader: false: the reader has gone (a pipe that `head` closed, a terminal that hung up).
     """
 
-    def __init__(self, name: str, descriptor: int) -> None:
-        self.name = name
+    def __init__(self, title: str, descriptor: int) -> None:
+        super().__init__(descriptor, "w", closefd=False)
+        self.title = title
         self.lost: str | None = None
-        self.closed = False
-        self._descriptor = descriptor
+        self.has_reader = True
 
-    def write(self, data: bytes) -> None:
+    def write(self, data: Any) -> int:
         """Write all of the data; after the first error, to nowhere."""
         view = memoryview(data)
         try:
             while view:
-                view = view[os.write(self._descriptor, view) :]
+                view = view[os.write(self.fileno(), view) :]
         except OSError as error:
             self.lost = error.strerror or str(error)
-            self.closed = error.errno in (errno.EPIPE, errno.EIO, errno.EBADF)
+            self.has_reader = error.errno not in (errno.EPIPE, errno.EIO, errno.EBADF)
             # So that later text of this process, and of its libraries and children, goes nowhere as well.
             nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._descriptor)
+            os.dup2(nowhere, self.fileno())
             os.close(nowhere)
-
-
-class _Raw(io.RawIOBase):
-    """The bytes of an `Output` as a file of Python."""
-
-    def __init__(self, output: Output, descriptor: int) -> None:
-        self._output, self._descriptor = output, descriptor
-
-    def writable(self) -> bool:
-        return True
-
-    def fileno(self) -> int:
-        return self._descriptor
-
-    def isatty(self) -> bool:
-        return os.isatty(self._descriptor)
-
-    def write(self, data: bytes) -> int:  # type: ignore[override]
-        self._output.write(data)
         return len(data)
 
 
@@ -96,22 +77,17 @@ def surviving_output() -> Iterator[dict[str, Output]]:
             stream.flush()
         previous[name] = stream
         outputs[name] = Output(title, stream.fileno())
-        setattr(sys, name, _text(outputs[name], stream, name == "stderr"))
+        text = io.TextIOWrapper(
+            io.BufferedWriter(outputs[name]),
+            stream.encoding,
+            "backslashreplace",
+            line_buffering=name == "stderr" or stream.line_buffering,
+            write_through=stream.write_through,
+        )
+        setattr(sys, name, text)
     try:
         yield outputs
     finally:
         for name, stream in previous.items():
             getattr(sys, name).flush()
             setattr(sys, name, stream)
-
-
-def _text(output: Output, stream: io.TextIOWrapper, is_error: bool) -> io.TextIOWrapper:
-    buffer = io.BufferedWriter(cast(Any, _Raw(output, stream.fileno())))
-    by_line = is_error or stream.line_buffering
-    return io.TextIOWrapper(
-        buffer,
-        stream.encoding,
-        "backslashreplace",
-        line_buffering=by_line,
-        write_through=stream.write_through,
-    )

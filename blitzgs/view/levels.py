@@ -16,6 +16,10 @@ BASE_RESOLUTION = 0.001
 # Voxel keys have 21 bits per axis. With this many levels, the finest grid of `measure_levels` uses all of
 # them.
 MAX_LEVELS = 22
+# Longest box relative to that of the middle half of the points: some of a horizon, or of wrong matches, are
+# perhaps a thousand times as far as the rest, and one voxel would hold all of the scene.
+_LONGEST_BOX = 50
+_QUARTILE_SAMPLE = 100_000
 # Levels of footprints: four to an octave of the octree, and as many as the ops take.
 FOOTPRINT_LEVELS, FOOTPRINT_STEPS = 32, 4
 
@@ -99,8 +103,8 @@ def measure_levels(
 
     d_max and d_min are the 99.9 % and 0.1 % quantiles over cameras of the same quantiles of each camera's
     point distances; d_0 = d_max and K = max(1, round(log_f(d_max / d_min)) + 1). The box is 1.1 times the
-    largest extent between the 1 % and 99 % coordinate quantiles; level 0 has voxels of box / f^b with
-    b = round(log_2(1 / base_resolution)) - floor(K / 2) + 1.
+    largest extent between the 1 % and 99 % coordinate quantiles, at most 50 times that between the quartiles;
+    level 0 has voxels of box / f^b with b = round(log_2(1 / base_resolution)) - floor(K / 2) + 1.
 
     Args:
         points: float64 [M, 3], M >= 1, on any device.
@@ -118,6 +122,9 @@ def measure_levels(
     blocks = PointBlocks.of(points)
     d_max, d_min = (_quantile(values, q).item() for q, values in _distance_quantiles(blocks, centres).items())
     box = 1.1 * max((_quantile(axis, 0.99) - _quantile(axis, 0.01)).item() for axis in points.unbind(1))
+    sample = points[:: max(1, len(points) // _QUARTILE_SAMPLE)]
+    middle = (sample.quantile(0.75, dim=0) - sample.quantile(0.25, dim=0)).max().item()
+    box = min(box, _LONGEST_BOX * middle) if middle > 0 else box
     if not (box > 0 and d_min > 0):
         raise ValueError(
             "octree levels need points that are spread out, and cameras at some distance from them: the box "

@@ -16,6 +16,8 @@ _BOX = (
     "font:12px/1.5 ui-monospace,monospace;text-shadow:0 0 3px #000,0 0 3px #000;"
     "background:rgba(0,0,0,.45);border-radius:6px;padding:8px 12px"
 )
+# On a narrow page, the panel is at the bottom.
+_NARROW = "@media(max-width:600px){#blitzgs-figures{inset:14px 14px auto!important;font-size:11px!important}}"
 _TURBO = "linear-gradient(90deg,#7a0403,#d23105,#fb8022,#e1dd37,#61fc6c,#1ae4b6,#4490fe,#30123b)"
 _INFERNO = "linear-gradient(90deg,#000004,#420a68,#932667,#dd513a,#fca50a,#fcffa4)"
 _GREY = "linear-gradient(90deg,#000,#fff)"
@@ -42,7 +44,8 @@ def overlay(visitor: Visitor, shown: Shown, memory: str) -> str:
             f"{look.mode} {shown.low:.3g} <span style='display:inline-block;width:120px;height:9px;"
             f"background:{colours}'></span> {shown.high:.3g}"
         )
-    return f"<div id='blitzgs-figures' style='{_BOX}'>{scale_bar(visitor)}{'<br>'.join(lines)}</div>"
+    box = f"<style>{_NARROW}</style><div id='blitzgs-figures' style='{_BOX}'>"
+    return f"{box}{scale_bar(visitor)}{'<br>'.join(lines)}</div>"
 
 
 def scale_bar(visitor: Visitor) -> str:

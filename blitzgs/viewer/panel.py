@@ -97,7 +97,9 @@ class Panel:
 
         def tell() -> None:
             at = visitor.standing
-            name.content = f"Standing at **{exhibit.cameras[at].name}**" if at is not None else "*Free*"
+            name.content = (
+                f"Standing at **{exhibit.cameras[at].name}**" if at is not None else "*At no camera*"
+            )
 
         def chosen(_: Any) -> None:
             visitor.change(comparison=choice.value)

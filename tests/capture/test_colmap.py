@@ -10,7 +10,7 @@ import pytest
 
 from blitzgs.capture import colmap
 from blitzgs.capture.capture import MissingImagesError, load_capture
-from blitzgs.capture.names import match_names, unified
+from blitzgs.capture.names import files_below, match_names, unified
 from blitzgs.formats import native
 from tests.capture.helpers import (
     as_text,
@@ -202,6 +202,7 @@ NOTATIONS = [
     ({DECOMPOSED: E_ACUTE}, [], []),
     ({"a.jpg": "a.png", "b.jpg": "b.png"}, [], []),
     ({"a.tif": "a.JPEG"}, [], []),
+    ({"a.HEIC": "a.jpg", "b.ARW": "b.jpg"}, [], ["b.dng"]),
     ({"day/a.jpg": "a.jpg"}, [], []),
     ({"a.jpg": "day/a.jpg"}, [], []),
     ({"day/a.jpg": "day_a.jpg", "night/a.jpg": "night_a.jpg"}, [], []),
@@ -272,6 +273,15 @@ def test_transforms_that_were_written_on_windows(tmp_path):
         tmp_path / "masks" / f"{i}.png" for i in range(3)
     ]
     assert capture.test == [1] and len(capture.points) == 1
+
+
+def test_files_are_found_once_and_none_that_is_hidden(tmp_path):
+    for file in ("a.jpg", "._a.jpg", "day/b.jpg", ".cache/c.jpg"):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).touch()
+    (tmp_path / "day/up").symlink_to(tmp_path)
+    (tmp_path / "night").symlink_to("day")
+    assert files_below(tmp_path) == ["a.jpg", "day/b.jpg", "night/b.jpg"]
 
 
 def fifo(path):

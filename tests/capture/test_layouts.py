@@ -31,6 +31,7 @@ def test_nothing_to_load_is_said_clearly(tmp_path):
         load_capture(tmp_path / "nowhere")
     (tmp_path / "photographs").mkdir()
     (tmp_path / "photographs" / "DJI_0001.JPG").touch()
+    (tmp_path / "photographs" / "cameras.json").touch()  # a run has such a file, and it is no model
     with pytest.raises(FileNotFoundError, match="has images but not their cameras: blitzgs sfm"):
         load_capture(tmp_path)
     (tmp_path / "sparse" / "1").mkdir(parents=True)
@@ -128,7 +129,8 @@ def test_blender_transforms(tmp_path):
         ({"test_filenames": "a.png"}, "test_filenames must be a list"),
         ({"val_filenames": ["a.png", 3]}, "val_filenames must be a list"),
         ({"val_filenames": ["./a.png", "b.png"]}, r"name 1 images that are no frames \(first: b.png\)"),
-        ({"ply_file_path": None}, "ply_file_path must be text, got None"),
+        ({"ply_file_path": None}, "ply_file_path must name a file, got None"),
+        ({"ply_file_path": ""}, "ply_file_path must name a file, got ''"),
         ({"mask_path": 3}, "frame 0: mask_path must name an image or be null, got 3"),
         ({"mask_path": ""}, "frame 0: mask_path must name an image or be null, got ''"),
         ({"k4": 0.01}, "frame 0: k4 is 0.01, without k5 and k6: .* undistort the images"),
@@ -198,16 +200,6 @@ def test_missing_images_of_transforms_are_named_by_their_paths(tmp_path):
 def test_transforms_that_are_damaged_are_named(tmp_path, text):
     (tmp_path / "transforms.json").write_text(text)
     with pytest.raises(ValueError, match=f"{tmp_path}/transforms.json: not a transforms file"):
-        load_capture(tmp_path)
-
-
-def test_an_angle_of_zero_is_named(tmp_path):
-    write_image(tmp_path / "a.png", smooth_image(48, 64))
-    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "camera_angle_x": 0}
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
-    with pytest.raises(
-        ValueError, match="frame 0: camera_angle_x must be an angle of view in radians, above 0"
-    ):
         load_capture(tmp_path)
 
 

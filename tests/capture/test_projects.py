@@ -90,13 +90,15 @@ def test_metashape_fisheye(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "header",
-    ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2",
-     "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"],
+    ("separator", "header"),
+    [(",", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"),
+     (";", "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2")],
 )  # fmt: skip
-def test_realitycapture_with_the_points_of_a_bundle(tmp_path, header):
+def test_realitycapture_with_the_points_of_a_bundle(tmp_path, separator, header):
     capture = files.Posed(origin=UTM)
-    files.realitycapture(capture, capture.write_images(tmp_path) / "registration.csv", header)
+    path = capture.write_images(tmp_path) / "registration.csv"
+    files.realitycapture(capture, path, header)
+    path.write_text(path.read_text().replace(",", separator))
     files.bundler(capture, tmp_path / "bundle.out")
     views, points, source = read(tmp_path)
     assert residual(capture, views) < 1e-4

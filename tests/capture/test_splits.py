@@ -25,7 +25,7 @@ def test_every_nth_view_is_held_out(spec, test):
 
 
 def test_list_file_matches_names_file_names_and_stems(tmp_path):
-    (tmp_path / "test.txt").write_text("# held out\n\na/1.jpg\n2.jpg  # by file name\n3\n")
+    (tmp_path / "test.txt").write_text("# held out\n\na\\1.jpg\n2.jpg  # by file name\n3\n")
     assert split_views(NAMES, PATHS, tmp_path, "test.txt") == ([2], [0, 1, 3])
     assert split_views(NAMES, PATHS, ROOT, tmp_path / "test.txt") == ([2], [0, 1, 3])
 
@@ -41,7 +41,12 @@ def test_a_name_without_parts_is_split_like_any_other(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("line", "message"), [("1.jpg", "line 1: '1.jpg' names 2 views"), ("9", "names no view of the capture")]
+    ("line", "message"),
+    [
+        ("1.jpg", "line 1: '1.jpg' names 2 views"),
+        ("9", "names no view of the capture"),
+        ("# 9", "test.txt names no view: list the held-out ones, .* --data.split=0"),
+    ],
 )
 def test_list_entries_must_name_one_view(tmp_path, line, message):
     (tmp_path / "test.txt").write_text(line)

@@ -167,8 +167,9 @@ def test_control_points_give_the_world(trained, survey, tmp_path, capsys):
     wrong = [row.replace("P6,46", "P6,56") for row in rows]  # a slip of the surveyor by 100 km
     path.write_text("\n".join(["name,E,N,h,image,x,y", *wrong]))
     assert main(["align", str(trained[1]), "--gcp", str(path), "--crs", "EPSG:32632"]) == 0
-    out = capsys.readouterr().out
+    out, err = capsys.readouterr()
     assert "6 of 7 points used; RMS 0.0000 horizontal, 0.0000 vertical" in out and "contradicts" in out
+    assert "upside down" not in err
     frame = load_frame(trained[1])
     assert frame.crs == "EPSG:32632" and frame.scale == pytest.approx(12.5, rel=1e-9)
     np.testing.assert_allclose(frame.to_world(np.ones(3)), 12.5 * TURN @ np.ones(3) + SHIFT, atol=1e-6)
@@ -181,6 +182,13 @@ def test_control_points_give_the_world(trained, survey, tmp_path, capsys):
     moved = load_frame(trained[1])
     assert moved.crs == "EPSG:32633" and moved.scale == pytest.approx(12.5, rel=0.01)
     assert abs(moved.translation[0] - frame.translation[0]) > 1e5
+
+
+def test_a_world_of_exchanged_axes_is_named(trained, survey, tmp_path, capsys):
+    path = tmp_path / "gcp.csv"
+    path.write_text("\n".join(["name,N,E,h,image,x,y", *survey[1]]))
+    with pytest.warns(UserWarning, match="upside down in this world: are E and N exchanged"):
+        assert main(["align", str(trained[1]), "--gcp", str(path), "--crs", "EPSG:32632"]) == 0
 
 
 def test_what_cannot_be_aligned_is_refused(trained, survey, tmp_path, capsys):

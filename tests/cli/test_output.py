@@ -17,7 +17,7 @@ import torch
 from blitzgs._built import LIBRARY_DIR
 from blitzgs.cli import _NAMED_ERRORS, COMMANDS, _user_errors, doctor, main
 from blitzgs.cli.completion import script
-from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
+from tests.training.tiny import OVERRIDES, as_flags
 
 TRAIN = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.3", "log.every=1", "log.pictures=0")
 
@@ -29,13 +29,6 @@ def shell(script, **variables):
         ["bash", "-c", script], capture_output=True, text=True, timeout=200, env=environment
     )
     return done.returncode, done.stdout, done.stderr
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("capture")
-    write_tiny_capture(folder)
-    return folder
 
 
 FULL = "standard output cannot be written (No space left on device)"
@@ -113,8 +106,8 @@ def test_ctrl_c_at_the_start_has_no_traceback(capture, tmp_path, moment):
     program = (
         f"import os, signal, sys, {module} as module\nfrom blitzgs.cli import main\n"
         f"real = module.{name}\n"
-        "def interrupted(*arguments):\n"
-        "    os.kill(os.getpid(), signal.SIGINT)\n    return real(*arguments)\n"
+        "def interrupted(*arguments, **named):\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n    return real(*arguments, **named)\n"
         f"module.{name} = interrupted\n"
         f"sys.exit(main(['train', '--data', {str(capture)!r}, '--out', {str(tmp_path / 'r')!r}]))"
     )

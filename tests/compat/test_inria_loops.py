@@ -16,7 +16,7 @@ import blitzgs
 from blitzgs.compat.gsplat import DefaultStrategy
 from blitzgs.compat.inria import DepthGaussianRasterizer as DepthRasterizer
 from blitzgs.compat.inria import GaussianRasterizationSettings, GaussianRasterizer, distCUDA2, fused_ssim
-from tests.compat.inria_formulas import camera
+from tests.compat.test_inria import camera
 from tests.helpers import random_scene
 
 WIDTH, HEIGHT, VIEWS, TANFOV = 40, 32, 6, 0.5

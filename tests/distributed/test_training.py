@@ -28,7 +28,6 @@ from tests.training.tiny import (
     steps_of,
     tiny_config,
     tiny_scene,
-    write_tiny_capture,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -300,13 +299,6 @@ def _command(rank, arguments):
     from blitzgs.cli import main
 
     return main(arguments)
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("capture")
-    write_tiny_capture(folder)
-    return folder
 
 
 def train_flags(capture, folder, command="train"):

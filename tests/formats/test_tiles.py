@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -280,9 +281,31 @@ def test_a_killed_export_leaves_no_tileset(tmp_path):
         assert process.stdout.readline() == "ready\n"
         process.kill()
     assert not (tmp_path / "t").exists() and not list(tmp_path.rglob("tileset.json"))
+    left = list(tmp_path.iterdir())
     with new_folder(tmp_path / "t") as folder:
+        assert len(left) == 1 and not left[0].exists()
+        with pytest.raises(KeyError), new_folder(tmp_path / "t"):
+            raise KeyError(folder.stat())  # a folder in use is not removed
         (folder / "x").write_text("x")
     assert (tmp_path / "t" / "x").exists()
+
+
+def ready_for_long(*_: object) -> None:
+    print("ready", flush=True)
+    time.sleep(20)
+
+
+@pytest.mark.timeout(100)
+def test_the_processes_of_a_killed_export_end_with_it():
+    program = (
+        "from blitzgs.formats.tiles import each_part\n"
+        "from tests.formats.test_tiles import ready_for_long\n"
+        "list(each_part(ready_for_long, None, None, 2, [0, 1]))\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.kill()
+        process.stdout.read()  # ends when no process has it open
 
 
 def test_up_turns_to_z():

@@ -25,7 +25,7 @@ from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes
 from blitzgs.ops.scatter import gather_splats, scatter_splats, words_of
 from blitzgs.table.table import GaussianTable
 from tests.frame.test_sharded_rendering import OPTIONS, cameras
-from tests.frame.transports import IdleEvent, rasterize_into
+from tests.frame.test_transport import IdleEvent, rasterize_into
 from tests.helpers import sum_of_ranks
 from tests.training.tiny import random_gaussians
 

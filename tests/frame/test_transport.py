@@ -1,18 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splats reach the ranks that composite them, once each, and their gradients return."""
+"""Transports of splats between ranks, with doubles that record calls or stand for a GPU."""
+
+from __future__ import annotations
 
 from types import SimpleNamespace
 
 import pytest
 import torch
+from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.shared_memory import Shared
 from blitzgs.frame import frame as pipeline
 from blitzgs.frame.run import run
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.frame.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport, peer
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT
-from blitzgs.frame.transport.protocol import CapacityEstimate, Traffic
+from blitzgs.frame.transport.protocol import (
+    CapacityEstimate,
+    Exchange,
+    ExchangeResult,
+    Mark,
+    Traffic,
+    Transport,
+    unmarked,
+)
 from blitzgs.frame.transport.way_back import CollectiveWayBack
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project_splats
@@ -21,9 +33,91 @@ from blitzgs.ops.scatter import scatter_splats
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.distributed.rank_harness import run_ranks
 from tests.frame.test_sharded_rendering import OPTIONS, cameras
-from tests.frame.transports import IdleEvent, LoneMemory, RecordingTransport, rasterize_into
 from tests.helpers import parameter_gradients, sum_of_ranks
 from tests.training.tiny import random_gaussians
+
+
+class RecordingTransport:
+    """Wraps a transport; its first exchanges fail as if the capacity were too small.
+
+    Attributes:
+        calls: "start", with its capacity, and "finish", in order.
+    """
+
+    def __init__(
+        self, inner: Transport, too_small: int = 0, capacity: CapacityEstimate | None = None
+    ) -> None:
+        """Wrap a transport; its first `too_small` exchanges do not finish."""
+        self.capacity = capacity or inner.capacity
+        self.inner, self.too_small = inner, too_small
+        self.calls: list[tuple[str, Sizes | None]] = []
+
+    def project_and_send(
+        self,
+        inputs: ProjectionInputs,
+        assignment: TileAssignment | None,
+        sizes: Sizes | None,
+        mark: Mark = unmarked,
+    ) -> RecordingExchange:
+        """See `Transport.project_and_send`."""
+        self.calls.append(("start", sizes))
+        return RecordingExchange(self, self.inner.project_and_send(inputs, assignment, sizes, mark))
+
+
+class RecordingExchange:
+    """An exchange of a `RecordingTransport`."""
+
+    def __init__(self, transport: RecordingTransport, inner: Exchange) -> None:
+        """Wrap an exchange."""
+        self._transport, self._inner = transport, inner
+        self.arrived, self.gradient_table = inner.arrived, inner.gradient_table
+
+    def finish(self) -> tuple[Sizes, ExchangeResult | None]:
+        """See `Exchange.finish`."""
+        self._transport.calls.append(("finish", None))
+        needed, result = self._inner.finish()
+        if self._transport.too_small > 0:
+            self._transport.too_small -= 1
+            return needed, None
+        return needed, result
+
+
+class LoneMemory:
+    """A `SharedMemory` of a single rank, on any device, for tests of transports that need one."""
+
+    def __init__(self, words: int) -> None:
+        """Begin with a buffer of this number of words."""
+        self.buffers = [torch.full((words,), -1, dtype=torch.int32)]
+        self.generation = 0
+
+    def barrier(self) -> None:
+        """Return at once: there is no other rank."""
+
+    def share(self, values: Tensor) -> Shared:
+        """Return the rank's own numbers."""
+        return Shared(values[None], values, values[None])
+
+    def reserve(self, words: int) -> None:
+        """Enlarge the buffer."""
+        self.buffers = [torch.full((words,), -1, dtype=torch.int32)]
+
+
+class IdleEvent:
+    """Replaces `torch.cuda.Event` on a CPU, where nothing is pending."""
+
+    def record(self, stream: object = None) -> None:
+        """Return at once."""
+
+    def synchronize(self) -> None:
+        """Return at once."""
+
+
+def rasterize_into(*arguments):
+    """Replaces `rasterize_fwd_` on a CPU."""
+    *rest, table, n_splats = arguments
+    table[: int(n_splats)] = 0
+    return torch.ops.blitzgs.rasterize_fwd(*rest, False, False, n_splats)[:6]
+
 
 WIDTH, HEIGHT, CAMERAS = 100, 60, 2
 TILES = CAMERAS * 7 * 4

@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from blitzgs.ops.intersect import intersect, tile_counts
+from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.ops.splat_gradients import GradientBuffer, gradient_columns, packed_table
 from tests.ops.splats import Splats, dense_composite, kept_by, near_a_cut, random_splats
+from tests.ops.test_photometric import images
 
 WIDTH, HEIGHT = 53, 37  # neither is a multiple of a tile
 ROOT = Path(__file__).resolve().parents[2]
@@ -231,13 +233,15 @@ torch.save(scalar_case(), sys.argv[1])
 
 
 def scalar_case():
+    """Return images and their gradients, and those of the loss."""
     results = []
     for channels in (3, 4, 6):
         splats = random_splats(700, WIDTH, HEIGHT, channels=channels, smallest=0.1, largest=80, seed=channels)
         v_renders = torch.randn(1, HEIGHT, WIDTH, channels, generator=torch.Generator().manual_seed(1))
         outputs = forward(splats)
         results += [*outputs, *backward(splats, outputs, v_renders)]
-    return results
+    x, targets, masks = images((1, 60, 50))
+    return [*results, *photometric_fwd_bwd(x, targets, masks, torch.ones(1), torch.ones(1))]
 
 
 def test_scalar_code_gives_the_same_bits(tmp_path):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `LazyAdam` refuses, by name, and without changing anything."""
+"""What `LazyAdam` refuses, by name, and without changing anything; closures, hooks and profilers."""
 
 import pytest
 import torch
@@ -144,3 +144,32 @@ def test_an_order_that_is_none_changes_nothing(order, error, message):
         optimizer.permute(order)
     assert optimizer.param_groups[0]["params"][0] is means
     assert len(optimizer.permute(torch.arange(0))["means"]) == 0
+
+
+def test_a_closure_computes_the_loss():
+    param = torch.ones(4, 3, requires_grad=True)
+    optimizer = LazyAdam([param], lr=0.1)
+
+    def closure():
+        optimizer.zero_grad()
+        loss = param.square().sum()
+        loss.backward()
+        return loss
+
+    first = optimizer.step(closure).item()
+    assert optimizer.step(closure).item() < first == 12.0
+
+
+def test_step_hooks_and_profilers_see_each_step():
+    param, seen = torch.nn.Parameter(torch.ones(4, 3)), []
+    optimizer = LazyAdam([param])
+    before = optimizer.register_step_pre_hook(lambda *_: seen.append("before"))
+    after = optimizer.register_step_post_hook(lambda *_: seen.append("after"))
+    param.grad = torch.ones_like(param)
+    optimizer.step()
+    before.remove()
+    after.remove()
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+        optimizer.step()
+    assert seen == ["before", "after"] and int(optimizer.state[param]["step"]) == 2
+    assert "Optimizer.step#LazyAdam.step" in {event.name for event in profile.events()}

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The wheel in dist/ works in fresh environments without a compiler; `make test-wheel` runs this.
 
-Each environment downloads a torch, which takes gigabytes. Interpreters that are not there are skipped:
+Each environment has a torch, which takes gigabytes, so it is removed before the next one is made;
+UV_TORCH_BACKEND=cpu takes torch without CUDA. Interpreters that are not there are skipped:
 PYTHONS="/path/python3.10 /path/python3.13" names others than those in PATH and of pyenv.
 """
 
 import json
 import os
 import re
+import select
 import shutil
 import subprocess
 import urllib.request
@@ -16,8 +18,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-WHEELS = sorted((ROOT / "dist").glob("blitzgs-*manylinux_2_28_x86_64.whl"))
-ARCHIVES = sorted((ROOT / "dist").glob("blitzgs-*.tar.gz"))
+WHEELS, ARCHIVES = (
+    sorted((ROOT / "dist").glob(f"blitzgs-*{suffix}"), key=os.path.getmtime)
+    for suffix in ("manylinux_2_28_x86_64.whl", ".tar.gz")
+)
 PYTHONS = os.environ.get("PYTHONS", "python3.10 python3.13").split()
 TORCHES = os.environ.get("TORCHES", "2.11.0 2.13.0").split()
 CALL = """
@@ -59,7 +63,18 @@ def environment(request, tmp_path_factory):
     """A fresh environment with the wheel; the PATH of its programs has no compiler."""
     assert WHEELS, "build the wheel first: make wheel"
     folder = tmp_path_factory.mktemp("environment")
-    return fresh(folder, *request.param, f"blitzgs[synth,view] @ file://{WHEELS[-1]}")
+    yield fresh(folder, *request.param, f"blitzgs[synth,view] @ file://{WHEELS[-1]}")
+    shutil.rmtree(folder)
+
+
+@pytest.fixture(scope="module")
+def model(environment):
+    """The PLY file of a first model, which the environment has trained."""
+    run(environment, "blitzgs", "synth", "city", "--views=24", "--width=96", "--height=64")
+    arguments = ("--config=smoke", "--data=city", "--out=run", "--schedule.scale=0.05", "--log.pictures=0")
+    run(environment, "blitzgs", "train", *arguments)
+    run(environment, "blitzgs", "export", "run", "--ply", "model.ply")
+    return environment / "model.ply"
 
 
 def variables(environment):
@@ -92,23 +107,18 @@ def test_the_public_call(environment):
     assert 0.45 < red < 0.5 and 0.0 < green < 0.25
 
 
-def test_a_first_model(environment):
-    run(environment, "blitzgs", "synth", "city", "--views=24", "--width=96", "--height=64")
-    arguments = ("--config=smoke", "--data=city", "--out=run", "--schedule.scale=0.05", "--log.pictures=0")
-    run(environment, "blitzgs", "train", *arguments)
+def test_a_first_model(environment, model):
     summary = json.loads((environment / "run" / "summary.json").read_text())
-    assert summary["psnr"] > 12
-    run(environment, "blitzgs", "export", "run", "--ply", "model.ply")
-    assert (environment / "model.ply").read_bytes().startswith(b"ply\n")
+    assert summary["psnr"] > 12 and model.read_bytes().startswith(b"ply\n")
 
 
-def test_the_viewer_sends_pictures(environment):
-    """Runs after `test_a_first_model`, whose model it shows."""
-    command = [environment / "bin" / "blitzgs", "view", "model.ply", "--port", "0"]
+def test_the_viewer_sends_pictures(environment, model):
+    command = [environment / "bin" / "blitzgs", "view", model, "--port", "0"]
     page = subprocess.Popen(
         command, env=variables(environment), cwd=environment, stdout=subprocess.PIPE, text=True
     )
     try:
+        assert select.select([page.stdout], [], [], 300)[0], "the viewer prints nothing"
         url = re.search(r"http://\S+", page.stdout.readline())[0]
         assert b"<html" in urllib.request.urlopen(url, timeout=60).read().lower()
         version = run(environment, "python", "-c", "import viser; print(viser.__version__)").strip()
@@ -132,3 +142,4 @@ def test_the_sources_install(tmp_path):
     lines = {line["name"] for line in found["lines"]}
     assert found["ok"] and {"lib cpu", "lib io"} <= lines and "lib cuda" not in lines
     run(environment, "python", "-c", CALL)
+    shutil.rmtree(environment)

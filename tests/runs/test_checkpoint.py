@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import checkpoint, manifest
 from tests.distributed.rank_harness import CONTEXT, RankError, run_ranks
+from tests.helpers import save_checkpoint
 
 ALONE = Ranks()
 POINTS = [
@@ -46,7 +47,7 @@ def by_id(shards):
 
 def test_round_trip_and_format(tmp_path):
     columns, state = table(101), {"iteration": 7, "note": ["ä", 1.5, None]}
-    path = checkpoint.save(tmp_path / "checkpoints", columns, state, ALONE)
+    path = save_checkpoint(tmp_path / "checkpoints", columns, state, ALONE)
     loaded = checkpoint.load_latest(tmp_path / "checkpoints", ALONE, "cpu")
     assert equal(loaded.columns, columns)
     assert loaded.state == state and loaded.name == path.name
@@ -54,13 +55,13 @@ def test_round_trip_and_format(tmp_path):
     assert equal(load_file(path / "shard_0000_of_0001.safetensors"), columns)
     assert checkpoint.load_latest(tmp_path / "nothing here", ALONE, "cpu") is None
     empty = table(0)
-    checkpoint.save(tmp_path / "checkpoints", empty, state, ALONE)
+    save_checkpoint(tmp_path / "checkpoints", empty, state, ALONE)
     assert equal(checkpoint.load_latest(tmp_path / "checkpoints", ALONE, "cpu").columns, empty)
 
 
 def test_keeps_the_last_k(tmp_path):
     for iteration in range(5):
-        checkpoint.save(tmp_path, table(3, iteration), {"iteration": iteration}, ALONE, keep=2)
+        save_checkpoint(tmp_path, table(3, iteration), {"iteration": iteration}, ALONE, keep=2)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint_000003", "checkpoint_000004"]
     assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 4}
 
@@ -86,8 +87,8 @@ def _flip_bit(path, offset):
     ],
 )
 def test_a_damaged_checkpoint_is_refused_by_name(tmp_path, damage, reason):
-    checkpoint.save(tmp_path, table(50, 1), {"iteration": 1}, ALONE)
-    newest = checkpoint.save(tmp_path, table(50, 2), {"iteration": 2}, ALONE)
+    save_checkpoint(tmp_path, table(50, 1), {"iteration": 1}, ALONE)
+    newest = save_checkpoint(tmp_path, table(50, 2), {"iteration": 2}, ALONE)
     damage(newest)
     with pytest.warns(
         UserWarning, match=f"checkpoint_000001 is damaged.*{reason}.*; using checkpoint_000000"
@@ -98,11 +99,11 @@ def test_a_damaged_checkpoint_is_refused_by_name(tmp_path, damage, reason):
     with pytest.raises(checkpoint.CheckpointError, match=f"checkpoint_000001 is damaged.*{reason}"):
         checkpoint.load(newest, ALONE, "cpu")
     # A new save does not reuse the damaged one's name.
-    assert checkpoint.save(tmp_path, table(5), {}, ALONE).name == "checkpoint_000002"
+    assert save_checkpoint(tmp_path, table(5), {}, ALONE).name == "checkpoint_000002"
 
 
 def test_each_damaged_checkpoint_is_named_once(tmp_path):
-    paths = [checkpoint.save(tmp_path, table(5), {}, ALONE) for _ in range(3)]
+    paths = [save_checkpoint(tmp_path, table(5), {}, ALONE) for _ in range(3)]
     for path in paths[1:]:
         (path / "manifest.json").unlink()
     with pytest.warns(UserWarning) as caught:
@@ -125,15 +126,15 @@ def _save_and_die(directory, point, keep):
         if label == point:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    checkpoint.save(directory, table(64, 2), {"iteration": 2}, ALONE, keep=keep, reached=reached)
+    save_checkpoint(directory, table(64, 2), {"iteration": 2}, ALONE, keep=keep, reached=reached)
 
 
 @pytest.mark.parametrize("point", POINTS)
 def test_kill_at_any_point_of_a_save(tmp_path, point):
     for attempt in range(3):
         directory = tmp_path / str(attempt)
-        checkpoint.save(directory, table(64, 0), {"iteration": 0}, ALONE)
-        checkpoint.save(directory, table(64, 1), {"iteration": 1}, ALONE)
+        save_checkpoint(directory, table(64, 0), {"iteration": 0}, ALONE)
+        save_checkpoint(directory, table(64, 1), {"iteration": 1}, ALONE)
         process = CONTEXT.Process(target=_save_and_die, args=(directory, point, 2))
         process.start()
         process.join(60)
@@ -145,7 +146,7 @@ def test_kill_at_any_point_of_a_save(tmp_path, point):
         assert loaded.state == {"iteration": 2 if complete else 1}
         assert equal(loaded.columns, table(64, loaded.state["iteration"]))
         # The next save clears what was left behind.
-        checkpoint.save(directory, table(4), {}, ALONE, keep=2)
+        save_checkpoint(directory, table(4), {}, ALONE, keep=2)
         assert len(list(directory.iterdir())) == 2
 
 
@@ -153,13 +154,13 @@ def _save_on_a_full_disk(directory, limit):
     # Past the limit every write fails; Python ignores the signal that comes with it.
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
     try:
-        checkpoint.save(directory, table(5000, 1), {"iteration": 1}, ALONE)
+        save_checkpoint(directory, table(5000, 1), {"iteration": 1}, ALONE)
     except checkpoint.CheckpointError as error:
         (directory / "message").write_text(str(error))
 
 
 def test_full_disk(tmp_path, monkeypatch):
-    checkpoint.save(tmp_path, table(64), {"iteration": 0}, ALONE)
+    save_checkpoint(tmp_path, table(64), {"iteration": 0}, ALONE)
     process = CONTEXT.Process(target=_save_on_a_full_disk, args=(tmp_path, 100_000))
     process.start()
     process.join(60)
@@ -169,7 +170,7 @@ def test_full_disk(tmp_path, monkeypatch):
     usage = type("Usage", (), {"free": 10})
     monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda path: usage)
     with pytest.raises(checkpoint.CheckpointError, match="GB are needed and 0.00 GB are free") as failure:
-        checkpoint.save(tmp_path, table(64), {}, ALONE)
+        save_checkpoint(tmp_path, table(64), {}, ALONE)
     assert failure.value.lacks_space
     assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 0}
 
@@ -191,14 +192,14 @@ def test_an_error_tells_whether_space_would_help(tmp_path, monkeypatch, error, w
 
     monkeypatch.setattr(checkpoint, "write_shard", write_shard)
     with pytest.raises(checkpoint.CheckpointError, match=text) as failure:
-        checkpoint.save(tmp_path, table(4), {}, ALONE)
+        save_checkpoint(tmp_path, table(4), {}, ALONE)
     assert failure.value.lacks_space == waits
 
 
 def test_numbers_may_have_more_than_six_digits(tmp_path):
     (tmp_path / "checkpoint_999999").mkdir()
     for number in range(1_000_000, 1_000_003):
-        path = checkpoint.save(tmp_path, table(4), {"iteration": number}, ALONE, keep=2)
+        path = save_checkpoint(tmp_path, table(4), {"iteration": number}, ALONE, keep=2)
         assert path.name == f"checkpoint_{number}"
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["checkpoint_1000001", "checkpoint_1000002"]
     assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 1_000_002}
@@ -217,30 +218,30 @@ def _refuse(monkeypatch, method, folder):
 
 def test_an_old_checkpoint_that_cannot_be_deleted_is_named_and_stays(tmp_path, monkeypatch):
     for iteration in range(2):
-        checkpoint.save(tmp_path, table(3), {"iteration": iteration}, ALONE, keep=2)
+        save_checkpoint(tmp_path, table(3), {"iteration": iteration}, ALONE, keep=2)
     with monkeypatch.context() as patch:
         _refuse(patch, "rename", tmp_path / "checkpoint_000000")
         with pytest.warns(UserWarning, match="could not be deleted.*not permitted.*checkpoint_000000"):
-            checkpoint.save(tmp_path, table(3), {"iteration": 2}, ALONE, keep=2)
+            save_checkpoint(tmp_path, table(3), {"iteration": 2}, ALONE, keep=2)
     assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 2}
-    checkpoint.save(tmp_path, table(3), {"iteration": 3}, ALONE, keep=2)
+    save_checkpoint(tmp_path, table(3), {"iteration": 3}, ALONE, keep=2)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint_000002", "checkpoint_000003"]
 
 
 def test_a_folder_that_cannot_be_read_is_a_failed_checkpoint(tmp_path, monkeypatch):
-    checkpoint.save(tmp_path, table(3), {}, ALONE)
+    save_checkpoint(tmp_path, table(3), {}, ALONE)
     _refuse(monkeypatch, "iterdir", tmp_path)
     with pytest.raises(checkpoint.CheckpointError, match=f"could not read {tmp_path}"):
-        checkpoint.save(tmp_path, table(3), {}, ALONE)
+        save_checkpoint(tmp_path, table(3), {}, ALONE)
 
 
 def test_bad_arguments(tmp_path):
     with pytest.raises(ValueError, match="of one length"):
-        checkpoint.save(tmp_path, {"a": torch.zeros(2), "b": torch.zeros(3)}, {}, ALONE)
+        save_checkpoint(tmp_path, {"a": torch.zeros(2), "b": torch.zeros(3)}, {}, ALONE)
     with pytest.raises(ValueError, match="keep must be at least 1"):
-        checkpoint.save(tmp_path, table(2), {}, ALONE, keep=0)
+        save_checkpoint(tmp_path, table(2), {}, ALONE, keep=0)
     with pytest.raises(ValueError, match="column a has dtype torch.complex64"):
-        checkpoint.save(tmp_path, {"a": torch.zeros(2, dtype=torch.complex64)}, {}, ALONE)
+        save_checkpoint(tmp_path, {"a": torch.zeros(2, dtype=torch.complex64)}, {}, ALONE)
 
 
 def _shard_of(whole, ranks, sizes):
@@ -249,7 +250,7 @@ def _shard_of(whole, ranks, sizes):
 
 
 def _save_shard(ranks, directory, sizes):
-    return checkpoint.save(directory, _shard_of(table(sum(sizes)), ranks, sizes), {"m": 4}, ranks).name
+    return save_checkpoint(directory, _shard_of(table(sum(sizes)), ranks, sizes), {"m": 4}, ranks).name
 
 
 def _load_shard(ranks, directory):
@@ -304,7 +305,7 @@ def test_dealing_keeps_the_order_and_opens_only_what_it_needs(tmp_path):
 
 def test_shared_columns_are_saved_and_checked(tmp_path):
     shared = {"costs": torch.rand(7), "views": torch.arange(3), "none": torch.empty(0, 4)}
-    path = checkpoint.save(tmp_path, table(5), {}, ALONE, shared=shared)
+    path = save_checkpoint(tmp_path, table(5), {}, ALONE, shared=shared)
     assert equal(checkpoint.load_latest(tmp_path, ALONE, "cpu").shared, shared)
     _flip_bit(path / checkpoint.SHARED, -1)
     with pytest.raises(checkpoint.CheckpointError, match="shared.safetensors does not match its SHA-256"):

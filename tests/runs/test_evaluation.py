@@ -29,6 +29,7 @@ from blitzgs.runs.export import export, export_ply
 from blitzgs.runs.folder import open_run
 from blitzgs.runs.source import open_source, source_of
 from blitzgs.runs.world import in_world, load_frame, rotated_harmonics, save_frame
+from tests.helpers import save_checkpoint
 
 
 def plain_ssim(x, y):
@@ -164,7 +165,7 @@ def test_fifty_million_gaussians_need_less_than_4_gb(trained, tmp_path, name):
     for times in (250, 500):
         columns = {key: column.repeat(times, *[1] * (column.dim() - 1)) for key, column in found[0].items()}
         run = tmp_path / str(times)
-        checkpoint.save(run / "checkpoints", columns, found[1], Ranks())
+        save_checkpoint(run / "checkpoints", columns, found[1], Ranks())
         del columns
         command = [sys.executable, "-c", _EXPORT, str(run), name, str(run / f"a.{name}")]
         count, peak = subprocess.run(command, capture_output=True, check=True, text=True).stdout.split()

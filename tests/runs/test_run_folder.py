@@ -23,6 +23,7 @@ from blitzgs.runs import checkpoint
 from blitzgs.runs import files as run_files
 from blitzgs.runs.export import export_ply, without_antialiasing
 from blitzgs.training.trainer import Trainer
+from tests.helpers import save_checkpoint
 from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene
 
 
@@ -290,7 +291,7 @@ def test_what_a_resume_may_change(trained):
 def test_a_checkpoint_of_another_version_is_named(trained, tmp_path, capsys, state):
     shutil.copy(trained[1] / "config.yaml", tmp_path)
     table = run_files.restore(trained[1], Ranks()).table
-    checkpoint.save(tmp_path / "checkpoints", {name: table[name] for name in table}, state, Ranks())
+    save_checkpoint(tmp_path / "checkpoints", {name: table[name] for name in table}, state, Ranks())
     assert main(["eval", str(tmp_path)]) == 1
     assert "checkpoint_000000 belongs to another version of BlitzGS" in capsys.readouterr().err
 
@@ -298,7 +299,7 @@ def test_a_checkpoint_of_another_version_is_named(trained, tmp_path, capsys, sta
 def test_no_flipped_bit_of_a_manifest_passes(tmp_path):
     columns = {"means": torch.randn(5, 3), "id": torch.arange(5)}
     state = {"progress": {"step": 12, "seconds": 1.5}, "config": {"seed": 0, "scale": 1e-3, "ok": True}}
-    path = checkpoint.save(tmp_path, columns, state, Ranks())
+    path = save_checkpoint(tmp_path, columns, state, Ranks())
     manifest = path / "manifest.json"
     good = manifest.read_bytes()
     choice, passed = random.Random(5), 0

@@ -281,7 +281,12 @@ def test_photographs_alone_are_recognised(tmp_path, capsys):
     assert main([*data, "--out", str(tmp_path / "run"), "--no-sfm", "--device=cpu"]) == 1
     assert "it has images but not their cameras: blitzgs sfm" in capsys.readouterr().err
     assert not (tmp_path / "run").exists() and not (tmp_path / "run_capture").exists()
+    (tmp_path / "data/config.yaml").touch()
+    with pytest.raises(FileNotFoundError, match="data is a run and no capture"):
+        command.understood_alone(config_of(tmp_path / "data"))
     (tmp_path / "data/transforms.json").write_text("{}")
+    with pytest.raises(FileNotFoundError, match=f"has its cameras: --data={tmp_path / 'data'} "):
+        command.with_poses(config_of(tmp_path / "data/images"), tmp_path / "x")
     assert command.with_poses(config_of(tmp_path / "data"), tmp_path / "x") == config_of(tmp_path / "data")
 
 

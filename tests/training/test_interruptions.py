@@ -27,6 +27,7 @@ from blitzgs.training.agreement import MAX_STEPS, Agreement, SaveClock, StopRequ
 from blitzgs.training.events import save
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
+from tests.helpers import save_checkpoint
 from tests.training.tiny import at_step, read_log, steps_of, tiny_config, tiny_scene
 
 ROOT = Path(__file__).parents[2]
@@ -65,7 +66,7 @@ def test_a_checkpoint_with_nan_is_not_resumed_from(tmp_path):
     table = running.state.table
     table["sh"][3] = float("nan")
     newest = checkpoint.load_latest(tmp_path / "checkpoints", Ranks(), "cpu")
-    checkpoint.save(tmp_path / "checkpoints", table.columns, newest.state, Ranks())
+    save_checkpoint(tmp_path / "checkpoints", table.columns, newest.state, Ranks())
     with pytest.warns(UserWarning, match="is refused: column 'sh' is not finite.*; using checkpoint_000001"):
         found = run_files.restore(tmp_path, Ranks())
     assert found.source == "checkpoint_000001 (the newest sound one; 1 newer refused)"

@@ -17,7 +17,7 @@ from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY
-from blitzgs.runs.exposure import LEAST_SPREAD, stored
+from blitzgs.runs.cameras import LEAST_SPREAD, stored_exposures
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batches import Batch
@@ -234,7 +234,7 @@ def test_saved_exposures_are_restored():
     second = Exposures(TRAIN, Ranks())
     second.restore(first.columns())
     assert torch.equal(first.effective(), second.effective()) and torch.equal(first.counts, second.counts)
-    assert torch.equal(stored(first.columns()), first.effective()) and stored({}) is None
+    assert torch.equal(stored_exposures(first.columns()), first.effective()) and stored_exposures({}) is None
     other = Exposures(TRAIN[1:], Ranks())
     other.restore(first.columns())
     assert other.counts.sum() == 0

@@ -31,7 +31,7 @@ from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_tabl
 
 def subject_of(model, part=slice(None)):
     columns = {name: getattr(model, name)[part] for name in (*PARAMETERS, "level")}
-    columns["id"] = torch.arange(len(model))[part]
+    columns["id"] = torch.arange(len(model), device=model.means.device)[part]
     options = render_options(model.config, model.space, model.sh_degree)
     return Subject(table_of_parameters(columns), options, model.space.unit, model.lod)
 
@@ -86,10 +86,13 @@ def test_levels_have_colours_of_their_own(scene, drawer):
     assert np.abs(levels.astype(int) - plain).mean() > 5
 
 
-def test_layers_of_depth_are_one_picture(scene, drawer, monkeypatch):
+@pytest.mark.parametrize("device", DEVICES)
+def test_layers_of_depth_are_one_picture(scene, trained, device, monkeypatch):
+    model = open_run(trained[1]).model(device)
+    drawer = Drawer(subject_of(model), TileOwners(Ranks(device=torch.device(device))))
     looks = {mode: look_of(*scene, mode=mode, background=(0.9, 0.2, 0.4)) for mode in MODES}
     whole = {mode: drawer.draw(look) for mode, look in looks.items()}
-    monkeypatch.setitem(LAYER_ROWS, "cpu", BLOCK_ROWS)
+    monkeypatch.setitem(LAYER_ROWS, device, BLOCK_ROWS)
     for mode, picture in whole.items():
         layered = drawer.draw(looks[mode])
         assert layered.gaussians == picture.gaussians

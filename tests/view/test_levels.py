@@ -51,6 +51,14 @@ def test_scales_with_the_world_exactly():
     assert scaled == Levels(levels.count, 2.0, levels.reference_distance * 64, levels.voxel_size * 64)
 
 
+def test_a_few_points_at_a_horizon_do_not_make_the_voxels_of_the_others_larger():
+    points, centres = cloud()
+    near = measure_levels(points, centres, 2.0)
+    for factor in (1e3, 1e6, 1e30):
+        levels = measure_levels(torch.cat([points[:-150], points[-150:] * factor]), centres, 2.0)
+        assert levels.voxel_size_of(levels.count - 1) < 2 * near.voxel_size_of(near.count - 1)
+
+
 def test_farthest_is_where_eq_1_still_rounds_up_to_the_level():
     levels = Levels(count=6, fork=2.0, reference_distance=10.0, voxel_size=1.0)
     for level in range(1, 6):

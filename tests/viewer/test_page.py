@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra view is not installed")
 
-from blitzgs.cli.live import live_page
+from blitzgs.cli.train import live_page
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.export import export_ply

@@ -29,8 +29,12 @@ _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 _SAME = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py", "z": "alt"}
 
 
+def _separator(line: str) -> str:
+    return ";" if ";" in line else ","  # spreadsheets of many countries write semicolons
+
+
 def _columns(line: str) -> list[str]:
-    names = [name.strip().lstrip("#").lower() for name in line.split(",")]
+    names = [name.strip().lstrip("#").lower() for name in line.split(_separator(line))]
     return [_SAME.get(name, name) for name in names]
 
 
@@ -47,7 +51,8 @@ def read_realitycapture(path: Path) -> Project:
     first = next(i for i, line in enumerate(lines[:2]) if set(_NEEDED) <= set(_columns(line)))
     columns = _columns(lines[first])
     views = []
-    for place, row in enumerate(csv.reader(lines[first + 1 :]), start=first + 2):
+    rows = csv.reader(lines[first + 1 :], delimiter=_separator(lines[first]))
+    for place, row in enumerate(rows, start=first + 2):
         if not row or row[0].startswith("#"):
             continue
         where = f"{path}: line {place}"

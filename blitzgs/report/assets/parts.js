@@ -39,8 +39,9 @@ function short(value) {
 function duration(seconds) {
   if (!isNumber(seconds)) return "–";
   if (seconds < 60) return `${seconds.toFixed(1)} s`;
-  if (seconds < 3600) return `${Math.floor(seconds / 60)} min ${Math.round(seconds % 60)} s`;
-  return `${Math.floor(seconds / 3600)} h ${Math.round((seconds % 3600) / 60)} min`;
+  const whole = Math.round(seconds), minutes = Math.round(seconds / 60);
+  if (whole < 3600) return `${Math.floor(whole / 60)} min ${whole % 60} s`;
+  return `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
 }
 
 const METRICS = {
@@ -108,7 +109,7 @@ function ticks(low, high, count) {
   const rough = (high - low) / count || 1, size = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 2.5, 5, 10].find((factor) => factor * size >= rough) * size;
   const found = [];
-  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) found.push(k * step);
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) found.push(k * step + 0);  // no -0
   return found;
 }
 
@@ -196,7 +197,8 @@ function curveCharts(runs) {
       chart("Loss", lines(["loss"], [""]), { ...options, zero: true }),
       chart("PSNR, dB", lines(["psnr", "held_out"], ["training", "held out"]), { ...options, text: (v) => v.toFixed(1) }),
       chart("Gaussians", lines(["gaussians"], [""]), { ...options, zero: true }),
-      chart("Memory, bytes", lines(["memory_bytes"], [""]), { ...options, zero: true }),
+      chart("Memory, GB", lines(["memory_bytes"], [""]).map((line) => ({ ...line,
+        points: line.points.map(([x, y]) => [x, y / 1e9]) })), { ...options, zero: true, text: (v) => number(v, v < 10 ? 2 : 0) }),
       chart("Images per second", lines(["images_per_second"], [""]), { ...options, zero: true }),
     ].filter(Boolean));
   }

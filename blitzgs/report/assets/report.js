@@ -71,7 +71,8 @@ function plan(open) {
   const [low, high] = [known[Math.floor(0.02 * known.length)], known[Math.ceil(0.98 * (known.length - 1))]];
   const colour = (psnr) => ramp(high > low ? (psnr - low) / (high - low) : 0.5);
   const canvas = el("canvas", { class: "plan", role: "img", "aria-label": "Plan of the cameras" });
-  const said = el("p", { class: "soft" }, "\u00a0"), pictured = new Set(data.pictures.map((view) => view.name));
+  const hint = "Point at a camera for its name and PSNR; a click on one with a picture opens it.";
+  const said = el("p", { class: "soft" }, hint), pictured = new Set(data.pictures.map((view) => view.name));
   const [xs, ys] = [0, 1].map((axis) => cameras.points.map((p) => p[axis]));
   const box = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
   let place;
@@ -89,7 +90,7 @@ function plan(open) {
     for (const held of [0, 1]) {
       // What is not measured lies below, and pale.
       for (const point of cameras.points.filter((p) => p[2] === held).sort((a, b) => isNumber(a[3]) - isNumber(b[3]))) {
-        const [x, y] = place(point), size = (held ? 5 : 3) * (many ? 0.6 : 1);
+        const [x, y] = place(point), size = (held ? 5 : isNumber(point[3]) ? 4.5 : 3) * (many ? 0.6 : 1);
         pen.beginPath();
         if (held) pen.rect(x - size, y - size, 2 * size, 2 * size); else pen.arc(x, y, size, 0, 7);
         pen.fillStyle = isNumber(point[3]) ? colour(point[3]) : "#8a93a366";
@@ -121,7 +122,7 @@ function plan(open) {
   }
   canvas.onpointermove = (event) => {
     const point = nearest(event);
-    said.textContent = point === null ? "\u00a0" : `${point[4]}, ${point[2] ? "held out" : "trained on"}` +
+    said.textContent = point === null ? hint : `${point[4]}, ${point[2] ? "held out" : "trained on"}` +
       (isNumber(point[3]) ? `, ${number(point[3], 2)} dB` : "");
     canvas.style.cursor = point && pictured.has(point[4]) ? "pointer" : "default";
   };

@@ -19,8 +19,8 @@ from blitzgs.runs.lod import scene_gate
 from blitzgs.training.state import TrainingState
 from blitzgs.util.output import write_file
 
-# At the end of a run, as many training views as held-out ones are measured, but at least and at most:
-LEAST_TRAINED, MOST_TRAINED = 8, 64
+# The end of a run measures as many training views as take this share of its time, at least and at most:
+TRAINED_SHARE, LEAST_TRAINED, MOST_TRAINED = 0.02, 8, 64
 
 
 def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
@@ -32,11 +32,15 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
     with state.paused_clock():
         folder = state.folder / run_files.EVALUATION / f"{state.images_seen:06d}"
         capture = state.capture
+        begin = state.clock()
         try:
             metrics = measure(state, capture.test or capture.train, folder, state.lpips)
             if event is None and capture.test:
-                count = min(MOST_TRAINED, max(LEAST_TRAINED, len(capture.test)))
-                _write_trained(state, spread(capture.train)[:count], folder)
+                cost = max(1e-9, (state.clock() - begin) / len(capture.test))
+                count = int(
+                    min(MOST_TRAINED, max(LEAST_TRAINED, TRAINED_SHARE * state.progress.seconds / cost))
+                )
+                _write_trained(state, spread(capture.train)[: state.ranks.broadcast_object(count)], folder)
         except EvaluationStoppedError:
             text = "evaluation given up: the run has to stop"
             state.log.event(state.images_seen, "evaluation stopped", {}, text)
