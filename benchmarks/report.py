@@ -52,8 +52,8 @@ COMMANDS = {
     "town_parts": f"{PLAN} --out runs/town_parts --capture town=DATA/town --seeds 0 1 2",
     "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 --popping --scale 0.6",
     "city_ranks": (
-        "python benchmarks/bm_city.py CITY --out RESULTS --gpus 4 --ranks 1 4 --arms all_off --batch-sizes 16 "
-        "--scale 13.85 --seconds-per-run 540"
+        "python benchmarks/bm_city.py CITY --out RESULTS --gpus 4 --ranks 1 4 --arms all_off "
+        "--batch-sizes 16 --scale 13.85 --seconds-per-run 540"
     ),
 }
 # The files of a group are of one commit, and so are those that are in no group. Comparisons of whole

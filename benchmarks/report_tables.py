@@ -28,7 +28,9 @@ class Section:
     origin: bool = True
 
 
-QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "corrected", "training PSNR / SSIM", "seconds", "Gaussians")
+QUALITY_COLUMNS = (
+    "recipe", "images", "seeds", "PSNR", "SSIM", "corrected", "training PSNR / SSIM", "seconds", "Gaussians",
+)  # fmt: skip
 ABLATION_COLUMNS = (
     "scene", "arm", "seeds", "PSNR", "corrected PSNR", "SSIM", "peak M", "final M", "peak GB"
 )  # fmt: skip

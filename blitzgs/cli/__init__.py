@@ -7,7 +7,6 @@ A command's file is imported when the command is used: `blitzgs --help` needs no
 from __future__ import annotations
 
 import argparse
-import ctypes
 import os
 import signal
 import sys
@@ -96,8 +95,6 @@ def _run(given: list[str]) -> int:
     # Our warnings are about the user's data, so they are shown without the line of code that raised them.
     warnings.formatwarning = lambda message, *_, **__: printable(f"{name}: warning: {message}\n")
     try:
-        if chosen == "train" and any(text.startswith("--out") for text in given):
-            threading.Thread(target=_wake_gpu, args=(int(os.environ.get("LOCAL_RANK", "0")), given)).start()
         with _quiet_interrupt(name):
             parser, commands = parser_of([chosen])
         command = commands.get(chosen)
@@ -114,26 +111,6 @@ def _run(given: list[str]) -> int:
             raise
         _print_error(f"{name}: {printable(_message(error))}")
         return 1
-
-
-def _wake_gpu(local_rank: int, given: Sequence[str]) -> None:
-    """Make this process's CUDA context and initialise NVML while torch is imported.
-
-    Torch uses both. On a host of several GPUs they take seconds, NVML within the first allocation of shared
-    memory, where no other thread of Python could run. Without a GPU, or with a device named, nothing happens.
-    """
-    if any(text.startswith(("--device", "--check", "--show-config")) for text in given):
-        return
-    try:
-        driver, management = ctypes.CDLL("libcuda.so.1"), ctypes.CDLL("libnvidia-ml.so.1")
-    except OSError:
-        return
-    count, device, context = ctypes.c_int(), ctypes.c_int(), ctypes.c_void_p()
-    if driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count)) or not count.value:
-        return
-    if not driver.cuDeviceGet(ctypes.byref(device), local_rank % count.value):
-        driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)
-        management.nvmlInit_v2()
 
 
 def _arguments(parser: Parser, command: Parser | None, chosen: str, given: list[str]) -> argparse.Namespace:

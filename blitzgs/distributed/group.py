@@ -132,8 +132,6 @@ class Ranks:
         if self.shares_gpu:
             # Torch reads this variable whenever it maps shared memory.
             os.environ["TORCH_SYMM_MEM_ALLOW_OVERLAPPING_DEVICES"] = "1"
-        # Nothing here uses multicast, which takes time for each piece of shared memory.
-        os.environ.setdefault("TORCH_SYMM_MEM_DISABLE_MULTICAST", "1")
         nccl = self.device.type == "cuda" and not self.shares_gpu
         dist.init_process_group(
             backend="gloo" if not nccl else "cpu:gloo,cuda:nccl" if tables_on_host else "nccl",
