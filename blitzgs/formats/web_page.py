@@ -209,8 +209,8 @@ def web_page(splats: WebSplats, scene: WebScene, title: str, left_out: str = "")
     known = asdict(scene) | {"count": len(splats), "degree": splats.degree, "harmonic": HARMONIC}
     return _filled(
         "file.js",
-        title=html.escape(title),
-        left_out=html.escape(left_out),
+        title=as_html(title),
+        left_out=as_html(left_out),
         # No text in a script element may look like a tag.
         scene=json.dumps(known, allow_nan=False).replace("<", "\\u003c"),
         model=base64.b64encode(packed(splats)).decode(),
@@ -219,7 +219,12 @@ def web_page(splats: WebSplats, scene: WebScene, title: str, left_out: str = "")
 
 def tiles_page(title: str) -> str:
     """Return the page that shows the tileset beside it; see `blitzgs.formats.tiles`."""
-    return _filled("tiles.js", title=html.escape(title), left_out="", scene="{}", model="")
+    return _filled("tiles.js", title=as_html(title), left_out="", scene="{}", model="")
+
+
+def as_html(text: str) -> str:
+    """Return text as HTML; what is no UTF-8 in the name of a file becomes question marks."""
+    return html.escape(text.encode("utf-8", "replace").decode())
 
 
 def _filled(program: str, **fields: str) -> str:

@@ -7,7 +7,6 @@ photographs and warnings may hold anything.
 
 from __future__ import annotations
 
-import html
 import json
 import math
 import os
@@ -21,7 +20,7 @@ import numpy as np
 
 from blitzgs.config.files import flat, to_dict
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.web_page import check_replaces_page
+from blitzgs.formats.web_page import as_html, check_replaces_page
 from blitzgs.report import gather
 from blitzgs.report.gather import RunData, read_run
 from blitzgs.runs import files as run_files
@@ -43,7 +42,7 @@ def page(
     """
     assets = files("blitzgs.report") / "assets"
     values = {
-        "@TITLE@": html.escape(title.encode("utf-8", "replace").decode()),
+        "@TITLE@": as_html(title),
         "@STYLE@": (assets / "style.css").read_text(encoding="utf-8"),
         "@SCRIPT@": "\n".join((assets / name).read_text(encoding="utf-8") for name in scripts),
         "@DATA@": _json(data),

@@ -416,11 +416,13 @@ def test_any_path_works(trained, tmp_path, capfd, name):
     assert main(["train", "--data", str(data), "--out", str(out), *flags]) == 0
     printed = capfd.readouterr().out
     assert "psnr" in printed
+    assert (out / "report.html").exists()
     assert name.encode(errors="backslashreplace").decode() in printed
     for command in (
         ["eval", str(out)],
         ["render", str(out), "--out", str(tmp_path / f"r {name}")],
         ["export", str(out), "--ply", str(tmp_path / f"{name.replace('/', '')}.ply")],
+        ["export", str(out), "--html", str(tmp_path / f"{name.replace('/', '')}.html")],
         ["train", "--out", str(out), "--resume"],
     ):
         assert main(command) == 0, capfd.readouterr().err
