@@ -146,7 +146,9 @@ def save(
     }
     keep = config.log.keep_checkpoints
     columns = {name: table[name] for name in table}
-    has_room = in_background and 2 * table.memory_bytes < _memory_left(table.device)
+    # Ranks that share a memory all copy their parts into it.
+    sharing = ranks.world_size if table.device.type == "cpu" or ranks.shares_gpu else 1
+    has_room = in_background and 2 * sharing * table.memory_bytes < _memory_left(table.device)
     if has_room:
         columns = {name: column.clone() for name, column in columns.items()}
     saving = checkpoint.Saving(folder / CHECKPOINTS, columns, state, ranks, keep, shared)

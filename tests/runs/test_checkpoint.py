@@ -5,15 +5,18 @@ import os
 import resource
 import signal
 import warnings
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import checkpoint, manifest
+from blitzgs.runs import checkpoint, files, manifest
 from tests.distributed.rank_harness import CONTEXT, RankError, run_ranks
 from tests.helpers import save_checkpoint
+from tests.training.tiny import random_gaussians, tiny_config
 
 ALONE = Ranks()
 POINTS = [
@@ -313,3 +316,17 @@ def test_shared_columns_are_saved_and_checked(tmp_path):
     (path / checkpoint.SHARED).unlink()
     with pytest.raises(checkpoint.CheckpointError, match="shared.safetensors is missing"):
         checkpoint.load(path, ALONE, "cpu")
+
+
+@pytest.mark.parametrize(("ranks", "copies"), [(1, True), (2, True), (3, False)])
+def test_ranks_that_share_a_memory_need_room_for_all_their_copies(tmp_path, monkeypatch, ranks, copies):
+    gaussians, written = random_gaussians(), []
+    job = SimpleNamespace(world_size=ranks, watchdog=SimpleNamespace(working=lambda what: nullcontext()))
+    monkeypatch.setattr(files, "check_before_saving", lambda *_: None)
+    monkeypatch.setattr(files, "available_bytes", lambda: 5 * gaussians.memory_bytes)
+    monkeypatch.setattr(
+        checkpoint, "Saving", lambda folder, columns, *_: written.append(columns) or SimpleNamespace(wait=int)
+    )
+    progress, space = files.Progress(1, 0, 1, 1, 0.0), files.Space((0.0, 0.0, 0.0), 1.0, 1.0)
+    files.save(tmp_path, gaussians, progress, space, tiny_config(), job, in_background=True)
+    assert (written[0]["means"].data_ptr() != gaussians["means"].data_ptr()) == copies
