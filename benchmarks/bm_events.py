@@ -136,7 +136,6 @@ def make_state(scene: BenchmarkScene, table: GaussianTable, ranks: Ranks) -> Tra
         optimiser=optimiser,
         stepper=Stepper(table, optimiser, owners, LOSS, 1.0),
         owners=owners,
-        lpips=None,
         run_id="",
         origin="",
         save_clock=cast(Any, None),

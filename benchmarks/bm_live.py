@@ -34,7 +34,7 @@ def train(kind: str, options) -> dict[str, float]:  # noqa: ANN001
     """Train once; return the figures."""
     config = load_config(
         recipe_path(options.config),
-        [f"data.path={options.data}", "log.tensorboard=false", "log.pictures=0", *options.fields],
+        [f"data.path={options.data}", "log.tensorboard=false", *options.fields],
     )
     device, _ = resolve_device(options.device, 0, 1, False)
     ranks = Ranks(device=device)

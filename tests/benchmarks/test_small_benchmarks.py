@@ -19,6 +19,8 @@ from scenes import aerial
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.tiles import write_tiles
 from blitzgs.runs import files as run_files
+from blitzgs.runs import lod
+from blitzgs.training import setup
 from blitzgs.training.trainer import Trainer
 from tests.formats.test_tiles import SCENE, city
 from tests.helpers import DEVICES, needs_cuda
@@ -88,16 +90,17 @@ def test_nearer_frames_load_more_and_small_errors_show_everything(tmp_path, caps
     assert coarse[-1]["distance"] < coarse[0]["distance"]
 
 
-FLAGS = (
-    "schedule.iterations=60", "view.lod=true", "schedule.densify_until=40", "lod.fork=1.3", "log.pictures=0",
-)  # fmt: skip
+FLAGS = ("schedule.iterations=60", "view.lod=true", "schedule.densify_until=40")
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("popping") / "run"
-    Trainer(tiny_config(*FLAGS), *tiny_scene(), folder, Ranks()).train()
-    return folder
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (setup, lod):  # levels so near that the tiny scene has several
+            patch.setattr(module, "FORK", 1.3)
+        Trainer(tiny_config(*FLAGS), *tiny_scene(), folder, Ranks()).train()
+        yield folder
 
 
 @pytest.mark.parametrize("device", DEVICES)
