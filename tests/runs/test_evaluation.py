@@ -22,7 +22,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats import gaussians as blocks
 from blitzgs.formats.models import FORMATS
 from blitzgs.formats.ply import read_ply
-from blitzgs.reference.gaussians import rotation_matrices, sh_basis
+from blitzgs.reference.projection import rotation_matrices, sh_basis
 from blitzgs.runs import checkpoint
 from blitzgs.runs.evaluation import correct_colours, image_metrics, load_lpips
 from blitzgs.runs.export import export, export_ply
