@@ -26,8 +26,8 @@ from blitzgs.formats.models import FORMATS, read_gaussians
 from blitzgs.runs.evaluation import _psnr
 from blitzgs.runs.export import export
 from blitzgs.runs.folder import open_run
-from blitzgs.runs.from_file import trained_columns
 from blitzgs.runs.source import source_of
+from blitzgs.runs.world import trained_columns
 from blitzgs.table.table import PARAMETERS
 from tests.formats.helpers import read_glb
 

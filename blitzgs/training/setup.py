@@ -26,9 +26,8 @@ from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_came
 from blitzgs.runs.evaluation import load_lpips
 from blitzgs.runs.files import Progress
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
-from blitzgs.runs.from_file import trained_columns
 from blitzgs.runs.log import LOG, RunLog
-from blitzgs.runs.world import save_frame
+from blitzgs.runs.world import save_frame, trained_columns
 from blitzgs.spawn.lineage import Ledger, Lineage, initial_births
 from blitzgs.spawn.rules import lineage_subject, open_spawn_gate
 from blitzgs.table.blocks import sort_rows
