@@ -27,11 +27,10 @@ from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint
 from blitzgs.runs import files as run_files
 from blitzgs.runs.checkpoint import CheckpointError
+from blitzgs.runs.checkpoint_files import DAMAGE, Shard, header_of, read_rows, verified
 from blitzgs.runs.folder import Model
 from blitzgs.runs.folder_checks import check_own
 from blitzgs.runs.lod import lod_gate
-from blitzgs.runs.manifest import DAMAGE, Shard, verified
-from blitzgs.runs.shard_file import header_of, read_rows
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.output import write_file
 from blitzgs.view.gate import LodGate
