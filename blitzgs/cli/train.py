@@ -26,8 +26,7 @@ from blitzgs.config.files import ConfigError, changed, default_recipe, load_conf
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.folder_checks import locked
-from blitzgs.training.budget import LEAST_IMAGES
-from blitzgs.training.estimate import estimate
+from blitzgs.training.budget import LEAST_IMAGES, estimate
 from blitzgs.training.inputs import open_capture, read_ahead
 from blitzgs.training.state import TrainingState
 from blitzgs.training.trainer import Trainer
