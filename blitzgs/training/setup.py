@@ -36,16 +36,14 @@ from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.budget import extended
-from blitzgs.training.curve import Curve
-from blitzgs.training.exposure import Exposures
+from blitzgs.training.exposure import Exposures, differ, track_gains
 from blitzgs.training.inputs import check_alike, check_capture, check_resolution
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.records import PICTURE
 from blitzgs.training.sampler import BatchSampler, tour_of
-from blitzgs.training.state import TrainingState
+from blitzgs.training.state import Curve, TrainingState
 from blitzgs.training.step import Stepper
-from blitzgs.training.track_gains import differ, track_gains
 from blitzgs.training.view_level import keep_to_views
 from blitzgs.view.levels import Levels, measure_levels
 from blitzgs.view.views import Space, ViewSet, trained_centres

@@ -13,9 +13,9 @@ import torch
 from blitzgs.capture.images import PhotographError
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.guard import ModelLostError
-from blitzgs.training.curve import FALL, WINDOW, Curve
 from blitzgs.training.events import evaluate as glances
 from blitzgs.training.events.evaluate import Glances, spread
+from blitzgs.training.state import FALL, WINDOW, Curve
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Look, Wish
