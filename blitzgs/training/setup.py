@@ -28,8 +28,8 @@ from blitzgs.runs.files import Progress
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
 from blitzgs.runs.log import LOG, RunLog
 from blitzgs.runs.world import save_frame, trained_columns
+from blitzgs.spawn.gate import lineage_subject, open_spawn_gate
 from blitzgs.spawn.lineage import Ledger, Lineage, initial_births
-from blitzgs.spawn.rules import lineage_subject, open_spawn_gate
 from blitzgs.table.blocks import sort_rows
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Pool

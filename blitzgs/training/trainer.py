@@ -26,7 +26,7 @@ from blitzgs.runs import files as run_files
 from blitzgs.runs.guard import LossGuard, ModelLostError
 from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.log import RunLog
-from blitzgs.spawn.rules import lineage_subject
+from blitzgs.spawn.gate import lineage_subject
 from blitzgs.table.pool import PoolError
 from blitzgs.training import view_level
 from blitzgs.training.agreement import MAX_STEPS, Agreement, StopRequest
