@@ -112,7 +112,7 @@ POSITION_LEFT, SH_SHARE = 0.01, 0.05
 RESET_OPACITY = 0.01
 
 # The limits of the `loss.opacity` that a run computes from `loss.opacity_total`: about the range that was
-# measured (docs/decisions/recipe.md).
+# measured (docs/decisions.md).
 LEAST_OPACITY, MAX_OPACITY = 0.005, 0.05
 
 
