@@ -9,8 +9,7 @@ includes the kernels. On CUDA each pass ends with a synchronisation, so a figure
 device. Each figure is a median over repeats.
 
 The second table has the steps of a trainer made of `raw_rasterization`, `l1_ssim` and a `LazyAdam` for each
-parameter, or one for all, by part, without synchronisations; each figure is a mean over repeats. It also
-says how many of torch's operations a step takes.
+parameter, or one for all, by part, without synchronisations; each figure is a mean over repeats.
 
 The third table has the steps of `blitzgs train` on eight photographs of 48 x 32 px with 400 Gaussians:
 medians of the time between two steps and of their parts, without synchronisations.
@@ -31,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Parts, make_parser, report, trace, write_json
+from harness import Parts, make_parser, report, write_json
 from scenes import aerial
 
 from blitzgs import l1_ssim, rasterization, raw_rasterization
@@ -125,8 +124,8 @@ class Trainer:
 
 
 def measure_trainer(device: str, repeats: int, in_one: bool) -> dict[str, float]:
-    """Return the host's microseconds for each part of a trainer's step, and the operations of a step."""
-    trainer, counted = Trainer(device, in_one), 5
+    """Return the host's microseconds for each part of a trainer's step."""
+    trainer = Trainer(device, in_one)
 
     def steps(count: int) -> None:
         for _ in range(count):
@@ -135,9 +134,7 @@ def measure_trainer(device: str, repeats: int, in_one: bool) -> dict[str, float]
     steps(repeats // 10 + 1)
     trainer.part = parts = Parts(torch.device(device))
     steps(repeats)
-    found = {row["part"]: 1e3 * row["host, ms"] for row in parts.rows(repeats)}
-    counts, *_ = trace(lambda: steps(counted), counted, torch.device(device))
-    return {**found, "torch's operations (a number)": counts[-1]["torch ops"]}
+    return {row["part"]: 1e3 * row["host, ms"] for row in parts.rows(repeats)}
 
 
 def measure_training(device: str, repeats: int) -> list[dict[str, Any]]:
