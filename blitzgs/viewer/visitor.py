@@ -18,8 +18,7 @@ from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Look, Picture
 from blitzgs.viewer import compare
 from blitzgs.viewer.exhibit import Exhibit
-from blitzgs.viewer.pace import STILL_SECONDS, Pace
-from blitzgs.viewer.settings import Settings
+from blitzgs.viewer.settings import STILL_SECONDS, Pace, Settings
 from blitzgs.viewer.shade import Shaded, shaded
 from blitzgs.viewer.world import SCALE, Stance, World
 
