@@ -20,7 +20,7 @@ from blitzgs.viewer.door import Door, is_loopback
 from blitzgs.viewer.film import read_film
 from blitzgs.viewer.frustums import MAX_FRUSTUMS, shown_cameras
 from blitzgs.viewer.live import Curves
-from blitzgs.viewer.overlay import round_length
+from blitzgs.viewer.panel import round_length
 from blitzgs.viewer.settings import Pace
 from blitzgs.viewer.world import World, looking, up_direction
 
