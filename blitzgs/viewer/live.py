@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from blitzgs.view.look import Picture, Wish
-from blitzgs.viewer.exhibit import Exhibit
 from blitzgs.viewer.page import Page
 from blitzgs.viewer.visitor import Ask, Visitor
+from blitzgs.viewer.world import Exhibit
 
 # A curve is drawn with this many points at most.
 _MAX_POINTS = 300

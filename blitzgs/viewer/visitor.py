@@ -18,9 +18,8 @@ from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Look, Picture
 from blitzgs.viewer import compare
 from blitzgs.viewer.compare import Shaded, shaded
-from blitzgs.viewer.exhibit import Exhibit
 from blitzgs.viewer.settings import STILL_SECONDS, Pace, Settings
-from blitzgs.viewer.world import SCALE, Stance, World
+from blitzgs.viewer.world import SCALE, Exhibit, Stance, World
 
 if TYPE_CHECKING:
     import viser
