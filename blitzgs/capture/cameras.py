@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of a capture: pinhole views of the re-centred world, and their undistortion."""
+"""Cameras of a capture: pinhole views of the re-centred world, and their undistortion.
+
+The camera of an undistorted image keeps the focal lengths and the principal ray, so the resolution at the
+centre does not change, and its pixel grid continues the old one. "crop" keeps the largest rectangle found in
+which every pixel was seen; "mask" keeps the bounding rectangle of what was seen (at most 70 degrees off the
+axis) and marks the rest.
+"""
 
 from __future__ import annotations
 
