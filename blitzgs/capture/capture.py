@@ -49,7 +49,7 @@ from blitzgs.capture.usable import (
     without_strays,
     without_unused,
 )
-from blitzgs.util.arguments import check_number
+from blitzgs.util.errors import check_number
 
 # In pixels. SSIM compares windows of 11 pixels, and a much smaller image shows too little to train on.
 _LEAST_SIDE = 8
