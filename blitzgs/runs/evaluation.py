@@ -29,7 +29,7 @@ from blitzgs.frame.frame import RenderOptions
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.tiles import TileAssignment, collect_images
 from blitzgs.ops.photometric import ssim
-from blitzgs.util.memory import explain_memory
+from blitzgs.util.errors import explain_memory
 from blitzgs.util.output import OutputFolder
 from blitzgs.util.progress import Report
 from blitzgs.view.gate import SceneGate
