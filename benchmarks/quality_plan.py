@@ -4,7 +4,7 @@
 The stress grid says how far a recipe is from losing what it has learnt: every capture x schedule x change of
 one value x batch size; a column has one capture and one value of the grid's other axes. A cell has the
 held-out PSNR, and the largest fall of the training PSNR below its running best
-(`blitzgs.training.curve.Curve.fall`).
+(`blitzgs.training.state.Curve.fall`).
 """
 
 from __future__ import annotations

@@ -18,9 +18,8 @@ from blitzgs._torch import hooks_on_saved_tensors
 from blitzgs.call.arguments import Gaussians, Scene
 from blitzgs.call.channels import ImageOptions, channels_of
 from blitzgs.call.covariances import Decomposed, shaped_by
-from blitzgs.frame.run import run
-from blitzgs.frame.transport.local import LocalExchange, LocalTransport
-from blitzgs.frame.transport.protocol import Exchange
+from blitzgs.frame.frame import run
+from blitzgs.frame.transport.protocol import Exchange, LocalExchange, LocalTransport
 from blitzgs.ops.project import TableRows, differentiable_splats, project_splats
 from blitzgs.ops.projection_types import (
     MAX_VIEWS,

@@ -38,14 +38,15 @@ from blitzgs.capture.names import MissingImagesError as MissingImagesError
 from blitzgs.capture.names import check_inside, existing
 from blitzgs.capture.points import SourcePoints
 from blitzgs.capture.projects.find import FoundProject, folder_of, project_at
-from blitzgs.capture.splits import split_capture, without_unused
 from blitzgs.capture.undistort import Rectification, rectify
 from blitzgs.capture.usable import (
     check_lenses,
     finite_points,
     points_at_random,
+    split_capture,
     with_finite_poses,
     without_strays,
+    without_unused,
 )
 from blitzgs.util.arguments import check_number
 

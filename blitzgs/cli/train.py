@@ -20,14 +20,13 @@ from rich.table import Table
 from blitzgs.cli.arguments import Commands, add_command, add_device, add_path, number
 from blitzgs.cli.report import kept_warnings, write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
-from blitzgs.config.describe import describe, describe_all, describe_page
 from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, changed, default_recipe, load_config, recipe_path, to_dict
+from blitzgs.config.ranges import describe, describe_all, describe_page
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.folder_checks import locked
-from blitzgs.training.budget import LEAST_IMAGES
-from blitzgs.training.estimate import estimate
+from blitzgs.training.budget import LEAST_IMAGES, estimate
 from blitzgs.training.inputs import open_capture, read_ahead
 from blitzgs.training.state import TrainingState
 from blitzgs.training.trainer import Trainer

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.frame.frame import RenderOptions, Views, inputs_of, tile_grid
-from blitzgs.frame.run import run
+from blitzgs.frame.frame import RenderOptions, Views, inputs_of, run, tile_grid
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import Exchange, LocalTransport, Transport, open_transport
 from blitzgs.ops.blocks import ActiveRows

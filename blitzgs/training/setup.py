@@ -26,27 +26,24 @@ from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_came
 from blitzgs.runs.evaluation import load_lpips
 from blitzgs.runs.files import Progress
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
-from blitzgs.runs.from_file import trained_columns
 from blitzgs.runs.log import LOG, RunLog
-from blitzgs.runs.world import save_frame
+from blitzgs.runs.world import save_frame, trained_columns
+from blitzgs.spawn.gate import lineage_subject, open_spawn_gate
 from blitzgs.spawn.lineage import Ledger, Lineage, initial_births
-from blitzgs.spawn.rules import lineage_subject, open_spawn_gate
 from blitzgs.table.blocks import sort_rows
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.budget import extended
-from blitzgs.training.curve import Curve
-from blitzgs.training.exposure import Exposures
+from blitzgs.training.exposure import Exposures, differ, track_gains
 from blitzgs.training.inputs import check_alike, check_capture, check_resolution
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.records import PICTURE
 from blitzgs.training.sampler import BatchSampler, tour_of
-from blitzgs.training.state import TrainingState
+from blitzgs.training.state import Curve, TrainingState
 from blitzgs.training.step import Stepper
-from blitzgs.training.track_gains import differ, track_gains
 from blitzgs.training.view_level import keep_to_views
 from blitzgs.view.levels import Levels, measure_levels
 from blitzgs.view.views import Space, ViewSet, trained_centres

@@ -26,8 +26,7 @@ from blitzgs.runs import files as run_files
 from blitzgs.runs.guard import LossGuard, ModelLostError
 from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.log import RunLog
-from blitzgs.runs.watch import Watcher
-from blitzgs.spawn.rules import lineage_subject
+from blitzgs.spawn.gate import lineage_subject
 from blitzgs.table.pool import PoolError
 from blitzgs.training import view_level
 from blitzgs.training.agreement import MAX_STEPS, Agreement, StopRequest
@@ -50,6 +49,7 @@ from blitzgs.training.understood import hints_of, largest_size
 from blitzgs.training.watching import Watching
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import Laps
+from blitzgs.view.look import Watcher
 from blitzgs.view.views import render_options
 
 

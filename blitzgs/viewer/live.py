@@ -8,8 +8,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from blitzgs.runs.watch import Wish
-from blitzgs.view.look import Picture
+from blitzgs.view.look import Picture, Wish
 from blitzgs.viewer.curves import Curves
 from blitzgs.viewer.exhibit import Exhibit
 from blitzgs.viewer.page import Page
@@ -30,7 +29,7 @@ MOVING_MS = 12.0
 
 
 class Live:
-    """Watches a training (`blitzgs.runs.watch.Watcher`), and shows it on a page.
+    """Watches a training (`blitzgs.view.look.Watcher`), and shows it on a page.
 
     Attributes:
         page: the page.

@@ -12,9 +12,8 @@ import torch
 from blitzgs.capture.pictures import encode_image
 from blitzgs.view.look import MODES
 from blitzgs.viewer import compare
-from blitzgs.viewer.files import note, safe_name, save_beside
 from blitzgs.viewer.frustums import Frustums
-from blitzgs.viewer.route import Route
+from blitzgs.viewer.route import Route, note, safe_name, save_beside
 from blitzgs.viewer.settings import Triple
 from blitzgs.viewer.visitor import Visitor
 from blitzgs.viewer.world import SCALE

@@ -19,7 +19,7 @@ from blitzgs.formats.tiles import upright
 from blitzgs.formats.web_page import WebScene
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import CAMERAS, load_cameras
-from blitzgs.runs.source import open_source
+from blitzgs.runs.export import open_source
 from blitzgs.view.views import CameraLike, Space, render_options
 from blitzgs.viewer.studio import box_of
 from blitzgs.viewer.web import web_scene

@@ -12,7 +12,7 @@ from torch._dynamo.testing import CompileCounterWithBackend
 import blitzgs
 from blitzgs.call.finite import _warn_of_gradient
 from blitzgs.ops.photometric import photometric_loss
-from blitzgs.reference.gaussians import covariance_factors
+from blitzgs.reference.projection import covariance_factors
 from tests.call.test_raw_rasterization import raw, raw_parameters
 from tests.helpers import DEVICES, PARAMETERS, random_scene, rasterize_scene, relative_error
 

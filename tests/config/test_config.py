@@ -14,7 +14,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from blitzgs.cli import main
-from blitzgs.config.describe import _entries, describe, describe_all
 from blitzgs.config.fields import Config
 from blitzgs.config.files import (
     REMOVED,
@@ -28,7 +27,7 @@ from blitzgs.config.files import (
     save_config,
     to_dict,
 )
-from blitzgs.config.ranges import CHOICES, RANGES, flat_fields, problems
+from blitzgs.config.ranges import CHOICES, RANGES, _entries, describe, describe_all, flat_fields, problems
 from blitzgs.config.schedule import Schedule
 from blitzgs.optim.table_adam import BETA1, BETA2, EPS
 

@@ -12,9 +12,8 @@ import torch
 from blitzgs.config.fields import LossConfig
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.frame import MAX_ATTEMPTS, RenderOptions, Views, run
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.run import MAX_ATTEMPTS, run
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges, collect_images
 from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops.projection_types import Sizes

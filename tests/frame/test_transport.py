@@ -12,7 +12,7 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import Shared
 from blitzgs.frame import frame as pipeline
-from blitzgs.frame.run import run
+from blitzgs.frame.frame import run
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.frame.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport, peer
 from blitzgs.frame.transport.collective import CollectiveWayBack

@@ -11,7 +11,7 @@ from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Sizes, splats_of
 from blitzgs.ops.rasterize import rasterize
-from blitzgs.reference.compositing import composited_weights, median_splats, strongest_splats
+from blitzgs.reference.render import composited_weights, median_splats, strongest_splats
 from tests.helpers import BACKENDS, DEVICES, needs_cuda, random_scene
 from tests.ops.test_importance import crowded, lists_of
 

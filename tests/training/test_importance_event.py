@@ -23,10 +23,17 @@ from blitzgs.runs import log as run_log
 from blitzgs.runs.guard import ModelLostError
 from blitzgs.spawn.candidates import FEATURES
 from blitzgs.spawn.fit import fit, read_spawns
-from blitzgs.spawn.gate import GateError, GateInfo, RandomVeto, SampledVeto, info_path
+from blitzgs.spawn.gate import (
+    GateError,
+    GateInfo,
+    RandomVeto,
+    SampledVeto,
+    info_path,
+    life_fields,
+    reasons_against,
+)
 from blitzgs.spawn.lineage import ABOUT, Cause
 from blitzgs.spawn.lineage_parts import read_lineage
-from blitzgs.spawn.rules import life_fields, reasons_against
 from blitzgs.table.layouts import CULL
 from blitzgs.training.events import importance
 from blitzgs.training.trainer import Trainer

@@ -21,11 +21,10 @@ from blitzgs.runs.cameras import LEAST_SPREAD, stored_exposures
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batches import Batch
-from blitzgs.training.exposure import Exposures
+from blitzgs.training.exposure import Exposures, _log_gains, differ, track_gains
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.loss import loss_terms, opacity_term, photometric, scale_term, weighted
 from blitzgs.training.step import Stepper
-from blitzgs.training.track_gains import _log_gains, differ, track_gains
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.gate import ViewGate
 from blitzgs_synth.generate import generate_city

@@ -22,7 +22,7 @@ from blitzgs.config.files import load_config, recipe_path
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.training import inputs
-from blitzgs.training.estimate import _grown, estimate
+from blitzgs.training.budget import _grown, estimate
 from blitzgs.training.understood import (
     HopelessCaptureError,
     check_worlds,

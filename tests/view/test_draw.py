@@ -16,12 +16,10 @@ from blitzgs.ops.blocks import BLOCK_ROWS
 from blitzgs.population.initialisation import _seen_by_more
 from blitzgs.runs.folder import open_run
 from blitzgs.table.table import PARAMETERS, GaussianTable
-from blitzgs.view import point_blocks
 from blitzgs.view.draw import LAYER_ROWS, Drawer, Subject, intrinsics, table_of_parameters
 from blitzgs.view.gate import LodGate, SceneGate
-from blitzgs.view.levels import measure_levels
+from blitzgs.view.levels import BLOCK_POINTS, PointBlocks, measure_levels
 from blitzgs.view.look import MODES, Look
-from blitzgs.view.point_blocks import BLOCK_POINTS, PointBlocks
 from blitzgs.view.views import render_options, viewmat
 from blitzgs.view.visible import VisibleFinder
 from tests.distributed.rank_harness import run_ranks
@@ -209,7 +207,7 @@ def test_every_point_is_between_the_bounds_of_its_block(count):
 @pytest.mark.parametrize("pairs", [1, 200, 1 << 20])
 @pytest.mark.parametrize(("count", "cameras"), [(700, 1), (6000, 150), (40, 300)])
 def test_levels_and_visible_voxels_are_those_of_all_distances(monkeypatch, pairs, count, cameras):
-    monkeypatch.setattr(point_blocks, "_PAIRS", pairs)
+    monkeypatch.setattr("blitzgs.view.levels._PAIRS", pairs)
     points, centres = flat_scene(count, cameras, seed=count)
     distances = np.linalg.norm(points.numpy()[None] - centres.numpy()[:, None], axis=2)
     levels = measure_levels(points, centres, 2.0, 0.001)
