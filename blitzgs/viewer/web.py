@@ -11,7 +11,7 @@ from torch import Tensor
 
 from blitzgs.formats.selection import opacity_length
 from blitzgs.formats.web_page import WebLevels, WebScene, WebSplats, estimated_bytes, frame_bytes, web_page
-from blitzgs.frame.frame import RenderOptions
+from blitzgs.frame.render import RenderOptions
 from blitzgs.runs.clean import contributions as measured
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import PARAMETERS, GaussianTable
