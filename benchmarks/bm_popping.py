@@ -38,8 +38,7 @@ from torch import Tensor
 
 from blitzgs.capture.pictures import to_uint8
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.render import RenderOptions, Views, render_frame
 from blitzgs.frame.survey import survey
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.runs import files as run_files
@@ -159,7 +158,7 @@ def curve_of(
         distance = (table["means"][rows].double() - centres_of(view.viewmats)[0]).norm(dim=1)
         footprint = size[rows] * float(view.Ks[0, 0, 0]) / distance
         keys = dict(zip(RULES, (reach[rows] / distance, footprint, light), strict=True))
-        image = pipeline.forward(table, view, options).renders[0].clamp(0, 1)
+        image = render_frame(table, view, options).renders[0].clamp(0, 1)
         seen.append((view, rows, light, keys, image))
     lines = []
     for rule in RULES:
@@ -172,7 +171,7 @@ def curve_of(
             for view, rows, light, keys, image in seen:
                 stays = keys[rule] >= threshold
                 active = _rows(rows[stays])
-                without = pipeline.forward(table, view, options, active).renders[0].clamp(0, 1)
+                without = render_frame(table, view, options, active).renders[0].clamp(0, 1)
                 error += float((without - image).square().mean()) / len(seen)
                 kept += float(stays.sum())
                 lit += float(light[stays].sum() / light.sum()) / len(seen)
@@ -253,7 +252,7 @@ class _Flight:
         self, table: GaussianTable, viewmats: Tensor, options: RenderOptions, active: ActiveRows | None
     ) -> Tensor:
         views = Views(viewmats, self._K.to(viewmats.device)[None], *self._size)
-        return pipeline.forward(table, views, options, active).renders[0].clamp(0, 1)
+        return render_frame(table, views, options, active).renders[0].clamp(0, 1)
 
 
 def _mean(values: list[float]) -> float:
