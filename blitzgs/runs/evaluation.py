@@ -98,7 +98,7 @@ def load_lpips(path: str | None) -> Lpips | None:
         metric: Lpips = torch.jit.load(path, map_location="cpu")
     except (RuntimeError, ValueError) as error:
         raise ValueError(
-            f"{path} is not a readable TorchScript module of LPIPS (--lpips, log.lpips_weights): {error}"
+            f"{path} is not a readable TorchScript module of LPIPS (--lpips): {error}"
         ) from error
     return metric
 
