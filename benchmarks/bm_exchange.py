@@ -39,8 +39,8 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.config.fields import FORK, Config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TILE_COST, TileOwners, cost_balance
+from blitzgs.frame.render import RenderOptions, Views
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
 from blitzgs.frame.transport import Mark, Traffic, unmarked
 from blitzgs.optim.table_adam import TableAdam

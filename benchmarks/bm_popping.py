@@ -32,8 +32,7 @@ from torch import Tensor
 from blitzgs.capture.pictures import to_uint8
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.film import new_film
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.render import RenderOptions, Views, render_frame
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import load_cameras
@@ -172,7 +171,7 @@ class _Flight:
         self, table: GaussianTable, viewmats: Tensor, options: RenderOptions, active: ActiveRows | None
     ) -> Tensor:
         views = Views(viewmats, self._K.to(viewmats.device)[None], *self._size)
-        return pipeline.forward(table, views, options, active).renders[0].clamp(0, 1)
+        return render_frame(table, views, options, active).renders[0].clamp(0, 1)
 
 
 def _mean(values: list[float]) -> float:

@@ -26,8 +26,8 @@ from scenes import BenchmarkScene, aerial, garden_like
 from blitzgs.config.fields import LossConfig, OptimiserConfig, ScheduleConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.frame import Views
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import Views
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.table.blocks import morton_order

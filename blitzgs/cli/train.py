@@ -319,9 +319,9 @@ def live_page(state: TrainingState, port: int, host: str) -> Live | None:
     """
     if state.ranks.rank != 0:
         return None
-    from blitzgs.viewer.exhibit import Exhibit
     from blitzgs.viewer.live import Live
     from blitzgs.viewer.studio import box_of
+    from blitzgs.viewer.world import Exhibit
 
     capture, images, options = state.capture, state.images, state.render_options
     exhibit = Exhibit(

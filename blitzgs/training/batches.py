@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.capture.images import ImageStore
-from blitzgs.frame.frame import Views
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import Views
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
 from blitzgs.ops.host import current_stream
 from blitzgs.training.sampler import BatchSampler

@@ -18,8 +18,8 @@ from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.frame import RenderOptions
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import RenderOptions
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs.files import Progress
 from blitzgs.runs.lod import lod_gate

@@ -20,7 +20,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.models import FORMATS, read_gaussians
 from blitzgs.runs.files import open_model
 from blitzgs.runs.world import load_frame
-from blitzgs.viewer.overlay import overlay
+from blitzgs.viewer.panel import overlay
 from blitzgs.viewer.studio import open_model as open_viewed
 from blitzgs.viewer.world import Stance, World
 from tests.capture import helpers as files
