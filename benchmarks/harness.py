@@ -16,9 +16,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -209,48 +207,3 @@ def _flatten(value: Any) -> list[Any]:
     if isinstance(value, list | tuple):
         return [leaf for item in value for leaf in _flatten(item)]
     return [value]
-
-
-class Parts:
-    """The times of named parts of steps.
-
-    Between two parts nothing waits for the device, so a part's device time is what lies between its begin and
-    its end on the device: its kernels, and pauses in which the device has nothing to do because the host is
-    late. If the host's times of all parts add up to the time of a step, the host limits it.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        """Time parts on a device."""
-        self._cuda = device.type == "cuda"
-        self._host: dict[str, float] = defaultdict(float)
-        self._events: list[tuple[str, Any, Any]] = []
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        """Add the time of the block to the part `name`."""
-        begin = self._mark()
-        start = time.perf_counter()
-        yield
-        self._host[name] += time.perf_counter() - start
-        self._events.append((name, begin, self._mark()))
-
-    def rows(self, steps: int) -> list[dict[str, Any]]:
-        """Return the times of each part per step, in milliseconds."""
-        device: dict[str, float] = defaultdict(float)
-        if self._cuda:
-            torch.cuda.synchronize()
-            for name, begin, end in self._events:
-                device[name] += begin.elapsed_time(end)
-        rows = [
-            {"part": name, "host, ms": spent / steps * 1e3, "device, ms": device[name] / steps}
-            for name, spent in self._host.items()
-        ]
-        total = {key: sum(row[key] for row in rows) for key in ("host, ms", "device, ms")}
-        return [*rows, {"part": "all", **total}]
-
-    def _mark(self) -> Any:
-        if not self._cuda:
-            return None
-        event = torch.cuda.Event(enable_timing=True)
-        event.record()
-        return event
