@@ -22,7 +22,7 @@ from blitzgs_synth.noise import Noise, cell_random, inside, stripes
 from blitzgs_synth.options import PRESETS, CityOptions
 from blitzgs_synth.plan import Plan
 from blitzgs_synth.processes import each
-from blitzgs_synth.raycast import RayCaster
+from blitzgs_synth.render import RayCaster
 from blitzgs_synth.tracks import ball, may_see
 
 pytest.importorskip("embreex")
