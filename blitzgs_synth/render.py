@@ -15,8 +15,7 @@ from blitzgs_synth.arrays import Bools, Bytes, Doubles, Floats, Ints, dot
 from blitzgs_synth.city import build_city
 from blitzgs_synth.flight import View
 from blitzgs_synth.ground import ground_color
-from blitzgs_synth.materials import Points, rgb
-from blitzgs_synth.noise import Noise
+from blitzgs_synth.materials import Noise, Points, rgb
 from blitzgs_synth.plan import Plan
 
 
