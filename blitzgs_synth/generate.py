@@ -28,9 +28,8 @@ from blitzgs.util.output import PARTIAL, write_file
 from blitzgs_synth.arrays import Doubles, Ints
 from blitzgs_synth.flight import View, plan_flight
 from blitzgs_synth.options import CityOptions
-from blitzgs_synth.photographs import CORNERS, Progress, take_photographs
+from blitzgs_synth.photographs import CORNERS, Progress, each, take_photographs
 from blitzgs_synth.plan import Plan
-from blitzgs_synth.processes import each
 from blitzgs_synth.render import City
 from blitzgs_synth.tracks import Cloud, track
 
