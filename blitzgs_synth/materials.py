@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Patterns (noise, stripes), and colours of walls, roofs, trees and cars at points on them.
 
-Every function takes the points of one material and returns linear RGB [3, R] in [0, 1].
+Colours are linear RGB [3, R] in [0, 1], for the points of one material. All patterns take the sampling
+footprint into account (metres covered by one sample), because a pattern finer than its sampling would flicker
+from view to view instead of averaging out.
 """
 
 from __future__ import annotations
