@@ -23,7 +23,7 @@ from blitzgs.capture.world import (
 )
 from blitzgs.cli.arguments import Commands, add_capture, add_command, add_path, add_run
 from blitzgs.config.files import load_config
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.world import load_frame, save_frame
 from blitzgs.training.inputs import load_configured
 from blitzgs.util.terminal import printable

@@ -23,8 +23,8 @@ from blitzgs.formats.selection import Selected, Selection, read_polygon
 from blitzgs.formats.web_page import check_replaces_page
 from blitzgs.runs.clean import cleaned
 from blitzgs.runs.export import COORDINATES, Exported, export, open_source, source_of, without_antialiasing
-from blitzgs.runs.files import run_and_checkpoint
 from blitzgs.runs.folder import Model, open_run
+from blitzgs.runs.run_files import run_and_checkpoint
 from blitzgs.runs.world import in_world, load_frame
 from blitzgs.util.output import write_file
 

@@ -24,8 +24,7 @@ from blitzgs.formats import gaussians
 from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource
 from blitzgs.formats.models import FORMATS, Format, check_replaces
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs import checkpoint
-from blitzgs.runs import files as run_files
+from blitzgs.runs import checkpoint, run_files
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.checkpoint_files import DAMAGE, Shard, header_of, read_rows, verified
 from blitzgs.runs.folder import Model

@@ -22,8 +22,8 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.models import offset_of
 from blitzgs.ops.harmonics import spherical_harmonics
-from blitzgs.runs.files import Progress, TrainedModel
 from blitzgs.runs.folder import Model
+from blitzgs.runs.run_files import Progress, TrainedModel
 from blitzgs.util.output import write_file
 from blitzgs.view.draw import table_of_parameters
 from blitzgs.view.gate import LodGate

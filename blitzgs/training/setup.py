@@ -21,12 +21,12 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY, octree_gaussians
 from blitzgs.population.position_noise import PositionNoise
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_cameras
 from blitzgs.runs.evaluation import load_lpips
-from blitzgs.runs.files import Progress
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
 from blitzgs.runs.log import LOG, RunLog
+from blitzgs.runs.run_files import Progress
 from blitzgs.runs.world import save_frame, trained_columns
 from blitzgs.spawn.gate import lineage_subject, open_spawn_gate
 from blitzgs.spawn.lineage import Ledger, Lineage, initial_births

@@ -19,7 +19,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import is_antialiased
 from blitzgs.formats.models import offset_of, read_gaussians
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, load_cameras
 from blitzgs.runs.folder import open_run
 from blitzgs.runs.world import gate_of, load_frame, trained_columns

@@ -17,7 +17,7 @@ from blitzgs.formats.models import offset_of
 from blitzgs.formats.ply import PlySource
 from blitzgs.formats.tiles import upright
 from blitzgs.formats.web_page import WebScene
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, load_cameras
 from blitzgs.runs.export import open_source
 from blitzgs.view.views import CameraLike, Space, render_options

@@ -18,7 +18,7 @@ from blitzgs.capture.world import geodetic
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.models import FORMATS, read_gaussians
-from blitzgs.runs.files import open_model
+from blitzgs.runs.run_files import open_model
 from blitzgs.runs.world import load_frame
 from blitzgs.viewer.overlay import overlay
 from blitzgs.viewer.studio import open_model as open_viewed

@@ -16,7 +16,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply, write_ply
 from blitzgs.frame.render import render_frame
 from blitzgs.population.importance import is_culled
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import image_metrics
 from blitzgs.runs.lod import lod_gate, scene_gate
 from blitzgs.table.layouts import CULL

@@ -26,7 +26,7 @@ from blitzgs.training.state import TrainingState
 MOST_SPREAD = 4.0
 
 
-def run(state: TrainingState, event: Event) -> None:
+def run_density_event(state: TrainingState, event: Event) -> None:
     """Run one density event and log what it did (errors: NonFiniteError, ModelLostError)."""
     state.stepper.write_back()
     # The largest column, sh, does not decide anything; it is checked with each record of the log.

@@ -13,7 +13,7 @@ from typing import Any
 from blitzgs.capture.images import PhotographError
 from blitzgs.config.schedule import Event
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, spread, worst_views
 from blitzgs.runs.lod import scene_gate
 from blitzgs.training.state import TrainingState
@@ -23,7 +23,7 @@ from blitzgs.util.output import write_file
 TRAINED_SHARE, LEAST_TRAINED, MOST_TRAINED = 0.02, 8, 64
 
 
-def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
+def evaluate_held_out(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
     """Measure the held-out views, or the training views if none are held out; the training clock pauses.
 
     Returns the mean of each metric, and under "split" which views were measured; nothing if the run has to
