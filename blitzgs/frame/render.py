@@ -23,12 +23,11 @@ from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import (
     Exchange,
     LocalTransport,
-    Mark,
     Traffic,
     Transport,
     WayBack,
     open_transport,
-    unmarked,
+    stage_ended,
 )
 from blitzgs.frame.transport.protocol import ExchangeResult
 from blitzgs.ops.blocks import ActiveRows, GateRules
@@ -162,7 +161,6 @@ def render_frame(
     active: ActiveRows | Callable[[Sizes | None], ActiveRows] | None = None,
     assignment: TileAssignment | None = None,
     transport: Transport | None = None,
-    mark: Mark = unmarked,
     backward_follows: bool = False,
 ) -> Frame:
     """Render views of a table whose active rows have no pending optimiser steps.
@@ -177,7 +175,6 @@ def render_frame(
         transport: sends the splats to the ranks that composite them. A transport that is used for several
             frames estimates the sizes of a frame from the frames before, so that the device need not wait for
             the host; the result does not depend on it. None: a new one.
-        mark: called at the end of each stage: "project", "exchange", "sort", "raster".
         backward_follows: prepare for a backward pass, which is then faster; the backward pass also works
             without.
 
@@ -203,7 +200,7 @@ def render_frame(
         lists = torch.ops.blitzgs.intersect(
             *geometry, splats.depths, splats.camera_ids, splats.ids, *grid, n_isects, n_splats, True
         )
-        mark("sort")
+        stage_ended("sort")
         arguments = (*geometry, splats.colors, backgrounds, *lists, *grid)
         shared = exchange.gradient_table
         if shared is not None and backward_follows:
@@ -213,10 +210,10 @@ def render_frame(
             *images, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, False, backward_follows, n_splats)
             if shared is not None:
                 zeros = None  # the gradients must be in `shared`, which the backward pass then zeroes
-        mark("raster")
+        stage_ended("raster")
         return _Composited(list(lists), images, zeros)
 
-    result, (lists, images, zeros) = run_attempts(transport, inputs, assignment, composite, mark)
+    result, (lists, images, zeros) = run_attempts(transport, inputs, assignment, composite)
     renders, transmittances, last_ids, tile_work, packed_splats, tile_order = images
     splats = result.splats
     return Frame(
@@ -275,12 +272,11 @@ def _backgrounds(colour: tuple[float, float, float], count: int, device: torch.d
     return torch.tensor(colour, device=device).repeat(count, 1) if any(colour) else None
 
 
-def backward_splats(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> SplatGradients:
+def backward_splats(frame: Frame, v_renders: Tensor) -> SplatGradients:
     """Compute the gradients of this rank's projected splats from the gradients of the images.
 
     Args:
         v_renders: gradient of the loss by the images, [B, H, W, 3]; only this rank's tiles are read.
-        mark: called at the end of each stage: "raster back", "exchange back".
 
     Raises:
         RuntimeError: the ranks share memory, and a later frame has overwritten this frame's splats.
@@ -301,10 +297,10 @@ def backward_splats(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> S
             *frame.saved, v_renders, None, *grid, False, options.deterministic
         )
         gradients = SplatGradients(parts)
-    mark("raster back")
+    stage_ended("raster back")
     if way_back is not None:
         gradients = way_back.return_gradients(gradients)
-    mark("exchange back")
+    stage_ended("exchange back")
     return gradients
 
 
@@ -320,7 +316,6 @@ def run_attempts(
     inputs: ProjectionInputs | Callable[[Sizes | None], ProjectionInputs],
     assignment: TileAssignment | None,
     consume: Callable[[Exchange], Consumed],
-    mark: Mark = unmarked,
 ) -> tuple[ExchangeResult, Consumed]:
     """Project, send the splats and consume them, without gradients, until all results had enough memory.
 
@@ -330,7 +325,6 @@ def run_attempts(
             sizes are not known, and the work waits for them).
         assignment: the tiles of each rank; None: one rank composites all.
         consume: queues the work with the splats that have arrived.
-        mark: called at the end of the stages "project" and "exchange".
 
     Returns:
         The splats, cut to their numbers, and what `consume` returned for them.
@@ -344,7 +338,7 @@ def run_attempts(
         given = inputs(sizes) if callable(inputs) else inputs
         # Skip autograd: for an op with a registered gradient formula, its Python takes 20 us of host time.
         with below_autograd():
-            exchange = transport.project_and_send(given, assignment, sizes, mark)
+            exchange = transport.project_and_send(given, assignment, sizes)
             consumed = consume(exchange)
             needed, result = exchange.finish()
         if transport.capacity is not None:

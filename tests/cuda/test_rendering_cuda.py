@@ -8,7 +8,7 @@ import torch
 
 import blitzgs
 from blitzgs.frame.render import backward_splats, render_frame, tile_grid
-from blitzgs.frame.transport import LocalTransport
+from blitzgs.frame.transport import LocalTransport, stages_told_to
 from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops import project, splat_gradients
 from blitzgs.ops.projection_types import Sizes, WeightedViews
@@ -214,9 +214,8 @@ def test_frames_do_not_depend_on_the_room_that_was_guessed():
     for sizes in [*rooms, (1, 1, 1)]:
         transport, attempts = LocalTransport(CapacityEstimate(Sizes(*sizes))), []
         enough = Sizes(*sizes).holds(needed)
-        frame = render_frame(
-            table, views, options, transport=transport, mark=attempts.append, backward_follows=True
-        )
+        with stages_told_to(attempts.append):
+            frame = render_frame(table, views, options, transport=transport, backward_follows=True)
         assert attempts.count("raster") == (1 if enough else 2)
         assert transport.capacity.sizes.holds(needed)
         for x, y in zip(frame.projected, plain.projected, strict=True):

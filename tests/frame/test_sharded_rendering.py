@@ -227,7 +227,7 @@ class NeedsMemory:
     def __init__(self, needed, sizes=None):
         self.capacity, self._needed, self.given = CapacityEstimate(sizes), needed, []
 
-    def project_and_send(self, inputs, assignment, sizes, mark):
+    def project_and_send(self, inputs, assignment, sizes):
         self.given.append(sizes)
         needed = self._needed(len(self.given))
         fits = sizes is not None and sizes.holds(needed)

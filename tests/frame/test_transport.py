@@ -20,10 +20,8 @@ from blitzgs.frame.transport.protocol import (
     CapacityEstimate,
     Exchange,
     ExchangeResult,
-    Mark,
     Traffic,
     Transport,
-    unmarked,
 )
 from blitzgs.ops.exchange import scatter_splats
 from blitzgs.ops.intersect import intersect
@@ -56,11 +54,10 @@ class RecordingTransport:
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
         sizes: Sizes | None,
-        mark: Mark = unmarked,
     ) -> RecordingExchange:
         """See `Transport.project_and_send`."""
         self.calls.append(("start", sizes))
-        return RecordingExchange(self, self.inner.project_and_send(inputs, assignment, sizes, mark))
+        return RecordingExchange(self, self.inner.project_and_send(inputs, assignment, sizes))
 
 
 class RecordingExchange:

@@ -57,7 +57,7 @@ def whole_run(tmp_path_factory):
     folder, steps = tmp_path_factory.mktemp("run"), {}
     forward = Stepper.forward
 
-    def watched(self, step, options, batch, mark=None, view_filter=None):
+    def watched(self, step, options, batch, view_filter=None):
         frame, *rest = forward(self, step, options, batch, view_filter=view_filter)
         table = {name: self.table[name].clone() for name in self.table}
         steps[step] = (view_filter, frame.projected, batch.indices, table)

@@ -15,9 +15,8 @@ from blitzgs.frame.transport.protocol import (
     Arrived,
     CapacityEstimate,
     ExchangeResult,
-    Mark,
     Traffic,
-    unmarked,
+    stage_ended,
 )
 from blitzgs.ops.exchange import RUN, gather_splats, scatter_splats, words_per_splat
 from blitzgs.ops.host import to_host
@@ -45,12 +44,11 @@ class CollectiveTransport:
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
         sizes: Sizes | None,
-        mark: Mark = unmarked,
     ) -> CollectiveExchange:
         """See `Transport.project_and_send`."""
         if assignment is None:
             raise ValueError("several ranks need an assignment of tiles")
-        return CollectiveExchange(self._ranks, inputs, assignment, sizes, mark)
+        return CollectiveExchange(self._ranks, inputs, assignment, sizes)
 
 
 class CollectiveExchange:
@@ -62,7 +60,6 @@ class CollectiveExchange:
         inputs: ProjectionInputs,
         assignment: TileAssignment,
         sizes: Sizes | None,
-        mark: Mark,
     ) -> None:
         """Project, exchange the numbers of splats, and send the splats."""
         tiles, n_views = assignment.composited_by_rank, assignment.ranges.n_views
@@ -81,7 +78,7 @@ class CollectiveExchange:
         self._needed = needed = traffic.own._replace(blocks=traffic.most_blocks)
         if sizes is not None and not sizes.holds(needed[:2]):
             projected = inputs.project(None, tiles)  # no queued work waits for another rank now
-        mark("project")
+        stage_ended("project")
         projected = projected.first(needed)
         own, sent = projected.splats, projected.for_compositing
         columns = [sent.means2d, sent.depths, sent.camera_ids, sent.ids]
@@ -100,7 +97,7 @@ class CollectiveExchange:
         if sizes is None or needed.blocks <= sizes.blocks:
             way_back = CollectiveWayBack(ranks, traffic, places)
             self._result = ExchangeResult(own, splats, visible, traffic, way_back)
-        mark("exchange")
+        stage_ended("exchange")
 
     def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """See `Exchange.finish`; the host has known all numbers since the splats were sent."""

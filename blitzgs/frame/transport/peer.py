@@ -52,9 +52,8 @@ from blitzgs.frame.transport.protocol import (
     Arrived,
     CapacityEstimate,
     ExchangeResult,
-    Mark,
     Traffic,
-    unmarked,
+    stage_ended,
 )
 from blitzgs.ops.exchange import runs_of
 from blitzgs.ops.host import current_stream
@@ -134,7 +133,6 @@ class PeerTransport:
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
         sizes: Sizes | None,
-        mark: Mark = unmarked,
     ) -> PeerExchange:
         """See `Transport.project_and_send`."""
         if assignment is None:
@@ -147,7 +145,7 @@ class PeerTransport:
                     self._memory.reserve(words)
         if self._buffers is None or self._buffers.buffers[0] is not self._memory.buffers[0]:
             self._buffers = PeerBuffers(self._memory.buffers, self._ranks.rank)
-        return PeerExchange(self._ranks, self._buffers, self._counted, inputs, assignment, sizes, mark)
+        return PeerExchange(self._ranks, self._buffers, self._counted, inputs, assignment, sizes)
 
 
 class PeerExchange:
@@ -161,7 +159,6 @@ class PeerExchange:
         inputs: ProjectionInputs,
         assignment: TileAssignment,
         sizes: Sizes | None,
-        mark: Mark,
     ) -> None:
         """Queue the projection and the writing of the splats; record `counted` behind the counts."""
         assert ranks.memory is not None  # see `PeerTransport`
@@ -181,11 +178,11 @@ class PeerExchange:
         memory.barrier()  # B
         memory.generation += 1
         self._generation = memory.generation
-        mark("project")
+        stage_ended("project")
         n_isects = self._read().n_isects if sizes is None else sizes.isects
         self.arrived = Arrived(buffers.splats, plan[:1], n_isects)
         self.gradient_table: Tensor | None = buffers.tables[ranks.rank]
-        mark("exchange")
+        stage_ended("exchange")
 
     def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """See `Exchange.finish`."""
