@@ -224,6 +224,11 @@ class ProjectionOutputs(NamedTuple):
         return self.totals[1:2]
 
     @property
+    def n_visible(self) -> Tensor:
+        """Return the number of visible Gaussians, int32 [1], on the device: the low half of its total."""
+        return self.totals.view(torch.int32)[:1]
+
+    @property
     def for_compositing(self) -> Splats:
         """Return the columns that compositing reads; without SH, the conics stand in for the colours.
 
