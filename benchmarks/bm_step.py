@@ -86,7 +86,7 @@ class OurStep:
         self.table = make_table(scene)
         self.batch = random_photographs(scene)
         schedule = Schedule(ScheduleConfig(batch_size=len(self.batch.views)))
-        optimiser = TableAdam(OptimiserConfig(*[RATE] * 7), schedule, 1.0, "cuda")
+        optimiser = TableAdam(OptimiserConfig(*[RATE] * 5), schedule, 1.0, "cuda")
         owners = TileOwners(Ranks(device=torch.device("cuda", torch.cuda.current_device())))
         self.behind = torch.arange(n, device="cuda", dtype=torch.int32) % BEHIND
         self.step = STEP

@@ -12,13 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture import transforms
-from blitzgs.capture.cameras import Camera, Float64, SourceView
+from blitzgs.capture.cameras import Camera, Float64, SourceView, rectify
 from blitzgs.capture.layouts import read_layout
 from blitzgs.capture.lengths import StrayCamera, random_points
 from blitzgs.capture.lens import Lens, check_lens
 from blitzgs.capture.names import read_lines
 from blitzgs.capture.points import SourcePoints
-from blitzgs.capture.undistort import rectify
 
 # Coordinates from here on are damage; the squares of smaller ones are finite.
 _FARTHEST = 1e100

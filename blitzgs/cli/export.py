@@ -174,7 +174,7 @@ def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
     _refuse(args, ("max_mb", "coordinates", "classic", "clean"), f"is not for {_TILES}")
     from blitzgs.formats.streamed_sog import write_streamed_sog
     from blitzgs.formats.tiles import TILE, write_tiles
-    from blitzgs.viewer.tileset import open_city
+    from blitzgs.viewer.web import open_city
 
     start, city = time.monotonic(), open_city(args.model)
     source, path = city.source, args.tiles or args.streamed_sog

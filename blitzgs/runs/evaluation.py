@@ -28,7 +28,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.frame.tiles import TileAssignment, collect_images
 from blitzgs.ops.photometric import ssim
-from blitzgs.util.memory import explain_memory
+from blitzgs.util.errors import explain_memory
 from blitzgs.util.output import OutputFolder
 from blitzgs.util.progress import Report
 from blitzgs.view.gate import SceneGate
@@ -98,7 +98,7 @@ def load_lpips(path: str | None) -> Lpips | None:
         metric: Lpips = torch.jit.load(path, map_location="cpu")
     except (RuntimeError, ValueError) as error:
         raise ValueError(
-            f"{path} is not a readable TorchScript module of LPIPS (--lpips, log.lpips_weights): {error}"
+            f"{path} is not a readable TorchScript module of LPIPS (--lpips): {error}"
         ) from error
     return metric
 

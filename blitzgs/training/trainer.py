@@ -81,8 +81,7 @@ class Trainer:
             capture.train,
             state.sampler,
             ranks.device,
-            config.data.prefetch,
-            state.owners if ranks.world_size > 1 else None,
+            owners=state.owners if ranks.world_size > 1 else None,
         )
         self._guard = LossGuard()
         self._unwritten: StepRecord | None = None  # the record of the last step

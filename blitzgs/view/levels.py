@@ -189,7 +189,10 @@ PAIRS_OF_POINTS = 1 << 13
 
 @dataclass(frozen=True)
 class PointBlocks:
-    """Boxes around blocks of neighbouring points.
+    """Boxes around blocks of neighbouring points, which bound their distances from cameras.
+
+    A city has millions of points and thousands of cameras. The bounds decide nearly every question about
+    their distances, so that only few of the distances themselves need to be computed.
 
     Attributes:
         order: int64 [M], the given points by block: `BLOCK_POINTS` in each, and the rest in the last one.

@@ -28,8 +28,8 @@ from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.draw import Drawer, Subject, table_of_parameters
 from blitzgs.view.gate import SceneGate
 from blitzgs.view.views import Space, render_options
-from blitzgs.viewer.exhibit import Exhibit
 from blitzgs.viewer.page import Page
+from blitzgs.viewer.world import Exhibit
 
 Photograph = Callable[[int], npt.NDArray[np.uint8]]
 

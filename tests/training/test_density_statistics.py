@@ -35,7 +35,7 @@ QUIET = (
     "schedule.iterations=200", "schedule.densify_from=150", "schedule.densify_until=180",
     "schedule.sh_every=2", "model.antialiased=true",
 )  # fmt: skip
-STILL = [f"optimiser.{name}=0" for name in ("position", "sh_dc", "sh_rest", "opacity", "scale", "rotation")]
+STILL = [f"optimiser.{name}=0" for name in ("position", "sh_dc", "opacity", "scale", "rotation")]
 
 
 def make_trainer(folder, *overrides, device: str = "cpu") -> Trainer:

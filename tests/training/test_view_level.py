@@ -43,7 +43,7 @@ from tests.training.tiny import (
 # The passes follow the density event at 40 and come at 70; the window ends at 60; the mask is cleared at 85.
 FLAGS = (
     "view.lod=true", "view.cull=true", "population.importance=true", "schedule.densify_until=60",
-    "schedule.t1=40", "schedule.t2=70", "log.pictures=0",
+    "schedule.t1=40", "schedule.t2=70",
 )  # fmt: skip
 
 
@@ -297,10 +297,10 @@ def test_a_photograph_that_is_lost_changes_neither_length_nor_opacity_term_of_a_
 
 def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path, monkeypatch):
     stop_at(monkeypatch, 65)
-    assert train(tmp_path / "stopped", "view.smooth=true")[1] is None
+    assert train(tmp_path / "stopped", "view.lod=smooth")[1] is None
     monkeypatch.undo()
-    resumed, _ = train(tmp_path / "stopped", "view.smooth=true", resume=True)
-    trainer, _ = train(tmp_path / "whole", "view.smooth=true")
+    resumed, _ = train(tmp_path / "stopped", "view.lod=smooth", resume=True)
+    trainer, _ = train(tmp_path / "whole", "view.lod=smooth")
     state = trainer.state
     assert_same_table(resumed.state.table, state.table)
     assert set(state.progress.gated_views) == {"1"}  # for any share that the views keep
@@ -321,8 +321,6 @@ def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path, monkeypat
     path = tmp_path / "model.ply"
     assert main(["export", str(tmp_path / "whole"), "--ply", str(path)]) == 0
     assert any(text.endswith(" finest 1 smooth") for text in read_ply(path).comments)
-    with pytest.raises(ConfigError, match="view.smooth: needs view.lod=true"):
-        tiny_config("view.smooth=true")
 
 
 def test_the_mask_is_cleared_halfway_after_the_last_pass():

@@ -151,7 +151,7 @@ def test_training_behind_the_gate_is_dense_adams(device, smooth):
     rounding error at the start.
     """
     steps, tables = 120, []
-    overrides = ("schedule.iterations=200", "optimiser.position=2e-3", "optimiser.position_final=1e-3")
+    overrides = ("schedule.iterations=200", "optimiser.position=2e-3")
     config = tiny_config(*overrides)
     schedule = Schedule(config.schedule)
     generator = torch.Generator().manual_seed(8)
