@@ -40,9 +40,10 @@ from blitzgs.config.fields import FORK, Config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TILE_COST, TileOwners, cost_balance
-from blitzgs.frame.render import RenderOptions, Views
+from blitzgs.frame.render import RenderOptions
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
 from blitzgs.frame.transport import Traffic, stages_told_to
+from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.runs.guard import LossGuard

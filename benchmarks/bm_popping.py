@@ -32,8 +32,9 @@ from torch import Tensor
 from blitzgs.capture.pictures import to_uint8
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.film import new_film
-from blitzgs.frame.render import RenderOptions, Views, render_frame
+from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.ops.blocks import ActiveRows
+from blitzgs.ops.projection_types import Views
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import load_cameras
 from blitzgs.runs.lod import MOST_KEPT, level_fork

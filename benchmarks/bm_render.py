@@ -27,7 +27,6 @@ from torch import Tensor
 from blitzgs import rasterization
 from blitzgs.frame.render import (
     RenderOptions,
-    Views,
     backward_splats,
     inputs_of,
     render_frame,
@@ -35,7 +34,7 @@ from blitzgs.frame.render import (
     stages_told_to,
 )
 from blitzgs.frame.transport import LocalTransport
-from blitzgs.ops.projection_types import WeightedViews
+from blitzgs.ops.projection_types import Views, WeightedViews
 from blitzgs.table.table import GaussianTable
 
 try:

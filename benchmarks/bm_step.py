@@ -26,9 +26,9 @@ from blitzgs.config.fields import LossConfig, OptimiserConfig, ScheduleConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import Views
 from blitzgs.frame.transport import stage_ended, stages_told_to
 from blitzgs.ops.photometric import photometric_fwd_bwd
+from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, GaussianTable

@@ -32,34 +32,17 @@ from blitzgs.frame.transport import (
 from blitzgs.frame.transport.protocol import ExchangeResult
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.intersect import TileGrid
-from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions, Sizes, Splats
+from blitzgs.ops.projection_types import (
+    ProjectedSplats,
+    ProjectionInputs,
+    ProjectionOptions,
+    Sizes,
+    Splats,
+    Views,
+)
 from blitzgs.ops.rasterize import RasterizeSaved
 from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients
 from blitzgs.table.table import GaussianTable
-
-
-@dataclass(frozen=True)
-class Views:
-    """B pinhole views of one image size, rendered together.
-
-    Attributes:
-        viewmats: world to camera, float32 [B, 4, 4].
-        Ks: intrinsics in pixels, float32 [B, 3, 3].
-        width: pixels.
-        height: pixels.
-    """
-
-    viewmats: Tensor
-    Ks: Tensor
-    width: int
-    height: int
-
-    def __len__(self) -> int:
-        return self.viewmats.shape[0]
-
-    def as_arguments(self) -> tuple[Tensor, Tensor, int, int]:
-        """Return viewmats, Ks, width and height, for functions that take these as separate arguments."""
-        return self.viewmats, self.Ks, self.width, self.height
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.frame.render import RenderOptions, Views, inputs_of, run_attempts, tile_grid
+from blitzgs.frame.render import RenderOptions, inputs_of, run_attempts, tile_grid
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import Exchange, LocalTransport, Transport, open_transport
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.projection_types import ProjectedSplats
+from blitzgs.ops.projection_types import ProjectedSplats, Views
 from blitzgs.table.table import GaussianTable
 
 

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -18,6 +19,26 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 MAX_VIEWS = 32
 # Where the splats of the views begin in `ProjectionOutputs.totals` (kTotalViews of csrc/project/project.h).
 VIEW_TOTALS = 4
+
+
+@dataclass(frozen=True)
+class Views:
+    """B pinhole views of one image size, rendered together.
+
+    Attributes:
+        viewmats: world to camera, float32 [B, 4, 4].
+        Ks: intrinsics in pixels, float32 [B, 3, 3].
+        width: pixels.
+        height: pixels.
+    """
+
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+
+    def __len__(self) -> int:
+        return self.viewmats.shape[0]
 
 
 class Sizes(NamedTuple):

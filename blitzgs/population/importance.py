@@ -26,13 +26,14 @@ from blitzgs.config.fields import ScoreRule
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import decimal_share, integer_mass_prefix, mass_prefix, smallest
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import RenderOptions, Views
+from blitzgs.frame.render import RenderOptions
 from blitzgs.frame.survey import Survey, survey
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import open_transport
 from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.counter_random import sampling_keys
 from blitzgs.ops.importance import ViewSums, view_sums_
+from blitzgs.ops.projection_types import Views
 from blitzgs.table.layouts import CULL
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import SceneGate
@@ -130,7 +131,7 @@ def sweep(
             if stops is not None and number > 0 and stops():
                 raise SweepStoppedError
             assignment = _assign(batch, options, owners)
-            visible = finder.find(*batch.views.as_arguments(), options.limits)
+            visible = finder.find(batch.views, options.limits)
             surveyed = survey(
                 visible.table, batch.views, options, assignment, transport, visible.active, rule == "energy"
             )

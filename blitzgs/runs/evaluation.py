@@ -116,7 +116,7 @@ def render_view(
     Returns float32 [H, W, 3] on rank `destination`, the same bits at any number of ranks; None elsewhere.
     """
     picked, ranks = views.pick([index]), owners.ranks
-    table, active, _ = finder.find(*picked.as_arguments(), options.limits)
+    table, active, _ = finder.find(picked, options.limits)
     try:
         if ranks.world_size == 1:
             return render_frame(table, picked, options, active).renders[0]

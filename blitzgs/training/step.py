@@ -94,10 +94,7 @@ class Stepper:
             # On the CPU the number of blocks is known at once: lists of this size need no estimate, and are
             # complete at the first attempt.
             capacity_blocks = sizes.blocks if sizes is not None and on_gpu else None
-            rows = self._blocks.active(
-                table, views.viewmats, views.Ks, views.width, views.height, options.near_plane,
-                options.far_plane, options.eps2d, rules, capacity_blocks,
-            )  # fmt: skip
+            rows = self._blocks.active(table, views, options.limits, rules, capacity_blocks)
             if not on_gpu:
                 rows = rows._replace(blocks=None)
             stage_ended("other")

@@ -240,10 +240,7 @@ def test_an_active_set_that_did_not_fit_is_found_again():
     def find(sizes):
         capacity_blocks = None if sizes is None else sizes.blocks
         asked.append(capacity_blocks)
-        return index.active(
-            table, views.viewmats, views.Ks, views.width, views.height, OPTIONS.near_plane,
-            OPTIONS.far_plane, capacity_blocks=capacity_blocks,
-        )  # fmt: skip
+        return index.active(table, views, OPTIONS.limits, capacity_blocks=capacity_blocks)
 
     def rendered(transport):
         asked.clear()

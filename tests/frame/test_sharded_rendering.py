@@ -12,10 +12,10 @@ import torch
 from blitzgs.config.fields import LossConfig
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import MAX_ATTEMPTS, RenderOptions, Views, render_frame, run_attempts
+from blitzgs.frame.render import MAX_ATTEMPTS, RenderOptions, render_frame, run_attempts
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges, collect_images
 from blitzgs.frame.transport.protocol import CapacityEstimate
-from blitzgs.ops.projection_types import Sizes
+from blitzgs.ops.projection_types import Sizes, Views
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batches import Batch
 from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term

@@ -13,8 +13,9 @@ from blitzgs.config.fields import LossConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import RenderOptions, Views, render_frame
+from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.frame.transport import stages_told_to
+from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY
 from blitzgs.runs.cameras import LEAST_SPREAD, stored_exposures
