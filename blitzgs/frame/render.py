@@ -152,7 +152,7 @@ def render_frame(
         views: at most 32 views.
         options: how to render.
         active: rows to consider, and the views of each; None: all rows in all views. Or a function that finds
-            them, given the estimated sizes of the frame (see `run_attempts`).
+            them, given the capacity for the frame (see `run_attempts`).
         assignment: the tiles of each rank; every rank of the job calls this with its table. None: render all
             tiles from this table alone.
         transport: sends the splats to the ranks that composite them. A transport that is used for several
@@ -171,10 +171,10 @@ def render_frame(
     backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
     rows = active if active is None or isinstance(active, ActiveRows) else None
 
-    def inputs(sizes: Sizes | None) -> ProjectionInputs:
+    def inputs(capacity: Sizes | None) -> ProjectionInputs:
         nonlocal rows
         if callable(active):
-            rows = active(sizes)
+            rows = active(capacity)
         return inputs_of(table, views, options, rows)
 
     def composite(exchange: Exchange) -> _Composited:
@@ -304,8 +304,8 @@ def run_attempts(
 
     Args:
         transport: sends the splats, and estimates the sizes.
-        inputs: of the projection; or a function that returns them, given the estimated sizes (None: the
-            sizes are not known, and the work waits for them).
+        inputs: of the projection; or a function that returns them, given the capacity (None: the sizes are
+            not known, and the work waits for them).
         assignment: the tiles of each rank; None: one rank composites all.
         consume: queues the work with the splats that have arrived.
 
@@ -317,19 +317,19 @@ def run_attempts(
             needed.
     """
     for _ in range(MAX_ATTEMPTS):
-        sizes = None if transport.capacity is None else transport.capacity.sizes
-        given = inputs(sizes) if callable(inputs) else inputs
+        capacity = None if transport.estimate is None else transport.estimate.sizes
+        given = inputs(capacity) if callable(inputs) else inputs
         # Skip autograd: for an op with a registered gradient formula, its Python takes 20 us of host time.
         with below_autograd():
-            exchange = transport.project_and_send(given, assignment, sizes)
+            exchange = transport.project_and_send(given, assignment, capacity)
             consumed = consume(exchange)
             needed, result = exchange.finish()
-        if transport.capacity is not None:
-            transport.capacity.learn(needed)
+        if transport.estimate is not None:
+            transport.estimate.learn(needed)
         if result is not None:
             return result, consumed
         del exchange, consumed  # before the next attempt takes as much memory again
     raise RuntimeError(
         f"{MAX_ATTEMPTS} attempts have each needed more than the one before had asked for: the last had "
-        f"{sizes} and needs {tuple(needed)}. The inputs must not change during a call"
+        f"{capacity} and needs {tuple(needed)}. The inputs must not change during a call"
     )

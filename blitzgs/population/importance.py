@@ -126,7 +126,7 @@ def sweep(
     sums = _Sums(len(table), n_views, table.device, rule)
     owners = owners or TileOwners(ranks)
     transport, finder = open_transport(ranks), VisibleFinder(scene, lod)
-    with _NextSurvey(table.device, ranks.world_size == 1 and scene is table) as beside:
+    with _SideWork(table.device, ranks.world_size == 1 and scene is table) as side:
         for number, batch in enumerate(batches):
             if stops is not None and number > 0 and stops():
                 raise SweepStoppedError
@@ -135,7 +135,7 @@ def sweep(
             surveyed = survey(
                 visible.table, batch.views, options, assignment, transport, visible.active, rule == "energy"
             )
-            with beside.work(surveyed, visible):
+            with side.work(surveyed, visible):
                 sums.add(surveyed, batch.columns, visible, ranks)
     return sums.result()
 
@@ -154,8 +154,8 @@ def _assign(batch: ViewBatch, options: RenderOptions, owners: TileOwners) -> Til
     return TileAssignment(owners.ranks, ranges)
 
 
-class _NextSurvey:
-    """Runs what follows each survey on a stream of its own, beside the survey of the next batch.
+class _SideWork:
+    """Runs what follows each survey on a side stream, beside the survey of the next batch.
 
     That work is many short kernels, most of which leave the GPU idle. When the block ends, for whatever
     reason, the caller's stream waits for all of it.
@@ -167,7 +167,7 @@ class _NextSurvey:
         self._held: object = None
         self._done: torch.cuda.Event | None = None
 
-    def __enter__(self) -> _NextSurvey:
+    def __enter__(self) -> _SideWork:
         return self
 
     def __exit__(self, *_error: object) -> None:

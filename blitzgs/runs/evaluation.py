@@ -247,7 +247,7 @@ def worst_views(views: Mapping[str, Mapping[str, float]], count: int = 3) -> lis
     return [(name, psnr) for psnr, name in ordered[:count]] if len(ordered) > 1 else []
 
 
-def spread(indices: Sequence[int]) -> list[int]:
+def evenly_ordered(indices: Sequence[int]) -> list[int]:
     """Order indices such that the first few of them are spread evenly, however many are taken."""
     share = (math.sqrt(5) - 1) / 2
     return [index for _, index in sorted((k * share % 1, index) for k, index in enumerate(indices))]

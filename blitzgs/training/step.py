@@ -90,10 +90,10 @@ class Stepper:
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
         on_gpu = views.viewmats.is_cuda
 
-        def active(sizes: Sizes | None) -> ActiveRows:
+        def active(capacity: Sizes | None) -> ActiveRows:
             # On the CPU the number of blocks is known at once: lists of this size need no estimate, and are
             # complete at the first attempt.
-            capacity_blocks = sizes.blocks if sizes is not None and on_gpu else None
+            capacity_blocks = capacity.blocks if capacity is not None and on_gpu else None
             rows = self._blocks.active(table, views, options.limits, rules, capacity_blocks)
             if not on_gpu:
                 rows = rows._replace(blocks=None)

@@ -161,8 +161,8 @@ class Drawer:
         active: ActiveRows | Callable[[Sizes | None], ActiveRows]
         if assignment is None and not isinstance(scene, Pool):
 
-            def active(sizes: Sizes | None) -> ActiveRows:
-                room = sizes.blocks if sizes is not None and scene.device.type == "cuda" else None
+            def active(capacity: Sizes | None) -> ActiveRows:
+                room = capacity.blocks if capacity is not None and scene.device.type == "cuda" else None
                 return self._together(lambda: self._found(look, views, options, room)).active
 
             table = scene

@@ -217,7 +217,7 @@ def test_frames_do_not_depend_on_the_room_that_was_guessed():
         with stages_told_to(attempts.append):
             frame = render_frame(table, views, options, transport=transport, backward_follows=True)
         assert attempts.count("raster") == (1 if enough else 2)
-        assert transport.capacity.sizes.holds(needed)
+        assert transport.estimate.sizes.holds(needed)
         for x, y in zip(frame.projected, plain.projected, strict=True):
             assert torch.equal(x, y)
         for x, y in zip(frame.splats, plain.splats, strict=True):

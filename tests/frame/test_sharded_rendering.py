@@ -225,7 +225,7 @@ class NeedsMemory:
     """A transport whose exchanges need the sizes that a function returns for each attempt."""
 
     def __init__(self, needed, sizes=None):
-        self.capacity, self._needed, self.given = CapacityEstimate(sizes), needed, []
+        self.estimate, self._needed, self.given = CapacityEstimate(sizes), needed, []
 
     def project_and_send(self, inputs, assignment, sizes):
         self.given.append(sizes)
@@ -271,7 +271,7 @@ def test_an_attempt_that_fails_leaves_the_estimate():
     transport = NeedsMemory(lambda _: Sizes(9, 9, 9), Sizes(1, 2, 3))
     with pytest.raises(MemoryError):
         run_attempts(transport, fail, None, lambda exchange: None)
-    assert transport.capacity.sizes == (1, 2, 3, 1)
+    assert transport.estimate.sizes == (1, 2, 3, 1)
 
 
 def test_threads_may_share_an_estimate():

@@ -42,10 +42,10 @@ class RecordingTransport:
     """
 
     def __init__(
-        self, inner: Transport, too_small: int = 0, capacity: CapacityEstimate | None = None
+        self, inner: Transport, too_small: int = 0, estimate: CapacityEstimate | None = None
     ) -> None:
         """Wrap a transport; its first `too_small` exchanges do not finish."""
-        self.capacity = capacity or inner.capacity
+        self.estimate = estimate or inner.estimate
         self.inner, self.too_small = inner, too_small
         self.calls: list[tuple[str, Sizes | None]] = []
 
@@ -53,11 +53,11 @@ class RecordingTransport:
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
-        sizes: Sizes | None,
+        capacity: Sizes | None,
     ) -> RecordingExchange:
         """See `Transport.project_and_send`."""
-        self.calls.append(("start", sizes))
-        return RecordingExchange(self, self.inner.project_and_send(inputs, assignment, sizes))
+        self.calls.append(("start", capacity))
+        return RecordingExchange(self, self.inner.project_and_send(inputs, assignment, capacity))
 
 
 class RecordingExchange:

@@ -25,10 +25,10 @@ from blitzgs.formats.ply import read_ply
 from blitzgs.reference.projection import rotation_matrices, sh_basis
 from blitzgs.runs import checkpoint
 from blitzgs.runs.evaluation import correct_colours, image_metrics, load_lpips
-from blitzgs.runs.export import export, export_ply, open_source, source_of
+from blitzgs.runs.export import export, open_source, source_of
 from blitzgs.runs.folder import open_run
 from blitzgs.runs.world import in_world, load_frame, rotated_harmonics, save_frame
-from tests.helpers import save_checkpoint
+from tests.helpers import export_ply, save_checkpoint
 
 
 def plain_ssim(x, y):

@@ -14,7 +14,7 @@ from blitzgs.capture.images import PhotographError
 from blitzgs.config.schedule import Event
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
-from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, spread, worst_views
+from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, evenly_ordered, worst_views
 from blitzgs.runs.lod import scene_gate
 from blitzgs.training.state import TrainingState
 from blitzgs.util.output import write_file
@@ -42,7 +42,8 @@ def evaluate_held_out(state: TrainingState, event: Event | None = None) -> dict[
                 count = int(
                     min(MOST_TRAINED, max(LEAST_TRAINED, TRAINED_SHARE * state.progress.seconds / cost))
                 )
-                _write_trained(state, spread(capture.train)[: state.ranks.broadcast_object(count)], folder)
+                count = state.ranks.broadcast_object(count)
+                _write_trained(state, evenly_ordered(capture.train)[:count], folder)
         except EvaluationStoppedError:
             text = "evaluation given up: the run has to stop"
             state.log.event(state.images_seen, "evaluation stopped", {}, text)
@@ -113,7 +114,7 @@ class Glances:
         self._state = state
         self._begin = state.progress.seconds
         self._spent, self._cost = 0.0, 0.0  # seconds in all, and the largest so far for a view
-        self._order = spread(state.capture.test)
+        self._order = evenly_ordered(state.capture.test)
         if state.config.schedule.evaluate_every > 0:
             self._order = []
 
