@@ -12,7 +12,7 @@ from torch import Tensor
 
 from blitzgs._torch import register_mapping
 from blitzgs.call.arguments import Gaussians
-from blitzgs.call.finite import non_finite
+from blitzgs.call.bad_values import non_finite
 from blitzgs.call.layout import Layout
 from blitzgs.call.lists import Lists
 from blitzgs.ops.projection_types import ProjectedSplats

@@ -17,9 +17,9 @@ from blitzgs.call.arguments import (
     with_covariances,
     with_signals,
 )
+from blitzgs.call.bad_values import warn_of_gradient
 from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.extras import checked_pixels
-from blitzgs.call.finite import warn_of_gradient
 from blitzgs.call.images import render
 from blitzgs.call.ranks import gather_views
 from blitzgs.ops.projection_types import ProjectionOptions

@@ -21,8 +21,8 @@ from blitzgs.call.arguments import (
     check_tensors,
     gaussians_of,
 )
+from blitzgs.call.bad_values import warn_of_gradient
 from blitzgs.call.channels import ImageOptions, background_rows
-from blitzgs.call.finite import warn_of_gradient
 from blitzgs.call.groups import ShTables, gathered_groups, groups_may_be_queued, groups_of
 from blitzgs.call.images import render
 from blitzgs.ops.projection_types import ProjectionOptions

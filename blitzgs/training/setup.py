@@ -26,7 +26,7 @@ from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_came
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
 from blitzgs.runs.log import LOG, RunLog
 from blitzgs.runs.run_files import Progress
-from blitzgs.runs.world import save_frame, trained_columns
+from blitzgs.runs.world import save_world_frame, trained_columns
 from blitzgs.spawn.gate import lineage_subject, open_spawn_gate
 from blitzgs.spawn.lineage import Ledger, Lineage, initial_births
 from blitzgs.table.blocks import sort_rows
@@ -107,7 +107,7 @@ def set_up(
         if restored is None or not (folder / CAMERAS).exists():
             save_cameras(folder, capture, run_id)
             if restored is None and capture.about.source.frame is not None:
-                save_frame(folder, capture.about.source.frame)
+                save_world_frame(folder, capture.about.source.frame)
     optimiser = TableAdam(config.optimiser, schedule, space.extent, ranks.device)
     owners = _tile_owners(ranks, progress, restored)
     views = ViewSet(list(capture.cameras), space, ranks.device)

@@ -18,7 +18,7 @@ from blitzgs.frame.transport.protocol import (
     Traffic,
     stage_ended,
 )
-from blitzgs.ops.exchange import RUN, gather_splats, scatter_splats, words_per_splat
+from blitzgs.ops.exchange import PLACE_SPLATS, gather_splats, scatter_splats, words_per_splat
 from blitzgs.ops.host import to_host
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats
 from blitzgs.ops.splat_gradients import SplatGradients
@@ -144,7 +144,7 @@ def return_sums(sums: Tensor, places: Tensor, traffic: Traffic, ranks: Ranks) ->
     """
     returned = ranks.all_to_all(sums, traffic.received, traffic.sent)
     total = sums.new_zeros(traffic.own.splats, sums.shape[1])
-    lanes = torch.arange(RUN, device=sums.device)
+    lanes = torch.arange(PLACE_SPLATS, device=sums.device)
     for group, runs in zip(returned.split(traffic.sent), places.unbind(1), strict=True):
         if group.shape[0] == 0:
             continue

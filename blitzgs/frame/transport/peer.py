@@ -55,7 +55,7 @@ from blitzgs.frame.transport.protocol import (
     Traffic,
     stage_ended,
 )
-from blitzgs.ops.exchange import runs_of
+from blitzgs.ops.exchange import place_runs
 from blitzgs.ops.host import current_stream
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, SplatGradients
@@ -196,7 +196,7 @@ class PeerExchange:
         composited = self._buffers.splats.first(sum(traffic.received))
         way_back = PeerWayBack(
             self._ranks, self._memory, self._generation, self._buffers.tables, traffic,
-            self._places[: runs_of(traffic.own.splats)],
+            self._places[: place_runs(traffic.own.splats)],
         )  # fmt: skip
         own = splats_of(self._own, traffic.own)
         return traffic.needed, ExchangeResult(own, composited, visible, traffic, way_back)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What calls say about input that has no effect on a picture.
+"""What calls say about values that have no effect on an image.
 
 Gaussians and views that are NaN or infinite are not rendered; intrinsics with a skew are refused, and get no
 gradient.
