@@ -214,8 +214,6 @@ def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float)
         if spec.popping and ranks.world_size == 1:
             state.catch_up()
             model = TrainedModel(state.config, state.progress, state.space, state.table)
-            result["curve"] = bm_popping.curve_of(model, capture.cameras, ranks.device)
-            note("curve")
             result["popping"] = popping(spec, model, capture.cameras, ranks)
             note("popped")
     result["status"] = "done" if is_done else "stopped"
