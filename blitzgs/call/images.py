@@ -26,7 +26,7 @@ from blitzgs.call.groups import (
 from blitzgs.call.layout import Layout
 from blitzgs.call.lists import Lists, lists_of, lists_of_pixels
 from blitzgs.call.meta import make_meta
-from blitzgs.call.ranks import Job, send_splats
+from blitzgs.call.ranks import CallRanks, send_splats
 from blitzgs.ops.importance import pixel_splats
 from blitzgs.ops.project import differentiable_splats
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
@@ -41,7 +41,7 @@ def render(
     projection: ProjectionOptions,
     image: ImageOptions,
     tables: ShTables | None = None,
-    job: Job | None = None,
+    job: CallRanks | None = None,
     groups: Sequence[Group] | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render images; return the results of `blitzgs.rasterization`.

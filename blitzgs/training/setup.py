@@ -35,7 +35,7 @@ from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.budget import extended
-from blitzgs.training.exposure import Exposures, differ, track_gains
+from blitzgs.training.exposure import Exposures, exposures_differ, track_gains
 from blitzgs.training.inputs import check_alike, check_capture, check_resolution
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
@@ -232,7 +232,7 @@ def _exposures(
     if gains is None:
         return exposures
     exposures.begin_with(gains)
-    return exposures if restored is not None or differ(gains) else None
+    return exposures if restored is not None or exposures_differ(gains) else None
 
 
 def _stepper(

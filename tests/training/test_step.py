@@ -22,7 +22,7 @@ from blitzgs.runs.cameras import LEAST_SPREAD, stored_exposures
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batches import Batch
-from blitzgs.training.exposure import Exposures, _log_gains, differ, track_gains
+from blitzgs.training.exposure import Exposures, _log_gains, exposures_differ, track_gains
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.loss import loss_terms, opacity_term, photometric, scale_term, weighted
 from blitzgs.training.step import Stepper
@@ -320,4 +320,4 @@ def test_photographs_of_fields_differ_if_their_exposures_do(tmp_path, exposure):
     gains = track_gains(capture, images, Ranks())
     images.close()
     assert gains is not None and torch.allclose(gains.mean(0), torch.ones(3).double())
-    assert differ(gains) == (exposure > 0)
+    assert exposures_differ(gains) == (exposure > 0)
