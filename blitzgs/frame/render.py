@@ -21,6 +21,7 @@ from torch import Tensor
 from blitzgs._library import below_autograd
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import (
+    Arrived,
     Exchange,
     LocalTransport,
     Traffic,
@@ -177,13 +178,12 @@ def render_frame(
             rows = active(capacity)
         return inputs_of(table, views, options, rows)
 
-    def composite(exchange: Exchange) -> _Composited:
-        splats, n_splats, n_isects = exchange.arrived
-        geometry = (splats.means2d, splats.conics, splats.opacities)
-        lists = torch.ops.blitzgs.intersect(
-            *geometry, splats.depths, splats.camera_ids, splats.ids, *grid, n_isects, n_splats, True
-        )
+    def composite(exchange: Exchange) -> tuple[list[Tensor], Sequence[Tensor], Tensor | None]:
+        """Return the tiles' lists, what `rasterize_fwd` returns, and zeros for the gradients of splats."""
+        splats, n_splats, _ = exchange.arrived
+        lists = tile_lists(exchange.arrived, grid)
         stage_ended("sort")
+        geometry = (splats.means2d, splats.conics, splats.opacities)
         arguments = (*geometry, splats.colors, backgrounds, *lists, *grid)
         shared = exchange.gradient_table
         if shared is not None and backward_follows:
@@ -194,7 +194,7 @@ def render_frame(
             if shared is not None:
                 zeros = None  # the gradients must be in `shared`, which the backward pass then zeroes
         stage_ended("raster")
-        return _Composited(list(lists), images, zeros)
+        return lists, images, zeros
 
     result, (lists, images, zeros) = run_attempts(transport, inputs, assignment, composite)
     renders, transmittances, last_ids, tile_work, packed_splats, tile_order = images
@@ -221,14 +221,6 @@ def render_frame(
     )
 
 
-class _Composited(NamedTuple):
-    """The tiles' lists, the outputs of `rasterize_fwd`, and memory for the gradients of the splats."""
-
-    lists: list[Tensor]
-    images: Sequence[Tensor]
-    zeros: Tensor | None
-
-
 def inputs_of(
     table: GaussianTable,
     views: Views,
@@ -241,6 +233,16 @@ def inputs_of(
     gaussians = table.parameters if colored else table.parameters[:4]
     level = table["level"] if options.fade else None
     return ProjectionInputs(gaussians, cameras, options.projection(views), active or (), table["id"], level)
+
+
+def tile_lists(arrived: Arrived, grid: TileGrid) -> list[Tensor]:
+    """Return the splats that each tile composites and where the list of each tile begins (op `intersect`)."""
+    splats, n_splats, n_isects = arrived
+    lists = torch.ops.blitzgs.intersect(
+        splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids,
+        *grid, n_isects, n_splats, True,
+    )  # fmt: skip
+    return list(lists)
 
 
 def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> TileGrid:

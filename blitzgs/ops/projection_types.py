@@ -60,9 +60,7 @@ class ProjectedSplats(NamedTuple):
     gaussian_ids: Tensor  # int32 [P]
     camera_ids: Tensor  # int32 [P]
     visible_ids: Tensor  # int32 [U], ascending
-    splat_offsets: (
-        Tensor  # int32 [U + 1]: splats splat_offsets[u] to splat_offsets[u + 1] are of visible_ids[u]
-    )
+    splat_offsets: Tensor  # int32 [U + 1]: visible_ids[u] has the splats from splat_offsets[u] on
     means2d: Tensor  # [P, 2], px; the centre of pixel (i, j) is (i + 0.5, j + 0.5)
     conics: Tensor  # [P, 3]: a, b, c of the inverse 2D covariance, 1/px^2
     depths: Tensor  # [P]: camera-space z
@@ -83,16 +81,11 @@ def splats_of(allocated: Sequence[Tensor], sizes: Sizes, counts: Tensor | None =
         counts: the first three of `sizes` as a CPU tensor, if there is one.
     """
     if allocated[0].shape[0] > sizes.splats or allocated[2].shape[0] > sizes.visible:
-        allocated = first_rows(allocated[:12], lengths_of(sizes))
+        visible, splats = sizes[:2]
+        allocated = first_rows(allocated[:12], [splats, splats, visible, visible + 1, *[splats] * 8])
     if counts is None:
         counts = torch.tensor(sizes[:3], device="cpu")
     return ProjectedSplats._make((*allocated[:12], counts))
-
-
-def lengths_of(sizes: Sizes) -> list[int]:
-    """Return the lengths of the columns of `ProjectedSplats` but for `counts`."""
-    visible, splats = sizes[:2]
-    return [splats, splats, visible, visible + 1, *[splats] * 8]
 
 
 def first_rows(columns: Sequence[Tensor], lengths: Sequence[int]) -> list[Tensor]:
