@@ -214,14 +214,12 @@ def run(args: argparse.Namespace) -> int:
             trainer = Trainer(config, capture, images, args.out, ranks, args.resume, args.extend, laps)
             trainer.warned = warned
             if args.viewer is not None:
-                trainer.watch(live_page(trainer.state, args.viewer, args.viewer_host), args.viewer_stay)
+                trainer.watch(live_page(trainer.state, args.viewer, args.viewer_host))
             summary = trainer.train()
             if ranks.rank == 0:
                 write_final_report(args.out, summary)
                 if summary is not None:
                     _print_summary(summary, args.out)
-                    say_where_to_look(args)
-            trainer.show_on()
     return 0
 
 
@@ -312,19 +310,6 @@ def add_live_page(parser: argparse.ArgumentParser) -> None:
         metavar="HOST",
         help="address to listen on (default: %(default)s, this machine only)",
     )
-    parser.add_argument(
-        "--viewer-stay",
-        action="store_true",
-        help="after the training, keep the page open until Ctrl-C (default: it closes)",
-    )
-
-
-def say_where_to_look(args: argparse.Namespace) -> None:
-    """Print whether the page of a finished training stays open."""
-    if args.viewer is not None and args.viewer_stay:
-        print("the viewer's page stays open (Ctrl-C ends)", flush=True)
-    elif args.viewer is not None:
-        print("the viewer's page is closed: see above, or train with --viewer-stay to keep it open")
 
 
 def live_page(state: TrainingState, port: int, host: str) -> Live | None:

@@ -89,28 +89,11 @@ class Trainer:
         self._writes_late = ranks.device.type == "cuda"
         self._warned_of_masks = False
         self._watching: Watching | None = None
-        self._watched_on = False
         self.memory: list[int] = []  # samples of what this rank's GPU has allocated
 
-    def watch(self, watcher: Watcher | None, stays: bool = False) -> None:
-        """Let somebody watch the training; every rank calls this before `train`, rank 0 with a watcher.
-
-        After a whole training, a watcher that `stays` does so until `show_on` ends.
-        """
-        self._watching, self._watched_on = Watching(self.state, watcher), stays
-
-    @torch.no_grad()
-    def show_on(self) -> None:
-        """Serve a watcher that stays after the training, until a signal (Ctrl-C); every rank calls this."""
-        state, watching = self.state, self._watching
-        if watching is None or not self._watched_on:
-            return
-        try:
-            with StopRequest() as stop:
-                agreement = Agreement(state.ranks, stop, state.save_clock)
-                watching.serve_on(lambda: agreement.now(state.progress.step).signal is not None)
-        finally:
-            watching.close()
+    def watch(self, watcher: Watcher | None) -> None:
+        """Let somebody watch the training; every rank calls this before `train`, rank 0 with a watcher."""
+        self._watching = Watching(self.state, watcher)
 
     @torch.no_grad()
     def train(self) -> dict[str, Any] | None:
@@ -233,9 +216,7 @@ class Trainer:
     def close(self) -> None:
         """Stop loading batches and close the log."""
         state = self.state
-        if self._watching is not None and not (
-            self._watched_on and state.progress.step >= state.schedule.steps
-        ):
+        if self._watching is not None:
             self._watching.close()
         for text in dict.fromkeys(self.warned):
             state.log.event(state.images_seen, "warned", {"warning": text})

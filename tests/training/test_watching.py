@@ -2,8 +2,6 @@
 """What is seen of a training: a viewer on its state, glances, figures and curves."""
 
 import json
-import os
-import signal
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -31,7 +29,6 @@ class Recorder:
     def __init__(self, look=None, fails=None, pauses=0, saves=0):
         self.look, self.fails, self.pauses, self.saves = look, fails, pauses, saves
         self.pictures, self.records, self.closed, self.failures = [], [], 0, []
-        self.stays, self.shown_on = False, 0
 
     def wants(self):
         if self.fails == "wants":
@@ -42,11 +39,6 @@ class Recorder:
         if self.fails == "wish":
             raise KeyError("a fault of the viewer")
         pauses, self.pauses = self.pauses > 0, self.pauses - 1
-        if self.stays:
-            self.shown_on += 1
-            if self.shown_on == 3:
-                os.kill(os.getpid(), signal.SIGINT)
-            pauses = True
         saves, self.saves = self.saves > 0, 0
         return Wish(self.look, pauses, saves)
 
@@ -58,9 +50,6 @@ class Recorder:
 
     def failed(self, reason):
         self.failures.append(reason)
-
-    def stay(self):
-        self.stays = True
 
     def told(self, t, values):
         self.records.append((t, dict(values)))
@@ -160,18 +149,6 @@ def test_a_rank_that_cannot_draw_does_not_end_the_training(tmp_path):
     (pictures, failures, images), (_, _, other) = run_ranks(_fails_on_the_second_rank, 2, tmp_path)
     assert (pictures, failures) == (0, {"rank 1: no room"})
     assert images == other == 20
-
-
-def test_a_watcher_may_stay_after_the_training(tmp_path):
-    trainer = Trainer(tiny_config("schedule.iterations=20"), *tiny_scene(), tmp_path, Ranks())
-    watcher = Recorder(some_look(trainer.state))
-    trainer.watch(watcher, stays=True)
-    trainer.train()
-    seen = len(watcher.pictures)
-    assert watcher.closed == 0
-    trainer.show_on()  # until the watcher sends a signal
-    assert watcher.closed == 1
-    assert len(watcher.pictures) >= seen + 2
 
 
 def test_intrinsics_are_centred():
