@@ -32,8 +32,8 @@ from quality_run import describe, means_of, synchronize, write
 
 from blitzgs.config.fields import Config
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.files import TrainedModel
 from blitzgs.runs.log import LOG
+from blitzgs.runs.run_files import TrainedModel
 from blitzgs.training.agreement import Agreement
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture, read_ahead

@@ -24,7 +24,7 @@ from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, changed, default_recipe, load_config, recipe_path, to_dict
 from blitzgs.config.ranges import describe, describe_all, describe_page
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.folder_checks import locked
 from blitzgs.training.budget import LEAST_IMAGES, estimate
 from blitzgs.training.inputs import open_capture, read_ahead

@@ -16,12 +16,12 @@ pytest.importorskip("viser", reason="the extra view is not installed")
 from blitzgs.cli.train import live_page
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.export import export_ply
 from blitzgs.runs.folder import open_run
 from blitzgs.training.trainer import Trainer
 from blitzgs.viewer.paths import from_json
 from blitzgs.viewer.studio import Studio, open_model
 from tests.browser import Browser, needs_chromium, wait_for
+from tests.helpers import export_ply
 from tests.training.tiny import tiny_config, tiny_scene
 
 
