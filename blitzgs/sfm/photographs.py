@@ -100,7 +100,7 @@ class Photographs:
             path = folder / f"{name}.png"
             if path.exists():
                 continue
-            counted = np.ones((1, 1), np.uint8) if mask is None else decode_mask(read_whole(mask), str(mask))
+            counted = np.ones((1, 1), np.uint8) if mask is None else decode_mask(read_whole(mask))
             pixels = 255 * cv2.resize(counted, size, interpolation=cv2.INTER_NEAREST)
             path.parent.mkdir(parents=True, exist_ok=True)
             write_file(path, bytes(cv2.imencode(".png", pixels)[1]), sync=False)
