@@ -8,6 +8,8 @@ from html import escape
 
 import numpy as np
 
+from blitzgs.capture.world import GEOCENTRIC
+from blitzgs.view.draw import LEVEL_COLOURS
 from blitzgs.viewer.visitor import Shown, Visitor
 from blitzgs.viewer.world import SCALE
 
@@ -44,8 +46,16 @@ def overlay(visitor: Visitor, shown: Shown, memory: str) -> str:
             f"{look.mode} {shown.low:.3g} <span style='display:inline-block;width:120px;height:9px;"
             f"background:{colours}'></span> {shown.high:.3g}"
         )
+    if look.mode == "level":
+        boxes = "".join(_level(k, colour) for k, colour in enumerate(LEVEL_COLOURS))
+        lines.append(f"level {boxes} (coarse to fine)")
     box = f"<style>{_NARROW}</style><div id='blitzgs-figures' style='{_BOX}'>"
     return f"{box}{scale_bar(visitor)}{'<br>'.join(lines)}</div>"
+
+
+def _level(level: int, colour: tuple[float, float, float]) -> str:
+    channels = ",".join(f"{255 * value:.0f}" for value in colour)
+    return f"<span style='background:rgb({channels});padding:0 4px'>{level}</span>"
 
 
 def scale_bar(visitor: Visitor) -> str:
@@ -54,17 +64,20 @@ def scale_bar(visitor: Visitor) -> str:
     distance = float(np.linalg.norm(np.array(camera.look_at) - np.array(camera.position)))
     if visitor.motion != "orbit":
         distance = float(np.linalg.norm(visitor.world.middle - visitor.stance.position))
-    # Width of the view at this distance in the capture's unit.
-    width = (
-        2 * distance * math.tan(visitor.stance.fov / 2) * camera.aspect / SCALE * visitor.exhibit.space.unit
-    )
-    if not (math.isfinite(width) and width > 0):
+    # Height of the view at this distance in the capture's unit, or in metres if these are known. The picture
+    # is as high as the page; beside the panel it is less wide.
+    frame, unit = visitor.exhibit.frame, visitor.exhibit.space.unit
+    in_metres = frame is not None and frame.crs == GEOCENTRIC
+    if frame is not None and in_metres:
+        unit *= frame.scale
+    height = 2 * distance * math.tan(visitor.stance.fov / 2) / SCALE * unit
+    if not (math.isfinite(height) and height > 0):
         return ""
-    length = round_length(width / 8)
-    share = 100 * length / width
+    length = round_length(height * camera.aspect / 8)
+    name = "m" if in_metres else "unit" if length == 1 else "units"
     return (
-        f"<div style='width:{share:.2f}vw;border:2px solid #fff;border-top:0;height:5px;margin:2px 0'></div>"
-        f"<div>{length:g} units at the orbit's centre</div>"
+        f"<div style='width:{100 * length / height:.2f}vh;border:2px solid #fff;border-top:0;height:5px;"
+        f"margin:2px 0'></div><div>{length:g} {name} at the orbit's centre</div>"
     )
 
 

@@ -19,11 +19,12 @@ from blitzgs.viewer.settings import Triple
 from blitzgs.viewer.visitor import Visitor
 from blitzgs.viewer.world import SCALE
 
-HELP = (
-    "**Orbit**: drag turns around a point, right drag moves it, the wheel nears it. "
-    "**Fly**: drag turns your head. **Walk**: the same, at eye height above the ground. "
-    "Keys: W A S D move level, Q down, E up, arrows turn. Click a frustum to stand there."
-)
+MOTIONS = {
+    "orbit": "**Orbit**: drag turns around a point, right drag moves it, the wheel nears it.",
+    "fly": "**Fly**: drag turns your head.",
+    "walk": "**Walk**: drag turns your head, at eye height above the ground.",
+}
+KEYS = "Keys: W A S D move level, Q down, E up, arrows turn. Click a frustum to stand there."
 
 
 class Panel:
@@ -89,7 +90,7 @@ class Panel:
             hint="Where a photograph was trained on, show the render with its exposure",
         )  # fmt: skip
         exposure.on_update(lambda _: visitor.change(exposure=exposure.value))
-        wipe = gui.add_slider("Wipe", min=0.0, max=1.0, step=0.01, initial_value=0.5)
+        wipe = gui.add_slider("Wipe", min=0.0, max=1.0, step=0.01, initial_value=0.5, disabled=True)
 
         def stand(_: Any) -> None:
             if number.value < len(exhibit.cameras):
@@ -103,6 +104,7 @@ class Panel:
 
         def chosen(_: Any) -> None:
             visitor.change(comparison=choice.value)
+            wipe.disabled = choice.value != "wipe"
             if choice.value != "off" and visitor.standing is None:
                 stand(None)
 
@@ -114,8 +116,7 @@ class Panel:
 
     def _move(self) -> None:
         visitor, gui = self._visitor, self._gui
-        motion = gui.add_button_group("Motion", ("orbit", "fly", "walk"))
-        motion.on_click(lambda _: visitor.choose_motion(motion.value))
+        motion = gui.add_button_group("Motion", tuple(MOTIONS))
         fov = gui.add_slider(
             "Field of view", min=10, max=110, step=1, initial_value=50, hint="Vertical, degrees"
         )
@@ -126,7 +127,17 @@ class Panel:
         fov.on_update(turn)
         gui.add_button("Level the horizon").on_click(lambda _: visitor.go(visitor.stance))
         gui.add_button("Back to the start").on_click(lambda _: self._restart())
-        gui.add_markdown(HELP)
+        help_text = gui.add_markdown("")
+
+        def moves(_: Any) -> None:
+            visitor.choose_motion(motion.value)
+            tell()
+
+        def tell() -> None:  # the buttons do not show which is chosen
+            help_text.content = f"{MOTIONS[visitor.motion]} {KEYS}"
+
+        motion.on_click(moves)
+        tell()
 
     def _restart(self) -> None:
         world = self._visitor.world
