@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import shlex
 import sys
 import time
 from collections.abc import Iterable
@@ -193,7 +194,7 @@ def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
         f"{time.monotonic() - start:.0f} s"
     )
     if args.tiles:
-        print(f"look at it: blitzgs view {path}")
+        print(f"look at it: blitzgs view {shlex.quote(str(path))}")
     return 0
 
 

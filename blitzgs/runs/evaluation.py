@@ -242,9 +242,9 @@ def _over_all_ranks(
 
 
 def worst_views(views: Mapping[str, Mapping[str, float]], count: int = 3) -> list[tuple[str, float]]:
-    """Return names and PSNR of the views of lowest PSNR, the worst first; none of a single view."""
+    """Return names and PSNR of views of the lower half by PSNR, the worst first."""
     ordered = sorted((view["psnr"], name) for name, view in views.items())
-    return [(name, psnr) for psnr, name in ordered[:count]] if len(ordered) > 1 else []
+    return [(name, psnr) for psnr, name in ordered[: min(count, len(ordered) // 2)]]
 
 
 def evenly_ordered(indices: Sequence[int]) -> list[int]:
