@@ -24,7 +24,7 @@ from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, changed, default_recipe, load_config, recipe_path, to_dict
 from blitzgs.config.ranges import describe, describe_all, describe_page
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.folder_checks import locked
 from blitzgs.training.budget import LEAST_IMAGES, estimate
 from blitzgs.training.inputs import open_capture, read_ahead
@@ -185,10 +185,13 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.check:
         return _check(args, config)
-    if not args.no_sfm:
-        config = with_poses(config, args.sfm or args.out.with_name(f"{args.out.name}_capture"))
     job, laps = config.ranks, Laps(since_start=True)
     laps.lap("imports")
+    if not args.no_sfm:
+        posed = with_poses(config, args.sfm or args.out.with_name(f"{args.out.name}_capture"))
+        if posed is not config:
+            laps.lap("poses")
+        config = posed
     with (
         kept_warnings() as warned,
         nullcontext(read_ahead(config.data)) as reading,  # while the ranks join
@@ -267,6 +270,21 @@ def _config(args: argparse.Namespace) -> Config:
     return config
 
 
+# How figures are printed: label, digits after the point, unit.
+_FIGURES: dict[str, tuple[str, int, float]] = {
+    "psnr": ("PSNR, dB", 2, 1),
+    "ssim": ("SSIM", 4, 1),
+    "psnr_corrected": ("PSNR, colours fitted, dB", 2, 1),
+    "images": ("images trained on", 0, 1),
+    "seconds": ("training time, minutes", 1, 60),
+    "images_per_second": ("images per second", 1, 1),
+    "gaussians": ("Gaussians", 0, 1),
+    "peak_gaussians": ("Gaussians at most", 0, 1),
+    "peak_memory_bytes": ("peak memory, GB", 2, 1e9),
+    "largest_fall": ("largest fall of the training PSNR, dB", 2, 1),
+}
+
+
 def _print_summary(summary: dict[str, object], folder: Path) -> None:
     console, table = Console(emoji=False), Table(show_header=False)
     # Print the path verbatim: rich must not interpret brackets and colons in it.
@@ -274,8 +292,9 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
     if summary.get("split") == "train":
         console.print("no view is held out: the figures are those of the training views", style="yellow")
     for name, value in summary.items():
+        label, digits, unit = _FIGURES.get(name, (name, 4 if isinstance(value, float) else 0, 1))
         if isinstance(value, (int, float)):
-            table.add_row(name, f"{value:,.4f}" if isinstance(value, float) else f"{value:,}")
+            table.add_row(label, f"{value / unit:,.{digits}f}")
     console.print(table)
     # Quoted, so that the commands can be copied.
     name = shlex.quote(str(folder))

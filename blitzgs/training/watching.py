@@ -62,9 +62,9 @@ class Watching:
 
     def _fulfil(self, wish: Wish) -> None:
         if wish.save:
-            save.run(self._state)
+            save.save_checkpoint(self._state)
             if wish.pause:  # no step comes after which it would be finished
-                save.finish(self._state)
+                save.finish_checkpoint(self._state)
         if wish.look is None:
             return
         begin, look = time.perf_counter(), wish.look

@@ -18,8 +18,7 @@ from scenes import aerial
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.tiles import write_tiles
-from blitzgs.runs import files as run_files
-from blitzgs.runs import lod
+from blitzgs.runs import lod, run_files
 from blitzgs.training import setup
 from blitzgs.training.trainer import Trainer
 from tests.formats.test_tiles import SCENE, city

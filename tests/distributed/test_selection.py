@@ -18,7 +18,7 @@ import blitzgs
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import mass_prefix, smallest
 from blitzgs.ops.counter_random import sampling_keys
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
 from tests.helpers import PARAMETERS, random_scene, rasterize_scene, relative_error
 from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture

@@ -12,7 +12,7 @@ from blitzgs.capture.images import PhotographError
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.guard import ModelLostError
 from blitzgs.training.events import evaluate as glances
-from blitzgs.training.events.evaluate import Glances, spread
+from blitzgs.training.events.evaluate import Glances, evenly_ordered
 from blitzgs.training.state import FALL, WINDOW, Curve
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.draw import intrinsics
@@ -213,7 +213,7 @@ def test_a_model_without_gaussians_is_no_result(tmp_path):
 
 @pytest.mark.parametrize("count", [1, 2, 7, 37])
 def test_the_first_views_are_spread(count):
-    order = spread(list(range(100, 100 + count)))
+    order = evenly_ordered(list(range(100, 100 + count)))
     assert sorted(order) == list(range(100, 100 + count))
     for few in range(2, count + 1):
         chosen = sorted(order[:few])
