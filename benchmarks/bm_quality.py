@@ -143,6 +143,21 @@ class Pool:
             result = describe(job.spec) | {"status": "failed", "error": error}
         write(path, result | {"per_gpu": self.per_gpu, "side_by_side": max(self.gpus, 1) * self.per_gpu})
 
+    def report(self) -> None:
+        """Write the tables."""
+        quality_report.report(self.out)
+
+    def summary(self, result: dict[str, Any]) -> str:
+        """Return a run's result as one line."""
+        if result["status"] != "done":
+            return f"FAILED: {result['error']}"
+        last = result["evaluations"][-1]
+        metrics = last.get("test", last.get("train"))
+        return (
+            f"{metrics['psnr']:.2f} dB / {metrics['ssim']:.4f}, training views {last['train']['psnr']:.2f}, "
+            f"{result['seconds']:.1f} s, {result['gaussians']:,} Gaussians"
+        )
+
     def stop(self) -> None:
         """End all present runs; the next call of this program repeats them."""
         for job in self.jobs:
@@ -150,18 +165,6 @@ class Pool:
         for job in self.jobs:
             job.process.wait()
             job.log.close()
-
-
-def summary(result: dict[str, Any]) -> str:
-    """Return a run's result as one line."""
-    if result["status"] != "done":
-        return f"FAILED: {result['error']}"
-    last = result["evaluations"][-1]
-    metrics = last.get("test", last.get("train"))
-    return (
-        f"{metrics['psnr']:.2f} dB / {metrics['ssim']:.4f}, training views {last['train']['psnr']:.2f}, "
-        f"{result['seconds']:.1f} s, {result['gaussians']:,} Gaussians"
-    )
 
 
 def last_line(job: Job) -> str:
@@ -189,8 +192,10 @@ def work(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> None:
             for job in pool.ended():
                 count += 1
                 result = json.loads(pool.result_path(job.spec).read_text())
-                print(f"[{count}/{total}, {elapsed:.0f} s] {job.spec.name}: {summary(result)}", flush=True)
-                quality_report.report(pool.out)
+                print(
+                    f"[{count}/{total}, {elapsed:.0f} s] {job.spec.name}: {pool.summary(result)}", flush=True
+                )
+                pool.report()
             if elapsed > printed + PRINT_EVERY:
                 printed = elapsed
                 for job in pool.jobs:
