@@ -23,7 +23,7 @@ from report_tables import SECTIONS, Json
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-PAGES = (*(ROOT / "docs" / name for name in ("performance.md", "city.md", "hardware.md")), ROOT / "README.md")
+PAGES = (*(ROOT / "docs" / name for name in ("performance.md", "city.md")), ROOT / "README.md")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end: \2 -->)", re.DOTALL)
 
 Results = dict[str, Json]
@@ -35,7 +35,6 @@ COMMANDS = {
     "render": "python benchmarks/bm_render.py",
     "step_1": "python benchmarks/bm_step.py --views 1",
     "step_4": "python benchmarks/bm_step.py --views 4",
-    "photometric": "python benchmarks/bm_photometric.py",
     "accuracy": "python benchmarks/bm_accuracy.py",
     "offload": "python benchmarks/bm_offload.py --ratios 2 4",
     "exchange": (

@@ -51,7 +51,7 @@ def test_a_library_that_was_not_rebuilt_is_named(tmp_path, monkeypatch):
 
 def test_a_library_that_is_missing_is_named(tmp_path):
     environment = os.environ | {"BLITZGS_LIBRARY_DIR": str(tmp_path)}
-    command = [sys.executable, "-c", "import blitzgs.ops.knn_distances"]
+    command = [sys.executable, "-c", "import blitzgs.ops.population"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode != 0
     assert f"{tmp_path}/libblitzgs_cpu.so is missing: the kernels are not built" in done.stderr
@@ -230,7 +230,7 @@ def test_the_compiler_was_given_these_flags():
 
 
 def test_one_file_alone_decides_which_gpus_and_sizes_take_which_branch():
-    """A build that forces the other branch (docs/testing.md) forces all of them."""
+    """A build that forces the other branch (CONTRIBUTING.md) forces all of them."""
     branches = re.compile(
         r"__CUDA_ARCH__\s*[<>=]|__CUDA_ARCH_(LIST|FEAT|SPECIFIC)|<=? \(?(std::int64_t\{1\}|1) << 30"
     )

@@ -23,7 +23,7 @@ from blitzgs.call.finite import warn_of_gradient
 from blitzgs.call.images import render
 from blitzgs.call.ranks import gather_views
 from blitzgs.ops.projection_types import ProjectionOptions
-from blitzgs.util.memory import explain_memory
+from blitzgs.util.errors import explain_memory
 
 # Colours of networks under autocast, and of SH tables in half precision.
 _HALF = (torch.float16, torch.bfloat16)
