@@ -298,7 +298,11 @@ class ImageStore:
         camera = self.capture.cameras[index]
         lens = camera.rectification.lens
         if camera.rectification.is_identity and (lens.width, lens.height) == (camera.width, camera.height):
-            return self._decode(camera, self._read(camera.image_path))
+            # Pixels that are turned later must not be there, even for a moment: another process may have put
+            # the image there meanwhile.
+            shared = self._shared if camera.orientation == 1 else None
+            place = None if shared is None else shared.place(("image", index, 1))
+            return self._decode(camera, self._read(camera.image_path), place)
         packed = self.compressed.get(index)
         if packed is not None:
             return _uint8(native.decode_qoi(packed))
@@ -346,9 +350,9 @@ class ImageStore:
             mask = _uint8(cv2.resize(mask, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST))
         return mask
 
-    def _decode(self, camera: Camera, file: ImageFile) -> UInt8:
+    def _decode(self, camera: Camera, file: ImageFile, place: UInt8 | None = None) -> UInt8:
         lens, path = camera.rectification.lens, camera.image_path
-        pixels = apply_orientation(decode_rgb(file, self._background), camera.orientation)
+        pixels = apply_orientation(decode_rgb(file, self._background, place), camera.orientation)
         if pixels.shape[:2] != (lens.height, lens.width):
             raise ValueError(
                 f"{path} is {pixels.shape[1]} x {pixels.shape[0]} now but was {lens.width} x {lens.height} "
