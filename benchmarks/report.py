@@ -23,7 +23,7 @@ from report_tables import SECTIONS, Json
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-PAGES = (*(ROOT / "docs" / name for name in ("performance.md", "city.md", "hardware.md")), ROOT / "README.md")
+PAGES = (*(ROOT / "docs" / name for name in ("performance.md", "city.md")), ROOT / "README.md")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end: \2 -->)", re.DOTALL)
 
 Results = dict[str, Json]

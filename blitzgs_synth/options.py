@@ -87,7 +87,7 @@ PRESETS = {
         extent=2000.0, views=5120, width=1368, height=912, points_per_view=1200, altitudes=3
     ),
     # Flat crops from straight above, with grain: a capture on which training can lose what it has learnt
-    # (docs/decisions/recipe.md).
+    # (docs/decisions.md).
     "farmland": CityOptions(
         extent=600.0,
         views=166,

@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 # A decision names what existed when it was taken.
-PRESENT = [name for name in NAMES if not name.startswith("docs/decisions/")]
+PRESENT = [name for name in NAMES if name != "docs/decisions.md"]
 FENCED = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 FOLDERS = ("benchmarks", "blitzgs", "cmake", "configs", "csrc", "docs", "examples", "tests")
 # The folder benchmarks/results exists only if something was measured.
@@ -203,7 +203,7 @@ def test_commands_are_used_rightly(name, tmp_path, monkeypatch, capsys):
 
 
 def test_the_paper_page_names_existing_ops_for_every_equation():
-    page = text_of(ROOT / "docs/paper.md")
+    page = text_of(ROOT / "docs/paper.md").split("## Its tables")[0]
     known = set(re.findall(r'm\.def\(\s*"(\w+)', (ROOT / "csrc/registration.cpp").read_text()))
     # A name without a dot is an op; the others are checked as modules and their members.
     named = set(re.findall(r"`(\w+)`", page))

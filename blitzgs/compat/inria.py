@@ -2,7 +2,7 @@
 """The interface of INRIA's `diff_gaussian_rasterization`, `simple_knn` and `fused_ssim` packages.
 
 Names, arguments and results are those of the original 3DGS code (Kerbl et al. 2023), so most names here do
-not follow this project's style. docs/guide/from-inria.md lists what differs.
+not follow this project's style. docs/guide/migration.md lists what differs.
 """
 
 from __future__ import annotations

@@ -110,7 +110,7 @@ MAX_STRETCH = 4.0
 RESET_OPACITY = 0.01
 
 # The limits of the `loss.opacity` that a run computes from `loss.opacity_total`: about the range that was
-# measured (docs/decisions/recipe.md).
+# measured (docs/decisions.md).
 LEAST_OPACITY, MAX_OPACITY = 0.005, 0.05
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The importance pass: one sweep over all training views that scores every Gaussian (BlitzGS, section 3.2).
+"""The importance passes: a sweep over all training views scores every Gaussian, then some are pruned.
 
 docs/guide/fewer-gaussians.md defines the scores, phi and the cull matrix. "density" is the contribution per
 pixel, however many pixels a Gaussian covers, so large Gaussians are pruned first. "weight" is the total
@@ -12,6 +12,7 @@ world size and for any division of the work.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,13 +24,14 @@ from torch import Tensor
 
 from blitzgs.config.fields import ScoreRule
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.selection import integer_mass_prefix
+from blitzgs.distributed.selection import decimal_share, integer_mass_prefix, mass_prefix, smallest
 from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.survey import Survey, survey
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import open_transport
 from blitzgs.ops.blocks import WORD_BITS
+from blitzgs.ops.counter_random import sampling_keys
 from blitzgs.ops.importance import ViewSums, view_sums_
 from blitzgs.table.layouts import CULL
 from blitzgs.table.table import GaussianTable
@@ -240,3 +242,49 @@ def _all_culled(n_views: int, device: torch.device) -> Tensor:
     bits[:n_views] = 1
     words = np.packbits(bits, bitorder="little").view("<i4")
     return torch.from_numpy(words)[None].to(device)
+
+
+def sample_by_score(score: Tensor, ids: Tensor, keep: float, seed: int, event: int, ranks: Ranks) -> Tensor:
+    """Draw the Gaussians that pass 1 keeps: without replacement, with probability proportional to score.
+
+    The Gaussians with the floor(keep N) smallest values of -log(u) / score are kept (exponential races,
+    Efraimidis and Spirakis 2006), where u depends only on (seed, event, id). A Gaussian with score zero is
+    kept only if all with positive scores are.
+
+    Args:
+        score: float32 [N_rank], >= 0.
+        ids: int64 [N_rank], persistent.
+        keep: share of all ranks' N Gaussians, in [0, 1]; its decimal value counts.
+        event: number that differs between draws, such as the time of the pass.
+        ranks: the job; every rank calls this.
+
+    Returns:
+        bool [N_rank], the same ids at every world size.
+    """
+    return smallest(sampling_keys(score, ids, seed, event), ids, _share_of_all(keep, score, ranks), ranks)
+
+
+def top_by_score(score: Tensor, ids: Tensor, mass: float, keep: float, ranks: Ranks) -> Tensor:
+    """Choose the Gaussians that pass 2 keeps: a prefix of the order by descending score.
+
+    Args:
+        score: float32 [N_rank], finite, >= 0.
+        ids: int64 [N_rank], persistent; they decide between equal scores.
+        mass: the prefix is the shortest that holds this share of the total score of all ranks, in [0, 1].
+        keep: the prefix has at most floor(keep N) of all ranks' N Gaussians; in [0, 1], its decimal value
+            counts.
+        ranks: the job; every rank calls this.
+
+    Returns:
+        bool [N_rank], the same ids at every world size.
+    """
+    kept = mass_prefix(score, ids, mass, ranks)
+    if keep < 1:
+        kept &= smallest(-score, ids, _share_of_all(keep, score, ranks), ranks)
+    return kept
+
+
+def _share_of_all(share: float, rows: Tensor, ranks: Ranks) -> int:
+    """Return the floor of a share, by its decimal value, of the rows of all ranks."""
+    total = ranks.all_reduce(torch.tensor(len(rows), device=rows.device))
+    return math.floor(decimal_share(share) * int(total))

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Redistributes the rows of a model so that the ranks' shards have equal lengths (BlitzGS, section 3.1)."""
+"""Divides the Gaussians among the ranks, and again when shards have become unequal (BlitzGS, 3.1)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
+from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.sharding import global_positions, imbalance, shard_sizes
 from blitzgs.table.table import GaussianTable
 
 # Rows are moved when the largest shard exceeds the smallest by this factor.
@@ -38,3 +40,38 @@ def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = MAX_
     arrived = positions[positions % ranks.world_size == ranks.rank]
     table.permute(arrived.argsort().to(table.device))
     return True
+
+
+def global_positions(sizes: Sequence[int], rank: int) -> Tensor:
+    """Return the position in the global order of each row of one shard.
+
+    The global order is row 0 of every rank, then row 1 of every rank, and so on; ranks without further rows
+    are skipped. So a table that was divided round-robin keeps its order. Shards whose sizes differ by at most
+    one (the larger ones first) already have exactly the positions = rank (mod M).
+
+    Args:
+        sizes: rows on each rank, M values.
+        rank: the rank of the shard.
+
+    Returns:
+        int64 [sizes[rank]], ascending.
+    """
+    rows = torch.arange(sizes[rank], dtype=torch.int64)
+    positions = torch.zeros_like(rows)
+    for other, size in enumerate(sizes):
+        # Rows of `other` in the rounds before this one, plus its row of this round if it comes first.
+        positions += (rows + 1 if other < rank else rows).clamp(max=size)
+    return positions
+
+
+def shard_sizes(rows: int, ranks: Ranks) -> list[int]:
+    """Return the present number of rows on each rank. Collective."""
+    counts = ranks.all_gather(torch.tensor([rows], dtype=torch.int64, device=ranks.device))
+    return [int(count) for count in torch.cat(counts).tolist()]
+
+
+def imbalance(sizes: Sequence[int]) -> float:
+    """Return largest over smallest shard; infinite if only some shards are empty, 1 if all are."""
+    if max(sizes) == 0:
+        return 1.0
+    return max(sizes) / min(sizes) if min(sizes) else float("inf")

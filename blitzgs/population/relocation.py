@@ -178,7 +178,7 @@ def _keep_moments(table: GaussianTable, sources: Tensor, copies: Tensor, before:
 
     With moments of zero instead, a row would move by several times its learning rate in its next steps, as
     Adam's bias correction is that of the run and not of the row. In each event the most opaque Gaussians are
-    copied, and such steps of all of them undo what a run has learnt (docs/decisions/recipe.md).
+    copied, and such steps of all of them undo what a run has learnt (docs/decisions.md).
 
     Args:
         table: changed in place.

@@ -26,7 +26,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.sharding import global_positions
+from blitzgs.population.redistribution import global_positions
 from blitzgs.runs.manifest import DAMAGE, Shard, finish, verified
 from blitzgs.runs.shard_file import header_of, write_shard
 from blitzgs.util.output import check_space, explain, is_lack_of_space

@@ -2,7 +2,7 @@
 """Training beyond the memory of a GPU: keeps the blocks that views need in a pool on the device.
 
 A `Pool` is a smaller table with the columns of the host's, whose slots hold blocks of 256 rows for a while
-(docs/design/training.md). The bounds of a block change only when a step moves its rows, and the blocks of the
+(docs/design.md). The bounds of a block change only when a step moves its rows, and the blocks of the
 present step keep their slots until it has ended, so what `seen_blocks` finds before a step is still right
 after it. If the blocks of this step and the next do not fit together, the next one loads the rest when it
 begins; blocks of later steps come early where that evens out the traffic.

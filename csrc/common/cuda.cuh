@@ -15,7 +15,7 @@
 
 // The GPU and the size of the work decide which code runs. A test build takes the other branches on the same
 // machine: BLITZGS_SM80_BRANCHES compiles the code for GPUs before sm_90 for all GPUs, and
-// BLITZGS_SMALL_STATES lowers the number of items from which sorts take 64-bit states (docs/testing.md).
+// BLITZGS_SMALL_STATES lowers the number of items from which sorts take 64-bit states (CONTRIBUTING.md).
 // Tests ask the library for both settings (branches_cuda.cu).
 
 #ifndef BLITZGS_SM80_BRANCHES
@@ -77,7 +77,7 @@ inline int multiprocessors() {
 //   block occupies a multiprocessor, so a kernel that spins for another GPU or stream must not let its
 //   successor in. For other kernels it would cost time, because the blocks of the next kernel are spread
 //   unevenly over the multiprocessors if they are placed while others still run
-//   (docs/decisions/host.md).
+//   (docs/decisions.md).
 // - Kernels of other libraries are launched plainly; they wait for all earlier kernels by themselves.
 
 // A kernel that is launched by launch_early calls this first.

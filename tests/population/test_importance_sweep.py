@@ -15,8 +15,15 @@ from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.survey import survey
 from blitzgs.population import importance
-from blitzgs.population.importance import PHI_EPS, SCORE_EPS, ViewBatch, is_culled, sweep
-from blitzgs.population.pruning import sample_by_score, top_by_score
+from blitzgs.population.importance import (
+    PHI_EPS,
+    SCORE_EPS,
+    ViewBatch,
+    is_culled,
+    sample_by_score,
+    sweep,
+    top_by_score,
+)
 from blitzgs.reference.importance import scores as by_definition
 from blitzgs.reference.importance import top_mass
 from blitzgs.table.table import GaussianTable

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.population.pruning import sample_by_score
+from blitzgs.population.importance import sample_by_score
 from blitzgs.spawn.candidates import FEATURES, Candidates
 from blitzgs.spawn.fit import Spawns, auc, best_feature, fit, judge
 from blitzgs.spawn.gate import (

@@ -8,7 +8,7 @@ The band's centres are in real_captures.json. A change that is meant to alter qu
 
 On a GPU sums are added up in another order every time. Three trainings of `sheffield` with different seeds
 ended at 30.53, 30.82 and 30.82 dB, so a single failure there may be chance; several are not. The centre of
-`sheffield` is that of one training, of seed 0 (docs/decisions/recipe.md).
+`sheffield` is that of one training, of seed 0 (docs/decisions.md).
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the pictures of docs/guide/view.md and docs/guide/report.md.
+"""Makes the pictures of docs/guide/view.md.
 
     python -m tests.viewer.pictures RUN [--data CAPTURE]
 

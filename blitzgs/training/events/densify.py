@@ -22,7 +22,7 @@ from blitzgs.table.table import PARAMETERS
 from blitzgs.training.state import TrainingState
 
 # The table is sorted again when the spread of its blocks exceeds that of the sorted table by this factor
-# (docs/decisions/population.md).
+# (docs/decisions.md).
 MOST_SPREAD = 4.0
 
 

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from blitzgs.config.fields import ScoreRule
 from blitzgs.config.schedule import Event
-from blitzgs.population.importance import Importance, ViewBatch, sweep
-from blitzgs.population.pruning import sample_by_score, top_by_score
+from blitzgs.population.importance import Importance, ViewBatch, sample_by_score, sweep, top_by_score
 from blitzgs.population.redistribution import redistribute
 from blitzgs.runs.guard import ModelLostError, check_table
 from blitzgs.runs.lod import scene_gate
