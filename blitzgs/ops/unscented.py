@@ -89,7 +89,7 @@ def project_unscented(inputs: ProjectionInputs, lenses: Lenses) -> ProjectedSpla
     splat_offsets = torch.cat([offsets[:1], ends])
     masks = gaussian_ids.new_empty(0, dtype=torch.int64)
     ids = (gaussian_ids, camera_ids, visible_ids, splat_offsets)
-    return ProjectedSplats(*ids, *columns, radii, tiles, masks, counts)
+    return ProjectedSplats._make((*ids, *columns, radii, tiles, masks, counts))
 
 
 def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:

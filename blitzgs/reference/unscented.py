@@ -69,10 +69,8 @@ def _pixels(points: Tensor, view: View) -> tuple[Tensor, Tensor]:
     last, last_valid = lens_pixels(_points_at(points, view, zero + 1), view)
     seen = valid | last_valid
     pixels = torch.where(valid[..., None], pixels, last)
-    for _ in range(10):
-        # The time is that of a row or column, so it has no derivative.
-        time = _times(pixels.detach(), view)
-        new, valid = lens_pixels(_points_at(points, view, time), view)
+    for _ in range(20):
+        new, valid = lens_pixels(_points_at(points, view, _times(pixels, view)), view)
         pixels = torch.where(seen[..., None], new, last)
     return pixels, valid & seen
 
@@ -120,10 +118,10 @@ def _largest_angle(k: Tensor) -> float:
 
 
 def _times(pixels: Tensor, view: View) -> Tensor:
-    """Return the times, from 0 to 1 in the image, at which the shutter sees pixels."""
+    """Return the times at which the shutter sees pixels: 0 for the first row or column, 1 for the last."""
     size, axis = (view.height, 1) if view.shutter in (0, 2) else (view.width, 0)
-    place = pixels[..., axis]
-    return (place.floor() if view.shutter in (0, 1) else size - place.ceil()) / (size - 1)
+    time = (pixels[..., axis] - 0.5) / (size - 1)
+    return time if view.shutter in (0, 1) else 1 - time
 
 
 def _points_at(points: Tensor, view: View, time: Tensor) -> Tensor:

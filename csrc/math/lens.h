@@ -11,9 +11,10 @@
 //                     |(u, v)|, valid where t is below the lens's largest angle; t is held there
 // and a valid pixel also lies within `margin` image sizes of the image.
 //
-// A rolling shutter sees a pixel at the time that follows from its row or column, rounded, so that the time
-// has no derivative. The time of a point is found in ten steps from its pixel at the begin of the frame, or
-// at the end where only this one is valid.
+// A rolling shutter sees the first row (or column) at the time 0 and the last one at 1. The time of a point
+// is found in at most 20 steps from its pixel at the begin of the frame, or at the end where only this one is
+// valid. Unlike gsplat's, it is not rounded to that of a row: there a 2D splat only bounds what is evaluated
+// in 3D, while here the pixels of close points are subtracted, which would leave the rounding.
 #pragma once
 #include "math/projection.h"
 
@@ -46,8 +47,8 @@ BLITZGS_HD LensPose load_pose(const T* m) {
   return {{{m[0], m[4], m[8]}, {m[1], m[5], m[9]}, {m[2], m[6], m[10]}}, {m[3], m[7], m[11]}};
 }
 
-// The quaternion q [4] of a rotation, over the largest of its four numbers (Shepperd 1978).
-BLITZGS_HD void quaternion_of(const Columns3<double>& r, double* q) {
+// The rotation vector of a rotation: its axis, as long as its angle (by the quaternion of Shepperd 1978).
+BLITZGS_HD Vec3<double> rotation_vector(const Columns3<double>& r) {
   const double xx = r.x.x, yy = r.y.y, zz = r.z.z;
   const double wx = r.y.z - r.z.y, wy = r.z.x - r.x.z, wz = r.x.y - r.y.x;
   const double xy = r.x.y + r.y.x, xz = r.x.z + r.z.x, yz = r.y.z + r.z.y;
@@ -57,46 +58,61 @@ BLITZGS_HD void quaternion_of(const Columns3<double>& r, double* q) {
                              {wz, xz, yz, 1 - xx - yy + zz}};
   int best = 0;
   for (int i = 1; i < 4; ++i) best = rows[i][i] > rows[best][best] ? i : best;
-  const UnitQuaternion<double> unit = normalize_quaternion(rows[best]);
-  q[0] = unit.w;
-  q[1] = unit.x;
-  q[2] = unit.y;
-  q[3] = unit.z;
+  const double* q = rows[best];
+  const double sign = q[0] < 0 ? -1.0 : 1.0;
+  const Vec3<double> axis{sign * q[1], sign * q[2], sign * q[3]};
+  const double length = std::sqrt(dot(axis, axis));
+  return length > 0 ? 2 * std::atan2(length, sign * q[0]) / length * axis : Vec3<double>{0, 0, 0};
 }
 
 struct LensCamera {
   double fx, fy, cx, cy, width, height;
   double k[kLensNumbers];
   LensPose start, end;
-  double q_start[4], q_end[4], angle;  // of a rolling shutter: rotations, and the angle between them
+  Vec3<double> turn, shift;  // of the pose from the begin of the frame to its end: a rotation vector, and t
+  double row_time[2];        // derivative of the time at which the shutter sees a pixel by the pixel
 
-  // The pose at a time of the frame: translations interpolated linearly, rotations spherically.
-  BLITZGS_HD LensPose at(const LensOptions& options, double time) const {
-    if (options.shutter == Shutter::kGlobal) return start;
-    const double sine = std::sin(angle), rest = 1 - time;
-    const double a = sine > 1e-6 ? std::sin(rest * angle) / sine : rest;
-    const double b = sine > 1e-6 ? std::sin(time * angle) / sine : time;
-    double q[4];
-    for (int i = 0; i < 4; ++i) q[i] = a * q_start[i] + b * q_end[i];
-    return {rotation_columns(normalize_quaternion(q)), rest * start.translation + time * end.translation};
+  // The pose at a time of the frame: it turns and moves at constant rates.
+  BLITZGS_HD LensPose at(double time) const {
+    const double angle = std::sqrt(dot(turn, turn));
+    if (angle == 0) return {start.columns, start.translation + time * shift};
+    const double half = 0.5 * time * angle, sine = std::sin(half) / angle;
+    const Columns3<double> r = rotation_columns(
+        UnitQuaternion<double>{std::cos(half), sine * turn.x, sine * turn.y, sine * turn.z, 1});
+    const auto turned = [&](const Vec3<double>& v) { return v.x * r.x + v.y * r.y + v.z * r.z; };
+    return {{turned(start.columns.x), turned(start.columns.y), turned(start.columns.z)},
+            start.translation + time * shift};
+  }
+  BLITZGS_HD double time_of(double x, double y) const {
+    const double time = row_time[0] * (x - 0.5) + row_time[1] * (y - 0.5);
+    return row_time[0] + row_time[1] < 0 ? 1 + time : time;
   }
 };
 
-// camera: makes a view that no pinhole projection has see nothing.
+// camera: makes a view that no pinhole projection has see nothing. viewmat_rs: null for a global shutter.
 template <class T>
 BLITZGS_HD LensCamera make_lens_camera(const Camera<T>& camera, int width, int height, const T* lens,
-                                       const T* viewmat, const T* viewmat_rs) {
-  LensCamera c{camera.fx, camera.fy, camera.cx, camera.cy, double(width), double(height)};
+                                       Shutter shutter, const T* viewmat, const T* viewmat_rs) {
+  LensCamera c{};
+  c.fx = camera.fx;
+  c.fy = camera.fy;
+  c.cx = camera.cx;
+  c.cy = camera.cy;
+  c.width = width;
+  c.height = height;
   for (int i = 0; i < kLensNumbers; ++i) c.k[i] = lens[i];
-  c.start = load_pose(viewmat);
+  c.start = c.end = load_pose(viewmat);
   if (!viewmat_rs) return c;
   c.end = load_pose(viewmat_rs);
-  quaternion_of(c.start.columns, c.q_start);
-  quaternion_of(c.end.columns, c.q_end);
-  double cosine = 0;
-  for (int i = 0; i < 4; ++i) cosine += c.q_start[i] * c.q_end[i];
-  for (int i = 0; i < 4; ++i) c.q_end[i] = cosine < 0 ? -c.q_end[i] : c.q_end[i];
-  c.angle = std::acos(smaller(std::fabs(cosine), 1.0));
+  const Columns3<double>& s = c.start.columns;
+  const Vec3<double> origin{0, 0, 0};
+  const LensPose rotation{c.end.columns, origin};
+  c.turn = rotation_vector({rotation.of({s.x.x, s.y.x, s.z.x}), rotation.of({s.x.y, s.y.y, s.z.y}),
+                            rotation.of({s.x.z, s.y.z, s.z.z})});
+  c.shift = c.end.translation - c.start.translation;
+  const bool rows = shutter == Shutter::kTopToBottom || shutter == Shutter::kBottomToTop;
+  const bool forward = shutter == Shutter::kTopToBottom || shutter == Shutter::kLeftToRight;
+  c.row_time[rows ? 1 : 0] = (forward ? 1.0 : -1.0) / larger((rows ? c.height : c.width) - 1, 1.0);
   return c;
 }
 
@@ -188,41 +204,44 @@ BLITZGS_HD Vec3<double> lens_pixel_vjp(const LensCamera& c, const LensOptions& o
   return {a * lens.stretch + along * q.x, b * lens.stretch + along * q.y, v_stretch * lens.by_z};
 }
 
-BLITZGS_HD double shutter_time(const LensCamera& c, Shutter shutter, const LensPixel& pixel) {
-  const double rows = larger(c.height - 1, 1.0), columns = larger(c.width - 1, 1.0);
-  switch (shutter) {
-    case Shutter::kTopToBottom:
-      return std::floor(pixel.y) / rows;
-    case Shutter::kLeftToRight:
-      return std::floor(pixel.x) / columns;
-    case Shutter::kBottomToTop:
-      return (c.height - std::ceil(pixel.y)) / rows;
-    case Shutter::kRightToLeft:
-      return (c.width - std::ceil(pixel.x)) / columns;
-    default:
-      return 0;
-  }
-}
+// A pixel of a world point: the time at which the shutter sees it, and whether this depends on the pixel.
+struct SeenPoint {
+  LensPixel pixel;
+  double time;
+  bool rolled;
+};
 
-// The pixel of a world point, and the time at which the shutter sees it.
-BLITZGS_HD LensPixel see_point(const LensCamera& c, const LensOptions& options, const Vec3<double>& point,
-                               double* time) {
-  constexpr int kSteps = 10;
-  LensPixel pixel = lens_pixel(c, options, c.start.of(point));
-  *time = 0;
-  if (options.shutter == Shutter::kGlobal) return pixel;
-  if (!pixel.valid) {
-    pixel = lens_pixel(c, options, c.end.of(point));
-    *time = 1;
-    if (!pixel.valid) return pixel;
+BLITZGS_HD SeenPoint see_point(const LensCamera& c, const LensOptions& options, const Vec3<double>& point) {
+  constexpr int kSteps = 20;
+  SeenPoint seen{lens_pixel(c, options, c.start.of(point)), 0, false};
+  if (options.shutter == Shutter::kGlobal) return seen;
+  if (!seen.pixel.valid) {
+    seen = {lens_pixel(c, options, c.end.of(point)), 1, false};
+    if (!seen.pixel.valid) return seen;
   }
   for (int i = 0; i < kSteps; ++i) {
-    const double next = shutter_time(c, options.shutter, pixel);
-    if (i > 0 && next == *time) break;
-    *time = next;
-    pixel = lens_pixel(c, options, c.at(options, next).of(point));
+    const double time = c.time_of(seen.pixel.x, seen.pixel.y);
+    if (seen.rolled && time == seen.time) break;
+    seen = {lens_pixel(c, options, c.at(time).of(point)), time, true};
   }
-  return pixel;
+  return seen;
+}
+
+// The gradient of a world point from that of its pixel p. The time follows the pixel: dp = J dx + u dt with
+// the pixel's velocity u, and dt = row_time . dp.
+BLITZGS_HD Vec3<double> see_point_vjp(const LensCamera& c, const LensOptions& options,
+                                      const Vec3<double>& point, double time, bool rolled,
+                                      const double* v_pixel) {
+  const LensPose pose = c.at(time);
+  const Vec3<double> q = pose.of(point);
+  if (!rolled) return pose.world_vjp(lens_pixel_vjp(c, options, q, v_pixel[0], v_pixel[1]));
+  const Vec3<double> across = lens_pixel_vjp(c, options, q, 1, 0), down = lens_pixel_vjp(c, options, q, 0, 1);
+  const Vec3<double> velocity = cross(c.turn, q - pose.translation) + c.shift;
+  const double u[2] = {dot(across, velocity), dot(down, velocity)};
+  const double v_time =
+      (u[0] * v_pixel[0] + u[1] * v_pixel[1]) / (1 - c.row_time[0] * u[0] - c.row_time[1] * u[1]);
+  return pose.world_vjp((v_pixel[0] + v_time * c.row_time[0]) * across +
+                        (v_pixel[1] + v_time * c.row_time[1]) * down);
 }
 
 }  // namespace blitzgs

@@ -35,9 +35,10 @@ BLITZGS_HD Vec3<double> sigma_point(const ActivatedGaussian<double>& gaussian, d
 }
 
 struct UnscentedFootprint {
-  double time[kSigmaPoints], offset[kSigmaPoints][2];  // of sigma points; d_i of all but the first
-  double mean2d[2], shift[2];                          // D
-  double xx, xy, yy, unblurred, det;                   // of Sigma', and the determinant before the blur
+  double time[kSigmaPoints], offset[kSigmaPoints][2];  // of sigma points (see_point); d_i
+  bool rolled[kSigmaPoints];
+  double mean2d[2], shift[2];         // D
+  double xx, xy, yy, unblurred, det;  // of Sigma', and the determinant before the blur
 };
 
 // Returns false if too few points are valid.
@@ -46,7 +47,10 @@ BLITZGS_HD bool unscented_footprint(const LensCamera& camera, const ActivatedGau
   double x = 0, y = 0, xx = 0, xy = 0, yy = 0;
   bool all = true, any = false;
   for (int i = 0; i < kSigmaPoints; ++i) {
-    const LensPixel pixel = see_point(camera, options, sigma_point(gaussian, options.spread, i), &f->time[i]);
+    const SeenPoint seen = see_point(camera, options, sigma_point(gaussian, options.spread, i));
+    const LensPixel& pixel = seen.pixel;
+    f->time[i] = seen.time;
+    f->rolled[i] = seen.rolled;
     all = all && pixel.valid;
     any = any || pixel.valid;
     if (i == 0) {
@@ -84,7 +88,7 @@ template <class T>
 BLITZGS_HD bool unscented_splat(const LensCamera& camera, const ActivatedGaussian<double>& gaussian,
                                 const ProjectOptions<T>& image, const UnscentedOptions& options,
                                 Splat<T>* splat) {
-  splat->depth = T(camera.at(options, 0.5).of(gaussian.mean).z);
+  splat->depth = T(camera.at(0.5).of(gaussian.mean).z);
   if (!in_depth_range(splat->depth, image)) return false;
   UnscentedFootprint f;
   if (!unscented_footprint(camera, gaussian, options, image.eps2d, &f)) return false;
@@ -142,17 +146,15 @@ BLITZGS_HD void unscented_splat_vjp(const LensCamera& camera, const ActivatedGau
       v_first[1] -= v_offset[1];
     }
     const double* v_pixel = i > 0 ? v_offset : v_first;
-    const LensPose pose = camera.at(options, f.time[i]);
-    const Vec3<double> point = pose.of(sigma_point(gaussian, options.spread, i));
-    const Vec3<double> v_point =
-        pose.world_vjp(lens_pixel_vjp(camera, options, point, v_pixel[0], v_pixel[1]));
+    const Vec3<double> v_point = see_point_vjp(camera, options, sigma_point(gaussian, options.spread, i),
+                                               f.time[i], f.rolled[i], v_pixel);
     gradient->mean = gradient->mean + v_point;
     if (i == 0) continue;
     Vec3<double>& v_axis = i % 3 == 1 ? gradient->axes.x : i % 3 == 2 ? gradient->axes.y : gradient->axes.z;
     v_axis = mul_add(i <= 3 ? options.spread : -options.spread, v_point, v_axis);
   }
   const Vec3<double> along{0, 0, double(v.depth)};
-  gradient->mean = gradient->mean + camera.at(options, 0.5).world_vjp(along);
+  gradient->mean = gradient->mean + camera.at(0.5).world_vjp(along);
 }
 
 // What the three passes below read. lenses [B, kLensNumbers]; viewmats_rs [B, 4, 4], the poses at the end of
@@ -168,7 +170,8 @@ struct UnscentedInputs {
   }
   BLITZGS_HD LensCamera camera(int view) const {
     return make_lens_camera(pinhole(view), in.options.width, in.options.height, lenses + kLensNumbers * view,
-                            in.viewmats + 16 * view, viewmats_rs ? viewmats_rs + 16 * view : nullptr);
+                            options.shutter, in.viewmats + 16 * view,
+                            viewmats_rs ? viewmats_rs + 16 * view : nullptr);
   }
   BLITZGS_HD ActivatedGaussian<double> gaussian(std::int64_t id) const {
     const T *m = in.means + 3 * id, *q = in.quats + 4 * id, *s = in.scales + 3 * id;
