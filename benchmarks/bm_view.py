@@ -29,9 +29,8 @@ from blitzgs.table.blocks import morton_order
 from blitzgs.view.draw import Drawer, Subject, intrinsics, table_of_parameters
 from blitzgs.view.look import Look
 from blitzgs.view.views import Space, render_options
-from blitzgs.viewer.exhibit import Exhibit
 from blitzgs.viewer.studio import Opened, Studio, box_of, open_model
-from blitzgs.viewer.world import SCALE, World, looking
+from blitzgs.viewer.world import SCALE, Exhibit, World, looking
 
 WARM_UP = 2.0
 

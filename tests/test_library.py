@@ -51,7 +51,7 @@ def test_a_library_that_was_not_rebuilt_is_named(tmp_path, monkeypatch):
 
 def test_a_library_that_is_missing_is_named(tmp_path):
     environment = os.environ | {"BLITZGS_LIBRARY_DIR": str(tmp_path)}
-    command = [sys.executable, "-c", "import blitzgs.ops.knn_distances"]
+    command = [sys.executable, "-c", "import blitzgs.ops.population"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode != 0
     assert f"{tmp_path}/libblitzgs_cpu.so is missing: the kernels are not built" in done.stderr

@@ -24,7 +24,7 @@ from blitzgs.call.images import render
 from blitzgs.call.lenses import check_with_ut, check_without_ut, with_lenses
 from blitzgs.call.ranks import gather_views
 from blitzgs.ops.projection_types import ProjectionOptions
-from blitzgs.util.memory import explain_memory
+from blitzgs.util.errors import explain_memory
 
 # Colours of networks under autocast, and of SH tables in half precision.
 _HALF = (torch.float16, torch.bfloat16)

@@ -22,9 +22,11 @@ from blitzgs.capture.cameras import (
     MAX_SIDE,
     Camera,
     Float64,
+    Rectification,
     SourceView,
     camera_centres,
     downscaled_size,
+    rectify,
     same_shape,
     scaled_matrix,
 )
@@ -38,16 +40,16 @@ from blitzgs.capture.names import MissingImagesError as MissingImagesError
 from blitzgs.capture.names import check_inside, existing
 from blitzgs.capture.points import SourcePoints
 from blitzgs.capture.projects.find import FoundProject, folder_of, project_at
-from blitzgs.capture.splits import split_capture, without_unused
-from blitzgs.capture.undistort import Rectification, rectify
 from blitzgs.capture.usable import (
     check_lenses,
     finite_points,
     points_at_random,
+    split_capture,
     with_finite_poses,
     without_strays,
+    without_unused,
 )
-from blitzgs.util.arguments import check_number
+from blitzgs.util.errors import check_number
 
 # In pixels. SSIM compares windows of 11 pixels, and a much smaller image shows too little to train on.
 _LEAST_SIDE = 8

@@ -28,7 +28,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.capture.cameras import Camera, same_shape
+from blitzgs.capture.cameras import Camera, Rectification, same_shape
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.check_files import FileCheck, mask_error
 from blitzgs.capture.image_files import (
@@ -42,7 +42,6 @@ from blitzgs.capture.image_files import (
 )
 from blitzgs.capture.shared_images import BoundedCache as BoundedCache
 from blitzgs.capture.shared_images import SharedImages
-from blitzgs.capture.undistort import Rectification
 from blitzgs.formats import native
 
 DEFAULT_BUDGET = 4 << 30

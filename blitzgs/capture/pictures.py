@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.util.arguments import check_tensor
+from blitzgs.util.errors import check_tensor
 from blitzgs.util.output import write_file
 
 UInt8 = npt.NDArray[np.uint8]

@@ -19,8 +19,8 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import input_files
 from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
-from blitzgs.runs.from_file import gate_of, model_of_file
 from blitzgs.runs.lod import lod_gate, scene_gate
+from blitzgs.runs.world import gate_of, model_of_file
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.util.progress import image_progress
 from blitzgs.util.terminal import printable

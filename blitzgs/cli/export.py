@@ -22,10 +22,9 @@ from blitzgs.formats.models import FORMATS, Format, check_replaces, offset_of, o
 from blitzgs.formats.selection import Selected, Selection, read_polygon
 from blitzgs.formats.web_page import check_replaces_page
 from blitzgs.runs.clean import cleaned
-from blitzgs.runs.export import COORDINATES, Exported, export, without_antialiasing
+from blitzgs.runs.export import COORDINATES, Exported, export, open_source, source_of, without_antialiasing
 from blitzgs.runs.files import run_and_checkpoint
 from blitzgs.runs.folder import Model, open_run
-from blitzgs.runs.source import open_source, source_of
 from blitzgs.runs.world import in_world, load_frame
 from blitzgs.util.output import write_file
 
@@ -175,7 +174,7 @@ def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
     _refuse(args, ("max_mb", "coordinates", "classic", "clean"), f"is not for {_TILES}")
     from blitzgs.formats.streamed_sog import write_streamed_sog
     from blitzgs.formats.tiles import TILE, write_tiles
-    from blitzgs.viewer.tileset import open_city
+    from blitzgs.viewer.web import open_city
 
     start, city = time.monotonic(), open_city(args.model)
     source, path = city.source, args.tiles or args.streamed_sog

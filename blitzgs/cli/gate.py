@@ -16,7 +16,6 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.folder import open_run
-from blitzgs.spawn import evaluation as gate_evaluation
 from blitzgs.spawn import fit as gate_fit
 from blitzgs.spawn import samples as spawn_samples
 from blitzgs.spawn.gate import SpawnGate, gate_file
@@ -84,7 +83,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         "--rate", type=float, default=0.6, help="share of the candidates to withhold (default: %(default)s)"
     )
     add_capture(again)
-    add_device(again)
+    add_device(again, shares_gpus=True)
 
 
 def run_fit(args: argparse.Namespace) -> int:
@@ -125,14 +124,14 @@ def run_evaluate(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     schedules = [load_config(folder / run_files.CONFIG).schedule for folder in args.runs]
     gate_from = [Schedule(schedule).pace.image(schedule.gate_from) for schedule in schedules]
-    results = gate_evaluation.evaluate(gate, runs, gate_from, output)
+    results = gate_fit.evaluate(gate, runs, gate_from, output)
     output.write(figures, (json.dumps(results, indent=1) + "\n").encode())
     for result in results:
         seen = "  (the gate was fitted on this scene)" if result["seen"] else ""
         r = result.get("regions", {}).get("r")
         regions = "" if r is None else f"; regions r {r:.2f}"
         print(_judgement(result) + regions + seen)
-    print(f"{args.out}: {figures.name}, {gate_evaluation.SURVIVAL} and maps of regions")
+    print(f"{args.out}: {figures.name}, {gate_fit.SURVIVAL} and maps of regions")
     return 0
 
 
@@ -151,7 +150,7 @@ def run_replay(args: argparse.Namespace) -> int:
         args.device,
         config.ranks.timeout_seconds,
         "auto",
-        config.ranks.share_gpus,
+        args.share_gpus,
         tables_on_host=config.memory.resident_gb > 0,
     ) as ranks:
         capture, images = open_capture(config, ranks)

@@ -20,14 +20,13 @@ from rich.table import Table
 from blitzgs.cli.arguments import Commands, add_command, add_device, add_path, number
 from blitzgs.cli.report import kept_warnings, write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
-from blitzgs.config.describe import describe, describe_all, describe_page
 from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, changed, default_recipe, load_config, recipe_path, to_dict
+from blitzgs.config.ranges import describe, describe_all, describe_page
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import files as run_files
 from blitzgs.runs.folder_checks import locked
-from blitzgs.training.budget import LEAST_IMAGES
-from blitzgs.training.estimate import estimate
+from blitzgs.training.budget import LEAST_IMAGES, estimate
 from blitzgs.training.inputs import open_capture, read_ahead
 from blitzgs.training.state import TrainingState
 from blitzgs.training.trainer import Trainer
@@ -139,7 +138,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     )
     parser.add_argument("--no-sfm", action="store_true", help="refuse photographs without poses")
     add_live_page(parser)
-    add_device(parser)
+    add_device(parser, shares_gpus=True)
 
 
 class _Help(argparse.Action):
@@ -197,7 +196,7 @@ def run(args: argparse.Namespace) -> int:
             args.device,
             job.timeout_seconds,
             cast(Transport, job.transport),
-            job.share_gpus,
+            args.share_gpus,
             tables_on_host=config.memory.resident_gb > 0,
             lap=laps.lap,
         ) as ranks,
@@ -335,9 +334,9 @@ def live_page(state: TrainingState, port: int, host: str) -> Live | None:
     """
     if state.ranks.rank != 0:
         return None
-    from blitzgs.viewer.exhibit import Exhibit
     from blitzgs.viewer.live import Live
     from blitzgs.viewer.studio import box_of
+    from blitzgs.viewer.world import Exhibit
 
     capture, images, options = state.capture, state.images, state.render_options
     exhibit = Exhibit(
@@ -349,7 +348,7 @@ def live_page(state: TrainingState, port: int, host: str) -> Live | None:
         background=options.background,
         levels=state.progress.level_count > 1,
         lod=state.progress.level_count > 1,
-        smooth=state.config.view.smooth,
+        smooth=state.config.view.lod == "smooth",
         box=box_of(state.table["means"]),
         cameras=capture.cameras,
         test=capture.test,

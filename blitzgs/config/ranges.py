@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The allowed values of every configuration field; they are checked when a configuration is read.
+"""The allowed values of every configuration field, and the description of fields for --help.
 
 A test checks that every field has an entry. The limits exclude values that cannot work (an infinite rate, an
 opacity of 2) or that would exhaust memory or never end; they are far from any sensible value.
@@ -7,13 +7,30 @@ opacity of 2) or that would exhaust memory or never end; they are far from any s
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
+import inspect
 import itertools
 import math
+import re
+import textwrap
+import types
+import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, get_args
 
-from blitzgs.config.fields import MAX_STRETCH, RESET_OPACITY, Config, ScheduleConfig, ScoreRule, Transport
+import yaml
+
+from blitzgs.config.fields import (
+    MAX_STRETCH,
+    RESET_OPACITY,
+    Config,
+    ConfigError,
+    ScheduleConfig,
+    ScoreRule,
+    Transport,
+)
 
 
 @dataclass(frozen=True)
@@ -45,12 +62,11 @@ _FIELDS: Mapping[Range, str] = {
     Range(0, 1, high_open=True): "lod.visible_threshold population.min_opacity",
     Range(0, 1, low_open=True): "population.pass1_keep population.pass2_mass population.pass2_keep",
     Range(0, 3): "model.sh_degree",
-    Range(0, 10): "optimiser.sh_dc optimiser.sh_rest optimiser.opacity optimiser.scale optimiser.rotation "
-    "population.growth",
-    Range(0, 1000): "data.prefetch view.footprint",
+    Range(0, 10): "optimiser.sh_dc optimiser.opacity optimiser.scale optimiser.rotation population.growth",
+    Range(0, 1000): "view.footprint",
     Range(0, 1e6): "model.near schedule.images_per_view schedule.minutes loss.opacity loss.opacity_total "
     "loss.scale population.clone_scale population.prune_screen_radius population.prune_world_scale "
-    "population.gaussians_per_point population.pass2_views memory.resident_gb log.pictures",
+    "population.gaussians_per_point population.pass2_views memory.resident_gb",
     Range(0, 1e9): "schedule.densify_from schedule.densify_until schedule.size_prune_after "
     "schedule.reset_every schedule.gate_from schedule.t1 schedule.t2 schedule.checkpoint_every "
     "schedule.evaluate_every population.pixels_per_gaussian log.checkpoint_seconds",
@@ -59,7 +75,6 @@ _FIELDS: Mapping[Range, str] = {
     Range(0, 1e30): "population.grad_threshold",
     Range(0, 2**50): "data.cache_bytes",
     Range(0, 2**63 - 1): "seed",
-    Range(1e-20, 1): "optimiser.position_final",
     Range(1e-9, 1): "optimiser.final",
     Range(1e-6, 1e6): "loss.scale_reference",
     SCALE: "schedule.scale",
@@ -69,7 +84,6 @@ _FIELDS: Mapping[Range, str] = {
     Range(1, 1e6): "population.min_observations ranks.timeout_seconds log.keep_checkpoints",
     Range(1, 1e9): "schedule.iterations schedule.resolution schedule.densify_every schedule.sh_every "
     "schedule.position_decay log.every",
-    Range(1.01, 100): "lod.fork",
 }
 RANGES: Mapping[str, Range] = {name: found for found, names in _FIELDS.items() for name in names.split()}
 
@@ -92,9 +106,6 @@ def problems(config: Config) -> Iterator[str]:
         if name in CHOICES and value not in CHOICES[name]:
             yield f"{name}: must be one of {', '.join(CHOICES[name])}, got {value}"
     schedule, population = config.schedule, config.population
-    if 0 < config.optimiser.position < 1e-20:
-        # The rate falls by a power of the ratio of position_final to it, which must stay a number.
-        yield f"optimiser.position: must be 0 or at least 1e-20, got {config.optimiser.position}"
     yield from _problems_of_length(schedule)
     yield from _problems_of_resolution(schedule)
     if schedule.reset_every > 0 and not population.min_opacity < RESET_OPACITY:
@@ -109,8 +120,8 @@ def problems(config: Config) -> Iterator[str]:
         )
     if population.strategy == "relocation" and population.gate is not None:
         yield "population.gate: withholds candidates of population.strategy=density; relocation has none"
-    if config.view.smooth and not config.view.lod:
-        yield "view.smooth: needs view.lod=true, whose cuts it smooths"
+    if config.view.lod not in (False, True, "smooth"):
+        yield f"view.lod: must be true, false or smooth, got {config.view.lod}"
     if config.view.cull and not population.importance:
         yield "view.cull: needs population.importance=true, whose passes make the mask"
 
@@ -159,3 +170,129 @@ def flat_fields(section: Any, where: str = "") -> Iterator[tuple[str, Any]]:
             yield from flat_fields(value, f"{where}{entry.name}.")
         else:
             yield where + entry.name, value
+
+
+_WIDTH = 100
+_PAGE_HEAD = """# Configuration
+
+Every field is a flag of `blitzgs train` (`--data.downscale=2`) and a line of a recipe, which overrides these
+defaults; with `--show-config` it prints the result. `--help data.downscale` has the range and the details of
+a field, and `--help-fields=markdown` made this page."""
+_KINDS = {int: "integer", float: "number", bool: "true or false", str: "text", type(None): "null"}
+
+
+def describe(wanted: str) -> str:
+    """Describe fields: meaning, kind, default and allowed values.
+
+    `wanted` is "section.field", a field's name without its section, or a section; leading dashes are allowed.
+    ConfigError: there is no such field.
+    """
+    name = wanted.lstrip("-").partition("=")[0]
+    sections = _sections()
+    if name in sections:
+        return _section(name)
+    fields = [(section, field) for section, kind in sections.items() for field in _fields(kind)]
+    found = [(section, field) for section, field in fields if name in (field, _joined(section, field))]
+    if not found:
+        known = [text for section, field in fields for text in (_joined(section, field), field)]
+        close = difflib.get_close_matches(name, [*known, *sections], n=3)
+        hint = f"did you mean {', '.join(close)}?" if close else "--help-fields describes all fields"
+        raise ConfigError(f"{name}: there is no such field of the configuration; {hint}")
+    return "\n\n".join(_field(section, field) for section, field in found)
+
+
+def describe_all() -> str:
+    """Describe all sections and fields."""
+    return "\n\n\n".join(_section(name) for name in _sections())
+
+
+def describe_page() -> str:
+    """Return docs/configuration.md: the first sentence about every field, in a table for each section."""
+    parts = [_PAGE_HEAD]
+    for section, kind in _sections().items():
+        if section:
+            parts.append(f"## {section}\n\n{_about(kind).partition(chr(10))[0]}")
+        rows = ["field|default|meaning", "---|---|---"]
+        for names, meaning in _entries(kind).items():
+            fields = ", ".join(f"`{_joined(section, name)}`" for name in names)
+            defaults = ", ".join(f"`{_default(kind, name)}`" for name in names)
+            rows.append(f"{fields}|{defaults}|{_first_clause(meaning)}")
+        parts.append("\n".join(rows))
+    return "\n\n".join(parts)
+
+
+def _first_clause(text: str) -> str:
+    """Return a text up to the first semicolon or full stop outside of parentheses."""
+    depth = 0
+    for place, sign in enumerate(text):
+        depth += (sign == "(") - (sign == ")")
+        if depth == 0 and re.match(r";|\.(?= [A-Z0-9]|$)", text[place:]):
+            return text[:place]
+    return text
+
+
+def _sections() -> dict[str, type]:
+    """Return the class of each section; that of "" has the fields without a section."""
+    found: dict[str, Any] = {"": Config}
+    hints = typing.get_type_hints(Config)
+    return found | {name: kind for name, kind in hints.items() if dataclasses.is_dataclass(kind)}
+
+
+def _fields(kind: type) -> dict[str, Any]:
+    """Return the types of a section's fields."""
+    hints = typing.get_type_hints(kind)
+    return {name: hint for name, hint in hints.items() if not dataclasses.is_dataclass(hint)}
+
+
+def _joined(section: str, field: str) -> str:
+    return f"{section}.{field}" if section else field
+
+
+def _section(name: str) -> str:
+    """Return the description of a section and of all of its fields."""
+    kind = _sections()[name]
+    about = f"{name}: {_about(kind)}" if name else _about(kind)
+    return "\n\n".join([about, *(_field(name, field) for field in _fields(kind))])
+
+
+def _about(kind: type) -> str:
+    """Return what the docstring of a section says before its fields."""
+    return (inspect.getdoc(kind) or "").partition("\nAttributes:")[0].strip()
+
+
+def _field(section: str, field: str) -> str:
+    """Return a line with kind, default and allowed values, and the meaning below it."""
+    kind, name = _sections()[section], _joined(section, field)
+    allowed = f", {RANGES[name]}" if name in RANGES else ""
+    head = f"--{name}={_default(kind, field)}   ({_type(_fields(kind)[field])}{allowed})"
+    names, meaning = next(entry for entry in _entries(kind).items() if field in entry[0])
+    # Fields that share their meaning begin with all their names.
+    text = (f"({', '.join(names)}) " if len(names) > 1 else "") + meaning
+    return f"{head}\n{textwrap.indent(textwrap.fill(text, _WIDTH), '    ')}"
+
+
+def _default(kind: type, field: str) -> str:
+    """Return the default of a field as YAML."""
+    value = getattr(kind(), field)
+    plain = list(value) if isinstance(value, tuple) else value
+    return yaml.safe_dump(plain, default_flow_style=True).split("\n...")[0].strip()
+
+
+def _type(hint: Any) -> str:
+    """Return the kind of a field's values as text."""
+    origin, options = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        return " or ".join(_type(option) for option in options)
+    if origin is tuple:
+        return "list" if options[-1] is Ellipsis else f"list of {len(options)}"
+    return _KINDS.get(hint, "value")
+
+
+def _entries(kind: type) -> dict[tuple[str, ...], str]:
+    """Return the meaning of the fields that share one, from the part "Attributes:" of a docstring."""
+    text = (inspect.getdoc(kind) or "").partition("Attributes:\n")[2]
+    entries: dict[tuple[str, ...], str] = {}
+    for entry in filter(str.strip, re.split(r"^    (?=\S)", text, flags=re.MULTILINE)):
+        names, _, meaning = entry.partition(":")
+        entries[tuple(name.strip() for name in names.split(","))] = " ".join(meaning.split())
+    return entries

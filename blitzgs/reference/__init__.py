@@ -5,8 +5,7 @@ Tests compare every kernel of every backend with `render`. It visits each Gaussi
 radius, no culling but the depth range), so it is for small inputs. Autograd differentiates it.
 """
 
-from blitzgs.reference.compositing import Composite, composite
 from blitzgs.reference.projection import Splats, project_splats
-from blitzgs.reference.render import ReferenceImage, render
+from blitzgs.reference.render import Composite, ReferenceImage, composite, render
 
 __all__ = ["Composite", "ReferenceImage", "Splats", "composite", "project_splats", "render"]

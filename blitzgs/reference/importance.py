@@ -9,8 +9,8 @@ from fractions import Fraction
 import torch
 from torch import Tensor
 
-from blitzgs.reference.compositing import ALPHA_CUT, composited_weights
 from blitzgs.reference.projection import project_splats
+from blitzgs.reference.render import ALPHA_CUT, composited_weights
 
 
 @dataclass

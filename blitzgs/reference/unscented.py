@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.reference.gaussians import covariance_factors
+from blitzgs.reference.projection import covariance_factors
 
 
 class View(NamedTuple):

@@ -27,8 +27,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.redistribution import global_positions
-from blitzgs.runs.manifest import DAMAGE, Shard, finish, verified
-from blitzgs.runs.shard_file import header_of, write_shard
+from blitzgs.runs.checkpoint_files import DAMAGE, Shard, finish, header_of, verified, write_shard
 from blitzgs.util.output import check_space, explain, is_lack_of_space
 
 SHARED = "shared.safetensors"

@@ -50,7 +50,6 @@ FREE_FIELDS = (
     "data.path",
     "data.allow_missing",
     "data.cache_bytes",
-    "data.prefetch",
     "schedule.checkpoint_every",
     "schedule.evaluate_every",
 )
@@ -81,7 +80,7 @@ class Progress:
     least_kept: float = 0.0
     # Digest of the names of the training views, in their order; empty in old checkpoints.
     train_views: str = ""
-    # Fields of `blitzgs.training.curve.Curve`; empty in old checkpoints.
+    # Fields of `blitzgs.training.state.Curve`; empty in old checkpoints.
     curve: dict[str, Any] = dataclasses.field(default_factory=dict)
     gate: str = ""  # digest of the spawn gate's files; empty without a gate, and in old checkpoints
     # Seconds of each kind of work besides the optimiser steps; see `TrainingState.stage`.

@@ -20,8 +20,7 @@ from torch import Tensor
 
 from blitzgs.ops.blocks import BLOCK_ROWS, swap_blocks_
 from blitzgs.ops.host import to_device
-from blitzgs.table.block_visibility import UNSEEN, BlockVisibility, Cameras, culled_blocks
-from blitzgs.table.blocks import BlockIndex
+from blitzgs.table.blocks import UNSEEN, BlockIndex, BlockVisibility, Cameras, culled_blocks
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.layouts import CULL, LAYOUTS, sectors_in
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable

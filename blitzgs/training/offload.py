@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.frame.frame import Frame, RenderOptions, ViewFilter
+from blitzgs.frame.render import Frame, RenderOptions, ViewFilter
 from blitzgs.frame.transport import Mark, unmarked
 from blitzgs.ops.host import to_device
 from blitzgs.ops.projection_types import MAX_VIEWS
-from blitzgs.table.block_visibility import Cameras
+from blitzgs.table.blocks import Cameras
 from blitzgs.table.pool import Pool
 from blitzgs.training.batches import Batch
 from blitzgs.training.loss import LossTerms

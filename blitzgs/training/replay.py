@@ -40,8 +40,8 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import decimal_share, smallest
 from blitzgs.ops.counter_random import hash_keys
 from blitzgs.runs import files as run_files
+from blitzgs.runs.checkpoint_files import MANIFEST
 from blitzgs.runs.folder_checks import locked
-from blitzgs.runs.manifest import MANIFEST
 from blitzgs.spawn.candidates import Candidates, Veto
 from blitzgs.spawn.gate import RandomVeto, RankVeto, SampledVeto, SpawnGate, veto_draws
 from blitzgs.spawn.lineage_parts import read_lineage

@@ -18,10 +18,9 @@ from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.frame import RenderOptions
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import RenderOptions
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs.evaluation import Lpips
 from blitzgs.runs.files import Progress
 from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.log import RunLog
@@ -30,10 +29,59 @@ from blitzgs.spawn.lineage import Lineage
 from blitzgs.table.blocks import sort_rows
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
-from blitzgs.training.curve import Curve
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
 from blitzgs.view.views import Space, ViewSet, render_options
+
+# Log records whose mean is compared: the views of one batch differ by more than a fall.
+WINDOW = 16
+# A fall of the mean by so many dB below its best is reported.
+FALL = 3.0
+
+
+@dataclass
+class Curve:
+    """Means of the training PSNR in the log records of a run; the same on every rank, and saved."""
+
+    recent: list[float] = field(default_factory=list)  # PSNR of the last `WINDOW` records, dB
+    best: float | None = None  # highest mean of so many records, dB; None before there are so many
+    best_at: int = 0  # images that the run had seen then
+    fall: float = 0.0  # largest fall of the mean below the best one before it, dB
+    fall_at: int = 0  # images that the run had seen then
+    warned: bool = False  # whether the present fall has been reported
+
+    def add(self, images: int, psnr: float) -> str | None:
+        """Add a record; return a warning when the mean has fallen by `FALL` for the first time."""
+        self.recent = [*self.recent[1 - WINDOW :], psnr]
+        if len(self.recent) < WINDOW:
+            return None
+        mean = sum(self.recent) / WINDOW
+        if self.best is None or mean > self.best:
+            self.best, self.best_at = mean, images
+        if self.best - mean > self.fall:
+            self.fall, self.fall_at = self.best - mean, images
+        if self.fall < FALL or self.warned:
+            return None
+        self.warned = True
+        return self.describe()
+
+    def restart(self) -> None:
+        """Forget the best mean, because the run changes the model on purpose; the largest fall is kept."""
+        self.recent, self.best = [], None
+
+    def describe(self) -> str:
+        """Return the warning about the largest fall."""
+        best = self.best if self.best is not None else float("nan")
+        return (
+            f"training PSNR fell by {self.fall:.1f} dB, from {best:.1f} dB after {self.best_at:,} images: "
+            "the run goes on unchanged. If it ends below that, train with half of optimiser.position and "
+            "optimiser.opacity, or fewer Gaussians (population.max_gaussians)"
+        )
+
+    def warnings(self) -> list[str]:
+        """Return the warnings for the summary."""
+        return [self.describe()] if self.fall >= FALL else []
+
 
 # Kinds of work during which the training clock does not run.
 _UNCOUNTED = ("setup", "evaluate", "paused", "final_checkpoint")
@@ -62,7 +110,6 @@ class TrainingState:
     optimiser: TableAdam
     stepper: Stepper  # takes the training steps
     owners: TileOwners  # measures what tiles cost, and divides them among the ranks
-    lpips: Lpips | None  # the perceptual metric, or None
     run_id: str  # identifies the run in its log, also after it is resumed
     origin: str  # describes where the run begins, for the log
     save_clock: SaveClock  # tells when the next checkpoint by wall time is due

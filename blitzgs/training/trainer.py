@@ -19,15 +19,14 @@ from blitzgs.config.fields import Config
 from blitzgs.config.files import save_config
 from blitzgs.config.schedule import Event
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.frame import Frame
+from blitzgs.frame.render import Frame
 from blitzgs.ops.population import density_stats_
 from blitzgs.population.importance import PHI
 from blitzgs.runs import files as run_files
 from blitzgs.runs.guard import LossGuard, ModelLostError
 from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.log import RunLog
-from blitzgs.runs.watch import Watcher
-from blitzgs.spawn.rules import lineage_subject
+from blitzgs.spawn.gate import lineage_subject
 from blitzgs.table.pool import PoolError
 from blitzgs.training import view_level
 from blitzgs.training.agreement import MAX_STEPS, Agreement, StopRequest
@@ -50,6 +49,7 @@ from blitzgs.training.understood import hints_of, largest_size
 from blitzgs.training.watching import Watching
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import Laps
+from blitzgs.view.look import Watcher
 from blitzgs.view.views import render_options
 
 
@@ -79,8 +79,7 @@ class Trainer:
             capture.train,
             state.sampler,
             ranks.device,
-            config.data.prefetch,
-            state.owners if ranks.world_size > 1 else None,
+            owners=state.owners if ranks.world_size > 1 else None,
         )
         self._guard = LossGuard()
         self._unwritten: StepRecord | None = None  # the record of the last step

@@ -11,12 +11,11 @@ from typing import Any, TypeVar
 
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs.lod import scene_gate
-from blitzgs.runs.watch import Watcher, Wish
 from blitzgs.table.pool import Pool
 from blitzgs.training.events import save
 from blitzgs.training.state import TrainingState
 from blitzgs.view.draw import Drawer, DrawingError, Subject
-from blitzgs.view.look import Look, Picture
+from blitzgs.view.look import Look, Picture, Watcher, Wish
 
 T = TypeVar("T")
 # Seconds between two questions to the watcher while the training is paused and nothing is to be drawn.

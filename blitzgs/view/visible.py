@@ -9,10 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.frame.frame import Views
+from blitzgs.frame.render import Views
 from blitzgs.ops.blocks import ActiveRows, gate_views_
-from blitzgs.table.block_visibility import Cameras
-from blitzgs.table.blocks import BlockIndex
+from blitzgs.table.blocks import BlockIndex, Cameras
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import SceneGate

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from blitzgs.capture.colmap import rotation_to_quat
-from blitzgs.viewer.exhibit import Exhibit
-from blitzgs.viewer.world import World
+from blitzgs.viewer.world import Exhibit, World
 
 if TYPE_CHECKING:
     import viser

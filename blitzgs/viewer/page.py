@@ -15,13 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 from blitzgs.view.look import Picture
 from blitzgs.viewer.door import Door, is_loopback
-from blitzgs.viewer.exhibit import Exhibit
 from blitzgs.viewer.frustums import Frustums
-from blitzgs.viewer.overlay import overlay
-from blitzgs.viewer.pace import MOVING_MS
-from blitzgs.viewer.panel import Panel
+from blitzgs.viewer.panel import Panel, overlay
+from blitzgs.viewer.settings import MOVING_MS
 from blitzgs.viewer.visitor import Ask, Shown, Visitor
-from blitzgs.viewer.world import World
+from blitzgs.viewer.world import Exhibit, World
 
 if TYPE_CHECKING:
     import viser

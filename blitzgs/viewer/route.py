@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controls for viewpoints and camera paths: save, record, play, load."""
+"""The controls for viewpoints and camera paths (save, record, play, load), and files of a visitor."""
 
 from __future__ import annotations
 
 import math
+import re
 import threading
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from blitzgs.viewer.files import note, safe_name, save_beside
+from blitzgs.util.output import write_file
 from blitzgs.viewer.paths import CameraPath, Keyframe, from_json, to_json
 from blitzgs.viewer.world import Stance
 
 if TYPE_CHECKING:
     from blitzgs.viewer.visitor import Visitor
+
 
 # Seconds between two keyframes of a recorded movement.
 RECORD_SECONDS = 0.5
@@ -126,3 +129,23 @@ class Route:
         self._tell()
         if self.path.keyframes:
             self._visitor.go(self.stance_of(self.path.keyframes[0]))
+
+
+def save_beside(folder: Path, name: str, content: bytes | str) -> str:
+    """Write a file into the folder for paths and screenshots; return what to tell the visitor."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_file(folder / name, content)
+    except OSError as error:
+        return f"the file is in the browser's downloads; {folder} cannot be written: {error}"
+    return f"saved as {folder / name}"
+
+
+def note(visitor: Visitor, text: str) -> None:
+    """Show a note on the visitor's page for some seconds."""
+    visitor.client.add_notification("BlitzGS", text, auto_close_seconds=6.0)
+
+
+def safe_name(text: str) -> str:
+    """Return a text as the name of a file."""
+    return re.sub(r"[^\w.-]+", "_", text).strip("._") or "view"

@@ -22,15 +22,14 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import CAMERAS, load_cameras
 from blitzgs.runs.folder import open_run
-from blitzgs.runs.from_file import gate_of, trained_columns
-from blitzgs.runs.world import load_frame
+from blitzgs.runs.world import gate_of, load_frame, trained_columns
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.draw import Drawer, Subject, table_of_parameters
 from blitzgs.view.gate import SceneGate
 from blitzgs.view.views import Space, render_options
-from blitzgs.viewer.exhibit import Exhibit
 from blitzgs.viewer.page import Page
+from blitzgs.viewer.world import Exhibit
 
 Photograph = Callable[[int], npt.NDArray[np.uint8]]
 

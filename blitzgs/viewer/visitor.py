@@ -17,11 +17,9 @@ from blitzgs.capture.colmap import quats_to_rotations
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Look, Picture
 from blitzgs.viewer import compare
-from blitzgs.viewer.exhibit import Exhibit
-from blitzgs.viewer.pace import STILL_SECONDS, Pace
-from blitzgs.viewer.settings import Settings
-from blitzgs.viewer.shade import Shaded, shaded
-from blitzgs.viewer.world import SCALE, Stance, World
+from blitzgs.viewer.compare import Shaded, shaded
+from blitzgs.viewer.settings import STILL_SECONDS, Pace, Settings
+from blitzgs.viewer.world import SCALE, Exhibit, Stance, World
 
 if TYPE_CHECKING:
     import viser

@@ -21,7 +21,7 @@ from opponents.spatial_partition import HALO, LEAST_SEEN, Grid, coverage, divide
 from quality_plan import SAFE, RunSpec, read_plan, runs_of
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.reference.gaussians import covariance_factors
+from blitzgs.reference.projection import covariance_factors
 from tests.helpers import DEVICES
 from tests.training.tiny import OVERRIDES, tiny_scene
 

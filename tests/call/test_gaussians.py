@@ -10,7 +10,7 @@ from scipy.special import sph_harm_y
 
 import blitzgs
 from blitzgs.call.covariances import decompose
-from blitzgs.reference.gaussians import covariance_factors
+from blitzgs.reference.projection import covariance_factors
 from tests.helpers import BACKENDS, DEVICES, PARAMETERS, random_scene, rasterize_scene, relative_error
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import blitzgs
-from blitzgs.reference.gaussians import rotation_matrices
+from blitzgs.reference.projection import rotation_matrices
 from blitzgs.runs.cameras import checked_camera
 from tests.helpers import (
     DEVICES,

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import blitzgs
-from blitzgs.reference.gaussians import covariance_factors
+from blitzgs.reference.projection import covariance_factors
 from tests.helpers import DEVICES, PARAMETERS, random_scene, rasterize_scene, relative_error
 
 PER_ROW = ("radii", "means2d", "depths", "conics", "opacities", "tiles_per_gauss")

@@ -10,8 +10,8 @@ import torch.utils.checkpoint
 
 import blitzgs
 from blitzgs.reference import render
-from blitzgs.reference.compositing import composited_weights, median_splats
-from blitzgs.reference.gaussians import normals, sh_colors, sh_values
+from blitzgs.reference.projection import normals, sh_colors, sh_values
+from blitzgs.reference.render import composited_weights, median_splats
 from tests.helpers import (
     BACKENDS,
     DEVICES,

@@ -11,11 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blitzgs.capture import colmap
-from blitzgs.capture.cameras import camera_centres, scaled_matrix
+from blitzgs.capture.cameras import camera_centres, rectify, scaled_matrix
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.lengths import NEAR_OF_EXTENT
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.undistort import rectify
 from tests.capture.helpers import as_text, look_at, smooth_image, write_image
 
 COUNT, W, H = 12, 64, 48

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from blitzgs.capture.capture import load_capture
-from blitzgs.capture.splits import split_views
+from blitzgs.capture.usable import split_views
 from tests.capture.helpers import look_at, reconstruction, smooth_image, write_capture, write_image
 
 NAMES = ["a/1.jpg", "a/2.jpg", "b/1.jpg", "b/3.jpg"]

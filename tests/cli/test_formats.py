@@ -20,7 +20,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.models import FORMATS, read_gaussians
 from blitzgs.runs.files import open_model
 from blitzgs.runs.world import load_frame
-from blitzgs.viewer.overlay import overlay
+from blitzgs.viewer.panel import overlay
 from blitzgs.viewer.studio import open_model as open_viewed
 from blitzgs.viewer.world import Stance, World
 from tests.capture import helpers as files
@@ -64,7 +64,7 @@ def test_a_file_is_measured_as_its_run(trained, whole, tmp_path, capsys):
 
 def test_a_training_begins_with_a_file(trained, whole, tmp_path, capsys):
     out = tmp_path / "run"
-    flags = ["--config=defaults", "--schedule.iterations=4", "--log.tensorboard=false", "--log.pictures=0"]
+    flags = ["--config=defaults", "--schedule.iterations=4", "--log.tensorboard=false"]
     arguments = ["train", "--data", str(trained[0]), "--out", str(out), "--start", str(whole)]
     assert main([*arguments, *flags]) == 0
     capsys.readouterr()

@@ -11,7 +11,7 @@ import torch
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
 from blitzgs.ops.unscented import GLOBAL_SHUTTER, Lenses, largest_angles, project_unscented
-from blitzgs.reference.gaussians import sh_colors
+from blitzgs.reference.projection import sh_colors
 from blitzgs.reference.unscented import View, lens_pixels, unscented_splats
 from tests.helpers import BACKENDS, random_scene, relative_error
 

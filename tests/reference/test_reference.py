@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from blitzgs.reference import composite, render
-from blitzgs.reference.gaussians import rotation_matrices, sh_basis
+from blitzgs.reference.projection import rotation_matrices, sh_basis
 from tests.helpers import image_error, random_scene, reference_images, relative_error
 
 

@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import load_file
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import checkpoint, files, manifest
+from blitzgs.runs import checkpoint, checkpoint_files, files
 from tests.distributed.rank_harness import CONTEXT, RankError, run_ranks
 from tests.helpers import save_checkpoint
 from tests.training.tiny import random_gaussians, tiny_config
@@ -296,7 +296,7 @@ def test_dealing_keeps_the_order_and_opens_only_what_it_needs(tmp_path):
     for m, columns in enumerate(four):
         file = tmp_path / f"{m}.safetensors"
         size, digest = checkpoint.write_shard(file, columns, lambda point: None)
-        shards.append(manifest.Shard(file.name, len(columns["id"]), size, digest))
+        shards.append(checkpoint_files.Shard(file.name, len(columns["id"]), size, digest))
     assert equal(checkpoint.read_share(tmp_path, shards, ALONE, torch.device("cpu")), whole)
     # Rows 1, 3, 5, ... are in the second and the fourth file; of the first, only the header is read.
     first = tmp_path / shards[0].file

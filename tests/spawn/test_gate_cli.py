@@ -11,8 +11,7 @@ import pytest
 
 from blitzgs.capture.colmap import read_model, write_model
 from blitzgs.cli import main
-from blitzgs.spawn.evaluation import correlation, region_rates, survival_by_cohort
-from blitzgs.spawn.fit import read_spawns
+from blitzgs.spawn.fit import correlation, read_spawns, region_rates, survival_by_cohort
 from blitzgs.spawn.samples import read_sample
 from tests.conftest import LINEAGE
 from tests.spawn.test_spawn_gate import spawns

@@ -10,9 +10,8 @@ import pytest
 import torch
 
 from blitzgs.ops.blocks import BLOCK_ROWS, seen_blocks
-from blitzgs.table import block_visibility, host_table
-from blitzgs.table.block_visibility import BlockVisibility, Cameras, culled_blocks
-from blitzgs.table.blocks import BlockIndex
+from blitzgs.table import host_table
+from blitzgs.table.blocks import BlockIndex, BlockVisibility, Cameras, culled_blocks
 from blitzgs.table.host_table import HostMemoryError, HostTable
 from blitzgs.table.pool import Moved, Pool, PoolError
 from blitzgs.table.table import GaussianTable
@@ -131,7 +130,7 @@ def known(monkeypatch, steps):
             seen[list(blocks)] |= 1 << view
         return torch.where(seen < 1 << 31, seen, seen - (1 << 32)).int()
 
-    monkeypatch.setattr(block_visibility, "seen_blocks", seen_blocks)
+    monkeypatch.setattr("blitzgs.table.blocks.seen_blocks", seen_blocks)
     return cameras(len(steps))
 
 

@@ -23,10 +23,17 @@ from blitzgs.runs import log as run_log
 from blitzgs.runs.guard import ModelLostError
 from blitzgs.spawn.candidates import FEATURES
 from blitzgs.spawn.fit import fit, read_spawns
-from blitzgs.spawn.gate import GateError, GateInfo, RandomVeto, SampledVeto, info_path
+from blitzgs.spawn.gate import (
+    GateError,
+    GateInfo,
+    RandomVeto,
+    SampledVeto,
+    info_path,
+    life_fields,
+    reasons_against,
+)
 from blitzgs.spawn.lineage import ABOUT, Cause
 from blitzgs.spawn.lineage_parts import read_lineage
-from blitzgs.spawn.rules import life_fields, reasons_against
 from blitzgs.table.layouts import CULL
 from blitzgs.training.events import importance
 from blitzgs.training.trainer import Trainer
@@ -43,7 +50,7 @@ from tests.training.tiny import (
 )
 
 # Density events at 20, 40, 60 and 80; the passes after those at 40 and 80.
-PASSES = ("population.importance=true", "schedule.t1=40", "schedule.t2=80", "log.pictures=0")
+PASSES = ("population.importance=true", "schedule.t1=40", "schedule.t2=80")
 
 
 def train(folder, *overrides, ranks=None, resume=False):

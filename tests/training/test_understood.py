@@ -13,16 +13,16 @@ import pytest
 import torch
 
 from blitzgs.capture import colmap
+from blitzgs.capture.cameras import rectify
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.undistort import rectify
 from blitzgs.cli import main
 from blitzgs.config.fields import Config
 from blitzgs.config.files import load_config, recipe_path
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.training import inputs
-from blitzgs.training.estimate import _grown, estimate
+from blitzgs.training.budget import _grown, estimate
 from blitzgs.training.understood import (
     HopelessCaptureError,
     check_worlds,

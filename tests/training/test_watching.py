@@ -13,13 +13,12 @@ import torch
 from blitzgs.capture.images import PhotographError
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.guard import ModelLostError
-from blitzgs.runs.watch import Wish
-from blitzgs.training.curve import FALL, WINDOW, Curve
 from blitzgs.training.events import evaluate as glances
 from blitzgs.training.events.evaluate import Glances, spread
+from blitzgs.training.state import FALL, WINDOW, Curve
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.draw import intrinsics
-from blitzgs.view.look import Look
+from blitzgs.view.look import Look, Wish
 from blitzgs.view.views import viewmat
 from blitzgs.view.visible import VisibleFinder
 from tests.distributed.rank_harness import run_ranks

@@ -15,13 +15,13 @@ from blitzgs.capture.colmap import rotation_to_quat
 from blitzgs.view.look import Picture
 from blitzgs.view.views import Space
 from blitzgs.viewer import compare, paths
-from blitzgs.viewer.curves import Curves
+from blitzgs.viewer.compare import shaded
 from blitzgs.viewer.door import Door, is_loopback
 from blitzgs.viewer.film import read_film
 from blitzgs.viewer.frustums import MAX_FRUSTUMS, shown_cameras
-from blitzgs.viewer.overlay import round_length
-from blitzgs.viewer.pace import Pace
-from blitzgs.viewer.shade import shaded
+from blitzgs.viewer.live import Curves
+from blitzgs.viewer.panel import round_length
+from blitzgs.viewer.settings import Pace
 from blitzgs.viewer.world import World, looking, up_direction
 
 

@@ -19,7 +19,7 @@ from blitzgs.runs.folder import open_run
 from blitzgs.view.draw import Drawer
 from blitzgs.view.look import Look
 from blitzgs.viewer.studio import open_model
-from blitzgs.viewer.tileset import open_city, to_globe
+from blitzgs.viewer.web import open_city, to_globe
 from tests.browser import Browser, needs_chromium, wait_for
 from tests.formats.helpers import read_glb
 from tests.formats.test_tiles import SCENE, city, nodes

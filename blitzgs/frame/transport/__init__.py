@@ -5,12 +5,12 @@ from __future__ import annotations
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.transport.collective import CollectiveTransport
-from blitzgs.frame.transport.local import LocalTransport
 from blitzgs.frame.transport.peer import PeerTransport
 from blitzgs.frame.transport.protocol import (
     Arrived,
     Exchange,
     ExchangeResult,
+    LocalTransport,
     Mark,
     Traffic,
     Transport,

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renders views of a table and computes the gradients of splats, without autograd.
+"""Renders views of a table and their gradients without autograd, in the one loop over attempts.
 
-`forward` projects the active Gaussians, lists them by tile and composites them; the result is a `Frame`.
+`render_frame` projects the active Gaussians, lists them by tile and composites them; the result is a `Frame`.
 `backward_splats` computes the gradients of the projected splats from the gradients of the images. No tensor
 here is as long as the table: the cost follows the Gaussians that the views see. Between projection and tile
 intersection, a transport (`blitzgs.frame.transport`) sends the splats to the ranks that composite them,
@@ -13,12 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
-from blitzgs.frame.run import run
+from blitzgs._library import below_autograd
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import (
     Exchange,
@@ -30,6 +30,7 @@ from blitzgs.frame.transport import (
     open_transport,
     unmarked,
 )
+from blitzgs.frame.transport.protocol import ExchangeResult
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions, Sizes, Splats
@@ -121,7 +122,7 @@ class ViewFilter(Protocol):
 
 
 class Frame(NamedTuple):
-    """The images that `forward` rendered, and the data that `backward_splats` needs.
+    """The images that `render_frame` rendered, and the data that `backward_splats` needs.
 
     Attributes:
         views: the views.
@@ -154,7 +155,7 @@ class Frame(NamedTuple):
     gradients: GradientBuffer
 
 
-def forward(
+def render_frame(
     table: GaussianTable,
     views: Views,
     options: RenderOptions,
@@ -170,7 +171,7 @@ def forward(
         views: at most 32 views.
         options: how to render.
         active: rows to consider, and the views of each; None: all rows in all views. Or a function that finds
-            them, given the estimated sizes of the frame (see `run`).
+            them, given the estimated sizes of the frame (see `run_attempts`).
         assignment: the tiles of each rank; every rank of the job calls this with its table. None: render all
             tiles from this table alone.
         transport: sends the splats to the ranks that composite them. A transport that is used for several
@@ -204,18 +205,18 @@ def forward(
         )
         mark("sort")
         arguments = (*geometry, splats.colors, backgrounds, *lists, *grid)
-        table = exchange.gradient_table
-        if table is not None and backward_follows:
-            images = torch.ops.blitzgs.rasterize_fwd_(*arguments, table, n_splats)
-            zeros = table
+        shared = exchange.gradient_table
+        if shared is not None and backward_follows:
+            images = torch.ops.blitzgs.rasterize_fwd_(*arguments, shared, n_splats)
+            zeros = shared
         else:
             *images, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, False, backward_follows, n_splats)
-            if table is not None:
-                zeros = None  # the gradients must be in this table, which the backward pass then zeroes
+            if shared is not None:
+                zeros = None  # the gradients must be in `shared`, which the backward pass then zeroes
         mark("raster")
         return _Composited(list(lists), images, zeros)
 
-    result, (lists, images, zeros) = run(transport, inputs, assignment, composite, mark)
+    result, (lists, images, zeros) = run_attempts(transport, inputs, assignment, composite, mark)
     renders, transmittances, last_ids, tile_work, packed_splats, tile_order = images
     splats = result.splats
     return Frame(
@@ -305,3 +306,53 @@ def backward_splats(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> S
         gradients = way_back.return_gradients(gradients)
     mark("exchange back")
     return gradients
+
+
+# A failed attempt reports the sizes that it needs, and the next attempt uses them. More attempts than this
+# mean that the inputs change or that the program is wrong.
+MAX_ATTEMPTS = 4
+
+Consumed = TypeVar("Consumed")
+
+
+def run_attempts(
+    transport: Transport,
+    inputs: ProjectionInputs | Callable[[Sizes | None], ProjectionInputs],
+    assignment: TileAssignment | None,
+    consume: Callable[[Exchange], Consumed],
+    mark: Mark = unmarked,
+) -> tuple[ExchangeResult, Consumed]:
+    """Project, send the splats and consume them, without gradients, until all results had enough memory.
+
+    Args:
+        transport: sends the splats, and estimates the sizes.
+        inputs: of the projection; or a function that returns them, given the estimated sizes (None: the
+            sizes are not known, and the work waits for them).
+        assignment: the tiles of each rank; None: one rank composites all.
+        consume: queues the work with the splats that have arrived.
+        mark: called at the end of the stages "project" and "exchange".
+
+    Returns:
+        The splats, cut to their numbers, and what `consume` returned for them.
+
+    Raises:
+        RuntimeError: `MAX_ATTEMPTS` attempts did not suffice, each with the sizes that the last one
+            needed.
+    """
+    for _ in range(MAX_ATTEMPTS):
+        sizes = None if transport.capacity is None else transport.capacity.sizes
+        given = inputs(sizes) if callable(inputs) else inputs
+        # Skip autograd: for an op with a registered gradient formula, its Python takes 20 us of host time.
+        with below_autograd():
+            exchange = transport.project_and_send(given, assignment, sizes, mark)
+            consumed = consume(exchange)
+            needed, result = exchange.finish()
+        if transport.capacity is not None:
+            transport.capacity.learn(needed)
+        if result is not None:
+            return result, consumed
+        del exchange, consumed  # before the next attempt takes as much memory again
+    raise RuntimeError(
+        f"{MAX_ATTEMPTS} attempts have each needed more than the one before had asked for: the last had "
+        f"{sizes} and needs {tuple(needed)}. The inputs must not change during a call"
+    )

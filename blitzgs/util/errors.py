@@ -1,12 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Turns the errors of failed allocations into a sentence about memory."""
+"""Errors with a remedy: arguments of the wrong type, and memory that does not suffice."""
 
 from __future__ import annotations
 
 import re
+from numbers import Real
 
 import psutil
 import torch
+from torch import Tensor
+
+
+def check_tensor(name: str, value: object) -> None:
+    """Raise a TypeError unless a value is a tensor."""
+    if isinstance(value, Tensor):
+        return
+    hint = ": convert it with torch.from_numpy" if type(value).__module__ == "numpy" else ""
+    raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}{hint}")
+
+
+def check_number(name: str, value: object) -> None:
+    """Raise a TypeError unless a value is a number."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name} must be a number, got {value!r} ({type(value).__name__})")
+
 
 # What torch says when memory is missing; kernels only learn that the call of an allocation failed.
 _MESSAGES = re.compile(
