@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from blitzgs_synth import buildings, greenery
+from blitzgs_synth import buildings
 from blitzgs_synth.mesh import GROUND, Look, Mesh, MeshBuilder
 from blitzgs_synth.plan import HOUSES, PARK, PLAZA, RETAIL, SIDEWALK, TOWERS, URBAN, Plan, Streets
 
@@ -41,7 +41,7 @@ def _fill_block(b: MeshBuilder, plan: Plan, i: int, j: int, rng: Rng) -> None:
     density = float(np.clip(1 - middle / plan.half, 0, 1))
     if kind == URBAN:
         court = buildings.town_block(b, block, density, rng)
-        greenery.trees(b, (court[0] + 2, court[1] + 2, court[2] - 2, court[3] - 2), 5, (4, 8), rng)
+        buildings.trees(b, (court[0] + 2, court[1] + 2, court[2] - 2, court[3] - 2), 5, (4, 8), rng)
     elif kind == HOUSES:
         _houses(b, plan, i, j, rng)
     elif kind == PARK:
@@ -49,18 +49,18 @@ def _fill_block(b: MeshBuilder, plan: Plan, i: int, j: int, rng: Rng) -> None:
     elif kind == TOWERS:
         buildings.tower(b, block, tower_height(plan) * float(rng.uniform(0.75, 1)), rng)
         for x in np.arange(x0 + 2, x1 - 1, 7):
-            greenery.tree(b, float(x), y0 + 1.2, float(rng.uniform(4, 6)), rng)
+            buildings.tree(b, float(x), y0 + 1.2, float(rng.uniform(4, 6)), rng)
     elif kind == PLAZA:
         buildings.church(b, block, rng)
         for x in np.arange(x0 + 3, x1 - 2, 6.5):
             for y in (y0 + 2.5, y1 - 2.5):
-                greenery.tree(b, float(x), y, float(rng.uniform(5, 7)), rng)
+                buildings.tree(b, float(x), y, float(rng.uniform(5, 7)), rng)
     elif kind == RETAIL:
         lot = buildings.shops(b, block, rng)
         for y in np.arange(lot[1] + 3.5, lot[3] - 2, 8.0):
             for x in np.arange(lot[0] + 2.25, lot[2] - 1.5, 2.5):
                 if rng.random() < 0.55:
-                    greenery.car(b, float(x), float(y), rng, along_x=False)
+                    buildings.car(b, float(x), float(y), rng, along_x=False)
 
 
 def house_lots(plan: Plan, i: int, j: int) -> list[tuple[float, float, float, float]]:
@@ -84,22 +84,22 @@ def _houses(b: MeshBuilder, plan: Plan, i: int, j: int, rng: Rng) -> None:
             if south
             else (x0 + 1.5, y0 + 1.5, x1 - 1.5, body[1] - 2)
         )
-        greenery.trees(b, garden, int(rng.integers(1, 4)), (3.5, 7.5), rng)
+        buildings.trees(b, garden, int(rng.integers(1, 4)), (3.5, 7.5), rng)
         if rng.random() < 0.7:
-            greenery.hedge(b, x0, y0 + 1, x0, y1 - 1, rng)
+            buildings.hedge(b, x0, y0 + 1, x0, y1 - 1, rng)
         if rng.random() < 0.5:
-            greenery.car(b, x0 + 2.2, y0 + 3.2 if south else y1 - 3.2, rng, along_x=False)
+            buildings.car(b, x0 + 2.2, y0 + 3.2 if south else y1 - 3.2, rng, along_x=False)
 
 
 def _park(b: MeshBuilder, block: tuple[float, float, float, float], rng: Rng) -> None:
     x0, y0, x1, y1 = block
     cx, cy = (x0 + x1) / 2, (y0 + y1) / 2
     radius = 0.3 * min(x1 - x0, y1 - y0)  # the lawn and pond in the middle stay open
-    greenery.kiosk(b, cx + 1.25 * radius, cy, rng)
+    buildings.kiosk(b, cx + 1.25 * radius, cy, rng)
     for area in ((x0, y0, x1, cy - radius), (x0, cy + radius, x1, y1)):
         x_low, y_low, x_high, y_high = area
         count = int((x_high - x_low) * (y_high - y_low) / 28)
-        greenery.trees(b, (x_low + 1.5, y_low + 1.5, x_high - 1.5, y_high - 1.5), count, (5, 11), rng, 4.2)
+        buildings.trees(b, (x_low + 1.5, y_low + 1.5, x_high - 1.5, y_high - 1.5), count, (5, 11), rng, 4.2)
 
 
 def _line_streets(b: MeshBuilder, streets: Streets, across: Streets, rng: Rng, *, along_x: bool) -> None:
@@ -121,12 +121,12 @@ def _line_streets(b: MeshBuilder, streets: Streets, across: Streets, rng: Rng, *
                     for along in np.arange(begin, end, 8.5):
                         offset = centre + side * (half + 0.45 * SIDEWALK)
                         x, y = (float(along), offset) if along_x else (offset, float(along))
-                        greenery.tree(b, x, y, float(rng.uniform(5, 7.5)), rng)
+                        buildings.tree(b, x, y, float(rng.uniform(5, 7.5)), rng)
 
 
 def _car(b: MeshBuilder, across: float, along: float, rng: Rng, along_x: bool) -> None:
     x, y = (along, across) if along_x else (across, along)
-    greenery.car(b, x, y, rng, along_x=along_x)
+    buildings.car(b, x, y, rng, along_x=along_x)
 
 
 def _outskirts(b: MeshBuilder, plan: Plan, rng: Rng) -> None:
@@ -139,7 +139,7 @@ def _outskirts(b: MeshBuilder, plan: Plan, rng: Rng) -> None:
         if rng.random() < 0.08:
             buildings.family_house(b, (float(x) - 8, float(y) - 8, float(x) + 8, float(y) + 8), rng)
             continue
-        greenery.trees(
+        buildings.trees(
             b, (float(x) - 5, float(y) - 5, float(x) + 5, float(y) + 5), int(rng.integers(1, 6)), (4, 9), rng
         )
 

@@ -25,9 +25,8 @@ from blitzgs.capture.usable import read_cameras
 from blitzgs.cli import arguments
 from blitzgs.cli.arguments import chosen_views
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.film import SUFFIX, check_film, new_film
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, RunCameras, input_files, load_cameras
 from blitzgs.runs.evaluation import render_view
 from blitzgs.runs.lod import lod_gate, scene_gate
@@ -39,7 +38,7 @@ from blitzgs.view.draw import Drawer, Subject
 from blitzgs.view.look import MAX_PIXELS, Look, Mode
 from blitzgs.view.views import CameraLike, Space, ViewSet, render_options, viewmat
 from blitzgs.view.visible import VisibleFinder
-from blitzgs.viewer.film import Film, read_film
+from blitzgs.viewer.film import SUFFIX, Film, check_film, new_film, read_film
 from blitzgs.viewer.studio import Opened, box_of, open_model
 
 # What may be written beside the colours.

@@ -25,6 +25,7 @@ enum blitzgs_io_status_code {
   BLITZGS_IO_VALUE_ERROR,   // arguments do not fit each other
   BLITZGS_IO_MEMORY_ERROR,
   BLITZGS_IO_ERROR,
+  BLITZGS_IO_SYSTEM_ERROR,  // the message is that of io::SystemError
 };
 
 // Contiguous values of one type, or the characters of a text. Texts are two columns: their characters, and

@@ -14,8 +14,8 @@ pytest.importorskip("av", reason="the extra film is not installed")
 import av
 
 from blitzgs.cli import main
-from blitzgs.formats.film import check_film, new_film
 from blitzgs.runs.folder import open_run
+from blitzgs.viewer.film import check_film, new_film
 from blitzgs.viewer.paths import CameraPath, Keyframe, to_json
 from tests.distributed.rank_harness import run_ranks
 

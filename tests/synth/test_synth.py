@@ -18,11 +18,11 @@ from blitzgs.capture.colmap import quats_to_rotations, read_model
 from blitzgs_synth import add_arguments, generate_city, run
 from blitzgs_synth.city import tower_height
 from blitzgs_synth.flight import CLIMB, flight_height, plan_flight
-from blitzgs_synth.noise import Noise, cell_random, inside, stripes
+from blitzgs_synth.materials import Noise, cell_random, inside, stripes
 from blitzgs_synth.options import PRESETS, CityOptions
+from blitzgs_synth.photographs import each
 from blitzgs_synth.plan import Plan
-from blitzgs_synth.processes import each
-from blitzgs_synth.raycast import RayCaster
+from blitzgs_synth.render import RayCaster
 from blitzgs_synth.tracks import ball, may_see
 
 pytest.importorskip("embreex")
