@@ -13,13 +13,13 @@ from blitzgs.reference.projection import covariance_factors
 
 
 class View(NamedTuple):
-    """A camera; `shutter` and `coefficients` (k1 to k6, p1, p2, s1 to s4) as for `blitzgs.ops.unscented`."""
+    """A camera; `lens` [13] and `shutter` as for `blitzgs.ops.unscented.Lenses`."""
 
     viewmat: Tensor
     K: Tensor
     width: int
     height: int
-    coefficients: Tensor
+    lens: Tensor
     fisheye: bool = False
     viewmat_rs: Tensor | None = None
     shutter: int = 4
@@ -77,7 +77,7 @@ def _pixels(points: Tensor, view: View) -> tuple[Tensor, Tensor]:
 
 def lens_pixels(points: Tensor, view: View) -> tuple[Tensor, Tensor]:
     """Return the pixels [..., 2] of camera-space points [..., 3], and whether they are valid."""
-    k, p, s = view.coefficients[:6], view.coefficients[6:8], view.coefficients[8:12]
+    k, p, s = view.lens[:6], view.lens[6:8], view.lens[8:12]
     in_front = points[..., 2] > 0
     x, y, z = torch.where(in_front[..., None], points, torch.ones_like(points)).unbind(dim=-1)
     u, v = x / z, y / z
@@ -85,8 +85,8 @@ def lens_pixels(points: Tensor, view: View) -> tuple[Tensor, Tensor]:
     if view.fisheye:
         radius = (x * x + y * y).clamp(min=1e-30).sqrt()
         angle = torch.atan2(radius, z)
-        most = _largest_angle(k)
-        t = angle.clamp(max=most)
+        most = view.lens[12]
+        t = torch.minimum(angle, most)
         stretch = t * (1 + k[0] * t**2 + k[1] * t**4 + k[2] * t**6 + k[3] * t**8) / radius
         across, down, valid = stretch * x, stretch * y, in_front & (angle < most)
     else:
@@ -100,21 +100,6 @@ def lens_pixels(points: Tensor, view: View) -> tuple[Tensor, Tensor]:
     size = torch.tensor([view.width, view.height], dtype=points.dtype)
     inside = (pixels >= -view.margin * size) & (pixels < (1 + view.margin) * size)
     return pixels, valid & inside.all(dim=-1)
-
-
-def _largest_angle(k: Tensor) -> float:
-    """Return the least positive angle at which the fisheye's polynomial no longer rises; infinite: none."""
-    powers = [1.0, 3 * k[0].item(), 5 * k[1].item(), 7 * k[2].item(), 9 * k[3].item()]
-    while len(powers) > 1 and powers[-1] == 0:
-        powers.pop()
-    n = len(powers) - 1
-    if n == 0:
-        return math.inf
-    companion = torch.diag(torch.ones(n - 1, dtype=torch.float64), -1)
-    companion[:, -1] = -torch.tensor(powers[:-1], dtype=torch.float64) / powers[-1]
-    roots = torch.linalg.eigvals(companion)
-    real = roots.real[(roots.imag.abs() < 1e-9) & (roots.real > 0)]
-    return math.sqrt(real.min().item()) if len(real) else math.inf
 
 
 def _times(pixels: Tensor, view: View) -> Tensor:

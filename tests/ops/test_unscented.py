@@ -53,16 +53,13 @@ def project(scene, lenses, **options):
     return project_unscented(ProjectionInputs(gaussians, (scene.viewmats, scene.Ks), options), lenses)
 
 
-def expected_columns(parts, view, ids, antialiased=False):
-    """The columns of `project` for Gaussians in a view, float64."""
-    means, quats, scales, opacities, sh = (part[ids] for part in parts)
-    means2d, (blurred, plain), depths, _ = unscented_splats(means, quats, scales, view)
-    inverse = blurred.inverse()
+def expected_columns(parts, view, antialiased):
+    """The columns of `columns_of` for Gaussians in a view, their covariances, and which points are valid."""
+    means2d, (blurred, plain), depths, valid = unscented_splats(*parts[:3], view)
+    inverse, centre = blurred.inverse(), -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
     conics = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], dim=1)
-    if antialiased:
-        opacities = opacities * (plain.det() / blurred.det()).sqrt()
-    centre = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
-    return means2d, conics, depths, opacities, sh_colors(means, sh, centre, 3)
+    opacities = parts[3] * ((plain.det() / blurred.det()).sqrt() if antialiased else 1)
+    return (means2d, conics, depths, opacities, sh_colors(parts[0], parts[4], centre, 3)), blurred, valid
 
 
 def columns_of(splats):
@@ -74,7 +71,7 @@ def test_pixels_of_the_reference_are_those_of_opencv(fisheye):
     points = torch.rand(500, 3, dtype=torch.float64) * 2 - 1
     points[:, 2] = points[:, 2].abs() + 0.8
     K = torch.tensor([[70.0, 0, 31], [0, 90, 25], [0, 0, 1]], dtype=torch.float64)
-    k = torch.tensor(FISHEYE if fisheye else BROWN, dtype=torch.float64)
+    k = torch.tensor([*(FISHEYE if fisheye else BROWN), math.inf], dtype=torch.float64)
     pixels, _ = lens_pixels(points, View(torch.eye(4), K, 64, 48, k, fisheye))
     zero = np.zeros(3)
     if fisheye:
@@ -102,8 +99,7 @@ def test_splats_and_gradients_match_the_reference(backend, fisheye, shutter):
     for c, view in enumerate(views_of(scene, lenses)):
         own = (splats.camera_ids == c).nonzero()[:, 0]
         ids = splats.gaussian_ids[own].long()
-        means2d, (blurred, plain), depths, valid = unscented_splats(*references[:3], view)
-        opacities = references[3] * ((plain.det() / blurred.det()).sqrt() if antialiased else 1)
+        (means2d, _, depths, opacities, _), blurred, valid = expected_columns(references, view, antialiased)
         reach = torch.stack([blurred[:, i, i].sqrt() for i in (0, 1)], dim=1)
         reach = reach * (2 * (255 * opacities).clamp(min=1).log()).sqrt()[:, None]
         size = torch.tensor([scene.width, scene.height])
@@ -111,7 +107,7 @@ def test_splats_and_gradients_match_the_reference(backend, fisheye, shutter):
         visible = valid.any(dim=1) & (depths > 0.01) & (opacities >= 1 / 255) & inside
         assert ids.tolist() == visible.nonzero()[:, 0].tolist()
         seen += len(ids)
-        columns = expected_columns(references, view, ids.cpu(), antialiased)
+        columns, _, _ = expected_columns([part[ids.cpu()] for part in references], view, antialiased)
         for actual, expected in zip(columns_of(splats), columns, strict=True):
             assert relative_error(actual[own], expected) < (1e-10 if exact else 3e-6)
             weights = torch.randn(expected.shape, generator=generator, dtype=torch.float64)
