@@ -90,6 +90,8 @@ BLITZGS_HD bool unscented_splat(const LensCamera& camera, const ActivatedGaussia
                                 Splat<T>* splat) {
   splat->depth = T(camera.at(0.5).of(gaussian.mean).z);
   if (!in_depth_range(splat->depth, image)) return false;
+  const Vec3<double> axes = gaussian.axes.x + gaussian.axes.y + gaussian.axes.z;
+  if (!is_finite(axes.x + axes.y + axes.z)) return false;
   UnscentedFootprint f;
   if (!unscented_footprint(camera, gaussian, options, image.eps2d, &f)) return false;
   if (!(f.det > 0 && f.xx >= 0 && f.yy >= 0)) return false;
@@ -98,6 +100,7 @@ BLITZGS_HD bool unscented_splat(const LensCamera& camera, const ActivatedGaussia
   Footprint<T> rounded;
   rounded.cov_xx = T(f.xx);
   rounded.cov_yy = T(f.yy);
+  if (!is_finite(rounded.cov_xx + rounded.cov_yy)) return false;
   rounded.magnitude = larger(rounded.cov_xx, rounded.cov_yy);
   rounded.root_det = T(std::sqrt(f.det) / rounded.magnitude);
   rounded.conic[0] = T(f.yy / f.det);

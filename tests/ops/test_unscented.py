@@ -190,6 +190,23 @@ def test_points_behind_the_camera_and_beside_the_image_are_invalid():
     assert relative_error(splats.conics[:, 1], blurred.inverse()[:, 0, 1]) < 1e-9
 
 
+@pytest.mark.parametrize("fisheye, shutter", [(False, 4), (True, 0)])
+def test_a_gaussian_that_is_not_finite_has_no_splat(fisheye, shutter):
+    scene = random_scene(n=60, cameras=2, scale=0.3)
+    lenses, whole = lenses_of(scene, fisheye, shutter), project(scene, lenses_of(scene, fisheye, shutter))
+    values = torch.tensor([torch.nan, torch.inf, -torch.inf])
+    for row, name in zip((0, 3, 6, 9), PARTS[:4], strict=True):
+        getattr(scene, name)[row : row + 3].view(3, -1)[:, 0] = values
+    for name in PARTS:
+        getattr(scene, name).requires_grad_()
+    splats = project(scene, lenses)
+    kept = whole.gaussian_ids >= 12
+    for name in ("gaussian_ids", "camera_ids", "means2d", "conics", "opacities", "colors"):
+        assert torch.equal(getattr(splats, name), getattr(whole, name)[kept]), name
+    sum(column.sum() for column in columns_of(splats)).backward()
+    assert all(getattr(scene, name).grad.isfinite().all() for name in PARTS)
+
+
 def test_a_fisheye_ends_where_its_polynomial_stops_to_rise():
     radial = torch.tensor([[0.0] * 4, [-0.2, 0, 0, 0], FISHEYE[:4], [-0.3, 0.1, 0.02, -0.05]])
     found = largest_angles(radial.double()).tolist()
