@@ -31,9 +31,8 @@ from blitzgs.frame.render import (
     inputs_of,
     render_frame,
     stage_ended,
-    stages_told_to,
 )
-from blitzgs.frame.transport import LocalTransport
+from blitzgs.frame.transport import LocalTransport, stages_told_to
 from blitzgs.ops.projection_types import Views, WeightedViews
 from blitzgs.table.table import GaussianTable
 
