@@ -15,17 +15,17 @@ Report = Callable[[int, int], None]
 
 
 @contextmanager
-def image_progress(what: str, shown: bool = True) -> Iterator[Report]:
+def image_progress(what: str, shown: bool = True, unit: str = "images") -> Iterator[Report]:
     """Show a bar on standard error while the context lasts, if standard error is a terminal.
 
-    Yields a function to call with (images done, number of images).
+    Yields a function to call with (images done, number of images), or so many of another unit.
     """
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("images"),
+        TextColumn(unit),
         TimeRemainingColumn(),
     )
     with Progress(
