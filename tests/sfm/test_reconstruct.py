@@ -253,7 +253,7 @@ def test_what_cannot_work_is_said(tmp_path, monkeypatch, capsys):
         patch.setenv("PATH", "")
         assert "pip install 'blitzgs[sfm]'" in message("photos", "capture")
     (tmp_path / "photos/view_1.jpg").write_bytes(b"hello")
-    assert "2 photographs can be used, 3 are needed" in message("photos", "capture")
+    assert "3 photographs are needed, 2 can be used" in message("photos", "capture")
 
 
 def test_a_failing_stage_shows_colmaps_last_words(tmp_path):
