@@ -19,7 +19,6 @@ from blitzgs.config.files import ConfigError
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.importance import PHI, is_culled
 from blitzgs.runs import files as run_files
-from blitzgs.runs import log as run_log
 from blitzgs.runs.guard import ModelLostError
 from blitzgs.spawn.candidates import FEATURES
 from blitzgs.spawn.fit import fit, read_spawns
@@ -30,6 +29,7 @@ from blitzgs.spawn.rules import life_fields, reasons_against
 from blitzgs.table.layouts import CULL
 from blitzgs.training.events import importance
 from blitzgs.training.trainer import Trainer
+from blitzgs.util import progress
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training import tiny
 from tests.training.tiny import (
@@ -79,7 +79,7 @@ def test_how_many_gaussians_the_importance_passes_keep(whole_run):
 
 
 def test_a_pass_says_how_many_views_are_done(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(run_log, "_LINE_SECONDS", 0.0)
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
     train(tmp_path)
     shown = capsys.readouterr().out
     views = len(tiny_scene()[0].train)
