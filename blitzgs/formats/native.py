@@ -26,7 +26,7 @@ class FormatError(ValueError):
     """A file is damaged; the message has the file, the place and the reason."""
 
 
-# In the order of blitzgs_io_type and blitzgs_io_status_code of csrc/io/io_api.h.
+# In the order of blitzgs_io_type and blitzgs_io_status_code of csrc/io/io_api.cpp.
 _TYPES = tuple(np.dtype(name) for name in ("u1", "u4", "i8", "u8", "f8"))
 _ERRORS = (None, FormatError, ValueError, MemoryError, RuntimeError)
 
