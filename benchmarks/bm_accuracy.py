@@ -36,7 +36,7 @@ from scenes import BenchmarkScene, aerial
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.frame import Frame, RenderOptions, Views, forward
+from blitzgs.frame.render import Frame, RenderOptions, Views, render_frame
 from blitzgs.frame.tiles import TileAssignment, TileRanges
 from blitzgs.frame.transport import CollectiveTransport, LocalTransport, Transport
 from blitzgs.ops.intersect import tile_counts
@@ -199,7 +199,7 @@ class Renderer:
 
     def forward(self) -> Frame:
         """Render."""
-        return forward(
+        return render_frame(
             self.table, self.views, self.options, assignment=self.assignment, transport=self.transport
         )
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures density events (relocation and growth) of a large table, by part, and what they do to steps.
+"""Measures density events (relocation and growth) of a large table, and what they do to steps.
 
     python benchmarks/bm_events.py [--millions 1 4 12] [--device cuda] [--json FILE]
     torchrun --nproc-per-node=4 benchmarks/bm_events.py [--millions 12]
@@ -8,8 +8,7 @@ The table is the `aerial` scene of `scenes.py`, dealt round-robin to the ranks, 
 Before every event, `--dead` of the Gaussians become transparent; an event replaces them, and the table grows
 by 5 % in each of the first `--events` and not in as many after them. Times are medians and means, in ms by
 the host's clock with the device idle before and after, of the slowest rank. "event" is an event as in a
-training. The parts are measured in further events, in which the host waits after each part; a part includes
-those that it calls. With one rank, steps of `--views` views are measured before the events, after them, and
+training. With one rank, steps of `--views` views are measured before the events, after them, and
 once the table is sorted again.
 """
 
@@ -21,14 +20,13 @@ import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import torch
 from bm_step import BEHIND, LOSS, OPTIONS, RATE, STEP, make_table, random_photographs
-from harness import make_parser, markdown_table, write_json
+from harness import make_parser, write_json
 from scenes import BenchmarkScene, aerial
 
 from blitzgs.config.fields import Config, OptimiserConfig
@@ -43,19 +41,6 @@ from blitzgs.table.table import GaussianTable
 from blitzgs.training.events import densify
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
-
-# Functions that are parts of an event, in this version or in one with which it is compared.
-PARTS = {
-    "blitzgs.training.events.densify": (
-        "check_table", "population_limit", "relocate", "redistribute", "_keep_sorted",
-    ),
-    "blitzgs.population.relocation": (
-        "death_causes", "draw", "_set_shares", "_copies", "morton_order", "place",
-    ),
-    "blitzgs.optim.table_adam:Pending": ("current", "catch_up"),
-    "blitzgs.table.table:GaussianTable": ("renew", "replace", "permute"),
-    "blitzgs.training.step:Stepper": ("catch_up", "reindex"),
-}  # fmt: skip
 
 
 class Measured:
@@ -77,22 +62,6 @@ class Measured:
         _wait(self._device)
         self.seconds[name].append(time.perf_counter() - begin)
         return result
-
-    def watch_parts(self) -> None:
-        """Measure the calls of all `PARTS` from now on."""
-        for place, names in PARTS.items():
-            module, _, kind = place.partition(":")
-            owner = import_module(module)
-            owner = getattr(owner, kind, None) if kind else owner
-            for name in names:
-                if (function := getattr(owner, name, None)) is not None:
-                    setattr(owner, name, self._timed(f"{kind + '.' if kind else ''}{name}", function))
-
-    def _timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            return self.time(name, function, *args, **kwargs)
-
-        return timed
 
 
 def _wait(device: torch.device) -> None:
@@ -117,7 +86,7 @@ def make_state(scene: BenchmarkScene, table: GaussianTable, ranks: Ranks) -> Tra
         ),
     )  # fmt: skip
     schedule = Schedule(config.schedule)
-    optimiser = TableAdam(OptimiserConfig(*[RATE] * 7), schedule, 1.0, ranks.device)
+    optimiser = TableAdam(OptimiserConfig(*[RATE] * 5), schedule, 1.0, ranks.device)
     owners = TileOwners(ranks)
     capture = SimpleNamespace(cameras=[], train=[], points=[])
     progress = Progress(step=STEP, sh_degree=3, level_count=1, peak_gaussians=0, seconds=0.0)
@@ -136,7 +105,6 @@ def make_state(scene: BenchmarkScene, table: GaussianTable, ranks: Ranks) -> Tra
         optimiser=optimiser,
         stepper=Stepper(table, optimiser, owners, LOSS, 1.0),
         owners=owners,
-        lpips=None,
         run_id="",
         origin="",
         save_clock=cast(Any, None),
@@ -243,36 +211,6 @@ def measure(millions: float, ranks: Ranks, args: argparse.Namespace) -> dict[str
     return result
 
 
-def measure_parts(millions: float, ranks: Ranks, args: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return the median time of each part of an event that grows the table, and of one that does not.
-
-    From then on all events are slower, because the host waits after each part.
-    """
-    scene = aerial(int(millions * 1e6), str(ranks.device), views=args.views)
-    state = make_state(scene, make_table(scene, rows_of(scene, ranks)), ranks)
-    events = Events(state, scene, args.dead)
-    rows: dict[str, dict[str, Any]] = {}
-    measured = Measured(ranks.device)
-    measured.watch_parts()
-    events.prepare_event()
-    events.event()
-    for growth in (0.05, 0.0):
-        state.config = grows_by(state.config, growth)
-        sums: dict[str, list[float]] = defaultdict(list)
-        for _ in range(args.events):
-            events.prepare_event()
-            measured.seconds.clear()
-            ranks.barrier()
-            measured.time("event, parts apart", events.event)
-            for name, seconds in measured.seconds.items():
-                sums[name].append(1e3 * sum(seconds))
-        column = {name: statistics.median(values) for name, values in sums.items()}
-        for name, ms in slowest(ranks, column).items():
-            rows.setdefault(name, {"part": name})[f"growth {growth:g}"] = round(ms, 3)
-    heads = ("part", "growth 0.05", "growth 0")
-    return [{head: row.get(head, 0.0) for head in heads} for row in rows.values()]
-
-
 @torch.no_grad()
 def main() -> None:
     """Measure all sizes; print tables, and write JSON when a file is named."""
@@ -286,16 +224,14 @@ def main() -> None:
     args = parser.parse_args()
     ranks = Ranks.from_environment(args.device)
     results = [measure(millions, ranks, args) for millions in args.millions]
-    parts = [measure_parts(millions, ranks, args) for millions in args.millions[-1:]]
     if ranks.rank == 0:
         for result in results:
             shown = ", ".join(
                 f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in result.items()
             )
             print(shown, flush=True)
-        print(f"\nParts at {args.millions[-1]:g} M, ms\n\n{markdown_table(parts[0])}")
         if args.json:
-            write_json(args.json, args.device, results=results, parts=parts[0])
+            write_json(args.json, args.device, results=results)
     ranks.close()
 
 

@@ -36,11 +36,11 @@ from harness import make_parser, write_json
 from scenes import aerial
 
 from blitzgs.capture.capture import load_capture
-from blitzgs.config.fields import Config
+from blitzgs.config.fields import FORK, Config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TILE_COST, TileOwners, cost_balance
+from blitzgs.frame.render import RenderOptions, Views
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
 from blitzgs.frame.transport import Mark, Traffic, unmarked
 from blitzgs.optim.table_adam import TableAdam
@@ -96,13 +96,13 @@ class Inputs(NamedTuple):
 
 def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
     """Return the octree of a capture's points and evenly spaced training views."""
-    capture, lod = load_capture(args.data, downscale=args.downscale), Config().lod
+    capture = load_capture(args.data, downscale=args.downscale)
     space = Space.of(capture.offset, capture.extent)
     points = torch.from_numpy(capture.points).to(device) / space.unit
     centres = trained_centres([capture.cameras[i] for i in capture.train], space).to(device)
     table = octree_gaussians(
         points, torch.from_numpy(capture.colors).to(device), centres,
-        measure_levels(points, centres, lod.fork), args.visible_threshold,
+        measure_levels(points, centres, FORK), args.visible_threshold,
     ).table(sh_degree=3, opacity=0.5)  # fmt: skip
     views = ViewSet(list(capture.cameras), space, device)
     count = min(args.batch * args.batches, len(capture.train))

@@ -157,7 +157,7 @@ def measure_training(device: str, repeats: int) -> list[dict[str, Any]]:
 
         setattr(owner, name, call)
 
-    chosen = (f"schedule.iterations={warm_up + repeats}", "schedule.batch_size=1", "log.pictures=0")
+    chosen = (f"schedule.iterations={warm_up + repeats}", "schedule.batch_size=1")
     never = (f"{name}={10 * (warm_up + repeats)}" for name in ("schedule.densify_from", "log.every"))
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(None):
         config = tiny_config(*chosen, *never)

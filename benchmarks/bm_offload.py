@@ -96,7 +96,7 @@ class Survey:
         self.targets = torch.randint(0, 256, shape, dtype=torch.uint8, device=device)
         self.samples = torch.full((batch_size,), float(self.targets[0].numel()), device=device)
         schedule = Schedule(ScheduleConfig(batch_size=batch_size))
-        self.optimiser = TableAdam(OptimiserConfig(*[RATE] * 7), schedule, 1.0, device)
+        self.optimiser = TableAdam(OptimiserConfig(*[RATE] * 5), schedule, 1.0, device)
 
     def batch(self, indices: list[int]) -> Batch:
         """Return views with photographs."""

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures what the LOD gate changes: popping along a descending flight, and what a view can leave out.
+"""Measures what the LOD gate changes: popping along a descending flight.
 
     python benchmarks/bm_popping.py RUN [--frames 240] [--out FOLDER] [--device cuda] [--json FILE]
-    python benchmarks/bm_popping.py RUN --curve [--device cuda] [--json FILE]
 
 The flight goes down the viewing axis of one of the run's cameras towards what it looks at, by the same ratio
 of distances from frame to frame, so that levels come at an even pace. Each frame is rendered with all
@@ -15,22 +14,16 @@ only the levels have changed. Both are reported as the mean and the largest over
 also the value that one pixel in 1,000 exceeds in the worst frame. More frames make smaller steps.
 
 Into the folder go a chart of the popping (popping.svg) and the clip (popping.mp4: full, gated, smooth).
-
-With --curve, views of the run's cameras are rendered with all Gaussians, and again without those that a rule
-puts below a threshold, which is the same for all views: by octree level and distance (as the gate of a run
-without view.footprint does), by footprint (as with view.footprint), and by the contribution to the very view,
-which no rule of distances can beat. For each share of the splats that is left out, the table has the
-threshold, the share of the light (sum of alpha T) and the PSNR against the picture with all.
 """
 
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from harness import make_parser, report
@@ -38,9 +31,8 @@ from torch import Tensor
 
 from blitzgs.capture.pictures import to_uint8
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import RenderOptions, Views
-from blitzgs.frame.survey import survey
+from blitzgs.formats.film import new_film
+from blitzgs.frame.render import RenderOptions, Views, render_frame
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import load_cameras
@@ -49,11 +41,9 @@ from blitzgs.runs.lod import MOST_KEPT, level_fork
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.charts import line_chart
 from blitzgs.view.gate import LodGate, SceneGate, centres_of
-from blitzgs.view.levels import footprint_sizes
 from blitzgs.view.views import CameraLike, ViewSet, render_options
 
 MODES = ("full", "gated", "smooth")
-FRAMES_PER_SECOND = 30.0
 # The flight begins and ends at these multiples of the distance between the camera and what it looks at.
 FARTHEST, NEAREST = 4.0, 0.5
 
@@ -106,94 +96,22 @@ def popping_of(
     viewmats, K, size = _flight(model, cameras, frames, width, camera)
     gates: dict[str, SceneGate | None] = {"full": None}
     gates |= {mode: _gate(model, mode == "smooth", ranks) for mode in MODES[1:]}
-    clip = None if out is None else _Clip(out / "popping.mp4", 3 * size[0], size[1])
     flights = {mode: _Flight(model, K, size, gate) for mode, gate in gates.items()}
-    for viewmat in viewmats.to(ranks.device):
-        images = [flight.next(viewmat[None]) for flight in flights.values()]
-        if clip is not None:
-            clip.add(torch.cat(images, dim=1))
+    width, height = 3 * size[0] // 2 * 2, size[1] // 2 * 2  # the codec needs even edges
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    with nullcontext() if out is None else new_film(out / "popping.mp4", width, height, 30.0) as append:
+        for viewmat in viewmats.to(ranks.device):
+            images = [flight.next(viewmat[None]) for flight in flights.values()]
+            if append is not None:
+                append(to_uint8(torch.cat(images, dim=1))[:height, :width])
     found: dict[str, Any] = {"frames": frames, "levels": model.progress.level_count}
     found |= {mode: flight.figures() for mode, flight in flights.items()}
-    if out is not None and clip is not None:
-        clip.close()
+    if out is not None:
         lines = {mode: list(enumerate(flights[mode].popping, 1)) for mode in MODES[1:]}
         chart = line_chart(lines, "frame", "popping, mean over pixels, 1/255")
         (out / "popping.svg").write_text(chart)
     return found
-
-
-# Shares of the splats that a rule leaves out.
-RULES = ("octree level", "footprint", "contribution")
-SHARES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
-
-
-@torch.no_grad()
-def curve_of(
-    model: TrainedModel, cameras: Any, device: torch.device, views: int = 16
-) -> list[dict[str, Any]]:
-    """Measure what views lose without the splats that a rule puts last, for each rule and share of `SHARES`.
-
-    Args:
-        model: the model; its table is on `device`.
-        cameras: the cameras of its capture, of which every n-th is a view.
-        device: renders the views.
-        views: number of views.
-
-    Returns:
-        For each rule and share "rule", "left out" (share of the splats), "threshold" (of the levels: the
-        factor by which the gate's distances shrink; of the footprints: pixels; of the contributions: sum of
-        alpha T in pixels), "light" (share of the sum of alpha T that goes) and "PSNR against all".
-    """
-    chosen = [cameras[i * len(cameras) // views] for i in range(min(views, len(cameras)))]
-    table, poses = model.table, ViewSet(chosen, model.space, device)
-    options = render_options(model.config, model.space, model.progress.sh_degree)
-    count = model.progress.level_count
-    gate = LodGate(model.progress.reference_distance, level_fork(model.config), count, count - 1)
-    reach = torch.tensor(gate.reach(), dtype=torch.float64, device=device)[table["level"].long()]
-    size = footprint_sizes(table["scales"], table["opacities"]).exp()
-    seen = []
-    for index in range(len(chosen)):
-        view = poses.pick([index])
-        found = survey(table, view, options)
-        rows, light = found.splats.gaussian_ids.long(), found.weights.double() * 2.0**-32
-        distance = (table["means"][rows].double() - centres_of(view.viewmats)[0]).norm(dim=1)
-        footprint = size[rows] * float(view.Ks[0, 0, 0]) / distance
-        keys = dict(zip(RULES, (reach[rows] / distance, footprint, light), strict=True))
-        image = pipeline.forward(table, view, options).renders[0].clamp(0, 1)
-        seen.append((view, rows, light, keys, image))
-    lines = []
-    for rule in RULES:
-        ordered = torch.cat([keys[rule] for *_, keys, _ in seen]).sort().values
-        for share in SHARES:
-            threshold = float(ordered[int(share * len(ordered))])
-            if math.isinf(threshold):  # views keep level 0 at any distance
-                break
-            error = kept = lit = 0.0
-            for view, rows, light, keys, image in seen:
-                stays = keys[rule] >= threshold
-                active = _rows(rows[stays])
-                without = pipeline.forward(table, view, options, active).renders[0].clamp(0, 1)
-                error += float((without - image).square().mean()) / len(seen)
-                kept += float(stays.sum())
-                lit += float(light[stays].sum() / light.sum()) / len(seen)
-            lines.append(
-                {
-                    "rule": rule,
-                    "left out": 1.0 - kept / len(ordered),
-                    "threshold": threshold,
-                    "light": 1.0 - lit,
-                    "PSNR against all": -10.0 * math.log10(error) if error > 0 else math.inf,
-                }
-            )
-    return lines
-
-
-def _rows(rows: Tensor) -> ActiveRows:
-    """Return the active set of one view that sees these rows, int64 [U]."""
-    ids = rows.sort().values.int()
-    return ActiveRows(
-        ids, torch.ones_like(ids), torch.tensor([len(ids)], dtype=torch.int32, device=ids.device)
-    )
 
 
 class _Flight:
@@ -253,7 +171,7 @@ class _Flight:
         self, table: GaussianTable, viewmats: Tensor, options: RenderOptions, active: ActiveRows | None
     ) -> Tensor:
         views = Views(viewmats, self._K.to(viewmats.device)[None], *self._size)
-        return pipeline.forward(table, views, options, active).renders[0].clamp(0, 1)
+        return render_frame(table, views, options, active).renders[0].clamp(0, 1)
 
 
 def _mean(values: list[float]) -> float:
@@ -307,27 +225,6 @@ def _camera(cameras: Any, name: str | None) -> CameraLike:
     raise ValueError(f"the run has no view '{name}'; it has for example {cameras[0].name}")
 
 
-class _Clip:
-    """A video file that grows frame by frame."""
-
-    def __init__(self, path: Path, width: int, height: int) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # The codec needs even edges.
-        self._size = width // 2 * 2, height // 2 * 2
-        self._writer = cv2.VideoWriter(
-            str(path), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_SECOND, self._size
-        )
-        if not self._writer.isOpened():
-            raise OSError(f"{path}: OpenCV cannot write MP4 files here; call without an output folder")
-
-    def add(self, image: Tensor) -> None:
-        width, height = self._size
-        self._writer.write(np.ascontiguousarray(to_uint8(image)[:height, :width, ::-1]))
-
-    def close(self) -> None:
-        self._writer.release()
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Run the benchmark."""
     parser = make_parser(__doc__)
@@ -336,14 +233,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, default=240)
     parser.add_argument("--width", type=int, default=640, help="of the frames in pixels")
     parser.add_argument("--camera", help="name of the view whose axis is flown along")
-    parser.add_argument("--curve", action="store_true", help="measure what views can leave out, not popping")
     options = parser.parse_args(arguments)
-    if options.curve:
-        ranks = Ranks(device=torch.device(options.device))
-        model = run_files.open_model(options.run, ranks)
-        lines = curve_of(model, load_cameras(options.run).cameras, ranks.device)
-        title = f"What views of {options.run.name} can leave out"
-        return report(title, lines, options.json, options.device)
     out = options.out or options.run / "popping"
     found = popping(options.run, out, options.device, options.frames, options.width, options.camera)
     rows = [

@@ -25,8 +25,15 @@ from scenes import BenchmarkScene, aerial, garden_like
 from torch import Tensor
 
 from blitzgs import rasterization
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import Mark, RenderOptions, Views, unmarked
+from blitzgs.frame.render import (
+    Mark,
+    RenderOptions,
+    Views,
+    backward_splats,
+    inputs_of,
+    render_frame,
+    unmarked,
+)
 from blitzgs.frame.transport import LocalTransport
 from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.table.table import GaussianTable
@@ -39,7 +46,7 @@ except ImportError:
 ops = torch.ops.blitzgs
 OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e10)
 WARM_UP = 5
-# The stages by their marks in `blitzgs.frame.frame`; the exchange of a single rank does nothing.
+# The stages by their marks in `blitzgs.frame.render`; the exchange of a single rank does nothing.
 STAGES = {
     "project": "project", "sort": "intersect", "raster": "rasterize", "raster back": "rasterize_backward",
     "project back": "project_backward",
@@ -53,7 +60,7 @@ SCENES: dict[str, Callable[[], BenchmarkScene]] = {
 
 
 class OurRender:
-    """The training step's own render, `blitzgs.frame.frame`, and the gradients of the projection, by stage.
+    """The training step's own render, `blitzgs.frame.render`, and the gradients of the projection, by stage.
 
     From the second call on, the host queues all stages of the forward pass with the sizes of earlier calls,
     and reads the true sizes while the device composites.
@@ -66,18 +73,18 @@ class OurRender:
 
     def forward(self, mark: Mark = unmarked) -> Tensor:
         """Return the image [B, H, W, 3]."""
-        self.frame = pipeline.forward(
+        self.frame = render_frame(
             self.table, self.views, OPTIONS, transport=self.transport, mark=mark, backward_follows=True
         )
         return self.frame.renders
 
     def backward(self, v_renders: Tensor, mark: Mark = unmarked) -> None:
         """Differentiate, to compact splats, dropping what the forward pass kept as soon as it is used."""
-        v_splats = pipeline.backward_splats(self.frame, v_renders, mark).parts
+        v_splats = backward_splats(self.frame, v_renders, mark).parts
         splats = self.frame.projected
         columns = [splats.camera_ids, splats.visible_ids, splats.splat_offsets]
         del self.frame, splats
-        inputs = pipeline.inputs_of(self.table, self.views, OPTIONS)
+        inputs = inputs_of(self.table, self.views, OPTIONS)
         ops.project_bwd(
             list(inputs.gaussians), *WeightedViews(*inputs.cameras), *columns, None, *inputs.options,
             v_splats, None, False,

@@ -26,8 +26,8 @@ from scenes import BenchmarkScene, aerial, garden_like
 from blitzgs.config.fields import LossConfig, OptimiserConfig, ScheduleConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.frame import Views
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import Views
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.table.blocks import morton_order
@@ -86,7 +86,7 @@ class OurStep:
         self.table = make_table(scene)
         self.batch = random_photographs(scene)
         schedule = Schedule(ScheduleConfig(batch_size=len(self.batch.views)))
-        optimiser = TableAdam(OptimiserConfig(*[RATE] * 7), schedule, 1.0, "cuda")
+        optimiser = TableAdam(OptimiserConfig(*[RATE] * 5), schedule, 1.0, "cuda")
         owners = TileOwners(Ranks(device=torch.device("cuda", torch.cuda.current_device())))
         self.behind = torch.arange(n, device="cuda", dtype=torch.int32) % BEHIND
         self.step = STEP

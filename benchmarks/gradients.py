@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from blitzgs.frame import frame as pipeline
+from blitzgs.frame.render import Frame, backward_splats
 from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.ops.splat_gradients import SplatGradients
 from blitzgs.table.table import GaussianTable
@@ -27,13 +27,13 @@ def sum_of_ranks(gradients: SplatGradients, splats: int) -> Tensor:
 
 
 def parameter_gradients(
-    table: GaussianTable, frame: pipeline.Frame, v_renders: Tensor, *weights: Tensor | None
+    table: GaussianTable, frame: Frame, v_renders: Tensor, *weights: Tensor | None
 ) -> list[Tensor]:
     """Return the gradients of the U visible Gaussians' parameters, from those of a frame's images.
 
     ``weights``: of regularisers, as those of `WeightedViews`.
     """
-    gradients, projected = pipeline.backward_splats(frame, v_renders), frame.projected
+    gradients, projected = backward_splats(frame, v_renders), frame.projected
     options = frame.options.projection(frame.views)
     parts = gradients.parts
     if gradients.places is not None:

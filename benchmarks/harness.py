@@ -212,14 +212,6 @@ def _flatten(value: Any) -> list[Any]:
     return [value]
 
 
-def copy_bandwidth(device: torch.device | str, megabytes: int = 2048) -> float:
-    """Return the GB/s (read plus written) of a device-to-device copy."""
-    source = torch.empty(megabytes << 20, dtype=torch.uint8, device=device)
-    target = torch.empty_like(source)
-    milliseconds = median_ms(lambda a, b: b.copy_(a), [(source, target)], repeats=10)
-    return 2 * source.numel() / milliseconds / 1e6
-
-
 # Names of the calls in which the host waits for CUDA.
 _WAITS = ("cudaStreamSynchronize", "cudaEventSynchronize", "cudaDeviceSynchronize", "cudaMemcpy")
 

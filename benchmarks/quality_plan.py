@@ -94,12 +94,8 @@ class RunSpec:
     def config(self) -> Config:
         """Return the training's configuration; an opponent's has the capture alone."""
         own = [] if self.strategy is not None else [*self.overrides, f"seed={self.seed}"]
-        log = ["log.tensorboard=false", "log.pictures=0", "log.checkpoint_seconds=0"]
-        log += [
-            "schedule.checkpoint_every=0",
-            "schedule.evaluate_every=0",
-            f"log.lpips_weights={json.dumps(self.lpips)}",
-        ]
+        log = ["log.tensorboard=false", "log.checkpoint_seconds=0"]
+        log += ["schedule.checkpoint_every=0", "schedule.evaluate_every=0"]
         source = self.source if self.grid is None else self.source.partition(":")[2]
         path = None if self.strategy is not None or source == DEFAULTS else source
         return load_config(path, [*own, *self.data, *log])

@@ -25,7 +25,7 @@ from quality_plan import RunSpec
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import files as run_files
-from blitzgs.runs.evaluation import METRICS, evaluate, load_lpips
+from blitzgs.runs.evaluation import METRICS, Lpips, evaluate, load_lpips
 from blitzgs.training.agreement import Agreement
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture
@@ -115,6 +115,7 @@ class RecordedTrainer(Trainer):
     """A trainer that measures its model during training, and saves no checkpoint."""
 
     recorder: Recorder
+    lpips: Lpips | None
     population: dict[str, Any]  # `population_report` of the finished run
 
     def step(self, step: int) -> None:
@@ -140,7 +141,7 @@ class RecordedTrainer(Trainer):
         with state.paused_clock():
             self.recorder.record(
                 state.images_seen, seconds, state.population(), end,
-                lambda indices: measure(state, indices, None),
+                lambda indices: measure(state, indices, None, self.lpips),
             )  # fmt: skip
 
 
@@ -153,7 +154,7 @@ def train_ours(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:
         trainer = RecordedTrainer(config, capture, images, shared, ranks)
         schedule = trainer.state.schedule
         recorder = Recorder(spec, (), schedule.iterations, capture, ranks.device)
-        trainer.recorder = recorder
+        trainer.recorder, trainer.lpips = recorder, load_lpips(spec.lpips)
         if trainer.train() is None:
             raise InterruptedError("stopped by a signal")
     return figures(recorder, trainer.state.progress.peak_gaussians) | {

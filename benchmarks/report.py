@@ -35,7 +35,6 @@ COMMANDS = {
     "render": "python benchmarks/bm_render.py",
     "step_1": "python benchmarks/bm_step.py --views 1",
     "step_4": "python benchmarks/bm_step.py --views 4",
-    "photometric": "python benchmarks/bm_photometric.py",
     "accuracy": "python benchmarks/bm_accuracy.py",
     "offload": "python benchmarks/bm_offload.py --ratios 2 4",
     "exchange": (

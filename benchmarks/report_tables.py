@@ -159,13 +159,6 @@ def city_lines(rows_of: Callable[[Json], city_report.Rows]) -> Callable[[Json], 
     return lines
 
 
-def photometric_lines(photometric: Json) -> list[str]:
-    """Tabulate L1 + SSIM against its byte floor and plain PyTorch."""
-    rows = [[r["work"], ms(r["ms"]), ms(r["floor_ms"])] for r in photometric["results"]]
-    size = "{views} view(s) of {width} × {height}".format(**photometric)
-    return table([size, "ms", "byte floor, ms"], rows)
-
-
 def accuracy_lines(accuracy: Json) -> list[str]:
     """Tabulate the error against time of each option."""
     rows = [
@@ -292,7 +285,6 @@ SECTIONS = {
     "step": Section(("step_1", "step_4"), step_lines),
     "exchange": Section(("exchange",), exchange_lines),
     "drop_in_full": Section(("drop_in_full",), row_lines),
-    "photometric": Section(("photometric",), photometric_lines),
     "accuracy": Section(("accuracy",), accuracy_lines),
     "quality": Section(("quality",), quality_lines),
     "compact": Section(("compact",), compact_lines),

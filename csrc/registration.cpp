@@ -2,8 +2,9 @@
 // The signatures of all ops of BlitzGS. Letters: N Gaussians, B views, P projected splats (pairs of a
 // Gaussian and a view), U Gaussians visible in at least one view, I splat-tile intersections, D channels,
 // K = (degree + 1)^2 SH coefficients. An argument n_splats, int64 [1], says how many of the P splats are
-// valid. A header of csrc/ defines what an op computes; blitzgs/ops/ has its Python function and autograd,
-// and blitzgs/_fakes.py its fake kernel.
+// valid. A SymInt is a number that `torch.compile` may leave open, so that one graph takes any image size and
+// number of views. A header of csrc/ defines what an op computes; blitzgs/ops/ has its Python function and
+// autograd, and blitzgs/_fakes.py its fake kernel.
 #include <torch/csrc/stable/library.h>
 
 #include <cstdint>
@@ -50,8 +51,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "project_fwd(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, "
       "Tensor? n_active, Tensor? n_blocks, Tensor? ids, Tensor? level, "
-      "int width, int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, "
-      "float radius_clip, bool antialiased, bool raw, float[] fade, "
+      "SymInt width, SymInt height, int tile_size, int sh_degree, float near_plane, float far_plane, "
+      "float eps2d, float radius_clip, bool antialiased, bool raw, float[] fade, "
       "int[] rank_tiles, int? visible_capacity, int? splat_capacity) -> (Tensor gaussian_ids, "
       "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor means2d, Tensor conics, "
       "Tensor depths, Tensor splat_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
@@ -61,8 +62,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "project_bwd(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor? scale_reg, Tensor? opacity_reg, "
       "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor? level, "
-      "int width, int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, "
-      "float radius_clip, bool antialiased, bool raw, float[] fade, "
+      "SymInt width, SymInt height, int tile_size, int sh_degree, float near_plane, float far_plane, "
+      "float eps2d, float radius_clip, bool antialiased, bool raw, float[] fade, "
       "Tensor[] v_splats, Tensor? v_depths, bool need_viewmats, bool dense=False) -> ("
       "Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, Tensor v_sh, "
       "Tensor v_viewmats)");
@@ -85,9 +86,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // and CUDA does not wait for the number.
   m.def(
       "intersect(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor depths, Tensor camera_ids, "
-      "Tensor? ids, int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, int "
-      "n_isects, "
-      "Tensor? n_splats=None, bool unchecked=False) -> (Tensor isect_splats, Tensor tile_offsets)");
+      "Tensor? ids, SymInt n_cameras, SymInt width, SymInt height, int tile_size, int tile_begin, "
+      "int tile_end, int n_isects, Tensor? n_splats=None, bool unchecked=False) -> (Tensor isect_splats, "
+      "Tensor tile_offsets)");
 
   // The exchange of splats between ranks: packed for a collective, or written to the memory of peers (CUDA).
   m.def(
@@ -117,7 +118,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "rasterize_fwd(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
       "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, "
-      "int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, "
+      "SymInt n_cameras, SymInt width, SymInt height, int tile_size, int tile_begin, int tile_end, "
       "bool clear_rest=True, bool backward_follows=False, Tensor? n_splats=None) -> (Tensor renders, "
       "Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor packed_splats, Tensor tile_order, "
       "Tensor splat_gradients)");
@@ -135,7 +136,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "rasterize_bwd(Tensor[] splats, Tensor? backgrounds, Tensor[] lists, Tensor[] composited, "
       "Tensor v_renders, Tensor? v_alphas, "
-      "int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, "
+      "SymInt n_cameras, SymInt width, SymInt height, int tile_size, int tile_begin, int tile_end, "
       "bool absgrad, bool deterministic, Tensor(a!)? gradients=None) -> (Tensor v_means2d, "
       "Tensor v_conics, Tensor v_splat_opacities, Tensor v_colors, Tensor v_means2d_abs)");
   // What follows the projection of a call, in one op. It gives splats the colours of the visible rows of

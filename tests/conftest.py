@@ -18,7 +18,7 @@ _TRAININGS = ("config", "report", "runs", "spawn", "training")
 LINEAGE = (
     "population.lineage=true", "population.grad_threshold=1e-4", "population.importance=true",
     "schedule.t1=40", "schedule.t2=90", "schedule.gate_from=60", "schedule.checkpoint_every=50",
-    "log.keep_checkpoints=9", "log.pictures=0",
+    "log.keep_checkpoints=9",
 )  # fmt: skip
 
 

@@ -27,7 +27,7 @@ from torch import Tensor
 from blitzgs import rasterization, relocate
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.images import ImageStore
-from blitzgs.frame.frame import RenderOptions
+from blitzgs.frame.render import RenderOptions
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.photometric import photometric_loss
 from blitzgs.population.initialisation import SH_C0

@@ -18,7 +18,7 @@ from blitzgs._torch import hooks_on_saved_tensors
 from blitzgs.call.arguments import Gaussians, Scene
 from blitzgs.call.channels import ImageOptions, channels_of
 from blitzgs.call.covariances import Decomposed, shaped_by
-from blitzgs.frame.frame import run
+from blitzgs.frame.render import run_attempts
 from blitzgs.frame.transport.protocol import Exchange, LocalExchange, LocalTransport
 from blitzgs.ops.project import TableRows, differentiable_splats, project_splats
 from blitzgs.ops.projection_types import (
@@ -249,7 +249,7 @@ def render_queued(
             image.backgrounds, n_isects, backward_follows, totals,
         )  # fmt: skip
 
-    result, (exchange, outputs) = run(transport, inputs, None, composite)
+    result, (exchange, outputs) = run_attempts(transport, inputs, None, composite)
     assert exchange.totals is not None
     splats, (visible, count, isects, *rest) = result.projected, exchange.totals
     isect_splats, tile_offsets, *images = outputs[: _LISTS + _IMAGES]

@@ -231,5 +231,7 @@ def _isect_ids(depths: Tensor, lists: Lists, images: int) -> Tensor:
     keys = torch.searchsorted(lists.offsets[1:], entries, right=True)
     n_tiles = lists.tiles_x * lists.tiles_y
     if images > 1:
-        keys = keys + keys // n_tiles * ((1 << n_tiles.bit_length()) - n_tiles)
+        # The bits of n_tiles. Its `bit_length()` would compile a graph for every number of tiles.
+        tiles = torch.full((), n_tiles, dtype=torch.float64, device=depths.device)
+        keys = (keys // n_tiles << torch.frexp(tiles).exponent) | keys % n_tiles
     return keys.bitwise_left_shift(32).bitwise_or(depths.float().view(torch.int32))

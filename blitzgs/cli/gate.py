@@ -83,7 +83,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         "--rate", type=float, default=0.6, help="share of the candidates to withhold (default: %(default)s)"
     )
     add_capture(again)
-    add_device(again)
+    add_device(again, shares_gpus=True)
 
 
 def run_fit(args: argparse.Namespace) -> int:
@@ -150,7 +150,7 @@ def run_replay(args: argparse.Namespace) -> int:
         args.device,
         config.ranks.timeout_seconds,
         "auto",
-        config.ranks.share_gpus,
+        args.share_gpus,
         tables_on_host=config.memory.resident_gb > 0,
     ) as ranks:
         capture, images = open_capture(config, ranks)

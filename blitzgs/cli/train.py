@@ -138,7 +138,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     )
     parser.add_argument("--no-sfm", action="store_true", help="refuse photographs without poses")
     add_live_page(parser)
-    add_device(parser)
+    add_device(parser, shares_gpus=True)
 
 
 class _Help(argparse.Action):
@@ -196,7 +196,7 @@ def run(args: argparse.Namespace) -> int:
             args.device,
             job.timeout_seconds,
             cast(Transport, job.transport),
-            job.share_gpus,
+            args.share_gpus,
             tables_on_host=config.memory.resident_gb > 0,
             lap=laps.lap,
         ) as ranks,
@@ -348,7 +348,7 @@ def live_page(state: TrainingState, port: int, host: str) -> Live | None:
         background=options.background,
         levels=state.progress.level_count > 1,
         lod=state.progress.level_count > 1,
-        smooth=state.config.view.smooth,
+        smooth=state.config.view.lod == "smooth",
         box=box_of(state.table["means"]),
         cameras=capture.cameras,
         test=capture.test,

@@ -41,7 +41,6 @@ class DataConfig:
         cache_bytes: memory for compressed images, of all ranks of a host together, at most half of the host's
             memory; decoded images take what these leave, and up to a quarter of it in addition. If all
             decoded images fit into half of it, the ranks of a host share them.
-        prefetch: number of batches to upload ahead; photographs are decoded for more batches ahead.
     """
 
     path: str = ""
@@ -56,7 +55,6 @@ class DataConfig:
     sparse: str = "largest"
     stray_cameras: str = "drop"
     cache_bytes: int = 8_000_000_000
-    prefetch: int = 3
 
 
 @dataclass(frozen=True)
@@ -94,17 +92,21 @@ class LodConfig:
     """The octree of the initial Gaussians: multi-resolution voxels of the SfM cloud.
 
     Attributes:
-        fork: ratio f of the voxel sizes of neighbouring levels.
         visible_threshold: a voxel is kept when its level is resolvable in more than this share of the
             cameras.
     """
 
-    fork: float = 2.0
     visible_threshold: float = 0.9
 
 
+# Ratio f of the voxel sizes of neighbouring octree levels.
+FORK = 2.0
+
 # The largest factor by which `schedule.images_per_view` makes a run longer.
 MAX_STRETCH = 4.0
+
+# The share of the position rate that is left in the end, and that of the rate of `sh_dc` for other SH.
+POSITION_LEFT, SH_SHARE = 0.01, 0.05
 
 # The opacities that `schedule.reset_every` leaves are at most this.
 RESET_OPACITY = 0.01
@@ -175,9 +177,10 @@ class OptimiserConfig:
     """Adam with batch scaling: lr sqrt(B), beta^B, eps / sqrt(B).
 
     Attributes:
-        position, position_final: learning rates of the means, relative to extent, at the start and after
-            `schedule.position_decay`.
-        sh_dc, sh_rest, opacity, scale, rotation: learning rates.
+        position: learning rate of the means at the start, relative to extent; after
+            `schedule.position_decay` a hundredth of it is left.
+        sh_dc: learning rate of the colours' constant part; that of the other SH coefficients is a twentieth.
+        opacity, scale, rotation: learning rates.
         final: share of the rates of colour, scale and rotation that is left in the end; they fall from
             `schedule.densify_until` until `schedule.position_decay`. 1: they are constant.
         position_noise: strength of the random steps of almost transparent Gaussians, relative to the position
@@ -185,9 +188,7 @@ class OptimiserConfig:
     """
 
     position: float = 1.6e-4
-    position_final: float = 1.6e-6
     sh_dc: float = 2.5e-3
-    sh_rest: float = 1.25e-4
     opacity: float = 2.5e-2
     scale: float = 5e-3
     rotation: float = 1e-3
@@ -306,19 +307,17 @@ class ViewConfig:
     Attributes:
         lod: from `schedule.densify_until` on, views leave out Gaussians that are too small for their
             distance. The trained model is evaluated and rendered in the same way. Views that would keep at
-            least 80 % of all Gaussians are rendered with all of them.
+            least 80 % of all Gaussians are rendered with all of them. With "smooth", opacities fade out over
+            half a level around the distance of the cut, and all views have the gate.
         footprint: the smallest footprint that `lod` keeps: opacity times size in pixels of a training view.
             0: a Gaussian is as small as the octree voxel that it descends from, as in the paper.
-        smooth: opacities fade out over half a level around the distance at which `lod` would cut them off.
-            All views then have the gate. Needs `lod`.
         cull: from the first importance pass on, a training view leaves out the Gaussians that did not count
             in it at the last pass. This ends halfway between the last pass and the end of the run. Needs
             `population.importance`.
     """
 
-    lod: bool = False
+    lod: str | bool = False
     footprint: float = 0.0
-    smooth: bool = False
     cull: bool = False
 
 
@@ -346,13 +345,10 @@ class RanksConfig:
         timeout_seconds: the job ends if a rank does not arrive at a collective within this time.
         transport: how splats are sent: "peer" (written to the other GPUs' memory), "collective" (by NCCL or
             Gloo) or "auto" ("peer" if it works, else "collective").
-        share_gpus: if a host has fewer GPUs than ranks, let several ranks use one GPU, in turns; slow, for
-            development.
     """
 
     timeout_seconds: float = 120.0
     transport: str = "auto"
-    share_gpus: bool = False
 
 
 @dataclass(frozen=True)
@@ -362,19 +358,15 @@ class LogConfig:
     Attributes:
         every: images between two log records.
         tensorboard: also write TensorBoard events, if the package is installed.
-        pictures: number of side-by-side pictures that an evaluation writes.
         checkpoint_seconds: seconds between two checkpoints; a crash loses at most this much training. 0: no
             checkpoints by wall time.
         keep_checkpoints: number of checkpoints that are kept on disk.
-        lpips_weights: path of a TorchScript module of LPIPS for the evaluation, or null.
     """
 
     every: int = 100
     tensorboard: bool = True
-    pictures: int = 8
     checkpoint_seconds: float = 600.0
     keep_checkpoints: int = 3
-    lpips_weights: str | None = None
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 
-from blitzgs.config.fields import Config
+from blitzgs.config.fields import FORK, POSITION_LEFT, SH_SHARE, Config
 from blitzgs.config.fields import ConfigError as ConfigError
 from blitzgs.config.ranges import problems
 from blitzgs.util.output import write_file
@@ -27,15 +27,29 @@ class Ignored:
     """Marks a removed field whose values have no effect any more."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Share:
+    """Marks a removed field whose value is now a share of another field's."""
+
+    field: str
+    share: float
+
+    def __repr__(self) -> str:
+        """Name both in messages."""
+        return f"{self.share:g} times {self.field}"
+
+
 # Fields of earlier versions, each with the value that stands for what BlitzGS does now. Files and checkpoints
 # that have this value are still read.
 REMOVED: Mapping[str, Any] = {
     "data.threads": Ignored(),
+    "data.prefetch": Ignored(),
     "model.far": 1e6,
     "model.eps2d": 0.3,
     "model.initial_opacity": 0.1,
     "model.scale_floor": 0.0,
     "lod.base_resolution": 0.001,
+    "lod.fork": FORK,
     "schedule.adaptive": False,
     "schedule.adaptive_limit": Ignored(),
     "schedule.placed": [],
@@ -45,6 +59,8 @@ REMOVED: Mapping[str, Any] = {
     "optimiser.beta2": 0.999,
     "optimiser.eps": 1e-15,
     "optimiser.sparse": False,
+    "optimiser.position_final": Share("optimiser.position", POSITION_LEFT),
+    "optimiser.sh_rest": Share("optimiser.sh_dc", SH_SHARE),
     "loss.size": 0.0,
     "population.absolute_gradients": False,
     "population.absolute_threshold": Ignored(),
@@ -54,8 +70,12 @@ REMOVED: Mapping[str, Any] = {
     "view.first_levels": Ignored(),
     "view.most_kept": 0.8,
     "view.level_ratio": Ignored(),
+    "view.smooth": False,
     "ranks.half_exchange": False,
     "ranks.max_imbalance": Ignored(),
+    "ranks.share_gpus": Ignored(),
+    "log.pictures": Ignored(),
+    "log.lpips_weights": Ignored(),
 }
 
 
@@ -207,7 +227,7 @@ def _build(kind: type, values: Any, where: str) -> Any:
     for name, value in values.items():
         path = f"{where}.{name}" if where else str(name)
         if path in REMOVED:
-            _check_removed(path, value)
+            _check_removed(path, value, {f"{where}.{other}": found for other, found in values.items()})
             continue
         if name not in hints:
             raise ConfigError(f"{path}: unknown field; {_hint(str(name), list(hints))}")
@@ -215,9 +235,9 @@ def _build(kind: type, values: Any, where: str) -> Any:
     return kind(**arguments)
 
 
-def _check_removed(name: str, value: Any) -> None:
+def _check_removed(name: str, value: Any, values: Mapping[str, Any]) -> None:
     """Refuse a value of a removed field, unless it stood for what BlitzGS does without the field."""
-    if not without_effect(name, value):
+    if not without_effect(name, value, values):
         raise ConfigError(
             f"{name}: this field was removed: BlitzGS now does what {REMOVED[name]!r} stood for, got "
             f"{value!r}; leave the field out, or go on with a run that was trained with it by the version "
@@ -225,11 +245,17 @@ def _check_removed(name: str, value: Any) -> None:
         )
 
 
-def without_effect(name: str, value: Any) -> bool:
-    """Tell whether a field is a removed one, with a value that stood for what BlitzGS does now."""
+def without_effect(name: str, value: Any, values: Mapping[str, Any]) -> bool:
+    """Tell whether a field is a removed one, with a value that stood for what BlitzGS does now.
+
+    `values` has the fields given beside it, "section.field": value.
+    """
     if name not in REMOVED:
         return False
     known = REMOVED[name]
+    if isinstance(known, Share):
+        whole = values.get(known.field, flat(to_dict(Config()))[known.field])
+        return math.isclose(_convert(float, value, name), known.share * _convert(float, whole, known.field))
     found = _convert(float, value, name) if isinstance(known, float) else value
     return isinstance(known, Ignored) or bool(found == known)
 

@@ -62,12 +62,11 @@ _FIELDS: Mapping[Range, str] = {
     Range(0, 1, high_open=True): "lod.visible_threshold population.min_opacity",
     Range(0, 1, low_open=True): "population.pass1_keep population.pass2_mass population.pass2_keep",
     Range(0, 3): "model.sh_degree",
-    Range(0, 10): "optimiser.sh_dc optimiser.sh_rest optimiser.opacity optimiser.scale optimiser.rotation "
-    "population.growth",
-    Range(0, 1000): "data.prefetch view.footprint",
+    Range(0, 10): "optimiser.sh_dc optimiser.opacity optimiser.scale optimiser.rotation population.growth",
+    Range(0, 1000): "view.footprint",
     Range(0, 1e6): "model.near schedule.images_per_view schedule.minutes loss.opacity loss.opacity_total "
     "loss.scale population.clone_scale population.prune_screen_radius population.prune_world_scale "
-    "population.gaussians_per_point population.pass2_views memory.resident_gb log.pictures",
+    "population.gaussians_per_point population.pass2_views memory.resident_gb",
     Range(0, 1e9): "schedule.densify_from schedule.densify_until schedule.size_prune_after "
     "schedule.reset_every schedule.gate_from schedule.t1 schedule.t2 schedule.checkpoint_every "
     "schedule.evaluate_every population.pixels_per_gaussian log.checkpoint_seconds",
@@ -76,7 +75,6 @@ _FIELDS: Mapping[Range, str] = {
     Range(0, 1e30): "population.grad_threshold",
     Range(0, 2**50): "data.cache_bytes",
     Range(0, 2**63 - 1): "seed",
-    Range(1e-20, 1): "optimiser.position_final",
     Range(1e-9, 1): "optimiser.final",
     Range(1e-6, 1e6): "loss.scale_reference",
     SCALE: "schedule.scale",
@@ -86,7 +84,6 @@ _FIELDS: Mapping[Range, str] = {
     Range(1, 1e6): "population.min_observations ranks.timeout_seconds log.keep_checkpoints",
     Range(1, 1e9): "schedule.iterations schedule.resolution schedule.densify_every schedule.sh_every "
     "schedule.position_decay log.every",
-    Range(1.01, 100): "lod.fork",
 }
 RANGES: Mapping[str, Range] = {name: found for found, names in _FIELDS.items() for name in names.split()}
 
@@ -109,9 +106,6 @@ def problems(config: Config) -> Iterator[str]:
         if name in CHOICES and value not in CHOICES[name]:
             yield f"{name}: must be one of {', '.join(CHOICES[name])}, got {value}"
     schedule, population = config.schedule, config.population
-    if 0 < config.optimiser.position < 1e-20:
-        # The rate falls by a power of the ratio of position_final to it, which must stay a number.
-        yield f"optimiser.position: must be 0 or at least 1e-20, got {config.optimiser.position}"
     yield from _problems_of_length(schedule)
     yield from _problems_of_resolution(schedule)
     if schedule.reset_every > 0 and not population.min_opacity < RESET_OPACITY:
@@ -126,8 +120,8 @@ def problems(config: Config) -> Iterator[str]:
         )
     if population.strategy == "relocation" and population.gate is not None:
         yield "population.gate: withholds candidates of population.strategy=density; relocation has none"
-    if config.view.smooth and not config.view.lod:
-        yield "view.smooth: needs view.lod=true, whose cuts it smooths"
+    if config.view.lod not in (False, True, "smooth"):
+        yield f"view.lod: must be true, false or smooth, got {config.view.lod}"
     if config.view.cull and not population.importance:
         yield "view.cull: needs population.importance=true, whose passes make the mask"
 

@@ -12,7 +12,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from blitzgs.config.fields import MAX_STRETCH, OptimiserConfig, ScheduleConfig
+from blitzgs.config.fields import (
+    MAX_STRETCH,
+    POSITION_LEFT,
+    SH_SHARE,
+    OptimiserConfig,
+    ScheduleConfig,
+)
 
 
 class Pace:
@@ -190,8 +196,8 @@ class Schedule:
     def learning_rates(self, config: OptimiserConfig, extent: float) -> Tensor:
         """Tabulate the learning rates of the whole run.
 
-        The position rate falls exponentially from `position` to `position_final` over `position_decay`
-        images, both times `extent`; with `position` 0 it stays 0. The opacity rate is constant. The other
+        The position rate falls exponentially from `position` times `extent` to `POSITION_LEFT` of it over
+        `position_decay` images. The opacity rate is constant; that of SH is `SH_SHARE` of `sh_dc`. The other
         rates fall exponentially from `densify_until` to `position_decay`, where `final` of them is left.
         Every rate is multiplied by sqrt(B).
 
@@ -206,11 +212,10 @@ class Schedule:
         times = self.pace.times(begin)
         densify_until, end = self._config.densify_until, self._config.position_decay
         progress = (times / end).clamp(max=1.0)
-        fall = config.position_final / config.position if config.position > 0 else 0.0
-        position = config.position * fall**progress * extent
+        position = config.position * POSITION_LEFT**progress * extent
         share = config.final ** ((times - densify_until) / max(end - densify_until, 1)).clamp(0.0, 1.0)
         table = torch.zeros(self.steps + 1, len(RATES), dtype=torch.float64)
-        falling = (config.rotation, config.scale, 0.0, config.sh_dc, config.sh_rest)
+        falling = (config.rotation, config.scale, 0.0, config.sh_dc, SH_SHARE * config.sh_dc)
         table[1:, 1:] = share[:, None] * torch.tensor(falling, dtype=torch.float64)
         table[1:, 0], table[1:, RATES.index("opacities")] = position, config.opacity
         return (table * math.sqrt(self.batch_size)).float()

@@ -350,6 +350,6 @@ def resolve_device(
         raise ValueError(
             f"local rank {local_rank} needs {chosen}, but this host has {count} CUDA devices; start fewer "
             "processes per node (torchrun --nproc-per-node), use --device cpu or, for development, let ranks "
-            "share GPUs (train: --ranks.share_gpus=true; eval and render: --share-gpus)"
+            "share GPUs (--share-gpus)"
         )
     return chosen, shared

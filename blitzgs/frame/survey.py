@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.frame.frame import RenderOptions, Views, inputs_of, run, tile_grid
+from blitzgs.frame.render import RenderOptions, Views, inputs_of, run_attempts, tile_grid
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import Exchange, LocalTransport, Transport, open_transport
 from blitzgs.ops.blocks import ActiveRows
@@ -48,8 +48,8 @@ def survey(
         options: how to render; no colour is computed.
         assignment: the tiles of each rank; every rank of the job calls this with its table. None: this rank
             composites all tiles.
-        transport: as for `forward`.
-        active: as for `forward`.
+        transport: as for `render_frame`.
+        active: as for `render_frame`.
         squares: whether to sum the squares as well.
 
     Returns:
@@ -69,7 +69,7 @@ def survey(
         )
         return torch.ops.blitzgs.contributions(*geometry, *lists, *grid, n_splats, squares)
 
-    result, sums = run(transport, inputs, assignment, measure)
+    result, sums = run_attempts(transport, inputs, assignment, measure)
     columns = [column[: len(result.splats.depths)] for column in (sums if squares else sums[:2])]
     if result.way_back is not None:
         returned = result.way_back.return_sums(torch.stack([column.long() for column in columns], 1))

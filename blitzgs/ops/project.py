@@ -312,7 +312,7 @@ def gaussian_tensors(
 def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
     """Project as `project` does, with grouped arguments, without gradients. Wait for the number of splats."""
     with below_autograd():
-        projected = inputs.run(None)
+        projected = inputs.project(None)
         return splats_of(projected.splats, Sizes(*to_host(projected.totals)[:3].tolist()))
 
 

@@ -179,7 +179,9 @@ class ProjectionInputs(NamedTuple):
         """The four arguments of the op that tell which Gaussians to consider."""
         return (*self.active, *_ALL_ROWS[len(self.active) :])
 
-    def run(self, capacity: Sizes | None, rank_tiles: Sequence[tuple[int, int]] = ()) -> ProjectionOutputs:
+    def project(
+        self, capacity: Sizes | None, rank_tiles: Sequence[tuple[int, int]] = ()
+    ) -> ProjectionOutputs:
         """Project the Gaussians, without gradients.
 
         Args:
@@ -201,7 +203,7 @@ class ProjectionInputs(NamedTuple):
 
 
 class ProjectionOutputs(NamedTuple):
-    """What `ProjectionInputs.run` returns.
+    """What `ProjectionInputs.project` returns.
 
     Attributes:
         splats: columns as long as the given capacity, if there was one; `counts` is None. The contents are

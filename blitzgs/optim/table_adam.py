@@ -10,7 +10,7 @@ from torch import Tensor
 
 from blitzgs.config.fields import OptimiserConfig
 from blitzgs.config.schedule import Schedule
-from blitzgs.frame.frame import Frame
+from blitzgs.frame.render import Frame
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, project_bwd_step_
 from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.ops.rows import put_rows_, take_rows
@@ -95,7 +95,7 @@ class TableAdam:
 
         Args:
             table: the table that was rendered, unchanged since.
-            frame: of `frame.forward`.
+            frame: of `render_frame`.
             gradients: gradients of the frame's splats, from `frame.backward_splats`.
             scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no
                 such term.

@@ -25,8 +25,8 @@ from torch import Tensor
 from blitzgs.config.fields import ScoreRule
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import decimal_share, integer_mass_prefix, mass_prefix, smallest
-from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import RenderOptions, Views
 from blitzgs.frame.survey import Survey, survey
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import open_transport

@@ -18,7 +18,7 @@ from blitzgs.capture.cameras import downscaled_size, scaled_matrix
 from blitzgs.capture.pictures import encode_image, strip
 from blitzgs.config.fields import ScoreRule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.render import RenderOptions, Views
 from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.population import CELL_BITS, voxel_keys

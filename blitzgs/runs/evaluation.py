@@ -24,9 +24,8 @@ from torch import Tensor
 from blitzgs.capture.images import ImageStore, PhotographError
 from blitzgs.capture.pictures import comparison, encode_image, error_map, to_uint8
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import RenderOptions
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.frame.tiles import TileAssignment, collect_images
 from blitzgs.ops.photometric import ssim
 from blitzgs.util.errors import explain_memory
@@ -99,7 +98,7 @@ def load_lpips(path: str | None) -> Lpips | None:
         metric: Lpips = torch.jit.load(path, map_location="cpu")
     except (RuntimeError, ValueError) as error:
         raise ValueError(
-            f"{path} is not a readable TorchScript module of LPIPS (--lpips, log.lpips_weights): {error}"
+            f"{path} is not a readable TorchScript module of LPIPS (--lpips): {error}"
         ) from error
     return metric
 
@@ -120,9 +119,9 @@ def render_view(
     table, active, _ = finder.find(*picked.as_arguments(), options.limits)
     try:
         if ranks.world_size == 1:
-            return pipeline.forward(table, picked, options, active).renders[0]
+            return render_frame(table, picked, options, active).renders[0]
         ranges = owners.divide([index], picked.width, picked.height, options.tile_size)
-        frame = pipeline.forward(table, picked, options, active, TileAssignment(ranks, ranges))
+        frame = render_frame(table, picked, options, active, TileAssignment(ranks, ranges))
     except (RuntimeError, MemoryError) as error:
         explain_memory(error, 1, picked.width, picked.height, len(table), ranks.device)
         raise

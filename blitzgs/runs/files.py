@@ -50,7 +50,6 @@ FREE_FIELDS = (
     "data.path",
     "data.allow_missing",
     "data.cache_bytes",
-    "data.prefetch",
     "schedule.checkpoint_every",
     "schedule.evaluate_every",
 )

@@ -12,7 +12,7 @@ from torch import Tensor
 from blitzgs._library import below_autograd
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.frame.frame import Frame
+from blitzgs.frame.render import Frame
 from blitzgs.table.table import PARAMETERS, GaussianTable
 
 

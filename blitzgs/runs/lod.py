@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 
-from blitzgs.config.fields import Config
+from blitzgs.config.fields import FORK, Config
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.files import Progress
 from blitzgs.table.table import GaussianTable
@@ -34,13 +34,13 @@ def lod_gate(config: Config, progress: Progress) -> LodGate | None:
         level_fork(config),
         progress.level_count,
         progress.finest_level,
-        config.view.smooth,
+        config.view.lod == "smooth",
     )
 
 
 def level_fork(config: Config) -> float:
     """Return the ratio of the distances of neighbouring levels of the LOD gate."""
-    return config.lod.fork ** (1 / FOOTPRINT_STEPS) if config.view.footprint > 0 else config.lod.fork
+    return FORK ** (1 / FOOTPRINT_STEPS) if config.view.footprint > 0 else FORK
 
 
 def scene_gate(config: Config, progress: Progress, table: GaussianTable, ranks: Ranks) -> SceneGate | None:

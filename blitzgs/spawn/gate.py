@@ -354,7 +354,8 @@ def reasons_against(gate: SpawnGate, config: Config, capture: Capture) -> list[s
     if known := [name for name, other in gate.info.scenes.items() if other == scene]:
         found.append(f"it was fitted on this very capture ({', '.join(known)}): its figures say nothing here")
     # A field that the gate's file lacks is newer than the file; its default is the earlier behaviour.
-    old = {name: value for name, value in gate.info.schedule.items() if not without_effect(name, value)}
+    given = gate.info.schedule
+    old = {name: value for name, value in given.items() if not without_effect(name, value, given)}
     fields, fitted = life_fields(config), life_fields(Config()) | old
     if different := sorted(name for name in fields | fitted if fields.get(name) != fitted.get(name)):
         listed = ", ".join(f"{name} ({fitted.get(name)}, here {fields.get(name)})" for name in different)

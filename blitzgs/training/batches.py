@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.capture.images import ImageStore
-from blitzgs.frame.frame import Views
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import Views
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
 from blitzgs.ops.host import current_stream
 from blitzgs.training.sampler import BatchSampler
@@ -37,6 +37,8 @@ class Batch:
     ranges: TileRanges | None  # the tiles of each rank; None on one rank
 
 
+# Batches that are uploaded beyond the requested one.
+AHEAD = 3
 # Photographs are decoded further ahead than batches are uploaded: for every batch that is uploaded ahead,
 # those of this number of later batches. Decoding one takes as long as several steps on a fast GPU.
 _DECODED_AHEAD = 4
@@ -146,7 +148,7 @@ class BatchLoader:
         train: list[int],
         sampler: BatchSampler,
         device: torch.device,
-        ahead: int,
+        ahead: int = AHEAD,
         owners: TileOwners | None = None,
     ) -> None:
         """Prepare to upload `ahead` batches beyond the requested one; the photographs of more are decoded.

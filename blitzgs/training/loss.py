@@ -15,7 +15,7 @@ from blitzgs.frame.tiles import LOSS_HALO
 from blitzgs.ops.photometric import photometric_fwd_bwd
 
 if TYPE_CHECKING:
-    from blitzgs.frame.frame import Frame
+    from blitzgs.frame.render import Frame
     from blitzgs.table.table import GaussianTable
     from blitzgs.training.batches import Batch
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.frame.frame import Frame, RenderOptions, ViewFilter
+from blitzgs.frame.render import Frame, RenderOptions, ViewFilter
 from blitzgs.frame.transport import Mark, unmarked
 from blitzgs.ops.host import to_device
 from blitzgs.ops.projection_types import MAX_VIEWS

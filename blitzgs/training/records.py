@@ -15,7 +15,7 @@ import torch
 
 from blitzgs.config.files import config_hash
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.frame.frame import Frame
+from blitzgs.frame.render import Frame
 from blitzgs.ops.host import HostCopy
 from blitzgs.runs.files import memory_bytes, peak_memory_bytes, versions
 from blitzgs.runs.guard import check_table, find_bad

@@ -12,7 +12,7 @@ import torch
 
 from blitzgs.capture.capture import Capture, train_views_fingerprint
 from blitzgs.capture.images import ImageStore
-from blitzgs.config.fields import Config
+from blitzgs.config.fields import FORK, Config
 from blitzgs.config.files import save_config
 from blitzgs.config.schedule import Schedule, stretched
 from blitzgs.distributed.group import Ranks
@@ -23,7 +23,6 @@ from blitzgs.population.initialisation import INITIAL_OPACITY, octree_gaussians
 from blitzgs.population.position_noise import PositionNoise
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_cameras
-from blitzgs.runs.evaluation import load_lpips
 from blitzgs.runs.files import Progress
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
 from blitzgs.runs.log import LOG, RunLog
@@ -80,7 +79,6 @@ def set_up(
     check_alike(config, capture, ranks, resume)
     check_resolution(config, capture)
     _check_folder(folder, ranks, resume)
-    lpips = load_lpips(config.log.lpips_weights)
     space = Space.of(capture.offset, capture.extent)
     lap("checks")
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
@@ -144,7 +142,6 @@ def set_up(
         optimiser=optimiser,
         stepper=stepper,
         owners=owners,
-        lpips=lpips,
         run_id=run_id,
         origin=_origin(restored, resume, folder, schedule.iterations),
         save_clock=SaveClock(config.log.checkpoint_seconds),
@@ -300,7 +297,7 @@ def first_gaussians(
     # Cameras that are far from the others would stretch the octree over distances that no photograph covers.
     together = [i for i in capture.train if i not in capture.apart] or capture.train
     centres = trained_centres([capture.cameras[i] for i in together], space).to(device)
-    levels = measure_levels(points, centres, lod.fork)
+    levels = measure_levels(points, centres, FORK)
     colors, most = torch.from_numpy(capture.colors).to(device), config.population.max_gaussians
     if config.model.start:
         return _of_file(config, space, levels, ranks, home)

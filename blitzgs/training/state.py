@@ -18,10 +18,9 @@ from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.frame import RenderOptions
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import RenderOptions
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs.evaluation import Lpips
 from blitzgs.runs.files import Progress
 from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.log import RunLog
@@ -111,7 +110,6 @@ class TrainingState:
     optimiser: TableAdam
     stepper: Stepper  # takes the training steps
     owners: TileOwners  # measures what tiles cost, and divides them among the ranks
-    lpips: Lpips | None  # the perceptual metric, or None
     run_id: str  # identifies the run in its log, also after it is resumed
     origin: str  # describes where the run begins, for the log
     save_clock: SaveClock  # tells when the next checkpoint by wall time is due

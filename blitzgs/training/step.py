@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import Frame, RenderOptions, ViewFilter
+from blitzgs.frame.render import Frame, RenderOptions, ViewFilter, backward_splats, render_frame
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import Mark, open_transport, unmarked
 from blitzgs.ops.blocks import ActiveRows, gate_views_
@@ -109,7 +108,7 @@ class Stepper:
                 gate_views_(rows, table["means"], views.viewmats, rules)
             return rows
 
-        frame = pipeline.forward(
+        frame = render_frame(
             table, views, options, active, assignment, self._transport, mark, backward_follows=True
         )
         if self.exposures is None:
@@ -137,7 +136,7 @@ class Stepper:
         With `keep_means2d`, returns the gradient of the splats' means2d, [P, 2] per pixel.
         """
         table = self.table
-        gradients = pipeline.backward_splats(frame, terms.v_renders, mark)
+        gradients = backward_splats(frame, terms.v_renders, mark)
         v_means2d = means2d_sums = None
         if keep_means2d:
             v_means2d = gradients.means2d

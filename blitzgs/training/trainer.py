@@ -19,7 +19,7 @@ from blitzgs.config.fields import Config
 from blitzgs.config.files import save_config
 from blitzgs.config.schedule import Event
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.frame import Frame
+from blitzgs.frame.render import Frame
 from blitzgs.ops.population import density_stats_
 from blitzgs.population.importance import PHI
 from blitzgs.runs import files as run_files
@@ -79,8 +79,7 @@ class Trainer:
             capture.train,
             state.sampler,
             ranks.device,
-            config.data.prefetch,
-            state.owners if ranks.world_size > 1 else None,
+            owners=state.owners if ranks.world_size > 1 else None,
         )
         self._guard = LossGuard()
         self._unwritten: StepRecord | None = None  # the record of the last step

@@ -14,9 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import Frame, RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import Frame, RenderOptions, Views, render_frame
 from blitzgs.frame.tiles import TileAssignment, collect_images
 from blitzgs.frame.transport import LocalTransport
 from blitzgs.ops.blocks import BLOCK_ROWS, ActiveRows
@@ -170,7 +169,7 @@ class Drawer:
         else:
             # All ranks find their rows before any projects: an error of one rank is one of all.
             table, active, _ = self._together(lambda: self._found(look, views, options))
-        frame = pipeline.forward(
+        frame = render_frame(
             _painted(table) if painted else table, views, options, active, assignment, self._transport
         )
         image, light = self._together(lambda: _channels(frame, look.mode)), frame.saved.composited[0]

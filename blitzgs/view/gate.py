@@ -83,7 +83,7 @@ class LodGate:
 
 @dataclass(frozen=True)
 class ViewGate:
-    """LOD gate and cull mask of the views of one batch (`blitzgs.frame.frame.ViewFilter`).
+    """LOD gate and cull mask of the views of one batch (`blitzgs.frame.render.ViewFilter`).
 
     Attributes:
         reach: `LodGate.reach`.
@@ -96,7 +96,7 @@ class ViewGate:
     columns: Sequence[int] = ()
 
     def rules(self, table: GaussianTable) -> GateRules:
-        """See `blitzgs.frame.frame.ViewFilter.rules`."""
+        """See `blitzgs.frame.render.ViewFilter.rules`."""
         mask = table.columns.get(CULL)
         sectors = None if mask is None else sectors_in(mask)
         return GateRules(table["level"], list(self.reach), self.lod_views, sectors, list(self.columns))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.frame.frame import Views
+from blitzgs.frame.render import Views
 from blitzgs.ops.blocks import ActiveRows, gate_views_
 from blitzgs.table.blocks import BlockIndex, Cameras
 from blitzgs.table.pool import Pool

@@ -117,7 +117,6 @@ class Live:
 
     Attributes:
         page: the page.
-        drawn: number of pictures so far.
     """
 
     def __init__(self, exhibit: Exhibit, total: int, host: str = "127.0.0.1", port: int = 8080) -> None:
@@ -129,7 +128,6 @@ class Live:
             host: address to listen on.
             port: 0: any free one.
         """
-        self.drawn = 0
         self._share, self._total = SHARE, total
         self._curves = Curves()
         self._count = 0
@@ -187,7 +185,6 @@ class Live:
         """Send a picture, and note what it cost."""
         if self._last is None:
             return
-        self.drawn += 1
         visitor, ask = self._last
         # Packing and sending the pictures before this one took time of the same processor.
         sent, self._sent = self.page.send_seconds - self._sent, self.page.send_seconds

@@ -20,7 +20,7 @@ from blitzgs.formats.ply import PlySource
 from blitzgs.formats.selection import opacity_length
 from blitzgs.formats.tiles import upright
 from blitzgs.formats.web_page import WebLevels, WebScene, WebSplats, estimated_bytes, frame_bytes, web_page
-from blitzgs.frame.frame import RenderOptions
+from blitzgs.frame.render import RenderOptions
 from blitzgs.runs import files as run_files
 from blitzgs.runs.cameras import CAMERAS, load_cameras
 from blitzgs.runs.clean import contributions as measured

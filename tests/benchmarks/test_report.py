@@ -8,7 +8,6 @@ import sys
 import time
 from pathlib import Path
 
-import bm_photometric
 import gpu_record
 import harness
 import pytest
@@ -32,15 +31,6 @@ def run(monkeypatch, benchmark, *flags):
     monkeypatch.setattr(sys, "argv", [str(Path(benchmark.__file__)), *map(str, flags)])
     monkeypatch.setenv("BLITZGS_COMMIT", "abc")
     benchmark.main()
-
-
-def test_a_benchmark_notes_what_the_report_needs(tmp_path, monkeypatch):
-    size = ("--device", "cpu", "--height", 20, "--width", 30, "--repeats", 1)
-    run(monkeypatch, bm_photometric, *size, "--json", tmp_path / "photometric.json")
-    page = made(tmp_path, "photometric")
-    command = "python benchmarks/bm_photometric.py --device cpu --height 20 --width 30 --repeats 1"
-    assert f"`{command}`" in page and "| 1 view(s) of 30 × 20 | ms | byte floor, ms |" in page
-    assert page.count("\n| ") == 5
 
 
 def test_the_exchange_benchmark_writes_what_the_report_reads(tmp_path):

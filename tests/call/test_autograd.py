@@ -7,6 +7,7 @@ from functools import partial
 import pytest
 import torch
 import torch.utils.checkpoint
+from torch._dynamo.testing import CompileCounterWithBackend
 
 import blitzgs
 from blitzgs.call.finite import _warn_of_gradient
@@ -258,19 +259,22 @@ def test_one_graph_is_compiled_of_a_call(device, options):
 
 
 @pytest.mark.parametrize("packed", [True, False])
-def test_a_graph_takes_other_numbers_of_gaussians(packed):
+def test_one_graph_takes_other_numbers_of_gaussians_views_and_pixels(packed):
     torch._dynamo.reset()
+    counter, graphs = CompileCounterWithBackend("aot_eager"), set()
     image_of = torch.compile(
-        lambda scene: rasterize_scene(scene, packed=packed)[0], fullgraph=True, backend="aot_eager"
+        lambda scene: rasterize_scene(scene, packed=packed)[0], fullgraph=True, dynamic=True, backend=counter
     )
-    for n in (20, 33, 45):
-        leaves = random_scene(n=n).leaves()
+    for n, cameras, width, height in ((20, 2, 40, 32), (33, 2, 40, 32), (33, 3, 40, 32), (33, 3, 17, 50)):
+        leaves = random_scene(n=n, cameras=cameras, width=width, height=height).leaves()
         image, expected = image_of(leaves), rasterize_scene(leaves, packed=packed)[0]
         assert torch.equal(image, expected)
         inputs = [getattr(leaves, name) for name in PARAMETERS]
         found = torch.autograd.grad(image.square().sum(), inputs)
         for actual, wanted in zip(found, torch.autograd.grad(expected.square().sum(), inputs), strict=True):
             assert relative_error(actual, wanted) < 1e-5
+        graphs.add(counter.frame_count)  # forward and backward
+    assert graphs == {2}
 
 
 def test_a_graph_of_many_views_and_one_of_covariances():

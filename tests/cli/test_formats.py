@@ -64,7 +64,7 @@ def test_a_file_is_measured_as_its_run(trained, whole, tmp_path, capsys):
 
 def test_a_training_begins_with_a_file(trained, whole, tmp_path, capsys):
     out = tmp_path / "run"
-    flags = ["--config=defaults", "--schedule.iterations=4", "--log.tensorboard=false", "--log.pictures=0"]
+    flags = ["--config=defaults", "--schedule.iterations=4", "--log.tensorboard=false"]
     arguments = ["train", "--data", str(trained[0]), "--out", str(out), "--start", str(whole)]
     assert main([*arguments, *flags]) == 0
     capsys.readouterr()

@@ -19,7 +19,7 @@ from blitzgs.cli import _NAMED_ERRORS, COMMANDS, _user_errors, doctor, main
 from blitzgs.cli.completion import script
 from tests.training.tiny import OVERRIDES, as_flags
 
-TRAIN = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.3", "log.every=1", "log.pictures=0")
+TRAIN = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.3", "log.every=1")
 
 
 def shell(script, **variables):
@@ -131,7 +131,7 @@ def test_a_field_takes_its_value_after_a_space(capsys):
     [
         (["--help", "downscale"], ["--data.downscale=1   (integer, in [1, 1,000])", "images are reduced"]),
         (["-h", "data.downscale"], ["--data.downscale=1"]),
-        (["--help", "lod"], ["lod: The octree", "--lod.fork=2.0"]),
+        (["--help", "lod"], ["lod: The octree", "--lod.visible_threshold=0.9"]),
         (["--help-fields"], ["--seed=0", "--log.every=100", "population: Density control"]),
         (["--help"], ["--extend IMAGES|FACTOR", "--help-fields"]),
     ],

@@ -140,11 +140,9 @@ def test_learning_rates():
     assert not table[0].any()
     for step in (1, 2, 77, 126, 250):
         fraction = min((step - 1) * 4 / 500, 1.0)
-        position = 2.0 * math.exp(
-            (1 - fraction) * math.log(config.position) + fraction * math.log(config.position_final)
-        )
+        position = 2.0 * math.exp(math.log(config.position) - fraction * math.log(100))
         share = 0.1 ** min(max((step - 1) * 4 - 100, 0) / 400, 1.0)
-        colors = [config.sh_dc * share, config.sh_rest * share]
+        colors = [config.sh_dc * share, config.sh_dc / 20 * share]
         others = [config.rotation * share, config.scale * share, config.opacity, *colors]
         expected = torch.tensor([position, *others]).double()
         torch.testing.assert_close(table[step], 2.0 * expected, rtol=1e-6, atol=0.0)
@@ -244,7 +242,7 @@ def test_rates_follow_the_configurations_own_times():
     assert schedule.iterations == 200 + 700 * 4
     table = schedule.learning_rates(optimiser, extent=2.0).double()
     for image, time in ((0, 0), (60, 60), (100, 100), (150, 200), (200, 300), (600, 400), (2_999, 999.75)):
-        fall = (optimiser.position_final / optimiser.position) ** min(time / 500, 1)
+        fall = 0.01 ** min(time / 500, 1)
         assert table[image + 1, 0] == pytest.approx(2.0 * optimiser.position * fall, rel=1e-6)
         assert table[image + 1, 3] == pytest.approx(optimiser.opacity, rel=1e-6)
 

@@ -138,11 +138,11 @@ class Rank:
         self.number = number
         ids = (torch.arange(n, device="cuda") * 7919 + number) % 100_003
         self.inputs = scene.inputs("cuda")._replace(ids=ids)
-        self.projected = self.inputs.run(None, RANGES)
+        self.projected = self.inputs.project(None, RANGES)
         self.totals = self.projected.totals
 
     def send(self, everyone, buffers, capacity):
-        projected = self.inputs.run(Sizes(capacity, capacity, 0), RANGES)
+        projected = self.inputs.project(Sizes(capacity, capacity, 0), RANGES)
         splats, _, totals = projected
         assert torch.equal(totals, self.totals)
         places, plan = ops.send_splats_(
@@ -217,7 +217,7 @@ def test_nothing_is_written_where_room_is_too_small(counts):
 
 def test_send_refuses_columns_below_the_capacity():
     rank = Rank(0, 100)
-    projected = rank.inputs.run(Sizes(64, 63, 0), RANGES)
+    projected = rank.inputs.project(Sizes(64, 63, 0), RANGES)
     with pytest.raises(RuntimeError, match="columns must have room for 64 splats, got 63"):
         ops.send_splats_(
             list(projected.for_compositing), projected.splats.rank_masks, rank.totals[None], 0,

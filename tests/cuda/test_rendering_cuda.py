@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import blitzgs
-from blitzgs.frame import frame as pipeline
+from blitzgs.frame.render import backward_splats, render_frame, tile_grid
 from blitzgs.frame.transport import LocalTransport
 from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops import project, splat_gradients
@@ -161,11 +161,11 @@ def test_packed_gradients_equal_those_from_columns(degree):
     table = GaussianTable.create({name: column.cuda() for name, column in columns.items()})
     options = dataclasses.replace(OPTIONS, sh_degree=degree, deterministic=True)
     views = cameras(3, device="cuda")
-    frame = pipeline.forward(table, views, options)
+    frame = render_frame(table, views, options)
     v_renders = torch.randn_like(frame.renders)
-    (packed,) = pipeline.backward_splats(frame, v_renders).parts
+    (packed,) = backward_splats(frame, v_renders).parts
     assert packed.shape == (len(frame.splats.depths), 12)
-    projected, grid = frame.projected, pipeline.tile_grid(views, options, None)
+    projected, grid = frame.projected, tile_grid(views, options, None)
     *unpacked, _ = ops.rasterize_bwd(*frame.saved, v_renders, None, *grid, False, True)
     for x, y in zip(gradient_columns(packed), unpacked, strict=True):
         assert y.any() and torch.equal(x, y)
@@ -185,14 +185,14 @@ def test_a_second_backward_pass_starts_from_zeros_too():
     small = random_gaussians(2000)
     table = GaussianTable({name: small[name].cuda() for name in small})
     options, views = dataclasses.replace(OPTIONS, deterministic=True), cameras(2, device="cuda")
-    plain = pipeline.forward(table, views, options)
-    frame = pipeline.forward(table, views, options, backward_follows=True)
+    plain = render_frame(table, views, options)
+    frame = render_frame(table, views, options, backward_follows=True)
     assert torch.equal(frame.renders, plain.renders)
     v_renders = torch.randn_like(frame.renders)
-    (expected,) = pipeline.backward_splats(plain, v_renders).parts
+    (expected,) = backward_splats(plain, v_renders).parts
     assert expected.any()
     for _ in range(2):
-        (found,) = pipeline.backward_splats(frame, v_renders).parts
+        (found,) = backward_splats(frame, v_renders).parts
         assert torch.equal(found, expected)
 
 
@@ -205,7 +205,7 @@ def test_frames_do_not_depend_on_the_room_that_was_guessed():
     small = random_gaussians(5000)
     table = GaussianTable({name: small[name].cuda() for name in small})
     options, views = dataclasses.replace(OPTIONS, deterministic=True), cameras(3, device="cuda")
-    plain = pipeline.forward(table, views, options)
+    plain = render_frame(table, views, options)
     needed = plain.projected.counts.tolist()
     v_renders = torch.randn_like(plain.renders)
     expected = parameter_gradients(table, plain, v_renders)
@@ -214,7 +214,7 @@ def test_frames_do_not_depend_on_the_room_that_was_guessed():
     for sizes in [*rooms, (1, 1, 1)]:
         transport, attempts = LocalTransport(CapacityEstimate(Sizes(*sizes))), []
         enough = Sizes(*sizes).holds(needed)
-        frame = pipeline.forward(
+        frame = render_frame(
             table, views, options, transport=transport, mark=attempts.append, backward_follows=True
         )
         assert attempts.count("raster") == (1 if enough else 2)
@@ -236,7 +236,7 @@ def test_an_active_set_that_did_not_fit_is_found_again():
     table = GaussianTable({name: small[name].cuda() for name in small})
     table.permute(morton_order(table["means"]))
     views, index, asked = cameras(3, device="cuda"), BlockIndex(table), []
-    expected = pipeline.forward(table, views, OPTIONS)
+    expected = render_frame(table, views, OPTIONS)
 
     def find(sizes):
         capacity_blocks = None if sizes is None else sizes.blocks
@@ -248,7 +248,7 @@ def test_an_active_set_that_did_not_fit_is_found_again():
 
     def rendered(transport):
         asked.clear()
-        return pipeline.forward(table, views, OPTIONS, find, transport=transport)
+        return render_frame(table, views, OPTIONS, find, transport=transport)
 
     blocks = int(find(None).blocks)
     assert blocks > 2
@@ -269,7 +269,7 @@ def test_a_frame_without_splats_works_with_any_capacity():
     views = cameras(2, device="cuda")
     for sizes in (Sizes(10, 10, 10), Sizes(1, 1, 1), None):
         transport = LocalTransport(CapacityEstimate(sizes))
-        frame = pipeline.forward(table, views, OPTIONS, transport=transport, backward_follows=True)
+        frame = render_frame(table, views, OPTIONS, transport=transport, backward_follows=True)
         assert len(frame.projected.gaussian_ids) == 0 and (frame.saved.composited[0] == 1).all()
         v_renders = torch.ones_like(frame.renders)
         assert not any(g.any() for g in parameter_gradients(table, frame, v_renders))

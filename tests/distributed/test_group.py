@@ -101,7 +101,7 @@ def test_ranks_share_gpus_only_when_told(monkeypatch):
     assert places("cuda:1", 2, True) == [(second, True)] * 2
     assert places("cuda:1", 1, True) == [(second, False)]
     assert places("cpu", 2, True) == [(torch.device("cpu"), False)] * 2
-    with pytest.raises(ValueError, match=r"local rank 2 needs cuda:2, but .* 2 CUDA.*ranks\.share_gpus=true"):
+    with pytest.raises(ValueError, match=r"local rank 2 needs cuda:2, but .* 2 CUDA.*\(--share-gpus\)"):
         places("cuda", 3, False)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     monkeypatch.setattr(torch.version, "cuda", None)

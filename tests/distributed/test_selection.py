@@ -276,7 +276,7 @@ def test_unsupported_distributed_options_are_refused(options):
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = (
-    *OVERRIDES, "schedule.iterations=1500", "population.max_gaussians=500", "log.pictures=0",
+    *OVERRIDES, "schedule.iterations=1500", "population.max_gaussians=500",
     "log.checkpoint_seconds=1", "ranks.timeout_seconds=20",
 )  # fmt: skip
 

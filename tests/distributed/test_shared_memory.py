@@ -14,8 +14,8 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.distributed import shared_memory
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import MAX_VALUES, SharedMemory, control_words
-from blitzgs.frame import frame as pipeline
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import backward_splats, render_frame
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import CollectiveTransport, PeerTransport
 from blitzgs.frame.transport.protocol import CapacityEstimate
@@ -45,7 +45,7 @@ def _assignment(ranks, n_views=3):
 def _exchange(table, ranks, transport):
     """Splats that arrive here in a fixed order, and the sums of a function of them that return."""
     views, assignment = _assignment(ranks)
-    frame = pipeline.forward(table, views, OPTIONS, assignment=assignment, transport=transport)
+    frame = render_frame(table, views, OPTIONS, assignment=assignment, transport=transport)
     got = frame.splats
     order = (got.ids * 4 + got.camera_ids).argsort()
     arrived = [column[order].clone() for column in got]
@@ -107,12 +107,12 @@ def _gradients(ranks):
         table = GaussianTable.create(columns)
         frames, splats, gradients, moments, kept = [], [], [], [], None
         for transport in transports:
-            frame = pipeline.forward(
+            frame = render_frame(
                 table, views, options, assignment=assignment, transport=transport,
                 backward_follows=count != 700,
             )  # fmt: skip
             v_renders = torch.where(frame.renders > 0, 1e-3, 1e-4)
-            splats.append(pipeline.backward_splats(frame, v_renders))
+            splats.append(backward_splats(frame, v_renders))
             copy = GaussianTable({name: table[name].clone() for name in table})
             if transport is transports[1]:
                 kept = torch.full_like(frame.projected.means2d, torch.nan)
@@ -153,10 +153,10 @@ def _hidden(ranks):
     ]
     views, assignment = _assignment(ranks)
     own = assignment.ranges.pixel_mask(ranks.rank, ranks.device)
-    alone = pipeline.forward(parts[1], views, OPTIONS)
+    alone = render_frame(parts[1], views, OPTIONS)
     transport = PeerTransport(ranks)
     for _ in range(4):
-        frame = pipeline.forward(parts[0], views, OPTIONS, assignment=assignment, transport=transport)
+        frame = render_frame(parts[0], views, OPTIONS, assignment=assignment, transport=transport)
         assert torch.equal(frame.renders[own], alone.renders[own])
         transmittances = [rendered.saved.composited[0][own] for rendered in (frame, alone)]
         assert torch.equal(*transmittances)
@@ -173,10 +173,10 @@ def test_splats_without_a_finite_colour_are_not_composited(world_size, device):
 def _overtaken(ranks):
     table, (views, assignment) = _table(300, ranks), _assignment(ranks, 2)
     transport = PeerTransport(ranks)
-    frame = pipeline.forward(table, views, OPTIONS, assignment=assignment, transport=transport)
-    pipeline.forward(table, views, OPTIONS, assignment=assignment)  # another transport with the same memory
+    frame = render_frame(table, views, OPTIONS, assignment=assignment, transport=transport)
+    render_frame(table, views, OPTIONS, assignment=assignment)  # another transport with the same memory
     with pytest.raises(RuntimeError, match="a later exchange has overwritten"):
-        pipeline.backward_splats(frame, torch.ones_like(frame.renders))
+        backward_splats(frame, torch.ones_like(frame.renders))
     return True
 
 

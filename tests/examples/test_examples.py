@@ -166,4 +166,4 @@ def test_the_pose_hook_is_a_rigid_motion():
 def test_an_example_is_short_and_needs_no_trainer(name):
     text = (ROOT / "examples" / f"{name}.py").read_text()
     assert len(text.splitlines()) <= 150
-    assert "blitzgs.training" not in text and "blitzgs.frame.frame" not in text
+    assert "blitzgs.training" not in text and "blitzgs.frame.render" not in text

@@ -14,7 +14,7 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import Shared
-from blitzgs.frame import frame as pipeline
+from blitzgs.frame.render import backward_splats, render_frame
 from blitzgs.frame.survey import survey
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.frame.transport import PeerTransport, peer
@@ -171,16 +171,16 @@ def _keys(ids, camera_ids):
 )
 def test_all_ranks_repeat_a_frame_that_did_not_fit(sizes, frames, backward_follows):
     table, views, ranges, owner = _scene()
-    alone = pipeline.forward(table, views, OPTIONS)
+    alone = render_frame(table, views, OPTIONS)
     weights = torch.linspace(-1, 1, alone.renders.numel()).view_as(alone.renders)
-    expected = torch.cat([p.reshape(len(p), -1) for p in pipeline.backward_splats(alone, weights).parts], 1)
+    expected = torch.cat([p.reshape(len(p), -1) for p in backward_splats(alone, weights).parts], 1)
     order = _keys(table["id"][alone.projected.gaussian_ids.long()], alone.projected.camera_ids).argsort()
 
     def rank(ranks):
         transport, part = PeerTransport(ranks, CapacityEstimate(sizes)), _part(table, owner, ranks)
         assignment, before = TileAssignment(ranks, ranges), ranks.memory.generation
         for count in (frames, 1):  # a second frame has the capacity that the first one needed
-            frame = pipeline.forward(
+            frame = render_frame(
                 part, views, OPTIONS, assignment=assignment, transport=transport,
                 backward_follows=backward_follows,
             )  # fmt: skip
@@ -190,7 +190,7 @@ def test_all_ranks_repeat_a_frame_that_did_not_fit(sizes, frames, backward_follo
             assert torch.equal(frame.renders[own], alone.renders[own])
             assert torch.equal(frame.visible, alone.visible)
             for _ in range(2):
-                gradients = pipeline.backward_splats(frame, weights)
+                gradients = backward_splats(frame, weights)
                 found = sum_of_ranks(gradients, len(frame.projected.depths))
                 ranks.memory.barrier()  # otherwise the next pass could write while other ranks read
         ids = part["id"][frame.projected.gaussian_ids.long()]

@@ -11,9 +11,8 @@ import torch
 
 from blitzgs.config.fields import LossConfig
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import MAX_ATTEMPTS, RenderOptions, Views, run
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import MAX_ATTEMPTS, RenderOptions, Views, render_frame, run_attempts
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges, collect_images
 from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops.projection_types import Sizes
@@ -88,7 +87,7 @@ def _render(ranks):
             if even:
                 ranges = owners.divide(keys, WIDTH, HEIGHT, halo=LOSS_HALO)
             assignment = TileAssignment(ranks, ranges)
-        frame = pipeline.forward(table, views, OPTIONS, assignment=assignment)
+        frame = render_frame(table, views, OPTIONS, assignment=assignment)
         image, tile_work = frame.renders.clone(), frame.tile_work
         if ranges is not None:
             collect_images(image, ranges, ranks, 0)
@@ -174,7 +173,7 @@ def _render_plain(ranks):
     table, views = shard(ranks), cameras(3)
     ranges = TileOwners(ranks).divide(range(3), WIDTH, HEIGHT)
     assignment = TileAssignment(ranks, ranges)
-    frame = pipeline.forward(table, views, OPTIONS, assignment=assignment)
+    frame = render_frame(table, views, OPTIONS, assignment=assignment)
     with pytest.raises(ValueError, match="the loss reads 10 px beyond"):
         loss_terms(frame, Batch([0, 1, 2], views, *photographs(3), ranges), LOSS, EXTENT)
     collect_images(frame.renders, ranges, ranks, 1)
@@ -184,7 +183,7 @@ def _render_plain(ranks):
 def test_rendering_without_a_loss_composites_no_halo():
     answers = run_ranks(_render_plain, 3)
     assert all(alone for alone, _ in answers)
-    assert torch.equal(answers[1][1], pipeline.forward(shard(Ranks()), cameras(3), OPTIONS).renders)
+    assert torch.equal(answers[1][1], render_frame(shard(Ranks()), cameras(3), OPTIONS).renders)
 
 
 def _gather_all(ranks):
@@ -250,7 +249,9 @@ def test_an_estimate_follows_the_largest_recent_sizes():
 
 def test_the_next_attempt_gets_the_sizes_the_last_one_needed():
     transport, asked, consumed = NeedsMemory(lambda _: Sizes(10, 100, 1000), Sizes(10, 99, 2000)), [], []
-    found = run(transport, asked.append, None, lambda exchange: consumed.append(exchange) or len(consumed))
+    found = run_attempts(
+        transport, asked.append, None, lambda exchange: consumed.append(exchange) or len(consumed)
+    )
     assert found == ("result", 2)
     assert asked == transport.given and len(asked) == 2
     assert transport.given[0] == (10, 99, 2000, 1) and transport.given[1].holds((10, 100, 1000))
@@ -259,7 +260,7 @@ def test_the_next_attempt_gets_the_sizes_the_last_one_needed():
 def test_attempts_are_bounded_when_the_needed_size_grows():
     transport = NeedsMemory(lambda count: Sizes(1, 10**count, 1))
     with pytest.raises(RuntimeError, match=f"{MAX_ATTEMPTS} attempts .* needs \\(1, 10000, 1, 0\\)"):
-        run(transport, lambda sizes: None, None, lambda exchange: None)
+        run_attempts(transport, lambda sizes: None, None, lambda exchange: None)
     assert len(transport.given) == MAX_ATTEMPTS
 
 
@@ -269,7 +270,7 @@ def test_an_attempt_that_fails_leaves_the_estimate():
 
     transport = NeedsMemory(lambda _: Sizes(9, 9, 9), Sizes(1, 2, 3))
     with pytest.raises(MemoryError):
-        run(transport, fail, None, lambda exchange: None)
+        run_attempts(transport, fail, None, lambda exchange: None)
     assert transport.capacity.sizes == (1, 2, 3, 1)
 
 

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import Shared
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import run
+from blitzgs.frame.render import render_frame, run_attempts
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.frame.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport, peer
 from blitzgs.frame.transport.collective import CollectiveWayBack
@@ -274,7 +273,7 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
             assert arrived.n_isects > 0 and len(arrived.splats.ids) >= len(table)
             return exchange
 
-        result, exchange = run(transport, lambda _: inputs, assignment, check)
+        result, exchange = run_attempts(transport, lambda _: inputs, assignment, check)
         return result, exchange.finish()[0]
 
     result, needed = finished()
@@ -304,10 +303,10 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
 def test_a_frame_by_shared_memory_is_the_local_one(alone):
     table, views = random_gaussians(700), cameras(3)
     ranges = TileRanges((0, 3 * 60), 3, views.width, views.height)
-    expected = pipeline.forward(table, views, OPTIONS)
+    expected = render_frame(table, views, OPTIONS)
     assignment, transport = TileAssignment(alone, ranges), PeerTransport(alone)
     for backward_follows in (False, True):
-        frame = pipeline.forward(
+        frame = render_frame(
             table, views, OPTIONS, assignment=assignment, transport=transport,
             backward_follows=backward_follows,
         )  # fmt: skip
@@ -342,9 +341,9 @@ def test_one_rank_needs_no_way_back():
 
 def test_a_frame_that_did_not_fit_is_rendered_again_but_not_for_ever():
     table, views = random_gaussians(300), cameras(2)
-    expected = pipeline.forward(table, views, OPTIONS)
+    expected = render_frame(table, views, OPTIONS)
     transport = RecordingTransport(LocalTransport(), too_small=2)
-    frame = pipeline.forward(table, views, OPTIONS, transport=transport)
+    frame = render_frame(table, views, OPTIONS, transport=transport)
     names = [name for name, _ in transport.calls]
     assert names == ["start", "finish"] * 3
     capacities = [capacity for name, capacity in transport.calls if name == "start"]
@@ -356,7 +355,7 @@ def test_a_frame_that_did_not_fit_is_rendered_again_but_not_for_ever():
         assert torch.equal(got, want)
     transport.too_small = 10
     with pytest.raises(RuntimeError, match="4 attempts have each needed more .* needs \\("):
-        pipeline.forward(table, views, OPTIONS, transport=transport)
+        render_frame(table, views, OPTIONS, transport=transport)
     assert transport.too_small == 6
 
 

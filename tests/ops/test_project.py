@@ -235,7 +235,7 @@ def test_each_splat_knows_the_ranks_that_composite_its_tiles():
     scene = random_scene(n=500, cameras=2, width=70, height=40)  # 5 x 3 tiles a view
     ranges = [(0, 18), (12, 12), (12, 30)]
     inputs = inputs_of(scene)
-    splats, ids, totals = inputs._replace(ids=torch.arange(500) + 7).run(None, ranges)
+    splats, ids, totals = inputs._replace(ids=torch.arange(500) + 7).project(None, ranges)
     assert torch.equal(ids, splats.gaussian_ids + 7)
     masks = torch.zeros_like(splats.rank_masks)
     for rank, (begin, end) in enumerate(ranges):
@@ -336,9 +336,9 @@ def test_groups_of_arguments_are_checked():
         ({"ids": torch.arange(3)}, r"ids must have shape \[4\], got \[3\]"),
     ):
         with pytest.raises(RuntimeError, match=text):
-            inputs._replace(**change).run(None)
+            inputs._replace(**change).project(None)
     with pytest.raises(RuntimeError, match="a begin and an end for each of at most 63 ranks, got 128"):
-        inputs.run(None, [(0, 1)] * 64)
+        inputs.project(None, [(0, 1)] * 64)
 
 
 def test_compiles_into_one_graph_with_the_same_gradients():

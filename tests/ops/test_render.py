@@ -94,9 +94,9 @@ def test_spare_capacity_changes_nothing(cameras, spare):
     options = ProjectionOptions(24, 20, sh_degree=3, raw=False)
     tables = ProjectionInputs(geometry, views, options)
     expected = project_splats(tables._replace(gaussians=[*geometry, sh]))
-    sizes = tables.run(None).totals.cpu()[:3]
+    sizes = tables.project(None).totals.cpu()[:3]
     capacity = Sizes(*(int(n) + spare for n in sizes))
-    projected = tables.run(capacity)
+    projected = tables.project(capacity)
     found, (rows, *_) = colored_rows(projected.splats, tables, (sh,), projected.totals)
     require_equal(splats_of(found, Sizes(*sizes.tolist())), expected)
     visible = expected.visible_ids.long()
@@ -109,8 +109,8 @@ def test_spare_capacity_changes_nothing(cameras, spare):
 def test_too_little_capacity_writes_nothing_beyond_it(missing):
     geometry, sh, views = scene_of("cuda")
     tables = ProjectionInputs(geometry, views, ProjectionOptions(24, 20, sh_degree=3, raw=False))
-    visible, splats, isects = tables.run(None).totals.cpu()[:3].tolist()
-    projected = tables.run(Sizes(visible - missing[0], splats - missing[1], isects))
+    visible, splats, isects = tables.project(None).totals.cpu()[:3].tolist()
+    projected = tables.project(Sizes(visible - missing[0], splats - missing[1], isects))
     colored_rows(projected.splats, tables, (sh,), projected.totals)
     torch.cuda.synchronize()
     assert projected.totals[:2].tolist() == [visible, splats]

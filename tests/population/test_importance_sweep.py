@@ -11,8 +11,8 @@ from blitzgs import rasterization
 from blitzgs.call import contributions
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import integer_mass_prefix
-from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import RenderOptions, Views
 from blitzgs.frame.survey import survey
 from blitzgs.population import importance
 from blitzgs.population.importance import (

@@ -224,7 +224,7 @@ def test_a_report_that_fails_does_not_fail_the_training(trained, tmp_path, monke
         raise KeyError("a fault")
 
     monkeypatch.setattr("blitzgs.report.report.report", fails)
-    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.2", "log.pictures=0")
+    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.2")
     with pytest.warns(UserWarning, match="the report was not written"):
         assert main(["train", "--data", str(trained[0]), "--out", str(tmp_path / "run"), *flags]) == 0
 

@@ -299,7 +299,7 @@ def test_one_run_at_a_time(tmp_path, monkeypatch, capsys):
 def other(trained, tmp_path_factory):
     """Another run of the same capture."""
     folder = tmp_path_factory.mktemp("other") / "run"
-    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.4", "log.pictures=0")
+    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.4")
     assert main(["train", "--data", str(trained[0]), "--out", str(folder), *flags]) == 0
     return folder
 

@@ -266,7 +266,7 @@ def test_a_failing_stage_shows_colmaps_last_words(tmp_path):
 
 
 ROOT = Path(__file__).resolve().parents[2]
-FLAGS = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.05", "log.pictures=0")
+FLAGS = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.05")
 
 
 def config_of(folder):

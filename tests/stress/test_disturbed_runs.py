@@ -25,8 +25,8 @@ INTERVAL = 0.5
 # Time for a step, for a save and for the scheduling of a busy machine.
 SLACK = 1.0
 SETTINGS = (
-    *OVERRIDES, "schedule.iterations=3000", "population.max_gaussians=700", "log.pictures=0",
-    "log.tensorboard=true", "data.cache_bytes=0", "data.prefetch=1", f"log.checkpoint_seconds={INTERVAL}",
+    *OVERRIDES, "schedule.iterations=3000", "population.max_gaussians=700",
+    "log.tensorboard=true", "data.cache_bytes=0", f"log.checkpoint_seconds={INTERVAL}",
 )  # fmt: skip
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]

@@ -164,7 +164,7 @@ def caught_up_and_projected(table, ids, views, count, viewmats, Ks):
     active = [tensor for tensor in (ids, views, count) if tensor is not None]
     options = ProjectionOptions(WIDTH, HEIGHT, near_plane=NEAR, far_plane=FAR)
     inputs = ProjectionInputs([after[name] for name in PARAMETERS], (viewmats, Ks), options, active)
-    splats, _, totals = inputs.run(None, [(0, 50)])
+    splats, _, totals = inputs.project(None, [(0, 50)])
     return [*after.values(), *splats._replace(counts=totals)]
 
 

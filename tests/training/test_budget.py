@@ -243,7 +243,7 @@ def test_ranks_whose_clocks_differ_take_the_same_steps(tmp_path):
 
 def test_the_command_takes_minutes(tmp_path, capsys):
     write_tiny_capture(tmp_path / "data")
-    flags = as_flags("config=defaults", *OVERRIDES, "log.pictures=0")
+    flags = as_flags("config=defaults", *OVERRIDES)
     command = ["train", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run"), *flags]
     assert main([*command, "--minutes=0.02"]) == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())

@@ -40,7 +40,7 @@ def test_the_log_itemises_the_set_up(trained):
 @pytest.mark.parametrize("strategy", ["density", "relocation"])
 @pytest.mark.parametrize("most", [420, 10])
 def test_the_log_names_the_limit_of_the_population(trained, tmp_path, capsys, strategy, most):
-    limit = f"population.strategy={strategy}", f"population.max_gaussians={most}", "log.pictures=0"
+    limit = f"population.strategy={strategy}", f"population.max_gaussians={most}"
     flags = as_flags("config=defaults", *OVERRIDES, "schedule.iterations=22", "population.growth=0.5", *limit)
     assert main(["train", "--data", str(trained[0]), "--out", str(tmp_path / "r"), *flags]) == 0
     lines = (tmp_path / "r" / "log.jsonl").read_text().splitlines()
@@ -87,7 +87,7 @@ def test_export_restores_the_units_of_the_capture(trained, tmp_path, capsys):
 
 
 def test_torchrun_entry(trained, tmp_path):
-    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.02", "log.pictures=0")
+    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.02")
     command = [sys.executable, "train.py", "--data", str(trained[0]), "--out", str(tmp_path / "r"), *flags]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, env=None)
     assert done.returncode == 0, done.stderr
@@ -242,7 +242,7 @@ def test_render_leaves_the_photographs_alone(tmp_path, kind):
         return str(path) if kind == "absolute" else f"../photos/{path.name}"
 
     data, photos = transforms_capture(tmp_path, name_of)
-    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.02", "log.pictures=1")
+    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.02")
     assert main(["train", "--data", str(data), "--out", str(tmp_path / "run"), *flags]) == 0
     before, everything = digest(photos), {path for path in tmp_path.rglob("*")}
     out = tmp_path / "rend" / "a"

@@ -36,7 +36,7 @@ OVERRIDES = (
     "schedule.size_prune_after=110", "schedule.sh_every=40", "schedule.position_decay=200",
     "population.grad_threshold=1e-3", "population.clone_scale=0.025", "population.prune_screen_radius=12",
     "population.min_opacity=0.0099", "loss.scale=1.0", "loss.opacity=0.2", "model.antialiased=true",
-    "log.every=10", "log.pictures=0",
+    "log.every=10",
 )  # fmt: skip
 # Up to the first density event, small differences stay small. After it, rounding occasionally decides
 # whether a Gaussian near a threshold grows.

@@ -50,7 +50,7 @@ from tests.training.tiny import (
 )
 
 # Density events at 20, 40, 60 and 80; the passes after those at 40 and 80.
-PASSES = ("population.importance=true", "schedule.t1=40", "schedule.t2=80", "log.pictures=0")
+PASSES = ("population.importance=true", "schedule.t1=40", "schedule.t2=80")
 
 
 def train(folder, *overrides, ranks=None, resume=False):

@@ -16,8 +16,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import RenderOptions
+from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.training.trainer import Trainer
@@ -69,7 +68,7 @@ def carpet_capture(device):
 
 
 def picture(table, views, index):
-    return pipeline.forward(table, views.pick([index]), RenderOptions(3, 0.01, 1e6)).renders[0]
+    return render_frame(table, views.pick([index]), RenderOptions(3, 0.01, 1e6)).renders[0]
 
 
 def flat(columns):

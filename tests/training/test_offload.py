@@ -82,8 +82,7 @@ VARIANTS = {
         "schedule.t2=40",
         "schedule.densify_until=32",
         "schedule.densify_every=4",
-        "view.lod=true",
-        "view.smooth=true",
+        "view.lod=smooth",
     ),
     "relocation": (
         "population.strategy=relocation",

@@ -46,7 +46,7 @@ def train(device: str, capture: str, seed: int, folder: Path) -> dict[str, Any]:
     data = shared_data()
     assert data is not None, "the real captures are not here: name their folder in BLITZGS_SHARED_DATA"
     config, *overrides = CASES[device, capture]
-    changes = [f"data.path={json.dumps(str(data / capture))}", f"seed={seed}", "log.pictures=0"]
+    changes = [f"data.path={json.dumps(str(data / capture))}", f"seed={seed}"]
     loaded = load_config(ROOT / config, [*overrides, *changes, "log.tensorboard=false"])
     ranks = Ranks.from_environment(device)
     photographed, images = open_capture(loaded, ranks)

@@ -12,9 +12,8 @@ from blitzgs.cli import main
 from blitzgs.config.fields import LossConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import RenderOptions, Views, render_frame
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY
 from blitzgs.runs.cameras import LEAST_SPREAD, stored_exposures
@@ -72,7 +71,7 @@ def test_regularisers_are_means_over_the_visible_gaussians_of_a_view(device):
     viewmats = torch.from_numpy(np.stack(poses)).float().to(device)
     K = torch.tensor([[90.0, 0, 40], [0, 90.0, 30], [0, 0, 1]], device=device).repeat(3, 1, 1)
     views = Views(viewmats, K, 80, 60)
-    frame = pipeline.forward(table, views, RenderOptions(0, 0.05, 100.0))
+    frame = render_frame(table, views, RenderOptions(0, 0.05, 100.0))
     targets = torch.zeros((3, 60, 80, 3), dtype=torch.uint8, device=device)
     samples = torch.full((3,), 3.0 * 60 * 80, device=device)
     terms = loss_terms(frame, Batch([0, 1, 2], views, targets, None, samples, None), CONFIG, EXTENT)

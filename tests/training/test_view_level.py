@@ -14,7 +14,7 @@ from blitzgs.config.files import ConfigError
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply, write_ply
-from blitzgs.frame import frame as pipeline
+from blitzgs.frame.render import render_frame
 from blitzgs.population.importance import is_culled
 from blitzgs.runs import files as run_files
 from blitzgs.runs.evaluation import image_metrics
@@ -43,7 +43,7 @@ from tests.training.tiny import (
 # The passes follow the density event at 40 and come at 70; the window ends at 60; the mask is cleared at 85.
 FLAGS = (
     "view.lod=true", "view.cull=true", "population.importance=true", "schedule.densify_until=60",
-    "schedule.t1=40", "schedule.t2=70", "log.pictures=0",
+    "schedule.t1=40", "schedule.t2=70",
 )  # fmt: skip
 
 
@@ -83,7 +83,7 @@ def test_gate_and_mask_apply_in_the_scheduled_phases(whole_run):
         assert bool(gate.columns) == has_mask and (has_lod or gate.lod_views == 0)
         seen = torch.zeros(len(table["id"]), dtype=torch.bool)
         seen[rows.visible_ids.long()] = True
-        everything = pipeline.forward(
+        everything = render_frame(
             GaussianTable(table), trainer.state.views.pick([index]), trainer.state.render_options
         ).projected
         allowed = torch.ones_like(seen)
@@ -137,9 +137,9 @@ def test_evaluation_has_the_gate_and_no_mask(tmp_path, monkeypatch):
     assert (distances <= reach).double().mean() < 0.95
     small = GaussianTable({name: state.table[name] for name in state.table})
     small.keep(distances <= reach)
-    image = pipeline.forward(small, view, state.render_options).renders[0]
+    image = render_frame(small, view, state.render_options).renders[0]
     assert found["psnr"] == image_metrics(image, tiny_scene()[1].get(3), None)["psnr"]
-    assert not torch.equal(image, pipeline.forward(state.table, view, state.render_options).renders[0])
+    assert not torch.equal(image, render_frame(state.table, view, state.render_options).renders[0])
     shown = blitzgs.open_run(tmp_path).model().render(camera)
     torch.testing.assert_close(shown, image, rtol=0, atol=1e-5)
 
@@ -297,10 +297,10 @@ def test_a_photograph_that_is_lost_changes_neither_length_nor_opacity_term_of_a_
 
 def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path, monkeypatch):
     stop_at(monkeypatch, 65)
-    assert train(tmp_path / "stopped", "view.smooth=true")[1] is None
+    assert train(tmp_path / "stopped", "view.lod=smooth")[1] is None
     monkeypatch.undo()
-    resumed, _ = train(tmp_path / "stopped", "view.smooth=true", resume=True)
-    trainer, _ = train(tmp_path / "whole", "view.smooth=true")
+    resumed, _ = train(tmp_path / "stopped", "view.lod=smooth", resume=True)
+    trainer, _ = train(tmp_path / "whole", "view.lod=smooth")
     state = trainer.state
     assert_same_table(resumed.state.table, state.table)
     assert set(state.progress.gated_views) == {"1"}  # for any share that the views keep
@@ -311,8 +311,8 @@ def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path, monkeypat
     faded = GaussianTable({name: state.table[name].clone() for name in state.table})
     faded["opacities"] = (faded["opacities"].double().sigmoid() * weights).logit().float()
     options = dataclasses.replace(state.render_options, fade=())
-    image = pipeline.forward(faded, view, options).renders[0]
-    found = pipeline.forward(state.table, view, state.render_options).renders[0]
+    image = render_frame(faded, view, options).renders[0]
+    found = render_frame(state.table, view, state.render_options).renders[0]
     torch.testing.assert_close(found, image, rtol=0, atol=1e-5)
     psnr = image_metrics(image, tiny_scene()[1].get(3), None)["psnr"]
     assert evaluate.measure(state, [3], None)["psnr"] == pytest.approx(psnr, abs=1e-3)
@@ -321,8 +321,6 @@ def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path, monkeypat
     path = tmp_path / "model.ply"
     assert main(["export", str(tmp_path / "whole"), "--ply", str(path)]) == 0
     assert any(text.endswith(" finest 1 smooth") for text in read_ply(path).comments)
-    with pytest.raises(ConfigError, match="view.smooth: needs view.lod=true"):
-        tiny_config("view.smooth=true")
 
 
 def test_the_mask_is_cleared_halfway_after_the_last_pass():

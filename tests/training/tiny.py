@@ -22,8 +22,7 @@ from blitzgs.capture.lengths import Sight
 from blitzgs.config.fields import Config
 from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import RenderOptions, Views
+from blitzgs.frame.render import RenderOptions, Views, render_frame
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, lazy_adam_step_
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.training.trainer import Trainer
@@ -34,7 +33,7 @@ OVERRIDES = (
     "population.pixels_per_gaussian=0", "schedule.iterations=100", "schedule.densify_from=20",
     "schedule.densify_until=90", "schedule.densify_every=20", "schedule.size_prune_after=50",
     "schedule.sh_every=30", "population.grad_threshold=2e-4", "population.prune_screen_radius=0",
-    "log.every=20", "log.tensorboard=false", "log.pictures=2",
+    "log.every=20", "log.tensorboard=false",
 )  # fmt: skip
 
 
@@ -156,7 +155,7 @@ def photographed(
             camera.width,
             camera.height,
         )
-        render = pipeline.forward(truth, views, RenderOptions(0, 0.01, 1e6)).renders[0]
+        render = render_frame(truth, views, RenderOptions(0, 0.01, 1e6)).renders[0]
         images.append((render.clamp(0, 1) * 255 + 0.5).byte())
     colors = (0.5 + 0.28209479 * truth["sh"][:, 0]).clamp(0, 1).mul(255).byte().numpy()
     train = [i for i in range(len(cameras)) if i != test]

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import RenderOptions, Views, render_frame
 from blitzgs.ops.blocks import BLOCK_ROWS
 from blitzgs.population.initialisation import _seen_by_more
 from blitzgs.runs.folder import open_run
@@ -233,8 +232,8 @@ def test_rows_outside_the_views_are_left_out_and_the_image_stays_the_same(device
     assert found.table is table and torch.equal(found.rows_of(ids), ids)
     assert seen(table, views.viewmats, views.Ks) <= allowed((ids, bits))
     assert len(ids) < 0.8 * len(table)
-    whole = pipeline.forward(table, views, OPTIONS).renders
-    assert whole.any() and torch.equal(pipeline.forward(table, views, OPTIONS, found.active).renders, whole)
+    whole = render_frame(table, views, OPTIONS).renders
+    assert whole.any() and torch.equal(render_frame(table, views, OPTIONS, found.active).renders, whole)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -244,9 +243,9 @@ def test_the_gate_leaves_out_the_rows_that_it_leaves_out_of_the_whole_table(devi
     lod = SceneGate(LodGate(20.0, 2.0, 6, 4), 1.0, table, Ranks(device=torch.device(device)))
     gated = lod.active(table, views.viewmats)
     found = VisibleFinder(table, lod).find(*views.as_arguments(), LIMITS).active
-    image, expected = (pipeline.forward(table, views, OPTIONS, rows).renders for rows in (found, gated))
+    image, expected = (render_frame(table, views, OPTIONS, rows).renders for rows in (found, gated))
     assert torch.equal(image, expected)
-    assert not torch.equal(image, pipeline.forward(table, views, OPTIONS).renders)
+    assert not torch.equal(image, render_frame(table, views, OPTIONS).renders)
     assert int(found.considered()) < int(gated.considered()) < len(table)
 
 
@@ -257,4 +256,4 @@ def test_a_table_without_rows_is_found_empty(device):
     views = Views(*make_views(device=device), WIDTH, HEIGHT)
     found = VisibleFinder(GaussianTable(table.columns)).find(*views.as_arguments(), LIMITS)
     assert len(found.active.listed()[0]) == 0
-    assert not pipeline.forward(found.table, views, OPTIONS, found.active).renders.any()
+    assert not render_frame(found.table, views, OPTIONS, found.active).renders.any()

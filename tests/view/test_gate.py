@@ -10,9 +10,8 @@ import torch
 
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import RenderOptions, Views
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import RenderOptions, Views, render_frame
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.ops.blocks import ActiveRows, GateRules, gate_views_
 from blitzgs.optim.table_adam import TableAdam
@@ -112,7 +111,7 @@ def test_a_level_beyond_the_finest_is_kept_nowhere_and_level_0_everywhere(device
 
 
 def render(table, viewmats, Ks, active=None):
-    return pipeline.forward(table, Views(viewmats, Ks, WIDTH, HEIGHT), OPTIONS, active).renders
+    return render_frame(table, Views(viewmats, Ks, WIDTH, HEIGHT), OPTIONS, active).renders
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -152,7 +151,7 @@ def test_training_behind_the_gate_is_dense_adams(device, smooth):
     rounding error at the start.
     """
     steps, tables = 120, []
-    overrides = ("schedule.iterations=200", "optimiser.position=2e-3", "optimiser.position_final=1e-3")
+    overrides = ("schedule.iterations=200", "optimiser.position=2e-3")
     config = tiny_config(*overrides)
     schedule = Schedule(config.schedule)
     generator = torch.Generator().manual_seed(8)
@@ -320,10 +319,10 @@ def _gated_image(ranks):
     fading = replace(OPTIONS, fade=smooth.fade())
     for active, options in ((scene.active(table, viewmats), OPTIONS), (masked, OPTIONS), (faded, fading)):
         if ranks.world_size == 1:
-            images.append(pipeline.forward(table, views, options, active).renders.cpu())
+            images.append(render_frame(table, views, options, active).renders.cpu())
             continue
         ranges = owners.divide(range(4), WIDTH, HEIGHT, OPTIONS.tile_size)
-        frame = pipeline.forward(table, views, options, active, TileAssignment(ranks, ranges))
+        frame = render_frame(table, views, options, active, TileAssignment(ranks, ranges))
         own = ranges.pixel_mask(ranks.rank, ranks.device)
         images.append(torch.where(own[..., None], frame.renders, 0.0).cpu())
     return shares, images

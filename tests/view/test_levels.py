@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame import frame as pipeline
-from blitzgs.frame.frame import Views
+from blitzgs.frame.render import Views, render_frame
 from blitzgs.ops.project import differentiable_splats, gaussian_tensors, project
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
 from blitzgs.reference.render import render as reference_render
@@ -146,7 +145,7 @@ def test_images_are_those_of_faded_opacities(device, antialiased):
     table = faint_scene(700, device)
     viewmats, Ks = make_views(2, device)
     options = replace(FADED, antialiased=antialiased)
-    images = pipeline.forward(table, Views(viewmats, Ks, WIDTH, HEIGHT), options).renders
+    images = render_frame(table, Views(viewmats, Ks, WIDTH, HEIGHT), options).renders
     for view, centre in enumerate(centres_of(viewmats)):
         weights = SMOOTH.weights(table["means"], table["level"], centre)
         assert ((weights > 0) & (weights < 1)).sum() > 15
@@ -168,12 +167,12 @@ def test_the_gate_before_the_projection_changes_nothing(device):
     views = Views(viewmats, Ks, WIDTH, HEIGHT)
     active = SceneGate(SMOOTH, math.inf, table, Ranks(device=torch.device(device))).active(table, viewmats)
     assert (active.views != 15).double().mean() > 0.2
-    faded = pipeline.forward(table, views, FADED, active)
-    everything = pipeline.forward(table, views, FADED)
+    faded = render_frame(table, views, FADED, active)
+    everything = render_frame(table, views, FADED)
     assert torch.equal(faded.renders, everything.renders)
     assert torch.equal(faded.projected.gaussian_ids, everything.projected.gaussian_ids)
     cut = SceneGate(GATE, math.inf, table, Ranks(device=torch.device(device))).active(table, viewmats)
-    assert not torch.equal(faded.renders, pipeline.forward(table, views, OPTIONS, cut).renders)
+    assert not torch.equal(faded.renders, render_frame(table, views, OPTIONS, cut).renders)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -195,9 +194,7 @@ def test_images_change_little_where_the_gate_makes_them_jump(device):
             viewmat = torch.eye(4, device=device)[None]
             viewmat[:, 2, 3] = gate.reach()[2] * 2 ** (0.5 - step / 80)
             options = replace(OPTIONS, fade=scene.gate.fade())
-            frame = pipeline.forward(
-                table, Views(viewmat, K, 160, 120), options, scene.active(table, viewmat)
-            )
+            frame = render_frame(table, Views(viewmat, K, 160, 120), options, scene.active(table, viewmat))
             images.append(frame.renders)
         stack = torch.cat(images)
         largest[smooth] = (stack[1:] - stack[:-1]).abs().max().item()
@@ -257,7 +254,7 @@ def test_errors_name_the_value():
 
     def call(level, fade):
         options = ProjectionOptions(WIDTH, HEIGHT, fade=fade)
-        ProjectionInputs(gaussians, (viewmats, Ks), options, level=level).run(None)
+        ProjectionInputs(gaussians, (viewmats, Ks), options, level=level).project(None)
 
     with pytest.raises(RuntimeError, match="project_fwd: levels need a fade_slope of at least 1"):
         call(table["level"], ())

@@ -68,7 +68,7 @@ class CollectiveExchange:
         tiles, n_views = assignment.composited_by_rank, assignment.ranges.n_views
         # Without sizes the projection waits for the device, which may still wait for other ranks.
         with ranks.watchdog.waiting("project"):
-            projected = inputs.run(sizes, tiles)
+            projected = inputs.project(sizes, tiles)
         everyone = projected.totals.repeat(ranks.world_size, 1)
         # Newer versions of torch have this function under another name and warn about the old one.
         gather = getattr(dist, "all_gather_single", dist.all_gather_into_tensor)
@@ -80,7 +80,7 @@ class CollectiveExchange:
         traffic = Traffic.of(totals, n_views, ranks.rank)
         self._needed = needed = traffic.own._replace(blocks=traffic.most_blocks)
         if sizes is not None and not sizes.holds(needed[:2]):
-            projected = inputs.run(None, tiles)  # no queued work waits for another rank now
+            projected = inputs.project(None, tiles)  # no queued work waits for another rank now
         mark("project")
         projected = projected.first(needed)
         own, sent = projected.splats, projected.for_compositing

@@ -170,7 +170,7 @@ class PeerExchange:
         self._n_views = inputs.n_views
         self._traffic: Traffic | None = None
         capacity = Sizes(buffers.length, buffers.length, 0)
-        projected = inputs.run(capacity, assignment.composited_by_rank)
+        projected = inputs.project(capacity, assignment.composited_by_rank)
         self._own = projected.splats
         self._shared = memory.share(projected.totals)  # barrier A
         counted.record(current_stream(ranks.device))

@@ -11,7 +11,7 @@ frame, on every rank:
     result.way_back.check_still_valid()                      # before the backward pass of compositing
     gradients = result.way_back.return_gradients(gradients)  # gradients of this rank's own splats
 
-`blitzgs.frame.frame` makes the first three, and the last two may be repeated. `collective` and `peer` have
+`blitzgs.frame.render` makes the first three, and the last two may be repeated. `collective` and `peer` have
 the other transports.
 """
 
@@ -205,7 +205,7 @@ class CapacityEstimate:
 
     If the host waited for the sizes, the device would be idle meanwhile. Instead, the host queues all the
     work with the estimate, and reads the true sizes while the device works. If the estimate was too small,
-    the host queues the work again (`blitzgs.frame.frame`).
+    the host queues the work again (`blitzgs.frame.render`).
 
     Attributes:
         sizes: the present estimate; None before the first frame has ended.
@@ -261,7 +261,7 @@ class LocalExchange:
         """Project."""
         # On the CPU the sizes are known at once, so no estimate is needed.
         self._capacity = sizes if inputs.gaussians[0].is_cuda else None
-        self.projected = projected = inputs.run(self._capacity)
+        self.projected = projected = inputs.project(self._capacity)
         self.gradient_table: Tensor | None = None
         splats, host = projected.for_compositing, projected.totals
         self._copy = HostCopy(host) if host.is_cuda else None

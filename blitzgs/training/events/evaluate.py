@@ -19,6 +19,8 @@ from blitzgs.runs.lod import scene_gate
 from blitzgs.training.state import TrainingState
 from blitzgs.util.output import write_file
 
+# The number of side-by-side pictures that an evaluation writes.
+PICTURES = 8
 # The end of a run measures as many training views as take this share of its time, at least and at most:
 TRAINED_SHARE, LEAST_TRAINED, MOST_TRAINED = 0.02, 8, 64
 
@@ -34,7 +36,7 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
         capture = state.capture
         begin = state.clock()
         try:
-            metrics = measure(state, capture.test or capture.train, folder, state.lpips)
+            metrics = measure(state, capture.test or capture.train, folder)
             if event is None and capture.test:
                 cost = max(1e-9, (state.clock() - begin) / len(capture.test))
                 count = int(
@@ -85,7 +87,7 @@ def measure(
             state.render_options,
             folder,
             TileOwners(state.ranks),
-            pictures=state.config.log.pictures,
+            pictures=PICTURES,
             lpips=lpips,
             report=report,
             optional_files=True,
@@ -131,7 +133,7 @@ class Glances:
         state = self._state
         started, views = state.clock(), sorted(self._order[:count])
         try:
-            metrics = measure(state, views, None, lpips=None)
+            metrics = measure(state, views, None)
         except EvaluationStoppedError:
             return
         except PhotographError as error:  # on every rank

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Renders views of a table and their gradients without autograd, in the one loop over attempts.
 
-`forward` projects the active Gaussians, lists them by tile and composites them; the result is a `Frame`.
+`render_frame` projects the active Gaussians, lists them by tile and composites them; the result is a `Frame`.
 `backward_splats` computes the gradients of the projected splats from the gradients of the images. No tensor
 here is as long as the table: the cost follows the Gaussians that the views see. Between projection and tile
 intersection, a transport (`blitzgs.frame.transport`) sends the splats to the ranks that composite them,
@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -37,9 +37,6 @@ from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, Proj
 from blitzgs.ops.rasterize import RasterizeSaved
 from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients
 from blitzgs.table.table import GaussianTable
-
-if TYPE_CHECKING:
-    from blitzgs.frame.tiles import TileAssignment
 
 
 @dataclass(frozen=True)
@@ -125,7 +122,7 @@ class ViewFilter(Protocol):
 
 
 class Frame(NamedTuple):
-    """The images that `forward` rendered, and the data that `backward_splats` needs.
+    """The images that `render_frame` rendered, and the data that `backward_splats` needs.
 
     Attributes:
         views: the views.
@@ -158,7 +155,7 @@ class Frame(NamedTuple):
     gradients: GradientBuffer
 
 
-def forward(
+def render_frame(
     table: GaussianTable,
     views: Views,
     options: RenderOptions,
@@ -174,7 +171,7 @@ def forward(
         views: at most 32 views.
         options: how to render.
         active: rows to consider, and the views of each; None: all rows in all views. Or a function that finds
-            them, given the estimated sizes of the frame (see `run`).
+            them, given the estimated sizes of the frame (see `run_attempts`).
         assignment: the tiles of each rank; every rank of the job calls this with its table. None: render all
             tiles from this table alone.
         transport: sends the splats to the ranks that composite them. A transport that is used for several
@@ -208,18 +205,18 @@ def forward(
         )
         mark("sort")
         arguments = (*geometry, splats.colors, backgrounds, *lists, *grid)
-        table = exchange.gradient_table
-        if table is not None and backward_follows:
-            images = torch.ops.blitzgs.rasterize_fwd_(*arguments, table, n_splats)
-            zeros = table
+        shared = exchange.gradient_table
+        if shared is not None and backward_follows:
+            images = torch.ops.blitzgs.rasterize_fwd_(*arguments, shared, n_splats)
+            zeros = shared
         else:
             *images, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, False, backward_follows, n_splats)
-            if table is not None:
-                zeros = None  # the gradients must be in this table, which the backward pass then zeroes
+            if shared is not None:
+                zeros = None  # the gradients must be in `shared`, which the backward pass then zeroes
         mark("raster")
         return _Composited(list(lists), images, zeros)
 
-    result, (lists, images, zeros) = run(transport, inputs, assignment, composite, mark)
+    result, (lists, images, zeros) = run_attempts(transport, inputs, assignment, composite, mark)
     renders, transmittances, last_ids, tile_work, packed_splats, tile_order = images
     splats = result.splats
     return Frame(
@@ -318,7 +315,7 @@ MAX_ATTEMPTS = 4
 Consumed = TypeVar("Consumed")
 
 
-def run(
+def run_attempts(
     transport: Transport,
     inputs: ProjectionInputs | Callable[[Sizes | None], ProjectionInputs],
     assignment: TileAssignment | None,
