@@ -31,7 +31,6 @@ from torch import Tensor
 
 from blitzgs.capture.pictures import to_uint8
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.film import new_film
 from blitzgs.frame.render import RenderOptions, Views, render_frame
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.runs import files as run_files
@@ -42,6 +41,7 @@ from blitzgs.table.table import GaussianTable
 from blitzgs.util.charts import line_chart
 from blitzgs.view.gate import LodGate, SceneGate, centres_of
 from blitzgs.view.views import CameraLike, ViewSet, render_options
+from blitzgs.viewer.film import new_film
 
 MODES = ("full", "gated", "smooth")
 # The flight begins and ends at these multiples of the distance between the camera and what it looks at.
