@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measures accuracy against time: each option's image error, gradient error and time.
 
-python benchmarks/bm_accuracy.py [--device cuda] [--gaussians 4000000] [--out runs/accuracy] [--json FILE]
+python benchmarks/bm_accuracy.py [--device cuda] [--gaussians 4000000] [--json FILE]
 
 Renders the aerial scene with each option as training does, forward and backward. Times are medians, per view.
 Errors are against the float64 reference of the same mode in a few windows of the same images: the largest
 absolute error of the image away from the declared cut pixels, and the largest error of a parameter's gradient
 (max |difference| / max |reference|). The benchmark fails if the default setting misses its bounds.
 
-Writes a table (Markdown) and the figures (JSON), again after each option, so that an interrupted run keeps
-its measurements.
+The figures are written again after each option, so that an interrupted run keeps its measurements.
 
 The row "exact exponential" needs a second build of the kernels, whose folder --exact-library names:
 
@@ -36,16 +35,17 @@ from scenes import BenchmarkScene, aerial
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.render import Frame, RenderOptions, Views, render_frame
+from blitzgs.frame.render import Frame, RenderOptions, render_frame
 from blitzgs.frame.tiles import TileAssignment, TileRanges
 from blitzgs.frame.transport import CollectiveTransport, LocalTransport, Transport
 from blitzgs.ops.intersect import tile_counts
+from blitzgs.ops.projection_types import Views
 from blitzgs.reference import Composite, Splats, composite, project_splats
 from blitzgs.table.table import PARAMETERS, GaussianTable, schema
 
 IMAGE_BOUND, GRADIENT_BOUND = 2e-5, 1e-4  # largest errors of the default setting
 
-NEAR, FAR, EPS2D = 0.01, 1e10, 0.3
+NEAR, FAR, EPS2D, TILE = 0.01, 1e10, 0.3, 16
 
 
 class ExactWindows:
@@ -136,7 +136,6 @@ class Option:
 
     name: str
     antialiased: bool = False
-    tile_size: int = 16
     deterministic: bool = False
     views: int = 1
     exchanged: bool = False  # splats pass through the exchange of one rank: all costs but the transfer
@@ -185,14 +184,14 @@ class Renderer:
         self.views = Views(viewmats, Ks, scene.width, scene.height)
         self.options = RenderOptions(
             sh_degree=3, near_plane=NEAR, far_plane=FAR, eps2d=EPS2D, antialiased=option.antialiased,
-            tile_size=option.tile_size, deterministic=option.deterministic,
+            deterministic=option.deterministic,
         )  # fmt: skip
         self.assignment: TileAssignment | None = None
         self.transport: Transport = LocalTransport()
         if option.exchanged:
-            columns, lines = tile_counts(scene.width, scene.height, option.tile_size)
+            columns, lines = tile_counts(scene.width, scene.height, TILE)
             bounds = (0, len(Ks) * columns * lines)
-            ranges = TileRanges(bounds, len(Ks), scene.width, scene.height, option.tile_size)
+            ranges = TileRanges(bounds, len(Ks), scene.width, scene.height, TILE)
             ranks = Ranks(device=device)
             self.assignment = TileAssignment(ranks, ranges)
             self.transport = CollectiveTransport(ranks)
@@ -271,13 +270,14 @@ def measure(option: Option, scenes: dict[int, BenchmarkScene], repeats: int) -> 
 def measure_library(folder: Path, arguments: list[str]) -> Figures:
     """Measure the default setting in a process that loads the kernels of another build."""
     with tempfile.TemporaryDirectory() as out:
+        path = Path(out) / "accuracy.json"
         subprocess.run(
-            [sys.executable, __file__, *arguments, "--only", "default", "--out", out],
+            [sys.executable, __file__, *arguments, "--only", "default", "--json", str(path)],
             env={**os.environ, "BLITZGS_LIBRARY_DIR": str(folder)},
             stdout=subprocess.DEVNULL,
             check=True,
         )
-        (row,) = json.loads((Path(out) / "accuracy.json").read_text())
+        (row,) = json.loads(path.read_text())["rows"]
     return replace(Figures(**row), name="exact exponential")
 
 
@@ -291,13 +291,6 @@ def line(figures: Figures) -> str:
     f = figures
     errors = f"{f.image_error:.1e} | {f.gradient_error:.1e}"
     return f"| {f.name} | {f.milliseconds:.2f} | {errors} | {f.cut_pixels:.2%} |"
-
-
-def write(rows: list[Figures], folder: Path) -> None:
-    """Write the table and the figures."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "accuracy.md").write_text("\n".join([HEAD, *map(line, rows)]) + "\n")
-    (folder / "accuracy.json").write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n")
 
 
 def require_bounds(default: Figures) -> None:
@@ -314,7 +307,6 @@ def main() -> None:
     parser.add_argument("--width", type=int, help="default: 1600 px on CUDA, 400 px on the CPU")
     parser.add_argument("--only", help="the one option to measure")
     parser.add_argument("--exact-library", type=Path, help="kernels built with BLITZGS_EXACT_EXP=ON")
-    parser.add_argument("--out", type=Path, help="folder for accuracy.json and accuracy.md")
     args = parser.parse_args()
     on_gpu = args.device.startswith("cuda")
     gaussians = args.gaussians or (4_000_000 if on_gpu else 100_000)
@@ -328,8 +320,6 @@ def main() -> None:
     def add(figures: Figures) -> None:
         rows.append(figures)
         print(line(figures), flush=True)
-        if args.out:
-            write(rows, args.out)
         if args.json:
             write_json(args.json, args.device, title=title, rows=[asdict(row) for row in rows])
 

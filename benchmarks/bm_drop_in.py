@@ -2,7 +2,7 @@
 """Runs gsplat's training loop with gsplat's parts and with ours, and compares time and quality.
 
     python benchmarks/bm_drop_in.py CAPTURE [--steps 7000] [--arms gsplat import four] [--device cuda]
-        [--profile] [--one-thread]
+        [--one-thread]
 
 The loop, learning rates and density strategy are those of gsplat's `simple_trainer.py` 1.5.3
 (`opponents/gsplat_training.py`), with photographs on the device. Arms:
@@ -15,24 +15,20 @@ The loop, learning rates and density strategy are those of gsplat's `simple_trai
 Times are of the whole training, of the two steps around each time at which the strategy may change the
 population, and of the steps between two such times at the end; PSNR is the mean over held-out views.
 `--one-thread` calls `torch.autograd.set_multithreading_enabled(False)` for all arms, as the guide recommends:
-autograd then runs the backward pass in the loop's own thread. `--profile` also times the parts of a step of
-each arm, on the host and on the device, counts their ops, launches and waits, and prints the ops and kernels
-that take most time.
+autograd then runs the backward pass in the loop's own thread.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from contextlib import nullcontext
-from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Parts, TracedParts, make_parser, report, trace
+from harness import make_parser, report
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer
 from torch import Tensor
 
@@ -46,13 +42,11 @@ class OneImport(GsplatTrainer):
     """gsplat's loop with another renderer.
 
     Attributes:
-        part: `Parts`, where the parts of a step are timed.
         loss_name: whose kernels compute the loss.
     """
 
     loss_name = "fused_ssim" if find_spec("fused_ssim") else "blitzgs.l1_ssim"
 
-    part: Any = staticmethod(nullcontext)
     rasterization: Any = staticmethod(blitzgs.rasterization)
 
     def loss(self, renders: Tensor, target: Tensor) -> Tensor:
@@ -84,20 +78,12 @@ class OneImport(GsplatTrainer):
 
     def _take_step(self) -> None:
         views, target, _ = self._batches[next(self._order)]
-        with self.part("render"):
-            image, info = self.render(views)
-        with self.part("strategy, before"):
-            self._strategy.step_pre_backward(self.params, self._optimisers, self._state, self.step, info)
-        with self.part("loss"):
-            loss = self.loss(image, target)
-        with self.part("backward"):
-            loss.backward()
-        with self.part("optimisers"):
-            self.move()
-        with self.part("learning rates"):
-            self._decay.step()
-        with self.part("strategy, after"):
-            self.change_population(info)
+        image, info = self.render(views)
+        self._strategy.step_pre_backward(self.params, self._optimisers, self._state, self.step, info)
+        self.loss(image, target).backward()
+        self.move()
+        self._decay.step()
+        self.change_population(info)
 
 
 # Refinements from one sorting of the rows to the next: each appends few rows, so the order stays good.
@@ -215,25 +201,7 @@ def measure(name: str, capture: Any, images: ImageStore, options: argparse.Names
         "Gaussians": len(trainer.params["means"]),
         "PSNR, dB": psnr(trainer, capture, images),
     }
-    if options.profile:
-        profile(name, trainer, options)
     return found
-
-
-def profile(name: str, trainer: OneImport, options: argparse.Namespace) -> None:
-    """Continue the training by some steps and report the parts of a step."""
-    steps, trace_steps = 40, 20  # with 5 steps to warm up, these reach no densification
-    trainer.train_to(trainer.step + 5)
-    trainer.part = parts = Parts(trainer.device)
-    seconds = seconds_of(trainer, trainer.step + steps)
-    title = f"{name}: a step at {len(trainer.params['means'])} Gaussians, {seconds / steps * 1e3:.2f} ms"
-    report(title, parts.rows(steps), None, options.device)
-    trainer.part = parts = TracedParts()
-    run = partial(trainer.train_to, trainer.step + trace_steps)
-    counts, kernel_ms, table = trace(run, trace_steps, trainer.device, parts)
-    trainer.part = nullcontext
-    report(f"{name}: work of a step, kernels {kernel_ms:.2f} ms", counts, None, options.device)
-    print(table)
 
 
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
@@ -243,7 +211,6 @@ def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--steps", type=int, default=7000)
     parser.add_argument("--downscale", type=float, default=1)
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=["gsplat", "import", "four"])
-    parser.add_argument("--profile", action="store_true", help="time the parts of a step of each arm")
     parser.add_argument("--one-thread", action="store_true", help="run autograd in the loop's own thread")
     options = parser.parse_args(arguments)
     capture = load_capture(options.capture, downscale=options.downscale)

@@ -34,8 +34,8 @@ from blitzgs.config.schedule import Event, Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs.files import Progress
 from blitzgs.runs.log import RunLog
+from blitzgs.runs.run_files import Progress
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.events import densify
@@ -147,7 +147,7 @@ class Events:
 
     def event(self) -> None:
         """Run an event."""
-        densify.run(self.state, Event(self._time, 0, "densify"))
+        densify.run_density_event(self.state, Event(self._time, 0, "densify"))
 
     def step_ms(self, repeats: int = 12) -> float | None:
         """Return the median ms of a step; None with several ranks."""

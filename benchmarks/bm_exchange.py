@@ -40,9 +40,10 @@ from blitzgs.config.fields import FORK, Config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TILE_COST, TileOwners, cost_balance
-from blitzgs.frame.render import RenderOptions, Views
+from blitzgs.frame.render import RenderOptions
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
-from blitzgs.frame.transport import Mark, Traffic, unmarked
+from blitzgs.frame.transport import Traffic, stages_told_to
+from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.runs.guard import LossGuard
@@ -156,12 +157,12 @@ class Workload:
         samples, targets = self.samples[: len(keys)], self.targets[: len(keys)]
         return Batch(keys, views, targets, None, samples, self.divide(keys, views))
 
-    def step(self, batch: Batch, mark: Mark = unmarked) -> dict[str, Any]:
+    def step(self, batch: Batch) -> dict[str, Any]:
         """Take one training step."""
         self.steps += 1
-        frame, terms, sums = self.stepper.forward(self.steps, self.options, batch, mark)
+        frame, terms, sums = self.stepper.forward(self.steps, self.options, batch)
         self.guard.check(self.steps, [str(key) for key in batch.indices], sums, self.table, frame)
-        self.stepper.backward(self.steps, frame, terms, mark)
+        self.stepper.backward(self.steps, frame, terms)
         return {
             "splats": len(frame.projected.gaussian_ids),
             "visible": len(frame.projected.visible_ids),
@@ -176,7 +177,8 @@ class Workload:
             batch = self.batch(keys, views)
             self.ranks.barrier()
             clock = Clock(self.ranks.device)
-            result = self.step(batch, clock.mark)
+            with stages_told_to(clock.mark):
+                result = self.step(batch)
             yield clock.milliseconds(), result
 
     def in_a_row(self) -> float:

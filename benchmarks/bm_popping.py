@@ -31,12 +31,13 @@ from torch import Tensor
 
 from blitzgs.capture.pictures import to_uint8
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.render import RenderOptions, Views, render_frame
+from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.runs import files as run_files
+from blitzgs.ops.projection_types import Views
+from blitzgs.runs import run_files
 from blitzgs.runs.cameras import load_cameras
-from blitzgs.runs.files import TrainedModel
 from blitzgs.runs.lod import MOST_KEPT, level_fork
+from blitzgs.runs.run_files import TrainedModel
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.charts import line_chart
 from blitzgs.view.gate import LodGate, SceneGate, centres_of

@@ -19,7 +19,7 @@ gsplat-default-reset (with the resets of opacities that 1.5.3 skips by mistake) 
     seeds: [0, 1, 2]
 
 --stress YAML runs the stress grid of a configuration (`benchmarks/quality_plan.py`) instead of recipes, and
-writes stress.md; --part 2/8 runs an eighth of it.
+writes stress.md.
 
 Every run is a process. By default, each GPU has one run at a time. With more (--per-gpu) the models are as
 good, but times no longer compare, and the table says so. When a run ends, it writes a JSON file into
@@ -51,8 +51,6 @@ from quality_plan import (
     STRESS_SEEDS,
     RunSpec,
     parse_named,
-    parse_part,
-    part_of,
     read_plan,
     runs_of,
     stress_markdown,
@@ -232,7 +230,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--seeds", type=int, nargs="+", help="of the trainings (default: the plan's, or 0)")
     parser.add_argument("--plan", type=Path, metavar="YAML", help="captures, recipes and seeds")
     parser.add_argument("--stress", metavar="YAML", help="run the stress grid of this configuration")
-    parser.add_argument("--part", type=parse_part, metavar="K/N", help="with --stress: this part of the grid")
     parser.add_argument(
         "--evaluate-at",
         type=positive,
@@ -272,7 +269,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         seeds = args.seeds or plan.get("seeds") or [0]
         evaluate_at = args.evaluate_at
         if args.stress is not None:
-            recipes |= part_of(stress_recipes(args.stress), args.part or (1, 1))
+            recipes |= stress_recipes(args.stress)
             seeds, evaluate_at = args.seeds or STRESS_SEEDS, []
         quality_report.collect(args.out, args.collect or [])
         specs = []

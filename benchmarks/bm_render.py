@@ -26,16 +26,15 @@ from torch import Tensor
 
 from blitzgs import rasterization
 from blitzgs.frame.render import (
-    Mark,
     RenderOptions,
-    Views,
     backward_splats,
     inputs_of,
     render_frame,
-    unmarked,
+    stage_ended,
+    stages_told_to,
 )
 from blitzgs.frame.transport import LocalTransport
-from blitzgs.ops.projection_types import WeightedViews
+from blitzgs.ops.projection_types import Views, WeightedViews
 from blitzgs.table.table import GaussianTable
 
 try:
@@ -71,16 +70,16 @@ class OurRender:
         self.views = Views(scene.viewmats, scene.Ks, scene.width, scene.height)
         self.transport = LocalTransport()
 
-    def forward(self, mark: Mark = unmarked) -> Tensor:
+    def forward(self) -> Tensor:
         """Return the image [B, H, W, 3]."""
         self.frame = render_frame(
-            self.table, self.views, OPTIONS, transport=self.transport, mark=mark, backward_follows=True
+            self.table, self.views, OPTIONS, transport=self.transport, backward_follows=True
         )
         return self.frame.renders
 
-    def backward(self, v_renders: Tensor, mark: Mark = unmarked) -> None:
+    def backward(self, v_renders: Tensor) -> None:
         """Differentiate, to compact splats, dropping what the forward pass kept as soon as it is used."""
-        v_splats = backward_splats(self.frame, v_renders, mark).parts
+        v_splats = backward_splats(self.frame, v_renders).parts
         splats = self.frame.projected
         columns = [splats.camera_ids, splats.visible_ids, splats.splat_offsets]
         del self.frame, splats
@@ -89,7 +88,7 @@ class OurRender:
             list(inputs.gaussians), *WeightedViews(*inputs.cameras), *columns, None, *inputs.options,
             v_splats, None, False,
         )  # fmt: skip
-        mark("project back")
+        stage_ended("project back")
 
 
 class CallRender:
@@ -157,11 +156,12 @@ def stages(render: OurRender, v_renders: Tensor, repeats: int) -> dict[str, floa
     samples: dict[str, list[float]] = {stage: [] for stage in STAGES.values()}
     for _ in range(WARM_UP + repeats):
         clock = Clock()
-        render.forward(clock.mark)
-        render.backward(v_renders, clock.mark)
-        for mark, ms in clock.stages():
-            if mark in STAGES:
-                samples[STAGES[mark]].append(ms)
+        with stages_told_to(clock.mark):
+            render.forward()
+            render.backward(v_renders)
+        for stage, ms in clock.stages():
+            if stage in STAGES:
+                samples[STAGES[stage]].append(ms)
     return {stage: statistics.median(sample[WARM_UP:]) for stage, sample in samples.items()}
 
 

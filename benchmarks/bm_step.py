@@ -13,7 +13,6 @@ scene, by default in Morton order, as the trainer keeps its table. Medians of CU
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -27,8 +26,9 @@ from blitzgs.config.fields import LossConfig, OptimiserConfig, ScheduleConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import Views
+from blitzgs.frame.transport import stage_ended, stages_told_to
 from blitzgs.ops.photometric import photometric_fwd_bwd
+from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, GaussianTable
@@ -99,10 +99,10 @@ class OurStep:
             self.table[name].copy_(self.step - 1 - self.behind)
         self.stepper.reindex()
 
-    def take(self, mark: Callable[[str], None]) -> None:
+    def take(self) -> None:
         """Take one step."""
-        frame, terms, _ = self.stepper.forward(self.step, OPTIONS, self.batch, mark)
-        self.stepper.backward(self.step, frame, terms, mark)
+        frame, terms, _ = self.stepper.forward(self.step, OPTIONS, self.batch)
+        self.stepper.backward(self.step, frame, terms)
         self.visible = len(frame.projected.visible_ids)
 
 
@@ -121,17 +121,17 @@ class GsplatStep:
     def prepare(self) -> None:
         """Do nothing; there is nothing to prepare."""
 
-    def take(self, mark: Callable[[str], None]) -> None:
+    def take(self) -> None:
         """Take one step."""
         image = self.render.forward()
-        mark("render")
+        stage_ended("render")
         v_image = photometric_fwd_bwd(image.detach(), self.batch.targets, None, *self.weights)[1]
-        mark("loss")
+        stage_ended("loss")
         self.optimiser.zero_grad(set_to_none=True)
         image.backward(v_image)
-        mark("render back")
+        stage_ended("render back")
         self.optimiser.step()
-        mark("optimiser")
+        stage_ended("optimiser")
 
 
 def measure(step: OurStep | GsplatStep, repeats: int) -> list[tuple[str, float]]:
@@ -140,7 +140,8 @@ def measure(step: OurStep | GsplatStep, repeats: int) -> list[tuple[str, float]]
     for _ in range(WARM_UP + repeats):
         step.prepare()
         clock = Clock()
-        step.take(clock.mark)
+        with stages_told_to(clock.mark):
+            step.take()
         stages = clock.stages()
         samples.append([*stages, ("total", sum(ms for _, ms in stages))])
     columns = zip(*samples[WARM_UP:], strict=True)

@@ -171,21 +171,6 @@ def popping_rows(file: Json) -> Rows:
     ]
 
 
-def curve_rows(file: Json) -> Rows:
-    """Tabulate what views can leave out, by rule."""
-    return [
-        {
-            "left out by": line["rule"],
-            "splats": f"{line['left out']:.0%}",
-            "below": f"{line['threshold']:.3g}",
-            "of the light": f"{line['light']:.2%}",
-            "PSNR against all": f"{line['PSNR against all']:.1f}",
-        }
-        for lines in (run["curve"] for run in file["results"] if "curve" in run)
-        for line in lines
-    ]
-
-
 def rank_rows(file: Json) -> Rows:
     """Tabulate runs of one arm on several ranks, against the one on one rank."""
 
@@ -238,6 +223,6 @@ def _budget(images: Json, kind: str) -> str:
 
 TABLES: dict[str, Callable[[Json], Rows]] = {
     "city": city_rows, "city_arms": arm_rows, "city_costs": cost_rows, "city_phases": phase_rows,
-    "city_popping": popping_rows, "city_curve": curve_rows, "city_ranks": rank_rows,
+    "city_popping": popping_rows, "city_ranks": rank_rows,
     "city_memory": memory_rows,
 }  # fmt: skip

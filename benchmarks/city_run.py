@@ -32,8 +32,8 @@ from quality_run import describe, means_of, synchronize, write
 
 from blitzgs.config.fields import Config
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.files import TrainedModel
 from blitzgs.runs.log import LOG
+from blitzgs.runs.run_files import TrainedModel
 from blitzgs.training.agreement import Agreement
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture, read_ahead
@@ -214,8 +214,6 @@ def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float)
         if spec.popping and ranks.world_size == 1:
             state.catch_up()
             model = TrainedModel(state.config, state.progress, state.space, state.table)
-            result["curve"] = bm_popping.curve_of(model, capture.cameras, ranks.device)
-            note("curve")
             result["popping"] = popping(spec, model, capture.cameras, ranks)
             note("popped")
     result["status"] = "done" if is_done else "stopped"

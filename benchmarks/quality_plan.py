@@ -258,25 +258,6 @@ def stress_recipes(source: str) -> dict[str, str]:
     }
 
 
-def part_of(found: dict[str, str], part: tuple[int, int]) -> dict[str, str]:
-    """Return part K of N (from 1) of the recipes: each part has some of every schedule and change."""
-    number, count = part
-    return dict(list(found.items())[number - 1 :: count])
-
-
-def parse_part(text: str) -> tuple[int, int]:
-    """Read "K/N".
-
-    Raises:
-        ValueError: it is not 1 <= K <= N.
-    """
-    number, _, count = text.partition("/")
-    part = int(number), int(count)
-    if not 1 <= part[0] <= part[1]:
-        raise ValueError(f"part {text}: write K/N with K from 1 to N")
-    return part
-
-
 def stress_markdown(runs: Sequence[dict[str, Any]]) -> str:
     """Return the stress table: worst PSNR and largest fall over the seeds, and the loss against the column.
 

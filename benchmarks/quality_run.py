@@ -24,12 +24,11 @@ from quality_plan import RunSpec
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import files as run_files
 from blitzgs.runs.evaluation import METRICS, Lpips, evaluate, load_lpips
 from blitzgs.training.agreement import Agreement
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture
-from blitzgs.training.records import population_report
+from blitzgs.training.records import peak_memory_bytes, population_report
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.views import Space, ViewSet, render_options
 
@@ -73,7 +72,7 @@ class Recorder:
 
     def record(self, images: int, seconds: float, gaussians: int, end: bool, measure: Measure) -> None:
         """Measure held-out views, and training views if that was planned."""
-        self.peak_bytes = max(self.peak_bytes, run_files.peak_memory_bytes(self._device))
+        self.peak_bytes = max(self.peak_bytes, peak_memory_bytes(self._device))
         found: dict[str, Any] = {"images": images, "seconds": seconds, "gaussians": gaussians}
         capture = self._capture
         if capture.test:

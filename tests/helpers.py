@@ -15,9 +15,12 @@ from torch import Tensor
 import blitzgs
 from benchmarks.gradients import parameter_gradients as parameter_gradients
 from benchmarks.gradients import sum_of_ranks as sum_of_ranks
+from blitzgs.formats.models import FORMATS
 from blitzgs.ops.photometric import report_
 from blitzgs.reference import ReferenceImage, render
 from blitzgs.runs.checkpoint import Saving
+from blitzgs.runs.export import Exported, export, source_of
+from blitzgs.runs.folder import Model
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
 
@@ -183,3 +186,8 @@ def save_checkpoint(*arguments: Any, **options: Any) -> Path:
     if saving.deleting is not None:
         saving.deleting.join()
     return path
+
+
+def export_ply(model: Model, path: Path, coordinates: str = "auto", crs: str = "") -> Exported:
+    """Write a model of a run in INRIA's layout."""
+    return export(source_of(model), model.space, FORMATS["ply"], path, coordinates, crs)

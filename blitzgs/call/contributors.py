@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.call.arguments import check_options, check_tensors, gaussians_of
+from blitzgs.call.bad_values import check_intrinsics, warn_of_gradient, warn_of_non_finite
 from blitzgs.call.extras import checked_pixels
-from blitzgs.call.finite import check_intrinsics, warn_of_gradient, warn_of_non_finite
 from blitzgs.call.groups import CUDA_TILE_SIZE
 from blitzgs.ops.importance import UNITS, PixelSplats, pixel_splats, splat_contributions
 from blitzgs.ops.intersect import TileGrid

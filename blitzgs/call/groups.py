@@ -209,7 +209,7 @@ def render_queued(
     inputs: ProjectionInputs,
     gaussians: Gaussians,
     image: ImageOptions,
-    plain: bool,
+    only_colors: bool,
     tables: ShTables | None = None,
 ) -> Rendered:
     """Render without gradients; the differentiable ops take this result instead of computing it again.
@@ -220,7 +220,7 @@ def render_queued(
     Args:
         inputs: inputs of `project_splats`.
         image: options of compositing.
-        plain: whether the colours that the projection computes are all channels.
+        only_colors: whether the colours that the projection computes are all channels.
         tables: the SH, if they are not part of `inputs`.
     """
     options, means, signals = inputs.options, inputs.gaussians[0], gaussians.signals
@@ -235,18 +235,18 @@ def render_queued(
     def composite(exchange: Exchange) -> tuple[LocalExchange, list[Tensor]]:
         assert isinstance(exchange, LocalExchange)
         _, n_splats, n_isects = exchange.arrived
-        splats, totals = exchange.projected.splats, None if n_splats is None else exchange.projected.totals
+        projected, has_spare = exchange.projected, n_splats is not None
+        splats = projected.splats
         if tables is not None:
-            # The low half of the first total, the number of visible Gaussians.
-            tables.before(splats.visible_ids, None if totals is None else totals.view(torch.int32)[:1])
+            tables.before(splats.visible_ids, projected.n_visible if has_spare else None)
         channels = None
         if not sh:
-            channels = splats.colors if plain else channels_of(splats, gaussians, image, not exact)
+            channels = splats.colors if only_colors else channels_of(splats, gaussians, image, not exact)
         return exchange, torch.ops.blitzgs.render(
             splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids,
             splats.visible_ids, splats.splat_offsets, splats.radii, splats.tiles_touched,
             channels, image.render_mode != "RGB", rows_of, sh, *inputs.cameras, *options,
-            image.backgrounds, n_isects, backward_follows, totals,
+            image.backgrounds, n_isects, backward_follows, projected.totals if has_spare else None,
         )  # fmt: skip
 
     result, (exchange, outputs) = run_attempts(transport, inputs, None, composite)

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from blitzgs.call.arguments import Gaussians, Scene
+from blitzgs.call.bad_values import CamerasOnHost, check_intrinsics, watch_for_non_finite
 from blitzgs.call.channels import ImageOptions, channels_of, split_channels
 from blitzgs.call.extras import Pixels, Signals
-from blitzgs.call.finite import CamerasOnHost, check_intrinsics, watch_for_non_finite
 from blitzgs.call.groups import (
     Group,
     ShTables,
@@ -26,11 +26,11 @@ from blitzgs.call.groups import (
 from blitzgs.call.layout import Layout
 from blitzgs.call.lists import Lists, lists_of, lists_of_pixels
 from blitzgs.call.meta import make_meta
-from blitzgs.call.ranks import Job, send_splats
+from blitzgs.call.ranks import CallRanks, send_splats
 from blitzgs.ops.importance import pixel_splats
 from blitzgs.ops.project import differentiable_splats
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
-from blitzgs.ops.rasterize import Through, rasterize
+from blitzgs.ops.rasterize import MetaGeometry, rasterize
 
 _CHANNELS_AT_A_TIME = 64
 
@@ -38,89 +38,90 @@ _CHANNELS_AT_A_TIME = 64
 def render(
     function: str,
     gaussians: Gaussians,
-    project: ProjectionOptions,
+    projection: ProjectionOptions,
     image: ImageOptions,
     tables: ShTables | None = None,
-    job: Job | None = None,
+    job: CallRanks | None = None,
     groups: Sequence[Group] | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render images; return the results of `blitzgs.rasterization`.
 
     Args:
         function: name of the public function, for warnings.
-        project: options of the projection.
+        projection: options of the projection.
         image: options of compositing.
         tables: the SH, if only the rows of visible Gaussians are read; only where `groups_may_be_queued`.
         job: the ranks among which the Gaussians and views are divided; None: this process has all of them.
         groups: `groups_of` the Gaussians, which have SH, if they are already known.
     """
     compiling = torch.compiler.is_compiling()
-    colours: list[Tensor] = []
+    nan_marks: list[Tensor] = []
     if groups is None:
         shown = gaussians
         valued = gaussians.colors is not None and gaussians.sh_degree is None
         if valued or gaussians.signals is not None:
-            colours = [_nan_or_zero(scene, valued, gaussians.signals) for scene in gaussians.scenes]
-            shown = _without_non_finite(gaussians, colours)
-        groups = groups_of(shown, project)
-    beside = gaussians.signals is not None or image.normals
-    plain = gaussians.sh_degree is not None and not beside and image.render_mode == "RGB"
-    ready, cameras = None, None
+            nan_marks = [_nan_or_zero(scene, valued, gaussians.signals) for scene in gaussians.scenes]
+            shown = _without_non_finite(gaussians, nan_marks)
+        groups = groups_of(shown, projection)
+    with_others = gaussians.signals is not None or image.normals
+    only_colors = gaussians.sh_degree is not None and not with_others and image.render_mode == "RGB"
+    queued, cameras = None, None
     if job is None and not compiling and image.pixels is None and groups_may_be_queued(groups):
-        ready = render_queued(groups[0].inputs, gaussians, image, plain, tables)
-        splats = differentiable_splats(groups[0].inputs, image.sparse_grad, ready.splats, ready.rows)
+        queued = render_queued(groups[0].inputs, gaussians, image, only_colors, tables)
+        splats = differentiable_splats(groups[0].inputs, image.sparse_grad, queued.splats, queued.rows)
     else:
         cameras = None if compiling else CamerasOnHost(gaussians)
         splats = project_groups(groups, image.sparse_grad)
     layout = Layout(splats, (*gaussians.lead, gaussians.opacities.shape[-1]), image.packed)
     # As in gsplat, Gaussians without a splat have their own opacity.
-    over_all = not (image.packed or project.antialiased or image.sparse_grad)
+    over_all = not (image.packed or projection.antialiased or image.sparse_grad)
     arranged = layout.rendered_columns(gaussians.opacities if over_all else None)
-    rendered, through = splats, None
+    rendered, meta_geometry = splats, None
     if layout.places is not None:
         if compiling or job is not None:
             columns = layout.gather(*arranged.values())
             rendered = splats._replace(**dict(zip(arranged, columns, strict=True)))
         else:
-            through = Through(
+            meta_geometry = MetaGeometry(
                 layout.places.arrange, [arranged[name] for name in ("means2d", "conics", "opacities")]
             )
             if image.render_mode != "RGB" or image.median:
                 rendered = splats._replace(depths=layout.gather(arranged["depths"])[0])
-    channels, lead = rendered.colors if plain else channels_of(rendered, gaussians, image), gaussians.lead
+    channels = rendered.colors if only_colors else channels_of(rendered, gaussians, image)
+    lead = gaussians.lead
     if job is not None:
         (rendered, channels), lead = send_splats(rendered, channels, job), (job.views,)
     # The projection counts the tiles of the splats that it returns. Ranks exchange splats, and the conics of
     # covariances differ from the projection's by rounding, so their tiles have to be counted again.
-    if ready is not None:
-        size = (project.width, project.height, project.tile_size)
-        lists = composited_lists = Lists(ready.isect_splats, ready.tile_offsets, *size)
+    if queued is not None:
+        size = (projection.width, projection.height, projection.tile_size)
+        lists = composited_lists = Lists(queued.isect_splats, queued.tile_offsets, *size)
     elif image.pixels is None:
         uncounted = compiling or job is not None or groups[0].covariances is not None
         count = -1 if uncounted else int(splats.counts[2])
-        lists, composited_lists = lists_of(rendered, math.prod(lead), project, count)
+        lists, composited_lists = lists_of(rendered, math.prod(lead), projection, count)
     else:
-        lists, composited_lists = lists_of_pixels(rendered, math.prod(lead), project, image.pixels)
+        lists, composited_lists = lists_of_pixels(rendered, math.prod(lead), projection, image.pixels)
     renders, alphas = rasterize(
         rendered.means2d, rendered.conics, rendered.opacities, channels,
-        composited_lists.splats, composited_lists.offsets, n_cameras=math.prod(lead), width=project.width,
-        height=project.height, tile_size=composited_lists.tile_size, backgrounds=image.backgrounds,
-        tell_absgrad=layout.absgrad_teller(arranged["means2d"]) if image.absgrad else None,
-        composited=None if ready is None else ready.composited, through=through,
+        composited_lists.splats, composited_lists.offsets, n_cameras=math.prod(lead), width=projection.width,
+        height=projection.height, tile_size=composited_lists.tile_size, backgrounds=image.backgrounds,
+        store_absgrad=layout.absgrad_store(arranged["means2d"]) if image.absgrad else None,
+        composited=None if queued is None else queued.composited, meta_geometry=meta_geometry,
     )  # fmt: skip
     if not compiling:
         # A view with a bad camera sees no Gaussian. Reading `cameras` does not wait: the host has waited for
         # the projection, which was queued after their copy.
         suspects_cameras = not cameras.are_finite() if cameras is not None else False
-        if ready is not None and ready.has_blank_view:
+        if queued is not None and queued.has_blank_view:
             check_intrinsics(gaussians.named["Ks"])
             suspects_cameras = True
-        watch_for_non_finite(gaussians, layout, function, colours, suspects_cameras)
+        watch_for_non_finite(gaussians, layout, function, nan_marks, suspects_cameras)
     alphas = alphas.unsqueeze(-1)
     if image.pixels is not None:
         renders, alphas = (t.flatten(0, 2).index_select(0, image.pixels.numbers) for t in (renders, alphas))
     others: dict[str, Tensor] = {}
-    if beside:
+    if with_others:
         renders, others = split_channels(renders, gaussians, image)
     if image.median:
         others["render_median"] = _median_depths(rendered, composited_lists, math.prod(lead), image.pixels)
@@ -129,7 +130,7 @@ def render(
         covered = alphas.clone().clamp_(min=1e-10)
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / covered], dim=-1)
     if len(lead) > 1 and image.pixels is None:
-        shape = (*lead, project.height, project.width)
+        shape = (*lead, projection.height, projection.width)
         renders, alphas = renders.view(*shape, renders.shape[-1]), alphas.view(*shape, 1)
         others = {key: values.view(*shape, values.shape[-1]) for key, values in others.items()}
     arrived = None if job is None else rendered
@@ -176,10 +177,10 @@ def _nan_or_zero(scene: Scene, valued: bool, signals: Signals | None) -> Tensor:
     return totals[0] if len(totals) == 1 else totals[0] + totals[1]
 
 
-def _without_non_finite(gaussians: Gaussians, colours: Sequence[Tensor]) -> Gaussians:
-    """Set the opacity of Gaussians to 0 whose `colours` (`_nan_or_zero`) are NaN: NaN reaches no pixel."""
+def _without_non_finite(gaussians: Gaussians, nan_marks: Sequence[Tensor]) -> Gaussians:
+    """Set the opacity of Gaussians to 0 whose `nan_marks` are NaN: NaN reaches no pixel."""
     scenes = [
         scene._replace(opacities=scene.opacities.masked_fill(value.isnan(), 0))
-        for scene, value in zip(gaussians.scenes, colours, strict=True)
+        for scene, value in zip(gaussians.scenes, nan_marks, strict=True)
     ]
     return replace(gaussians, scenes=tuple(scenes))

@@ -159,12 +159,12 @@ class Layout:
         means2d, conics, depths, opacities = self.arrange(*columns, under=under)
         return {"means2d": means2d, "conics": conics, "opacities": opacities, "depths": depths}
 
-    def absgrad_teller(self, means2d: Tensor) -> Callable[[Tensor], None]:
+    def absgrad_store(self, means2d: Tensor) -> Callable[[Tensor], None]:
         """Set `means2d.absgrad` to 0; return a function that fills it with the splats' gradients, [P, 2]."""
         absgrad = torch.zeros_like(means2d)
         means2d.absgrad = absgrad  # type: ignore[attr-defined]
 
-        def tell(gradient: Tensor) -> None:
+        def store(gradient: Tensor) -> None:
             absgrad.copy_(self.arrange(gradient)[0])
 
-        return tell
+        return store

@@ -53,16 +53,16 @@ class Lists:
 
 
 def lists_of(
-    splats: ProjectedSplats, images: int, project: ProjectionOptions, count: int
+    splats: ProjectedSplats, images: int, projection: ProjectionOptions, count: int
 ) -> tuple[Lists, Lists]:
     """Return the tile lists for meta, and those to composite.
 
     Args:
         images: number of images I.
-        project: the size of the images, and the caller's tile size.
+        projection: the size of the images, and the caller's tile size.
         count: number of entries of the lists for meta; -1: unknown.
     """
-    width, height, tile_size = project.width, project.height, project.tile_size
+    width, height, tile_size = projection.width, projection.height, projection.tile_size
 
     def listed_by(size: int, n_isects: int) -> Lists:
         isect_splats, offsets = torch.ops.blitzgs.intersect(
@@ -78,7 +78,7 @@ def lists_of(
 
 
 def lists_of_pixels(
-    splats: ProjectedSplats, images: int, project: ProjectionOptions, pixels: Pixels
+    splats: ProjectedSplats, images: int, projection: ProjectionOptions, pixels: Pixels
 ) -> tuple[Lists, Lists]:
     """Return the tile lists for meta, and those to composite; they are empty but in tiles that have a pixel.
 
@@ -86,34 +86,33 @@ def lists_of_pixels(
 
     Args:
         images: number of images I.
-        project: the size of the images, and the caller's tile size.
+        projection: the size of the images, and the caller's tile size.
     """
-    lists = _lists_by(project.tile_size, splats, images, project, pixels)
-    if not splats.means2d.is_cuda or project.tile_size == CUDA_TILE_SIZE:
+    lists = _lists_by(projection.tile_size, splats, images, projection, pixels)
+    if not splats.means2d.is_cuda or projection.tile_size == CUDA_TILE_SIZE:
         return lists, lists
-    return lists, _lists_by(CUDA_TILE_SIZE, splats, images, project, pixels)
+    return lists, _lists_by(CUDA_TILE_SIZE, splats, images, projection, pixels)
 
 
 def _lists_by(
-    edge: int, splats: ProjectedSplats, images: int, project: ProjectionOptions, pixels: Pixels
+    edge: int, splats: ProjectedSplats, images: int, projection: ProjectionOptions, pixels: Pixels
 ) -> Lists:
-    rows, columns = -(-project.height // edge), -(-project.width // edge)
+    grid = TileGrid(images, projection.width, projection.height, edge)
+    rows, columns = -(-grid.height // edge), -(-grid.width // edge)
     wanted = torch.zeros(images, rows, columns, dtype=torch.bool, device=splats.means2d.device)
     wanted[pixels.images, pixels.rows // edge, pixels.columns // edge] = True
     near = _splats_near(splats, wanted, edge)
     own = [t.detach().index_select(0, near) for t in (splats.means2d, splats.conics, splats.opacities)]
     depths, camera_ids = (t.detach().index_select(0, near) for t in (splats.depths, splats.camera_ids))
-    listed, offsets = torch.ops.blitzgs.intersect(
-        *own, depths, camera_ids, None, *TileGrid(images, project.width, project.height, edge), -1, None, True
-    )
+    listed, offsets = torch.ops.blitzgs.intersect(*own, depths, camera_ids, None, *grid, -1, None, True)
     lengths, count = offsets.diff(), int(offsets[-1])
     kept = wanted.view(-1).repeat_interleave(lengths, output_size=count)
     ends = (lengths * wanted.view(-1)).cumsum(0)
     return Lists(
         near.index_select(0, listed[:count][kept]).int(),
         torch.cat([ends.new_zeros(1), ends]),
-        project.width,
-        project.height,
+        grid.width,
+        grid.height,
         edge,
     )
 

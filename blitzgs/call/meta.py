@@ -12,7 +12,7 @@ from torch import Tensor
 
 from blitzgs._torch import register_mapping
 from blitzgs.call.arguments import Gaussians
-from blitzgs.call.finite import non_finite
+from blitzgs.call.bad_values import non_finite
 from blitzgs.call.layout import Layout
 from blitzgs.call.lists import Lists
 from blitzgs.ops.projection_types import ProjectedSplats
@@ -162,9 +162,8 @@ def make_meta(
     """
     entries = _Entries(gaussians, layout, lists, lead, arrived)
     numbers = {
-        "tile_width": lists.tiles_x, "tile_height": lists.tiles_y, "tile_size": lists.tile_size,
-        "width": lists.width, "height": lists.height, "n_batches": len(gaussians.scenes),
-        "n_cameras": lead[-1],
+        "tile_size": lists.tile_size, "width": lists.width, "height": lists.height,
+        "n_batches": len(gaussians.scenes), "n_cameras": lead[-1],
     }  # fmt: skip
     known = {**numbers, **known}
     if torch.compiler.is_compiling():
@@ -204,6 +203,12 @@ class _Entries(NamedTuple):
 
     def tiles_per_gauss(self) -> Tensor:
         return self.layout.arrange(self.layout.splats.tiles_touched)[0]
+
+    def tile_width(self) -> int:
+        return self.lists.tiles_x
+
+    def tile_height(self) -> int:
+        return self.lists.tiles_y
 
     def isect_ids(self) -> Tensor:
         splats = self.layout.splats if self.arrived is None else self.arrived

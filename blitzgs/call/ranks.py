@@ -23,7 +23,7 @@ from blitzgs.ops.derivatives import linear_map
 from blitzgs.ops.projection_types import ProjectedSplats
 
 
-class Job(NamedTuple):
+class CallRanks(NamedTuple):
     """The ranks of a call.
 
     Attributes:
@@ -37,7 +37,9 @@ class Job(NamedTuple):
     views: int
 
 
-def gather_views(gaussians: Gaussians, absgrad: bool, same: Sequence[Any]) -> tuple[Gaussians, Job | None]:
+def gather_views(
+    gaussians: Gaussians, absgrad: bool, same: Sequence[Any]
+) -> tuple[Gaussians, CallRanks | None]:
     """Return this rank's Gaussians with the views of all ranks, M C, in the order of ranks.
 
     Collective.
@@ -63,7 +65,7 @@ def gather_views(gaussians: Gaussians, absgrad: bool, same: Sequence[Any]) -> tu
         )
     if not dist.is_initialized() or dist.get_world_size() == 1:
         return gaussians, None
-    job = Job(dist.get_rank(), dist.get_world_size(), gaussians.views)
+    job = CallRanks(dist.get_rank(), dist.get_world_size(), gaussians.views)
     scene, recorded = gaussians.scenes[0], torch.is_grad_enabled()
     inputs = scene._replace(Ks=scene.means, covariances=None)  # Ks get no gradient
     need = recorded and any(t is not None and t.requires_grad for t in inputs[:-1])
@@ -90,7 +92,7 @@ def _require_same(given: tuple[Any, ...], device: torch.device) -> None:
     )
 
 
-def send_splats(splats: ProjectedSplats, channels: Tensor, job: Job) -> tuple[ProjectedSplats, Tensor]:
+def send_splats(splats: ProjectedSplats, channels: Tensor, job: CallRanks) -> tuple[ProjectedSplats, Tensor]:
     """Send each splat to the rank that renders its view. Collective, as is its backward pass.
 
     Args:
@@ -129,7 +131,7 @@ def _all_to_all(table: Tensor, sent: list[int], received: list[int]) -> Tensor:
     return arrived
 
 
-def _gathered(values: Tensor, job: Job) -> Tensor:
+def _gathered(values: Tensor, job: CallRanks) -> Tensor:
     parts = [torch.empty_like(values, memory_format=torch.contiguous_format) for _ in range(job.size)]
     dist.all_gather(parts, values.contiguous())
     return torch.cat(parts)
@@ -147,7 +149,7 @@ def _sent(table: Tensor, sent: list[int], received: list[int]) -> Tensor:
     return arrived
 
 
-def _all_poses(viewmats: Tensor, job: Job) -> Tensor:
+def _all_poses(viewmats: Tensor, job: CallRanks) -> Tensor:
     """Gather the poses of all ranks; the gradient of a pose is the sum over all ranks."""
 
     def summed(_saved: Any, _needed: Any, v: Sequence[Tensor | None]) -> list[Tensor]:

@@ -17,9 +17,9 @@ from blitzgs.call.arguments import (
     with_covariances,
     with_signals,
 )
+from blitzgs.call.bad_values import warn_of_gradient
 from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.extras import checked_pixels
-from blitzgs.call.finite import warn_of_gradient
 from blitzgs.call.images import render
 from blitzgs.call.ranks import gather_views
 from blitzgs.ops.projection_types import ProjectionOptions
@@ -203,7 +203,7 @@ def rasterization(
     if covars is not None:
         gaussians = with_covariances(gaussians, covars)
     antialiased = rasterize_mode == "antialiased"
-    project = ProjectionOptions(
+    projection = ProjectionOptions(
         width,
         height,
         tile_size,
@@ -234,7 +234,7 @@ def rasterization(
         same = (width, height, tile_size, render_mode, channels, signals, return_normals)
         gaussians, job = gather_views(gaussians, absgrad, same)
     try:
-        return render("rasterization", gaussians, project, image, job=job)
+        return render("rasterization", gaussians, projection, image, job=job)
     except (RuntimeError, MemoryError) as error:
         explain_memory(error, gaussians.images, width, height, means.shape[-2], means.device)
         raise

@@ -21,8 +21,8 @@ from blitzgs.call.arguments import (
     check_tensors,
     gaussians_of,
 )
+from blitzgs.call.bad_values import warn_of_gradient
 from blitzgs.call.channels import ImageOptions, background_rows
-from blitzgs.call.finite import warn_of_gradient
 from blitzgs.call.groups import ShTables, gathered_groups, groups_may_be_queued, groups_of
 from blitzgs.call.images import render
 from blitzgs.ops.projection_types import ProjectionOptions
@@ -138,7 +138,7 @@ def raw_rasterization(
         tensors["sh0"] = sh0 = harmonics[0] = of_shape(sh0, (len(sh0), 1, 3))
     sh_degree = _checked_degree(harmonics, len(means), sh_degree, shaded)
     antialiased = rasterize_mode == "antialiased"
-    project = ProjectionOptions(
+    projection = ProjectionOptions(
         width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, True
     )
     whole = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, "D", raw=True)
@@ -160,13 +160,13 @@ def raw_rasterization(
         for optimizer in lazy:
             optimizer.catch_up(sh_params.values(), rows, count)
 
-    groups = groups_of(gaussians, project)
+    groups = groups_of(gaussians, projection)
     tables = ShTables(harmonics if shaded else (), catch_up_sh)
     if groups_may_be_queued(groups):
-        return render("raw_rasterization", gaussians, project, image, tables=tables, groups=groups)
+        return render("raw_rasterization", gaussians, projection, image, tables=tables, groups=groups)
     # Several groups, no Gaussians, or another tile size: gather the Gaussians that any group sees.
     groups = gathered_groups(groups, tables)
-    return render("raw_rasterization", gaussians, project, image, groups=groups)
+    return render("raw_rasterization", gaussians, projection, image, groups=groups)
 
 
 def _check_leaves(params: Mapping[str, Tensor]) -> None:

@@ -25,7 +25,7 @@ def mask_error(error: Exception) -> ValueError:
 def read_mask_file(path: Path) -> None:
     """Decode a mask (ValueError: it is damaged; says that it is a mask)."""
     try:
-        decode_mask(read_whole(path), str(path))
+        decode_mask(read_whole(path))
     except ValueError as error:
         raise mask_error(error) from error
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import os
 import threading
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -28,7 +27,6 @@ _HEADER_BYTES = 1 << 16
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _HEADERS_WITH_SIZE = ("JPEG", "PNG", "TIFF")
 _LFS_START = b"version https://git-lfs.github.com/spec/"
-_PNG_START = b"\x89PNG\r\n\x1a\n"
 # Formats without a mark by which their content would tell them.
 _FORMATS_BY_SUFFIX = {".tga": "TGA", ".pcx": "PCX", ".svg": "SVG", ".eps": "EPS", ".psd": "Photoshop"}
 _FORMATS_BY_SUFFIX |= {".ico": "ICO", ".sgi": "SGI", ".xbm": "XBM", ".xcf": "GIMP"}
@@ -38,6 +36,14 @@ _CONVERT = "convert it to PNG or JPEG"
 _NEARLY = 1 / 16
 # The least brightness, of the whole range, that the counted pixels of a lossy mask have.
 _LEAST_WHITE = 1 / 4
+
+
+class ImageFile(NamedTuple):
+    """The bytes of an image file, and what its header says (csrc/io/image_header.h)."""
+
+    name: str
+    data: bytes | UInt8
+    header: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -61,35 +67,39 @@ def read_header(path: Path) -> ImageHeader:
         found = None
         if data[:4] not in _TIFF_STARTS:  # a TIFF may have its header at its end
             try:
-                found = _describe(data, str(path))
+                found = described(data, str(path))
             except ValueError:  # the size follows a large preview or colour profile
                 found = None
-        if found is None or found["format"] not in _HEADERS_WITH_SIZE:
+        if found is None or found.header["format"] not in _HEADERS_WITH_SIZE:
             data += file.read()
-            found = _describe(data, str(path))
-    _check_supported(found, str(path))
-    width, height = found["width"], found["height"]
-    if found["format"] not in _HEADERS_WITH_SIZE:
-        pixels = _imdecode(data, cv2.IMREAD_UNCHANGED, str(path), found)
+            found = described(data, str(path))
+    _check_supported(found)
+    header = found.header
+    width, height = header["width"], header["height"]
+    if header["format"] not in _HEADERS_WITH_SIZE:
+        pixels = _imdecode(found, cv2.IMREAD_UNCHANGED)
         height, width = pixels.shape[:2]
-    return ImageHeader(width, height, found["orientation"], bool(found["alpha"]), found["extras"])
+    return ImageHeader(width, height, header["orientation"], bool(header["alpha"]), header["extras"])
 
 
-def _describe(data: bytes, name: str) -> dict[str, Any]:
-    """Return what the header of a file says (csrc/io/image_header.h)."""
-    if not data:
+def described(data: bytes | UInt8, name: str, header: dict[str, Any] | None = None) -> ImageFile:
+    """Return an image file in memory with what its header says; None: `header` is not read yet.
+
+    ValueError: it is damaged, or not an image file but what is there instead of one.
+    """
+    if len(data) == 0:
         raise ValueError(f"{name}: the file is empty; copy it again")
-    if data.startswith(_LFS_START):
+    if bytes(data[: len(_LFS_START)]) == _LFS_START:
         raise ValueError(f"{name}: a pointer of Git LFS, not the file itself; fetch it with git lfs pull")
-    found: dict[str, Any] = native.read_image_header(data, os.fsencode(name))
-    suffix = Path(name).suffix.lower()
-    if not found["format"] and suffix in _FORMATS_BY_SUFFIX:
-        return found | {"format": _FORMATS_BY_SUFFIX[suffix], "supported": False}
-    return found
+    found = native.read_image_header(data, os.fsencode(name)) if header is None else header
+    if not found["format"] and (kind := _FORMATS_BY_SUFFIX.get(Path(name).suffix.lower())):
+        found |= {"format": kind, "supported": False}
+    return ImageFile(name, data, found)
 
 
-def _check_supported(header: dict[str, Any], name: str) -> None:
+def _check_supported(file: ImageFile) -> None:
     """Refuse a photograph of a kind that would be decoded wrongly or not at all."""
+    name, header = file.name, file.header
     kind, bits, colors, alpha = (header[key] for key in ("format", "bits", "colors", "alpha"))
     bands = colors + header["extras"] + bool(alpha)
     if not header["supported"]:
@@ -128,8 +138,11 @@ _quiet_count, _loud = 0, 0
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep OpenCV from writing to the terminal; our messages name the file and the reason."""
+def quiet() -> Iterator[None]:
+    """Keep OpenCV from writing to the terminal; our messages name the file and the reason.
+
+    Within another such context it costs nothing.
+    """
     global _quiet_count, _loud
     log = cv2.utils.logging
     with _quiet_lock:
@@ -145,12 +158,13 @@ def _quiet() -> Iterator[None]:
                 log.setLogLevel(_loud)
 
 
-def _imdecode(data: bytes, flags: int, name: str, header: dict[str, Any]) -> npt.NDArray[Any]:
-    if data[:4] in _TIFF_STARTS:
+def _imdecode(file: ImageFile, flags: int) -> npt.NDArray[Any]:
+    name, data, header = file
+    if header["format"] == "TIFF":
         data = native.tiff_as_stored(data, os.fsencode(name))
     try:
-        with _quiet():
-            pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+        with quiet():
+            pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error as error:
         raise ValueError(f"{name}: cannot be decoded: {error}") from error
     if pixels is None:
@@ -160,57 +174,37 @@ def _imdecode(data: bytes, flags: int, name: str, header: dict[str, Any]) -> npt
     return np.asarray(pixels)
 
 
-def read_whole(path: Path) -> bytes:
-    """Return the bytes of an image file; refuse a file if a decoder would conceal its damage.
+def read_whole(path: Path) -> ImageFile:
+    """Return an image file; refuse it if a decoder would conceal its damage.
 
-    Decoders show the lost part of a JPEG as grey, without an error, so this function walks the codes of the
-    file. Damage that leaves a valid sequence of codes (most changes of a single bit) cannot be detected. The
+    Decoders show the lost part of a JPEG as grey, without an error, so the codes of the file are walked.
+    Damage that leaves a valid sequence of codes (most changes of a single bit) cannot be detected. The
     checksums of a PNG are compared, because decoders complain of them on the terminal. ValueError names the
     file, the byte offset and the reason.
     """
-    data = path.read_bytes()
-    if data[:2] == b"\xff\xd8":
-        native.check_jpeg(data, os.fsencode(path))
-    elif data[:8] == _PNG_START:
-        check_png(data, str(path))
-    return data
+    name = str(path)
+    data, header = native.read_image_file(name)
+    return described(data, name, header)
 
 
-def check_png(data: bytes, name: str) -> None:
-    """Refuse a PNG without all of its chunks, or with a wrong checksum of one that a picture needs."""
-    at, kinds = len(_PNG_START), set()
-    while b"IEND" not in kinds:
-        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
-        if len(data) < max(end, at + 12):
-            raise native.FormatError(f"{name}: at byte {at}: truncated PNG: it ends before its last chunk")
-        kind = data[at + 4 : at + 8]
-        # The names of chunks that a picture needs begin with a capital letter. Others may be damaged.
-        is_needed = not kind[0] & 0x20 or kind == b"tRNS"
-        checksum = int.from_bytes(data[end - 4 : end], "big")
-        if is_needed and zlib.crc32(memoryview(data)[at + 4 : end - 4]) != checksum:
-            raise native.FormatError(f"{name}: at byte {at}: damaged PNG: the checksum of a chunk is wrong")
-        kinds.add(kind)
-        at = end
-    if b"IDAT" not in kinds:
-        raise native.FormatError(f"{name}: damaged PNG: it has no image data")
-
-
-def decode_rgb(data: bytes, name: str, background: tuple[float, float, float] | None = None) -> UInt8:
+def decode_rgb(file: ImageFile, background: tuple[float, float, float] | None = None) -> UInt8:
     """Decode to RGB uint8 [H, W, 3] as stored (EXIF orientation not applied).
 
     If the file says that it has alpha, colours are composited over `background` (0 to 1); None: they are used
     as they are stored. ValueError: the file cannot be decoded, or is of a kind that is not supported.
     """
-    header = _describe(data, name)
-    _check_supported(header, name)
+    _check_supported(file)
+    header = file.header
     if background is not None and header["alpha"]:
-        pixels = _imdecode(data, cv2.IMREAD_UNCHANGED, name, header)
+        pixels = _imdecode(file, cv2.IMREAD_UNCHANGED)
         if (grey := header["transparent_grey"]) is not None and pixels.ndim == 2:
             pixels = _with_transparent_grey(pixels, grey, header["bits"])
         if pixels.ndim == 3 and pixels.shape[2] == 4:
             return _over(pixels, background, _full(pixels, header), header["alpha"] == "associated")
-    pixels = _imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, name, header)
-    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
+    pixels = _imdecode(file, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    rgb = np.empty_like(pixels)  # OpenCV would take the GIL once more to make it
+    cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB, rgb)
+    return rgb
 
 
 def check_photograph(path: Path) -> bool:
@@ -219,12 +213,12 @@ def check_photograph(path: Path) -> bool:
     JPEG and PNG files without alpha are not decoded: `read_whole` finds their damage. ValueError: the file is
     damaged or not supported; names it.
     """
-    data, name = read_whole(path), str(path)
-    header = _describe(data, name)
-    _check_supported(header, name)
+    file = read_whole(path)
+    _check_supported(file)
+    header = file.header
     if header["format"] in ("JPEG", "PNG") and not header["alpha"]:
         return True
-    pixels = _imdecode(data, cv2.IMREAD_UNCHANGED, name, header)
+    pixels = _imdecode(file, cv2.IMREAD_UNCHANGED)
     if header["alpha"] and pixels.ndim == 3 and pixels.shape[2] == 4:
         return bool(pixels[..., 3].any())
     return True
@@ -260,14 +254,14 @@ def _over(
     return np.asarray((np.minimum(blended, 1) * 255 + 0.5).astype(np.uint8))
 
 
-def decode_mask(data: bytes, name: str) -> UInt8:
+def decode_mask(file: ImageFile) -> UInt8:
     """Decode a mask to uint8 [H, W]: 0 where the file is black or transparent (excluded), 1 elsewhere.
 
     Numbers and colours may be labels, so of a lossless file only black is black; but a file of nothing else
     than nearly black and nearly white pixels has no labels. In a lossy file all darker than half its
     brightest pixel is black. If all colours are black, the transparent pixels are the excluded ones.
     """
-    header = _describe(data, name)
+    name, header = file.name, file.header
     if not header["supported"]:
         raise ValueError(f"{name}: not supported: {header['format']}; {_CONVERT}")
     if _is_misread(header):
@@ -275,7 +269,7 @@ def decode_mask(data: bytes, name: str) -> UInt8:
     # Labels may be small numbers of 16 bits or dark colours: a conversion to 8 bits or to grey would make
     # them black.
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    pixels = _imdecode(data, cv2.IMREAD_UNCHANGED if header["alpha"] else flags, name, header)
+    pixels = _imdecode(file, cv2.IMREAD_UNCHANGED if header["alpha"] else flags)
     full = _full(pixels, header)
     if (grey := header["transparent_grey"]) is not None and pixels.ndim == 2:
         pixels = _with_transparent_grey(pixels, grey, header["bits"])

@@ -14,13 +14,14 @@ or the order of calls.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import OrderedDict
 from collections.abc import Hashable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -32,10 +33,12 @@ from blitzgs.capture.cameras import Camera, Rectification, same_shape
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.check_files import FileCheck, mask_error
 from blitzgs.capture.image_files import (
+    ImageFile,
     UInt8,
     apply_orientation,
     decode_mask,
     decode_rgb,
+    quiet,
     read_whole,
     reduced,
     reduced_mask,
@@ -121,7 +124,7 @@ class ImageStore:
             raise TypeError(f"capture must be a Capture, as load_capture returns it, got {capture!r}")
         self.capture, self._shared = capture, shared
         self._background = background if capture.has_alpha else None
-        self.compressed: BoundedCache[Path | int, bytes] = BoundedCache(budget_bytes)
+        self.compressed: BoundedCache[Path | int, Any] = BoundedCache(budget_bytes)
         self._decoded_bytes = decoded_bytes
         self.decoded: BoundedCache[_Key, UInt8] = BoundedCache(self._decoded_budget())
         self._maps: OrderedDict[Rectification, _Maps] = OrderedDict()
@@ -133,6 +136,8 @@ class ImageStore:
         self._check: FileCheck | None = None
         self._whole_jpegs: set[Path] = set()  # that were read; their check takes half as long as decoding
         self._pool = ThreadPoolExecutor(max(1, threads), thread_name_prefix="blitzgs-images")
+        self._quiet = contextlib.ExitStack()
+        self._quiet.enter_context(quiet())
 
     def get(self, index: int, factor: int = 1) -> Tensor:
         """Return a camera's image, uint8 RGB [height, width, 3] on the CPU. It is shared: do not write to it.
@@ -201,6 +206,7 @@ class ImageStore:
         if self._check is not None:
             self._check.close()
         self._pool.shutdown(wait=True, cancel_futures=True)
+        self._quiet.close()
 
     def _room(self) -> int:
         # All images have a place in shared memory, so there this limit is never reached.
@@ -274,19 +280,19 @@ class ImageStore:
         self.decoded.put(key, pixels, pixels.nbytes, spare)
         return pixels
 
-    def _read(self, path: Path) -> bytes:
-        data = self.compressed.get(path)
-        if data is None:
-            data = self._read_whole(path)
+    def _read(self, path: Path) -> ImageFile:
+        file: ImageFile | None = self.compressed.get(path)
+        if file is None:
+            file = self._read_whole(path)
             if self._shared is None:  # an image in shared memory stays decoded
-                self.compressed.put(path, data, len(data))
-        return data
+                self.compressed.put(path, file, len(file.data))
+        return file
 
-    def _read_whole(self, path: Path) -> bytes:
-        data = read_whole(path)
-        if data[:2] == b"\xff\xd8":
+    def _read_whole(self, path: Path) -> ImageFile:
+        file = read_whole(path)
+        if file.header["format"] == "JPEG":
             self._whole_jpegs.add(path)
-        return data
+        return file
 
     def _make_image(self, index: int) -> UInt8:
         camera = self.capture.cameras[index]
@@ -324,7 +330,7 @@ class ImageStore:
     def _file_mask(self, camera: Camera, path: Path) -> UInt8:
         lens = camera.rectification.lens
         try:
-            mask = decode_mask(self._read(path), str(path))
+            mask = decode_mask(self._read(path))
         except ValueError as error:
             raise mask_error(error) from error
         stored = (lens.width, lens.height) if camera.orientation < 5 else (lens.height, lens.width)
@@ -340,9 +346,9 @@ class ImageStore:
             mask = _uint8(cv2.resize(mask, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST))
         return mask
 
-    def _decode(self, camera: Camera, data: bytes) -> UInt8:
+    def _decode(self, camera: Camera, file: ImageFile) -> UInt8:
         lens, path = camera.rectification.lens, camera.image_path
-        pixels = apply_orientation(decode_rgb(data, str(path), self._background), camera.orientation)
+        pixels = apply_orientation(decode_rgb(file, self._background), camera.orientation)
         if pixels.shape[:2] != (lens.height, lens.width):
             raise ValueError(
                 f"{path} is {pixels.shape[1]} x {pixels.shape[0]} now but was {lens.width} x {lens.height} "

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import warnings
 from collections import Counter
 from collections.abc import Sequence
@@ -109,7 +110,9 @@ def _hint(root: Path) -> str:
             f"move the model to {root / 'sparse' / '0'}"
         )
     if any(path.suffix.lower() in _PHOTOGRAPH_SUFFIXES for path in [*root.glob("*"), *root.glob("*/*")]):
-        return f"; it has images but not their cameras: blitzgs sfm {root} CAPTURE finds these"
+        return (
+            f"; it has images but not their cameras: blitzgs sfm {shlex.quote(str(root))} CAPTURE finds these"
+        )
     return ""
 
 

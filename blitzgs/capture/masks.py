@@ -156,6 +156,6 @@ def check_masks(masks: Sequence[Path | None]) -> None:
 
 def _share(path: Path) -> float | None:
     try:
-        return 1.0 - float(decode_mask(read_whole(path), str(path)).mean())
+        return 1.0 - float(decode_mask(read_whole(path)).mean())
     except (OSError, ValueError):
         return None

@@ -98,6 +98,7 @@ class SharedImages:
         self._bytes = np.frombuffer(mmap.mmap(file, 0), dtype=np.uint8)
         self._flags = self._bytes[_TOKEN_BYTES : _TOKEN_BYTES + len(shapes)]
         self._places: dict[Hashable, tuple[int, UInt8]] = {}
+        self._found: dict[Hashable, UInt8] = {}  # the images whose flags this process has seen
         begin = _begin_of_images(len(shapes))
         for number, (key, shape) in enumerate(shapes.items()):
             end = begin + math.prod(shape)
@@ -129,8 +130,12 @@ class SharedImages:
 
     def get(self, key: Hashable) -> UInt8 | None:
         """Return an image in shared memory; None if no process has put it there yet. Do not write to it."""
-        number, pixels = self._places[key]
-        return pixels if native.flag_is_set(self._flags, number) else None
+        found = self._found.get(key)  # a step asks for each of its images several times
+        if found is None:
+            number, pixels = self._places[key]
+            if native.flag_is_set(self._flags, number):
+                found = self._found[key] = pixels
+        return found
 
     def put(self, key: Hashable, pixels: UInt8) -> UInt8:
         """Copy an image to its place, and return it there."""

@@ -116,7 +116,7 @@ def fit_similarity(capture: Float64, world: Float64, crs: str = "", source: str 
     return WorldFrame(crs, scale, rotation, target - scale * rotation @ mean, source)
 
 
-def read_frame(path: Path) -> WorldFrame:
+def read_world_frame(path: Path) -> WorldFrame:
     """Read `geo.json` (ValueError: the file is damaged)."""
     try:
         content = json.loads(read_small(path))
@@ -148,7 +148,7 @@ def frame_beside(root: Path) -> WorldFrame | None:
     the reference system in a `.prj` beside it, if there is one. ValueError: the file is damaged.
     """
     if (root / GEO).is_file():
-        return read_frame(root / GEO)
+        return read_world_frame(root / GEO)
     paths = sorted({*root.glob("*offset.xyz"), *root.glob("offset.txt")})
     return read_offset(paths[0], sorted(root.glob("*.prj"))) if paths else None
 

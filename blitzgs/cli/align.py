@@ -23,8 +23,8 @@ from blitzgs.capture.world import (
 )
 from blitzgs.cli.arguments import Commands, add_capture, add_command, add_path, add_run
 from blitzgs.config.files import load_config
-from blitzgs.runs import files as run_files
-from blitzgs.runs.world import load_frame, save_frame
+from blitzgs.runs import run_files
+from blitzgs.runs.world import load_world_frame, save_world_frame
 from blitzgs.training.inputs import load_configured
 from blitzgs.util.terminal import printable
 
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         frame = _converted(args, capture)
     _warn_if_turned_over(frame, capture)
-    path = save_frame(args.folder, frame)
+    path = save_world_frame(args.folder, frame)
     print(f"{path}: {printable(frame.name)}, scale {frame.scale:.9g}")
     return 0
 
@@ -164,7 +164,7 @@ def _centres(capture: Capture) -> Float64:
 
 
 def _converted(args: argparse.Namespace, capture: Capture) -> WorldFrame:
-    known = load_frame(args.folder) or capture.about.source.frame
+    known = load_world_frame(args.folder) or capture.about.source.frame
     if known is None or not known.crs:
         _check_lengths(args.crs)
         frame = known or WorldFrame()

@@ -47,6 +47,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 # The largest errors of the small rendering in float32, and of its gradients relative to the largest of each.
 _IMAGE_ERROR, _GRADIENT_ERROR = 1e-5, 1e-3
 _SLOW_DISK_MB_S = 50
+TIMEOUT = 120.0  # seconds of each test
 _LITTLE_MEMORY = 4 << 30
 _NOT_FOR_USERS = ("test", "lint", "all")
 _REINSTALL = "pip install --force-reinstall --no-deps blitzgs (in a checkout: make build)"
@@ -75,18 +76,11 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     add_path(
         parser, "--folder", "DIR", "measure the disk of this folder too, with a file of 64 MB that is removed"
     )
-    parser.add_argument(
-        "--timeout",
-        type=float,
-        default=120.0,
-        metavar="SECONDS",
-        help="end each test after this time (default: %(default)g)",
-    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the report; returns 1 if something required is missing or failed, else 0."""
-    lines = examine(args.folder, args.timeout)
+    lines = examine(args.folder)
     broken = [line for line in lines if line.required and line.state in ("missing", "failed")]
     if args.json:
         print(json.dumps({"ok": not broken, "lines": [asdict(line) for line in lines]}, indent=1))
@@ -99,28 +93,28 @@ def run(args: argparse.Namespace) -> int:
     return 1 if broken else 0
 
 
-def examine(folder: Path | None = None, timeout: float = 120.0) -> list[Line]:
+def examine(folder: Path | None = None) -> list[Line]:
     """Return the lines of the report."""
     lines = [Line("blitzgs", "ok", f"{__version__} in {_PACKAGE}"), _system(), _memory(), *_packages()]
-    torch_line = _torch(timeout)
+    torch_line = _torch()
     gpus = torch_line.values.get("gpus", [])
     lines += [
         torch_line,
-        _driver(timeout),
+        _driver(),
         *(_gpu(number, gpu) for number, gpu in enumerate(gpus)),
-        _nvcc(timeout),
+        _nvcc(),
     ]
     works = torch_line.state in ("ok", "warning")
-    checks: list[Callable[[], Line]] = [lambda: _library("io", timeout)]
+    checks: list[Callable[[], Line]] = [lambda: _library("io")]
     if works:
         backends = ["cpu", *(["cuda"] if gpus else [])]
-        checks += [lambda name=name: _library(name, timeout, gpus) for name in backends]  # type: ignore[misc]
-        checks += [lambda device=device: _render(device, timeout) for device in backends]  # type: ignore[misc]
-        checks.append(lambda: _exchange("cpu", timeout))
+        checks += [lambda name=name: _library(name, gpus) for name in backends]  # type: ignore[misc]
+        checks += [lambda device=device: _render(device) for device in backends]  # type: ignore[misc]
+        checks.append(lambda: _exchange("cpu"))
         if gpus:
-            checks.append(lambda: _exchange("cuda", timeout) if len(gpus) > 1 else _nccl(timeout))
+            checks.append(lambda: _exchange("cuda") if len(gpus) > 1 else _nccl())
     if folder is not None:
-        checks.append(lambda: _disk(folder, timeout))
+        checks.append(lambda: _disk(folder))
     with ThreadPoolExecutor(2) as pool:
         lines += pool.map(lambda check: check(), checks)
     if not works:
@@ -128,10 +122,10 @@ def examine(folder: Path | None = None, timeout: float = 120.0) -> list[Line]:
     return lines
 
 
-def probe(name: str, *arguments: str, timeout: float) -> dict[str, Any]:
+def probe(name: str, *arguments: str) -> dict[str, Any]:
     """Run a probe in a process of its own and return what it found; raises ProbeError as `run_command`."""
     command = [sys.executable, "-m", "blitzgs.cli.doctor_probes", name, *arguments]
-    output = run_command(command, timeout)
+    output = run_command(command)
     try:
         found: dict[str, Any] = json.loads(output.splitlines()[-1])
     except (IndexError, ValueError) as error:
@@ -139,10 +133,10 @@ def probe(name: str, *arguments: str, timeout: float) -> dict[str, Any]:
     return found
 
 
-def run_command(command: Sequence[str], timeout: float) -> str:
+def run_command(command: Sequence[str]) -> str:
     """Run a command, with all processes that it starts, and return its standard output.
 
-    ProbeError: it cannot be started, failed, was killed or took longer than `timeout` seconds.
+    ProbeError: it cannot be started, failed, was killed or took longer than `TIMEOUT`.
     """
     path = os.pathsep.join(filter(None, [str(_PACKAGE.parent), os.environ.get("PYTHONPATH")]))
     try:
@@ -158,11 +152,11 @@ def run_command(command: Sequence[str], timeout: float) -> str:
     except OSError as error:
         raise ProbeError(f"{command[0]}: {error.strerror}") from error
     try:
-        output, errors = process.communicate(timeout=timeout)
+        output, errors = process.communicate(timeout=TIMEOUT)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
-        raise ProbeError(f"no answer within {timeout:g} s") from None
+        raise ProbeError(f"no answer within {TIMEOUT:g} s") from None
     if process.returncode < 0:
         raise ProbeError(f"ended by {signal.Signals(-process.returncode).name}: {_last(errors)}")
     if process.returncode:
@@ -237,12 +231,12 @@ def _version(text: str) -> tuple[int, ...]:
     return tuple(map(int, re.findall(r"\d+", text.partition("+")[0])[:2]))
 
 
-def _torch(timeout: float) -> Line:
+def _torch() -> Line:
     bounds = _torch_bounds()
     limits = ",".join(f"{sign}{version}" for sign, version in bounds.items())
     install = f"pip install 'torch{limits}'" if bounds else "pip install torch"
     try:
-        found = probe("torch", timeout=timeout)
+        found = probe("torch")
     except ProbeError as error:
         missing = "No module named 'torch'" in str(error)
         return Line("torch", "missing" if missing else "failed", str(error), install)
@@ -257,12 +251,12 @@ def _torch(timeout: float) -> Line:
     return Line("torch", "ok", text, values=found)
 
 
-def _driver(timeout: float) -> Line:
+def _driver() -> Line:
     query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     if shutil.which("nvidia-smi") is None:
         return Line("driver", "missing", "no NVIDIA driver: BlitzGS trains on the CPU", "", False)
     try:
-        version = run_command(query, timeout).split("\n")[0]
+        version = run_command(query).split("\n")[0]
     except ProbeError as error:
         return Line("driver", "failed", str(error), "restart the machine, or install the driver again", False)
     return Line("driver", "ok", f"NVIDIA {version}", "", False)
@@ -275,17 +269,17 @@ def _gpu(number: int, gpu: dict[str, Any]) -> Line:
     return Line(f"GPU {number}", "ok", text, "", False, gpu)
 
 
-def _nvcc(timeout: float) -> Line:
+def _nvcc() -> Line:
     if shutil.which("nvcc") is None:
         return Line("nvcc", "missing", "only needed to build the CUDA library from the sources", "", False)
     try:
-        found = re.search(r"release [\d.]+", run_command(["nvcc", "--version"], timeout))
+        found = re.search(r"release [\d.]+", run_command(["nvcc", "--version"]))
     except ProbeError as error:
         return Line("nvcc", "warning", str(error), "", False)
     return Line("nvcc", "ok", found[0] if found else "", "", False)
 
 
-def _library(name: str, timeout: float, gpus: Sequence[dict[str, Any]] = ()) -> Line:
+def _library(name: str, gpus: Sequence[dict[str, Any]] = ()) -> Line:
     path = LIBRARY_DIR / f"libblitzgs_{name}.so"
     line = f"lib {name}"
     if not path.exists():
@@ -293,7 +287,7 @@ def _library(name: str, timeout: float, gpus: Sequence[dict[str, Any]] = ()) -> 
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     text = f"{path.stat().st_size / 1e6:.1f} MB, sha256 {digest}"
     try:
-        found = probe("library", name, timeout=timeout)
+        found = probe("library", name)
     except ProbeError as error:
         return Line(line, "failed", f"{text}: {error}", _REINSTALL)
     if "cuda" in found:
@@ -306,9 +300,9 @@ def _library(name: str, timeout: float, gpus: Sequence[dict[str, Any]] = ()) -> 
     return Line(line, "ok", text, values=found | {"sha256": digest})
 
 
-def _render(device: str, timeout: float) -> Line:
+def _render(device: str) -> Line:
     try:
-        found = probe("render", device, timeout=timeout)
+        found = probe("render", device)
     except ProbeError as error:
         return Line(f"render {device}", "failed", str(error), _REINSTALL)
     good = found["image_error"] <= _IMAGE_ERROR and found["gradient_error"] <= _GRADIENT_ERROR
@@ -320,13 +314,13 @@ def _render(device: str, timeout: float) -> Line:
     return Line(f"render {device}", "ok" if good else "failed", text, remedy, values=found)
 
 
-def _exchange(device: str, timeout: float) -> Line:
+def _exchange(device: str) -> Line:
     """Let two processes render together."""
     port = _free_port()
     name = "exchange " + ("Gloo" if device == "cpu" else "NCCL")
     try:
         with ThreadPoolExecutor(2) as pool:
-            found = list(pool.map(lambda rank: probe("exchange", device, rank, port, timeout=timeout), "01"))
+            found = list(pool.map(lambda rank: probe("exchange", device, rank, port), "01"))
     except ProbeError as error:
         remedy = "allow connections to 127.0.0.1; until then train with one process"
         return Line(name, "failed", str(error), remedy, False)
@@ -338,9 +332,9 @@ def _exchange(device: str, timeout: float) -> Line:
     return Line(name, "ok" if good else "failed", text, remedy, False, {"ranks": found})
 
 
-def _nccl(timeout: float) -> Line:
+def _nccl() -> Line:
     try:
-        good = probe("nccl", _free_port(), timeout=timeout)["sum"] == 28.0
+        good = probe("nccl", _free_port())["sum"] == 28.0
     except ProbeError as error:
         return Line("exchange NCCL", "failed", str(error), "NCCL_DEBUG=WARN blitzgs doctor", False)
     text = "one GPU: it sums" if good else "one GPU: a wrong sum"
@@ -353,9 +347,9 @@ def _free_port() -> str:
         return str(listener.getsockname()[1])
 
 
-def _disk(folder: Path, timeout: float) -> Line:
+def _disk(folder: Path) -> Line:
     try:
-        found = probe("disk", str(folder), timeout=timeout)
+        found = probe("disk", str(folder))
     except ProbeError as error:
         return Line("disk", "failed", f"{folder}: {error}", "choose a folder that can be written", False)
     slow = min(found["write_mb_s"], found["read_mb_s"]) < _SLOW_DISK_MB_S

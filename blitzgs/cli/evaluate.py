@@ -16,7 +16,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians, is_antialiased
 from blitzgs.formats.models import read_gaussians
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.cameras import input_files
 from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
 from blitzgs.runs.lod import lod_gate, scene_gate

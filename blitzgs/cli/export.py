@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import shlex
 import sys
 import time
 from collections.abc import Iterable
@@ -23,9 +24,9 @@ from blitzgs.formats.selection import Selected, Selection, read_polygon
 from blitzgs.formats.web_page import check_replaces_page
 from blitzgs.runs.clean import cleaned
 from blitzgs.runs.export import COORDINATES, Exported, export, open_source, source_of, without_antialiasing
-from blitzgs.runs.files import run_and_checkpoint
 from blitzgs.runs.folder import Model, open_run
-from blitzgs.runs.world import in_world, load_frame
+from blitzgs.runs.run_files import run_and_checkpoint
+from blitzgs.runs.world import in_world, load_world_frame
 from blitzgs.util.output import write_file
 
 # Default of --max-mb, and the largest file whose text browsers still hold in one piece.
@@ -193,7 +194,7 @@ def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
         f"{time.monotonic() - start:.0f} s"
     )
     if args.tiles:
-        print(f"look at it: blitzgs view {path}")
+        print(f"look at it: blitzgs view {shlex.quote(str(path))}")
     return 0
 
 
@@ -273,7 +274,7 @@ def _export_run(
             model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
         crs = ""
         if coordinates == "world":
-            frame = load_frame(run_folder)
+            frame = load_world_frame(run_folder)
             if frame is None:
                 raise FileNotFoundError(
                     f"{run_folder} has no geo.json, so its place in the world is unknown: use blitzgs align"

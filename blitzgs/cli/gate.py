@@ -14,7 +14,7 @@ from blitzgs.config.fields import ScheduleConfig
 from blitzgs.config.files import ConfigError, changed, load_config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.folder import open_run
 from blitzgs.spawn import fit as gate_fit
 from blitzgs.spawn import samples as spawn_samples

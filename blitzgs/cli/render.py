@@ -26,7 +26,7 @@ from blitzgs.cli import arguments
 from blitzgs.cli.arguments import chosen_views
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, RunCameras, input_files, load_cameras
 from blitzgs.runs.evaluation import render_view
 from blitzgs.runs.lod import lod_gate, scene_gate

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TextIO
 
 from blitzgs.cli.arguments import Commands, add_command, add_path, add_run
-from blitzgs.runs.files import check_is_run
+from blitzgs.runs.run_files import check_is_run
 from blitzgs.util.terminal import printable
 
 HELP = """\

@@ -15,7 +15,7 @@ from blitzgs.capture.transforms import find_transforms
 from blitzgs.cli.arguments import Commands, add_command, add_path
 from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
-from blitzgs.runs.files import CONFIG
+from blitzgs.runs.run_files import CONFIG
 from blitzgs.sfm.photographs import Photographs, estimate, has_photographs_alone, photograph_folder
 from blitzgs.sfm.reconstruct import MAPPERS, PAIRS, WORK, Settings, is_finished, reconstruct
 from blitzgs.util.terminal import printable

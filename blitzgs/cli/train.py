@@ -24,7 +24,7 @@ from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, changed, default_recipe, load_config, recipe_path, to_dict
 from blitzgs.config.ranges import describe, describe_all, describe_page
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.folder_checks import locked
 from blitzgs.training.budget import LEAST_IMAGES, estimate
 from blitzgs.training.inputs import open_capture, read_ahead
@@ -185,10 +185,13 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.check:
         return _check(args, config)
-    if not args.no_sfm:
-        config = with_poses(config, args.sfm or args.out.with_name(f"{args.out.name}_capture"))
     job, laps = config.ranks, Laps(since_start=True)
     laps.lap("imports")
+    if not args.no_sfm:
+        posed = with_poses(config, args.sfm or args.out.with_name(f"{args.out.name}_capture"))
+        if posed is not config:
+            laps.lap("poses")
+        config = posed
     with (
         kept_warnings() as warned,
         nullcontext(read_ahead(config.data)) as reading,  # while the ranks join
@@ -214,14 +217,12 @@ def run(args: argparse.Namespace) -> int:
             trainer = Trainer(config, capture, images, args.out, ranks, args.resume, args.extend, laps)
             trainer.warned = warned
             if args.viewer is not None:
-                trainer.watch(live_page(trainer.state, args.viewer, args.viewer_host), args.viewer_stay)
+                trainer.watch(live_page(trainer.state, args.viewer, args.viewer_host))
             summary = trainer.train()
             if ranks.rank == 0:
                 write_final_report(args.out, summary)
                 if summary is not None:
                     _print_summary(summary, args.out)
-                    say_where_to_look(args)
-            trainer.show_on()
     return 0
 
 
@@ -269,6 +270,21 @@ def _config(args: argparse.Namespace) -> Config:
     return config
 
 
+# How figures are printed: label, digits after the point, unit.
+_FIGURES: dict[str, tuple[str, int, float]] = {
+    "psnr": ("PSNR, dB", 2, 1),
+    "ssim": ("SSIM", 4, 1),
+    "psnr_corrected": ("PSNR, colours fitted, dB", 2, 1),
+    "images": ("images trained on", 0, 1),
+    "seconds": ("training time, minutes", 1, 60),
+    "images_per_second": ("images per second", 1, 1),
+    "gaussians": ("Gaussians", 0, 1),
+    "peak_gaussians": ("Gaussians at most", 0, 1),
+    "peak_memory_bytes": ("peak memory, GB", 2, 1e9),
+    "largest_fall": ("largest fall of the training PSNR, dB", 2, 1),
+}
+
+
 def _print_summary(summary: dict[str, object], folder: Path) -> None:
     console, table = Console(emoji=False), Table(show_header=False)
     # Print the path verbatim: rich must not interpret brackets and colons in it.
@@ -276,8 +292,9 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
     if summary.get("split") == "train":
         console.print("no view is held out: the figures are those of the training views", style="yellow")
     for name, value in summary.items():
+        label, digits, unit = _FIGURES.get(name, (name, 4 if isinstance(value, float) else 0, 1))
         if isinstance(value, (int, float)):
-            table.add_row(name, f"{value:,.4f}" if isinstance(value, float) else f"{value:,}")
+            table.add_row(label, f"{value / unit:,.{digits}f}")
     console.print(table)
     # Quoted, so that the commands can be copied.
     name = shlex.quote(str(folder))
@@ -312,19 +329,6 @@ def add_live_page(parser: argparse.ArgumentParser) -> None:
         metavar="HOST",
         help="address to listen on (default: %(default)s, this machine only)",
     )
-    parser.add_argument(
-        "--viewer-stay",
-        action="store_true",
-        help="after the training, keep the page open until Ctrl-C (default: it closes)",
-    )
-
-
-def say_where_to_look(args: argparse.Namespace) -> None:
-    """Print whether the page of a finished training stays open."""
-    if args.viewer is not None and args.viewer_stay:
-        print("the viewer's page stays open (Ctrl-C ends)", flush=True)
-    elif args.viewer is not None:
-        print("the viewer's page is closed: see above, or train with --viewer-stay to keep it open")
 
 
 def live_page(state: TrainingState, port: int, host: str) -> Live | None:

@@ -25,7 +25,7 @@ from blitzgs.cli.arguments import (
 )
 from blitzgs.distributed.group import Ranks, extend_memory_in_place, resolve_device
 from blitzgs.formats.tiles import PAGE, TILESET
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.training.inputs import open_capture
 
 HELP = """\

@@ -14,7 +14,7 @@ from torch.nn import Parameter
 
 from blitzgs.ops.population import MAX_COPIES, position_noise_
 from blitzgs.population.density import CHILDREN_OF_A_SPLIT, SPLIT_SHRINK, rotations
-from blitzgs.population.relocation import shared
+from blitzgs.population.relocation import shared_among_copies
 
 Params = MutableMapping[str, Parameter]
 Optimizers = Mapping[str, torch.optim.Optimizer]
@@ -354,7 +354,7 @@ class MCMCStrategy(Strategy):
         times = torch.bincount(sources, minlength=len(params["means"]))
         rows = times.nonzero()[:, 0]
         opacities, scales = params["opacities"].detach(), params["scales"].detach()
-        logits, logs = shared(
+        logits, logs = shared_among_copies(
             opacities.flatten()[rows], scales[rows], (times[rows] + 1).clamp(max=MAX_COPIES)
         )
         logits = logits.clamp(min=math.log(self.min_opacity / (1 - self.min_opacity)))

@@ -142,7 +142,7 @@ class GaussianRasterizer(torch.nn.Module):
         renders, _ = rasterize(
             means2d, splats.conics, splats.opacities, channels, *lists,
             n_cameras=1, width=width, height=height, backgrounds=background,
-            tell_absgrad=None if means2D_densify is None else absolute.append,
+            store_absgrad=None if means2D_densify is None else absolute.append,
         )  # fmt: skip
         image, radii = renders[0].permute(2, 0, 1), _radii(splats, len(means3D))
         if of_depth is None:

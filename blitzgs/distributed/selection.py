@@ -2,7 +2,7 @@
 """Exact selection over all ranks: the k smallest keys, and the shortest prefix that holds a share of a mass.
 
 Both find a threshold by refining a histogram of the float's bits. Each round sums one histogram over the
-ranks, of at most 2^16 integers for each set of rows, so no rank needs the others' scores. All sums are
+ranks, of at most 2^16 integers, so no rank needs the others' scores. All sums are
 integers, so the same rows are selected at every world size. Ids decide between equal scores.
 """
 
@@ -62,40 +62,28 @@ def smallest(keys: Tensor, ids: Tensor, k: int, ranks: Ranks) -> Tensor:
     for width in _KEY_DIGITS:
         shift -= width
         counts = ranks.all_reduce(key_histogram(keys, prefix, shift, width))
-        digit, left = _descend(counts[None], left)
+        digit, left = _descend(counts, left)
         prefix = (prefix << width) | digit
     limit = key_of_bits(prefix)
     tied = keys == limit
     # Usually all tied rows are selected.
     if bool(counts[digit] > left):
-        rows = tied.nonzero().squeeze(1)
-        last, _ = _kth(ids[rows], _ID_DIGITS, left, torch.zeros_like(rows), ranks)
-        tied[rows] = ids[rows] <= last
+        _keep_smallest_ids(tied, ids, left, ranks)
     return tied.logical_or_(keys < limit)
 
 
-def mass_prefix(
-    scores: Tensor,
-    ids: Tensor,
-    fraction: float,
-    ranks: Ranks,
-    segments: Tensor | None = None,
-    n_segments: int = 1,
-) -> Tensor:
+def mass_prefix(scores: Tensor, ids: Tensor, fraction: float, ranks: Ranks) -> Tensor:
     """Mark the fewest rows, by descending score (ties by id), that hold a share of the total score.
 
     Args:
         scores: float32 [N_rank], finite, >= 0.
-        ids: int64 [N_rank], >= 0, unique over all ranks within a segment.
+        ids: int64 [N_rank], >= 0, unique over all ranks.
         fraction: share of the total of all ranks, in [0, 1]; its decimal value counts (0.99 is 99/100).
         ranks: the job.
-        segments: int64 [N_rank] in [0, n_segments), to select in several independent sets at once (views of
-            a sweep, say); None: one set.
-        n_segments: number of sets.
 
     Returns:
-        bool [N_rank]; the same ids at every world size. The sums are exact. A set whose total is zero selects
-        nothing.
+        bool [N_rank]; the same ids at every world size. The sums are exact. If the total is zero, nothing is
+        marked.
 
     Raises:
         ValueError: on every rank, when a score of any rank is negative or not finite, or for a fraction
@@ -103,25 +91,18 @@ def mass_prefix(
     """
     if not 0 <= fraction <= 1:
         raise ValueError(f"mass_prefix: fraction must be in [0, 1], got {fraction}")
-    share = decimal_share(fraction)
     n_invalid = ranks.all_reduce((~scores.isfinite() | (scores < 0)).sum()).item()
     if n_invalid:
         raise ValueError(f"mass_prefix: {n_invalid} scores are negative or not finite")
-    if segments is None:
-        segments = torch.zeros_like(ids)
     bits = scores.clamp(min=0.0).view(torch.int32).to(torch.int64)
     # An ascending order of these keys is a descending order of the scores.
     keys = (1 << 31) - 1 - bits
     mantissas = (bits & ((1 << _MANTISSA_BITS) - 1)) | ((bits >> _MANTISSA_BITS > 0).long() << _MANTISSA_BITS)
-    threshold, left = _mass_threshold(keys, mantissas, share, segments, n_segments, ranks)
-    return _with_ties(
-        keys,
-        ids,
-        torch.tensor(threshold, device=keys.device),
-        torch.tensor(left, device=keys.device),
-        segments,
-        ranks,
-    )
+    threshold, left = _mass_threshold(keys, mantissas, decimal_share(fraction), ranks)
+    tied = keys == threshold
+    if ranks.all_reduce(tied.sum()).item() > left:
+        _keep_smallest_ids(tied, ids, torch.tensor([left], device=keys.device), ranks)
+    return tied.logical_or_(keys < threshold)
 
 
 def integer_mass_prefix(
@@ -135,8 +116,8 @@ def integer_mass_prefix(
 ) -> Tensor:
     """Mark the fewest items of each segment, by descending weight, that hold a share of its total.
 
-    This is `mass_prefix` for integers. With one rank the host does not wait for the device. Several ranks
-    wait once, and exchange one histogram of all segments per round.
+    This is `mass_prefix` for integers, in several independent sets. With one rank the host does not wait for
+    the device. Several ranks wait once, and exchange one histogram of all segments per round.
 
     Args:
         weights: int64 [P], not negative; a segment's sum over all ranks must be below 2^62.
@@ -174,82 +155,53 @@ def integer_mass_prefix(
     return cut.chosen
 
 
-def _kth(
-    keys: Tensor,
-    digits: tuple[int, ...],
-    k: Tensor,
-    segments: Tensor,
-    ranks: Ranks,
-) -> tuple[Tensor, Tensor]:
-    """Find the k-th smallest key of each segment.
-
-    Args:
-        keys: int64 [N_rank] >= 0, below 2^sum(digits).
-        digits: bits per round.
-        k: int64 [S], 1-based and at most the segment's size; 0 gives the threshold -1.
-        segments: int64 [N_rank].
-        ranks: the job.
-
-    Returns:
-        threshold [S], and left [S]: how many of the rows equal to it are among the k.
-    """
-    left, prefix, shift = k.clone(), torch.zeros_like(k), sum(digits)
-    for width in digits:
+def _keep_smallest_ids(tied: Tensor, ids: Tensor, k: Tensor, ranks: Ranks) -> None:
+    """Unmark, of the marked rows of all ranks, all but the k with the smallest ids; k: int64 [1], > 0."""
+    rows = tied.nonzero().squeeze(1)
+    left, last, shift = k, torch.zeros_like(k), sum(_ID_DIGITS)
+    for width in _ID_DIGITS:
         shift -= width
-        counts = _histogram(keys, prefix, shift, width, segments, None, ranks)
-        digit, left = _descend(counts, left)
-        prefix = (prefix << width) | digit
-    return torch.where(k > 0, prefix, -1), torch.where(k > 0, left, 0)
+        digit, left = _descend(_histogram(ids[rows], last, shift, width, None, ranks), left)
+        last = (last << width) | digit
+    tied[rows] = ids[rows] <= last
 
 
 def _descend(counts: Tensor, left: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the digit [S] at which counts [S, digits] reach `left` [S], and how many are left before it."""
-    ends = counts.cumsum(1)
-    digit = (ends < left[:, None]).sum(1).clamp(max=counts.shape[1] - 1)
-    return digit, left - (ends - counts).gather(1, digit[:, None]).squeeze(1)
+    """Find the digit [1] at which counts [digits] reach `left` [1], and how many are left before it."""
+    ends = counts.cumsum(0)
+    digit = (ends < left).sum(0, keepdim=True).clamp(max=len(counts) - 1)
+    return digit, left - (ends - counts).gather(0, digit)
 
 
-def _mass_threshold(
-    keys: Tensor, mantissas: Tensor, share: Fraction, segments: Tensor, n_segments: int, ranks: Ranks
-) -> tuple[list[int], list[int]]:
-    """Find, per segment, the key at which the mass of the rows before it and of some equal to it suffices.
+def _mass_threshold(keys: Tensor, mantissas: Tensor, share: Fraction, ranks: Ranks) -> tuple[int, int]:
+    """Find the key at which the mass of the rows before it and of some equal to it suffices.
 
     Masses are integers: a score is mantissa * 2^max(exponent, 1), in units of the smallest positive float.
 
     Returns:
-        threshold (-1: select nothing) and how many rows equal to it are needed, one of each per segment.
+        threshold (-1: select nothing), and how many rows equal to it are needed.
     """
-    prefix = torch.zeros(n_segments, dtype=torch.int64, device=keys.device)
-    missing: list[int] = []
-    shift = sum(_SCORE_DIGITS)
+    prefix, shift = 0, sum(_SCORE_DIGITS)
+    missing: int | None = None
     for width in _SCORE_DIGITS:
         shift -= width
-        sums = _histogram(keys, prefix, shift, width, segments, mantissas, ranks).tolist()
-        chosen = []
-        for segment, (start, row) in enumerate(zip(prefix.tolist(), sums, strict=True)):
-            masses = [
-                mass << _exponent((start << width | digit) << shift) if mass else 0
-                for digit, mass in enumerate(row)
-            ]
-            if not missing or len(missing) <= segment:
-                total = sum(masses)
-                missing.append(-(-total * share.numerator // share.denominator))
-            digit = 0
-            while digit < len(masses) - 1 and masses[digit] < missing[segment]:
-                missing[segment] -= masses[digit]
-                digit += 1
-            chosen.append(digit)
-        prefix = (prefix << width) | torch.tensor(chosen, device=keys.device)
-    threshold, left = prefix.tolist(), []
-    for segment, key in enumerate(threshold):
-        bits = (1 << 31) - 1 - key
-        score = (bits & ((1 << _MANTISSA_BITS) - 1) | (bits >> _MANTISSA_BITS > 0) << _MANTISSA_BITS) << (
-            _exponent(key)
-        )
-        left.append(-(-missing[segment] // score) if missing[segment] > 0 else 0)
-        if missing[segment] <= 0:
-            threshold[segment] = -1
-    return threshold, left
+        sums = _histogram(keys, prefix, shift, width, mantissas, ranks).tolist()
+        masses = [
+            mass << _exponent((prefix << width | digit) << shift) if mass else 0
+            for digit, mass in enumerate(sums)
+        ]
+        if missing is None:
+            missing = -(-sum(masses) * share.numerator // share.denominator)
+        digit = 0
+        while digit < len(masses) - 1 and masses[digit] < missing:
+            missing -= masses[digit]
+            digit += 1
+        prefix = prefix << width | digit
+    if not missing:
+        return -1, 0
+    bits = (1 << 31) - 1 - prefix
+    mantissa = bits & ((1 << _MANTISSA_BITS) - 1) | (bits >> _MANTISSA_BITS > 0) << _MANTISSA_BITS
+    return prefix, -(-missing // (mantissa << _exponent(prefix)))
 
 
 def _exponent(key: int) -> int:
@@ -258,39 +210,16 @@ def _exponent(key: int) -> int:
 
 
 def _histogram(
-    keys: Tensor,
-    prefix: Tensor,
-    shift: int,
-    width: int,
-    segments: Tensor,
-    weights: Tensor | None,
-    ranks: Ranks,
+    keys: Tensor, prefix: Tensor | int, shift: int, width: int, weights: Tensor | None, ranks: Ranks
 ) -> Tensor:
-    """Count (or add up the weights of) the keys under each segment's prefix, by their next digit.
+    """Count (or add up the weights of) the keys under a prefix, by their next digit.
 
     Returns:
-        int64 [S, 2^width], summed over the ranks.
+        int64 [2^width], summed over the ranks.
     """
     heads = keys >> shift
-    under = (heads >> width == prefix[segments]).nonzero().squeeze(1)
-    bins = (segments[under] << width) | (heads[under] & ((1 << width) - 1))
-    counts = torch.zeros(len(prefix) << width, dtype=torch.int64, device=keys.device)
+    under = (heads >> width == prefix).nonzero().squeeze(1)
+    bins = heads[under] & ((1 << width) - 1)
+    counts = torch.zeros(1 << width, dtype=torch.int64, device=keys.device)
     counts.index_add_(0, bins, torch.ones_like(bins) if weights is None else weights[under])
-    return ranks.all_reduce(counts).view(len(prefix), 1 << width)
-
-
-def _with_ties(
-    keys: Tensor, ids: Tensor, threshold: Tensor, left: Tensor, segments: Tensor, ranks: Ranks
-) -> Tensor:
-    """Mark the rows below their segment's threshold and, of those equal to it, the `left` smallest ids."""
-    limit = threshold[segments]
-    tied = (keys == limit).nonzero().squeeze(1)
-    chosen = keys < limit
-    counts = torch.zeros_like(left).index_add_(0, segments[tied], torch.ones_like(tied))
-    if not bool((ranks.all_reduce(counts) > left).any()):
-        # The usual case: all tied rows are selected.
-        chosen[tied] = True
-        return chosen
-    last, _ = _kth(ids[tied], _ID_DIGITS, left, segments[tied], ranks)
-    chosen[tied] = ids[tied] <= last[segments[tied]]
-    return chosen
+    return ranks.all_reduce(counts)

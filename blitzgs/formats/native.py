@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The compiled readers of files (csrc/io), loaded when they are first needed.
 
-They run without the GIL. Arrays that they return own the memory that was filled; arguments are not copied if
-they have the wanted type.
+They run without the GIL, if they take longer than it takes to get it back. Arrays that they return own the
+memory that was filled; arguments are not copied if they have the wanted type.
 """
 
 from __future__ import annotations
 
 import ctypes
+import json
 import os
-import weakref
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -26,9 +27,17 @@ class FormatError(ValueError):
     """A file is damaged; the message has the file, the place and the reason."""
 
 
+def _system_error(message: str) -> OSError:
+    """Return the error that Python's own functions raise; the message is that of csrc/io/image_file.h."""
+    number, _, path = message.partition(" ")
+    return OSError(int(number), os.strerror(int(number)), path)
+
+
 # In the order of blitzgs_io_type and blitzgs_io_status_code of csrc/io/io_api.cpp.
 _TYPES = tuple(np.dtype(name) for name in ("u1", "u4", "i8", "u8", "f8"))
-_ERRORS = (None, FormatError, ValueError, MemoryError, RuntimeError)
+_ERRORS: tuple[Callable[[str], Exception] | None, ...] = (
+    None, FormatError, ValueError, MemoryError, RuntimeError, _system_error,
+)  # fmt: skip
 
 
 class _Column(ctypes.Structure):
@@ -36,15 +45,15 @@ class _Column(ctypes.Structure):
 
 
 @cache
-def _library() -> ctypes.CDLL:
-    """Load libblitzgs_io.so.
+def _library(kind: type[ctypes.CDLL]) -> ctypes.CDLL:
+    """Load libblitzgs_io.so, whose functions keep the GIL if it is loaded as a `ctypes.PyDLL`.
 
     Raises:
         ImportError: it was not built, or cannot be loaded; says how to build it.
     """
     path = LIBRARY_DIR / "libblitzgs_io.so"
     try:
-        library = ctypes.CDLL(str(path))
+        library = kind(str(path))
     except OSError as error:
         raise ImportError(
             f"the readers of files are not built ({error}): run `pip install .`, or `make build` "
@@ -63,36 +72,51 @@ def _library() -> ctypes.CDLL:
 class _Reply:
     """The memory of the results of a call, which lives as long as one of the arrays in it."""
 
-    def __init__(self, handle: int) -> None:
-        weakref.finalize(self, _library().blitzgs_io_free, handle)
+    def __init__(self, handle: int, free: Callable[[int], None]) -> None:
+        self._handle, self._free = handle, free
 
-    def array(self, column: _Column) -> Array:
-        dtype = _TYPES[column.type]
-        if not column.size:
-            return np.empty(0, dtype)
-        memory = (ctypes.c_char * (column.size * dtype.itemsize)).from_address(column.data)
-        memory.reply = self
-        return np.frombuffer(memory, dtype)
+    def __del__(self) -> None:
+        self._free(self._handle)
 
 
-def _call(name: str, *arguments: Path | Array) -> list[Array]:
-    """Call a function of csrc/io/io_api.cpp; arrays must be contiguous."""
-    library = _library()
+class _Memory:
+    """A column of a reply as numpy takes it; an array of it keeps the reply alive."""
+
+    def __init__(self, reply: _Reply, column: _Column, dtype: np.dtype[Any]) -> None:
+        self._reply = reply
+        data, shape = (column.data, False), (column.size,)
+        self.__array_interface__ = {"version": 3, "shape": shape, "typestr": dtype.str, "data": data}
+
+
+def _array_of(reply: _Reply, column: _Column) -> Array:
+    dtype = _TYPES[column.type]
+    return np.asarray(_Memory(reply, column, dtype)) if column.size else np.empty(0, dtype)
+
+
+def _call(name: str, *arguments: Path | Array, keeps_gil: bool = False) -> list[Array]:
+    """Call a function of csrc/io/io_api.cpp; arrays must be contiguous.
+
+    `keeps_gil`: for microseconds of work. Whoever gets the GIL meanwhile may keep it for longer.
+    """
+    quick = _library(ctypes.PyDLL)
+    library = quick if keeps_gil else _library(ctypes.CDLL)
     values = [os.fsencode(value) if isinstance(value, str) else value for value in arguments]
     columns = (_Column * len(values))()
     for column, value in zip(columns, values, strict=True):
         if isinstance(value, bytes):
             column.data, column.size = ctypes.cast(ctypes.c_char_p(value), ctypes.c_void_p).value, len(value)
         else:
-            column.data, column.size, column.type = value.ctypes.data, value.size, _TYPES.index(value.dtype)
+            column.data, column.size = value.__array_interface__["data"][0], value.size
+            column.type = _TYPES.index(value.dtype)
     handle = library.blitzgs_io_call(name.encode(), columns, len(columns))
     if not handle:
         raise MemoryError
-    reply = _Reply(handle)
-    if error := _ERRORS[library.blitzgs_io_status(handle)]:
-        raise error(os.fsdecode(library.blitzgs_io_message(handle)))
+    reply = _Reply(handle, library.blitzgs_io_free)
+    if error := _ERRORS[quick.blitzgs_io_status(handle)]:
+        raise error(os.fsdecode(quick.blitzgs_io_message(handle)))
     found = ctypes.POINTER(_Column)()
-    return [reply.array(found[i]) for i in range(library.blitzgs_io_columns(handle, ctypes.byref(found)))]
+    count = quick.blitzgs_io_columns(handle, ctypes.byref(found))
+    return [_array_of(reply, found[i]) for i in range(count)]
 
 
 def _array(values: object, dtype: str) -> Array:
@@ -169,41 +193,39 @@ def read_ply(
     return _texts(comments, comment_ends), properties, int(count[0]), rows, int(total[0])
 
 
-def check_jpeg(data: bytes, name: Path) -> None:
-    """Refuse a JPEG that is damaged (csrc/io/jpeg.h); `name` names it in the message."""
-    _call("check_jpeg", data, name)
+def read_image_file(path: Path) -> tuple[Array, dict[str, Any]]:
+    """Read the bytes of an image file, uint8, and `read_image_header` of it.
+
+    A JPEG or PNG whose damage a decoder would conceal is refused (csrc/io/image_file.h).
+    """
+    header, data = _call("read_image_file", path)
+    return data, json.loads(header.tobytes())
 
 
-def read_image_header(data: bytes, name: Path) -> dict[str, Any]:
+def read_image_header(data: bytes | Array, name: Path) -> dict[str, Any]:
     """Return what the header of an image says: the fields of `ImageHeader` in csrc/io/image_header.h."""
-    texts, ends, numbers, flags, grey = _call("read_image_header", data, name)
-    numbered = ("width", "height", "orientation", "bits", "colors", "extras")
-    flagged = ("supported", "is_white_zero", "is_lossy", "is_planar")
-    return {
-        **dict(zip(("format", "samples", "alpha"), _texts(texts, ends), strict=True)),
-        **dict(zip(numbered, numbers.tolist(), strict=True)),
-        **dict(zip(flagged, (flags != 0).tolist(), strict=True)),
-        "transparent_grey": None if grey[0] < 0 else int(grey[0]),
-    }
+    (header,) = _call("read_image_header", data, name)
+    found: dict[str, Any] = json.loads(header.tobytes())
+    return found
 
 
-def tiff_as_stored(data: bytes, name: Path) -> bytes:
+def tiff_as_stored(data: bytes | Array, name: Path) -> bytes | Array:
     """Return a TIFF that OpenCV decodes as it is stored (csrc/io/image_header.h)."""
     (changed,) = _call("tiff_as_stored", data, name)
-    return changed.tobytes() if len(changed) else data
+    return changed if len(changed) else data
 
 
-def encode_qoi(rgb: Array) -> bytes:
-    """Return a picture, uint8 [H, W, 3], as a QOI file."""
+def encode_qoi(rgb: Array) -> Array:
+    """Return a picture, uint8 [H, W, 3], as the bytes of a QOI file."""
     if rgb.ndim != 3 or rgb.shape[2] != 3:
         raise ValueError("qoi: the image must be [H, W, 3]")
     (file,) = _call(
         "encode_qoi", _array(rgb, "u1"), _array(rgb.shape[:1], "u8"), _array(rgb.shape[1:2], "u8")
     )
-    return file.tobytes()
+    return file
 
 
-def decode_qoi(data: bytes) -> Array:
+def decode_qoi(data: bytes | Array) -> Array:
     """Return the picture in a QOI file, uint8 [H, W, 3]."""
     size, rgb = _call("decode_qoi", data)
     return rgb.reshape(int(size[0]), int(size[1]), 3)
@@ -211,9 +233,9 @@ def decode_qoi(data: bytes) -> Array:
 
 def set_flag(flags: npt.NDArray[np.uint8], index: int) -> None:
     """Set a flag in shared memory: who sees it also sees all that was written before."""
-    _call("set_flag", flags[index : index + 1])
+    _call("set_flag", flags[index : index + 1], keeps_gil=True)
 
 
 def flag_is_set(flags: npt.NDArray[np.uint8], index: int) -> bool:
     """Tell whether `set_flag` was called for a flag."""
-    return bool(_call("flag_is_set", flags[index : index + 1])[0][0])
+    return bool(_call("flag_is_set", flags[index : index + 1], keeps_gil=True)[0][0])

@@ -21,46 +21,29 @@ from torch import Tensor
 from blitzgs._library import below_autograd
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import (
+    Arrived,
     Exchange,
     LocalTransport,
-    Mark,
     Traffic,
     Transport,
     WayBack,
     open_transport,
-    unmarked,
+    stage_ended,
 )
 from blitzgs.frame.transport.protocol import ExchangeResult
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.intersect import TileGrid
-from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions, Sizes, Splats
+from blitzgs.ops.projection_types import (
+    ProjectedSplats,
+    ProjectionInputs,
+    ProjectionOptions,
+    Sizes,
+    Splats,
+    Views,
+)
 from blitzgs.ops.rasterize import RasterizeSaved
 from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients
 from blitzgs.table.table import GaussianTable
-
-
-@dataclass(frozen=True)
-class Views:
-    """B pinhole views of one image size, rendered together.
-
-    Attributes:
-        viewmats: world to camera, float32 [B, 4, 4].
-        Ks: intrinsics in pixels, float32 [B, 3, 3].
-        width: pixels.
-        height: pixels.
-    """
-
-    viewmats: Tensor
-    Ks: Tensor
-    width: int
-    height: int
-
-    def __len__(self) -> int:
-        return self.viewmats.shape[0]
-
-    def as_arguments(self) -> tuple[Tensor, Tensor, int, int]:
-        """Return viewmats, Ks, width and height, for functions that take these as separate arguments."""
-        return self.viewmats, self.Ks, self.width, self.height
 
 
 @dataclass(frozen=True)
@@ -162,7 +145,6 @@ def render_frame(
     active: ActiveRows | Callable[[Sizes | None], ActiveRows] | None = None,
     assignment: TileAssignment | None = None,
     transport: Transport | None = None,
-    mark: Mark = unmarked,
     backward_follows: bool = False,
 ) -> Frame:
     """Render views of a table whose active rows have no pending optimiser steps.
@@ -171,13 +153,12 @@ def render_frame(
         views: at most 32 views.
         options: how to render.
         active: rows to consider, and the views of each; None: all rows in all views. Or a function that finds
-            them, given the estimated sizes of the frame (see `run_attempts`).
+            them, given the capacity for the frame (see `run_attempts`).
         assignment: the tiles of each rank; every rank of the job calls this with its table. None: render all
             tiles from this table alone.
         transport: sends the splats to the ranks that composite them. A transport that is used for several
             frames estimates the sizes of a frame from the frames before, so that the device need not wait for
             the host; the result does not depend on it. None: a new one.
-        mark: called at the end of each stage: "project", "exchange", "sort", "raster".
         backward_follows: prepare for a backward pass, which is then faster; the backward pass also works
             without.
 
@@ -191,19 +172,18 @@ def render_frame(
     backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
     rows = active if active is None or isinstance(active, ActiveRows) else None
 
-    def inputs(sizes: Sizes | None) -> ProjectionInputs:
+    def inputs(capacity: Sizes | None) -> ProjectionInputs:
         nonlocal rows
         if callable(active):
-            rows = active(sizes)
+            rows = active(capacity)
         return inputs_of(table, views, options, rows)
 
-    def composite(exchange: Exchange) -> _Composited:
-        splats, n_splats, n_isects = exchange.arrived
+    def composite(exchange: Exchange) -> tuple[list[Tensor], Sequence[Tensor], Tensor | None]:
+        """Return the tiles' lists, what `rasterize_fwd` returns, and zeros for the gradients of splats."""
+        splats, n_splats, _ = exchange.arrived
+        lists = tile_lists(exchange.arrived, grid)
+        stage_ended("sort")
         geometry = (splats.means2d, splats.conics, splats.opacities)
-        lists = torch.ops.blitzgs.intersect(
-            *geometry, splats.depths, splats.camera_ids, splats.ids, *grid, n_isects, n_splats, True
-        )
-        mark("sort")
         arguments = (*geometry, splats.colors, backgrounds, *lists, *grid)
         shared = exchange.gradient_table
         if shared is not None and backward_follows:
@@ -213,10 +193,10 @@ def render_frame(
             *images, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, False, backward_follows, n_splats)
             if shared is not None:
                 zeros = None  # the gradients must be in `shared`, which the backward pass then zeroes
-        mark("raster")
-        return _Composited(list(lists), images, zeros)
+        stage_ended("raster")
+        return lists, images, zeros
 
-    result, (lists, images, zeros) = run_attempts(transport, inputs, assignment, composite, mark)
+    result, (lists, images, zeros) = run_attempts(transport, inputs, assignment, composite)
     renders, transmittances, last_ids, tile_work, packed_splats, tile_order = images
     splats = result.splats
     return Frame(
@@ -241,14 +221,6 @@ def render_frame(
     )
 
 
-class _Composited(NamedTuple):
-    """The tiles' lists, the outputs of `rasterize_fwd`, and memory for the gradients of the splats."""
-
-    lists: list[Tensor]
-    images: Sequence[Tensor]
-    zeros: Tensor | None
-
-
 def inputs_of(
     table: GaussianTable,
     views: Views,
@@ -263,6 +235,16 @@ def inputs_of(
     return ProjectionInputs(gaussians, cameras, options.projection(views), active or (), table["id"], level)
 
 
+def tile_lists(arrived: Arrived, grid: TileGrid) -> list[Tensor]:
+    """Return the splats that each tile composites and where the list of each tile begins (op `intersect`)."""
+    splats, n_splats, n_isects = arrived
+    lists = torch.ops.blitzgs.intersect(
+        splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids,
+        *grid, n_isects, n_splats, True,
+    )  # fmt: skip
+    return list(lists)
+
+
 def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> TileGrid:
     """Return the grid of tiles, with the range of them that this rank composites."""
     tiles = (0, -1) if assignment is None else assignment.composited_tiles
@@ -275,12 +257,11 @@ def _backgrounds(colour: tuple[float, float, float], count: int, device: torch.d
     return torch.tensor(colour, device=device).repeat(count, 1) if any(colour) else None
 
 
-def backward_splats(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> SplatGradients:
+def backward_splats(frame: Frame, v_renders: Tensor) -> SplatGradients:
     """Compute the gradients of this rank's projected splats from the gradients of the images.
 
     Args:
         v_renders: gradient of the loss by the images, [B, H, W, 3]; only this rank's tiles are read.
-        mark: called at the end of each stage: "raster back", "exchange back".
 
     Raises:
         RuntimeError: the ranks share memory, and a later frame has overwritten this frame's splats.
@@ -301,10 +282,10 @@ def backward_splats(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> S
             *frame.saved, v_renders, None, *grid, False, options.deterministic
         )
         gradients = SplatGradients(parts)
-    mark("raster back")
+    stage_ended("raster back")
     if way_back is not None:
         gradients = way_back.return_gradients(gradients)
-    mark("exchange back")
+    stage_ended("exchange back")
     return gradients
 
 
@@ -320,17 +301,15 @@ def run_attempts(
     inputs: ProjectionInputs | Callable[[Sizes | None], ProjectionInputs],
     assignment: TileAssignment | None,
     consume: Callable[[Exchange], Consumed],
-    mark: Mark = unmarked,
 ) -> tuple[ExchangeResult, Consumed]:
     """Project, send the splats and consume them, without gradients, until all results had enough memory.
 
     Args:
         transport: sends the splats, and estimates the sizes.
-        inputs: of the projection; or a function that returns them, given the estimated sizes (None: the
-            sizes are not known, and the work waits for them).
+        inputs: of the projection; or a function that returns them, given the capacity (None: the sizes are
+            not known, and the work waits for them).
         assignment: the tiles of each rank; None: one rank composites all.
         consume: queues the work with the splats that have arrived.
-        mark: called at the end of the stages "project" and "exchange".
 
     Returns:
         The splats, cut to their numbers, and what `consume` returned for them.
@@ -340,19 +319,19 @@ def run_attempts(
             needed.
     """
     for _ in range(MAX_ATTEMPTS):
-        sizes = None if transport.capacity is None else transport.capacity.sizes
-        given = inputs(sizes) if callable(inputs) else inputs
+        capacity = None if transport.estimate is None else transport.estimate.sizes
+        given = inputs(capacity) if callable(inputs) else inputs
         # Skip autograd: for an op with a registered gradient formula, its Python takes 20 us of host time.
         with below_autograd():
-            exchange = transport.project_and_send(given, assignment, sizes, mark)
+            exchange = transport.project_and_send(given, assignment, capacity)
             consumed = consume(exchange)
             needed, result = exchange.finish()
-        if transport.capacity is not None:
-            transport.capacity.learn(needed)
+        if transport.estimate is not None:
+            transport.estimate.learn(needed)
         if result is not None:
             return result, consumed
         del exchange, consumed  # before the next attempt takes as much memory again
     raise RuntimeError(
         f"{MAX_ATTEMPTS} attempts have each needed more than the one before had asked for: the last had "
-        f"{sizes} and needs {tuple(needed)}. The inputs must not change during a call"
+        f"{capacity} and needs {tuple(needed)}. The inputs must not change during a call"
     )

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.frame.render import RenderOptions, Views, inputs_of, run_attempts, tile_grid
+from blitzgs.frame.render import RenderOptions, inputs_of, run_attempts, tile_grid, tile_lists
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import Exchange, LocalTransport, Transport, open_transport
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.projection_types import ProjectedSplats
+from blitzgs.ops.projection_types import ProjectedSplats, Views
 from blitzgs.table.table import GaussianTable
 
 
@@ -62,11 +62,9 @@ def survey(
     grid = tile_grid(views, options, assignment)
 
     def measure(exchange: Exchange) -> tuple[Tensor, Tensor, Tensor]:
-        splats, n_splats, n_isects = exchange.arrived
+        splats, n_splats, _ = exchange.arrived
+        lists = tile_lists(exchange.arrived, grid)
         geometry = (splats.means2d, splats.conics, splats.opacities)
-        lists = torch.ops.blitzgs.intersect(
-            *geometry, splats.depths, splats.camera_ids, splats.ids, *grid, n_isects, n_splats, True
-        )
         return torch.ops.blitzgs.contributions(*geometry, *lists, *grid, n_splats, squares)
 
     result, sums = run_attempts(transport, inputs, assignment, measure)

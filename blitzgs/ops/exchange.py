@@ -11,8 +11,8 @@ from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-# Splats that share an entry of `places`, see csrc/exchange/places.h.
-RUN = 32
+# Consecutive splats, a run, that share an entry of `places`: kPlaceSplats of csrc/exchange/places.h.
+PLACE_SPLATS = 32
 
 
 def scatter_splats(
@@ -28,8 +28,9 @@ def scatter_splats(
 
     Returns:
         packed int32 [words]: one group after the other, in each the columns one after the other; and places
-        int64 [ceil(P / RUN), M], where in each group the splats are: what `splat_gradients.sum_splats`
-        needs. The order of the splats of a run is kept; on CUDA that of runs is not.
+        int64 [ceil(P / PLACE_SPLATS), M], where in each group the splats are: what
+        `splat_gradients.sum_splats` needs. The order of the splats of a run is kept; on CUDA that of runs is
+        not.
 
     Raises:
         RuntimeError: columns of different lengths, or too many.
@@ -59,9 +60,9 @@ def gather_splats(packed: Tensor, like: Sequence[Tensor], group_sizes: Sequence[
     return [as_column(part, column) for part, column in zip(parts, like, strict=True)]
 
 
-def runs_of(splats: int) -> int:
+def place_runs(splats: int) -> int:
     """Return the number of entries of `places` for each rank."""
-    return -(-splats // RUN)
+    return -(-splats // PLACE_SPLATS)
 
 
 def words_per_splat(column: Tensor) -> int:

@@ -163,8 +163,8 @@ def _splat_gradients(saved: _Saved, v: _Differentiable) -> list[Tensor]:
     return [part if column is None else column for column, part in zip(columns, parts, strict=False)]
 
 
-class ProjectCall(NamedTuple):
-    """The arguments of `Project` that have no gradient; see `blitzgs.ops.project.differentiable_splats`."""
+class _ProjectCall(NamedTuple):
+    """The arguments of `_Project` that have no gradient; see `blitzgs.ops.project.differentiable_splats`."""
 
     inputs: ProjectionInputs
     sparse_grad: bool
@@ -172,7 +172,7 @@ class ProjectCall(NamedTuple):
     rows: TableRows | None
 
 
-class Project(torch.autograd.Function):
+class _Project(torch.autograd.Function):
     """Makes the splats of `project_splats` differentiable, as the op `project_fwd` is (see below).
 
     It is for calls outside of `torch.compile`. Calling an op with a registered formula through torch takes
@@ -181,7 +181,7 @@ class Project(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, _viewmats: Tensor, call: ProjectCall, *tables: Tensor) -> Any:
+    def forward(ctx: Any, _viewmats: Tensor, call: _ProjectCall, *tables: Tensor) -> Any:
         """Return the columns of the splats that have gradients; `tables` are the inputs that may need one."""
         _save(ctx, call.inputs, call.splats, call.rows)
         # Means, quats and scales are leaves, or come from operations that accept a sparse gradient.
@@ -333,8 +333,8 @@ def differentiable_splats(
     if not torch.compiler.is_compiling():
         splats = project_splats(inputs) if splats is None else splats
         tables = inputs.gaussians if rows is None else [*inputs.gaussians, *rows.sh]
-        call = ProjectCall(inputs, sparse_grad, splats, rows)
-        columns = Project.apply(viewmats, call, *tables)  # type: ignore[no-untyped-call]
+        call = _ProjectCall(inputs, sparse_grad, splats, rows)
+        columns = _Project.apply(viewmats, call, *tables)  # type: ignore[no-untyped-call]
         means2d, conics, depths, opacities, colors = columns
         return splats._replace(
             means2d=means2d, conics=conics, depths=depths, opacities=opacities, colors=colors

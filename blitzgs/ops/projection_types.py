@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -18,6 +19,26 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 MAX_VIEWS = 32
 # Where the splats of the views begin in `ProjectionOutputs.totals` (kTotalViews of csrc/project/project.h).
 VIEW_TOTALS = 4
+
+
+@dataclass(frozen=True)
+class Views:
+    """B pinhole views of one image size, rendered together.
+
+    Attributes:
+        viewmats: world to camera, float32 [B, 4, 4].
+        Ks: intrinsics in pixels, float32 [B, 3, 3].
+        width: pixels.
+        height: pixels.
+    """
+
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+
+    def __len__(self) -> int:
+        return self.viewmats.shape[0]
 
 
 class Sizes(NamedTuple):
@@ -39,9 +60,7 @@ class ProjectedSplats(NamedTuple):
     gaussian_ids: Tensor  # int32 [P]
     camera_ids: Tensor  # int32 [P]
     visible_ids: Tensor  # int32 [U], ascending
-    splat_offsets: (
-        Tensor  # int32 [U + 1]: splats splat_offsets[u] to splat_offsets[u + 1] are of visible_ids[u]
-    )
+    splat_offsets: Tensor  # int32 [U + 1]: visible_ids[u] has the splats from splat_offsets[u] on
     means2d: Tensor  # [P, 2], px; the centre of pixel (i, j) is (i + 0.5, j + 0.5)
     conics: Tensor  # [P, 3]: a, b, c of the inverse 2D covariance, 1/px^2
     depths: Tensor  # [P]: camera-space z
@@ -62,16 +81,11 @@ def splats_of(allocated: Sequence[Tensor], sizes: Sizes, counts: Tensor | None =
         counts: the first three of `sizes` as a CPU tensor, if there is one.
     """
     if allocated[0].shape[0] > sizes.splats or allocated[2].shape[0] > sizes.visible:
-        allocated = first_rows(allocated[:12], lengths_of(sizes))
+        visible, splats = sizes[:2]
+        allocated = first_rows(allocated[:12], [splats, splats, visible, visible + 1, *[splats] * 8])
     if counts is None:
         counts = torch.tensor(sizes[:3], device="cpu")
     return ProjectedSplats._make((*allocated[:12], counts))
-
-
-def lengths_of(sizes: Sizes) -> list[int]:
-    """Return the lengths of the columns of `ProjectedSplats` but for `counts`."""
-    visible, splats = sizes[:2]
-    return [splats, splats, visible, visible + 1, *[splats] * 8]
 
 
 def first_rows(columns: Sequence[Tensor], lengths: Sequence[int]) -> list[Tensor]:
@@ -222,6 +236,11 @@ class ProjectionOutputs(NamedTuple):
     def n_splats(self) -> Tensor:
         """Return the number of splats, int64 [1], on the device."""
         return self.totals[1:2]
+
+    @property
+    def n_visible(self) -> Tensor:
+        """Return the number of visible Gaussians, int32 [1], on the device: the low half of its total."""
+        return self.totals.view(torch.int32)[:1]
 
     @property
     def for_compositing(self) -> Splats:

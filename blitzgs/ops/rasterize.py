@@ -43,7 +43,7 @@ class RasterizeSaved(NamedTuple):
 Arrange = Callable[[Sequence[Tensor]], Sequence[Tensor]]
 
 
-class Through(NamedTuple):
+class MetaGeometry(NamedTuple):
     """The geometry of splats in the arrangement of `meta`, whose tensors get the gradients.
 
     `rasterize` composites the splats themselves. Its backward pass arranges the gradients of their geometry
@@ -73,9 +73,9 @@ def rasterize(
     backgrounds: Tensor | None = None,
     tile_begin: int = 0,
     tile_end: int = -1,
-    tell_absgrad: Callable[[Tensor], object] | None = None,
+    store_absgrad: Callable[[Tensor], object] | None = None,
     composited: Sequence[Tensor] | None = None,
-    through: Through | None = None,
+    meta_geometry: MetaGeometry | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Composite the splats of each tile's list into images.
 
@@ -104,38 +104,38 @@ def rasterize(
         backgrounds: [B, D], or None for black.
         tile_begin: first owned tile; pixels of tiles outside [tile_begin, tile_end) are zero.
         tile_end: end of the owned tiles, -1 for all.
-        tell_absgrad: the backward pass calls it with the sum over pixels of the absolute gradient of means2d,
-            per axis, [P, 2], whichever gradients it computes.
+        store_absgrad: the backward pass calls it with the sum over pixels of the absolute gradient of
+            means2d, per axis, [P, 2], whichever gradients it computes.
         composited: the result of the op `rasterize_fwd` for these arguments and alphas, if they are already
             known; None: call the op.
-        through: the same means2d, conics and splat_opacities in an arrangement, which get the gradients in
-            their place; not under `torch.compile`.
+        meta_geometry: the same means2d, conics and splat_opacities as `meta` has them, which get the
+            gradients in their place; not under `torch.compile`.
 
     Returns:
         Renders [B, H, W, D] and alphas [B, H, W].
 
     Raises:
         RuntimeError: wrong shapes or dtypes, or a tile range outside the images.
-        ValueError: `tell_absgrad` under `torch.compile`.
+        ValueError: `store_absgrad` under `torch.compile`.
     """
     splats = (means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets)
     grid = TileGrid(n_cameras, width, height, tile_size, tile_begin, tile_end)
     if torch.compiler.is_compiling():
-        if tell_absgrad is not None:
+        if store_absgrad is not None:
             raise ValueError("absolute gradients are not supported under torch.compile")
         renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, *grid, True, False, None)
         alphas = 1 - transmittances
     else:
-        geometry = (means2d, conics, splat_opacities) if through is None else through.columns
-        arrange = None if through is None else through.arrange
+        geometry = (means2d, conics, splat_opacities) if meta_geometry is None else meta_geometry.columns
+        arrange = None if meta_geometry is None else meta_geometry.arrange
         # Whether gradients will be packed, see `_gradients`.
         packed = (
             composited is None
-            and tell_absgrad is None
+            and store_absgrad is None
             and torch.is_grad_enabled()
             and any(x.requires_grad for x in (*geometry, colors))
         )
-        call = _Call(splats, grid, tell_absgrad, arrange, packed, composited)
+        call = _Call(splats, grid, store_absgrad, arrange, packed, composited)
         renders, alphas = _Rasterize.apply(*geometry, colors, backgrounds, call)  # type: ignore[no-untyped-call]
     if (tile_begin, tile_end) != (0, -1):
         end = sys.maxsize if tile_end < 0 else tile_end
@@ -229,7 +229,7 @@ class _Call(NamedTuple):
 
     splats: tuple[Any, ...]  # the tensors that the op takes
     grid: TileGrid
-    tell_absgrad: Callable[[Tensor], object] | None
+    store_absgrad: Callable[[Tensor], object] | None
     arrange: Arrange | None
     backward_follows: bool
     composited: Sequence[Tensor] | None
@@ -250,16 +250,16 @@ class _Rasterize(torch.autograd.Function):
         else:
             *output, alphas = call.composited
         _save(ctx, call.splats, call.grid, output)
-        ctx.tell_absgrad, ctx.arrange = call.tell_absgrad, call.arrange
+        ctx.store_absgrad, ctx.arrange = call.store_absgrad, call.arrange
         return output[0], alphas
 
     @staticmethod
     def backward(ctx: Any, *v_output: Tensor | None) -> tuple[Tensor | None, ...]:
         v_renders, v_alphas = v_output
-        tell = ctx.tell_absgrad
-        *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, tell is not None, may_pack=True)
+        store = ctx.store_absgrad
+        *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, store is not None, may_pack=True)
         if v_abs is not None:
-            tell(v_abs.detach())
+            store(v_abs.detach())
         if ctx.arrange is not None and splat_gradients[0] is not None:
             splat_gradients[:3] = ctx.arrange(splat_gradients[:3])
         return (*splat_gradients, None)

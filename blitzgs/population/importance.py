@@ -26,13 +26,14 @@ from blitzgs.config.fields import ScoreRule
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import decimal_share, integer_mass_prefix, mass_prefix, smallest
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import RenderOptions, Views
+from blitzgs.frame.render import RenderOptions
 from blitzgs.frame.survey import Survey, survey
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import open_transport
 from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.counter_random import sampling_keys
 from blitzgs.ops.importance import ViewSums, view_sums_
+from blitzgs.ops.projection_types import Views
 from blitzgs.table.layouts import CULL
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import SceneGate
@@ -125,16 +126,16 @@ def sweep(
     sums = _Sums(len(table), n_views, table.device, rule)
     owners = owners or TileOwners(ranks)
     transport, finder = open_transport(ranks), VisibleFinder(scene, lod)
-    with _NextSurvey(table.device, ranks.world_size == 1 and scene is table) as beside:
+    with _SideWork(table.device, ranks.world_size == 1 and scene is table) as side:
         for number, batch in enumerate(batches):
             if stops is not None and number > 0 and stops():
                 raise SweepStoppedError
             assignment = _assign(batch, options, owners)
-            visible = finder.find(*batch.views.as_arguments(), options.limits)
+            visible = finder.find(batch.views, options.limits)
             surveyed = survey(
                 visible.table, batch.views, options, assignment, transport, visible.active, rule == "energy"
             )
-            with beside.work(surveyed, visible):
+            with side.work(surveyed, visible):
                 sums.add(surveyed, batch.columns, visible, ranks)
     return sums.result()
 
@@ -153,8 +154,8 @@ def _assign(batch: ViewBatch, options: RenderOptions, owners: TileOwners) -> Til
     return TileAssignment(owners.ranks, ranges)
 
 
-class _NextSurvey:
-    """Runs what follows each survey on a stream of its own, beside the survey of the next batch.
+class _SideWork:
+    """Runs what follows each survey on a side stream, beside the survey of the next batch.
 
     That work is many short kernels, most of which leave the GPU idle. When the block ends, for whatever
     reason, the caller's stream waits for all of it.
@@ -166,7 +167,7 @@ class _NextSurvey:
         self._held: object = None
         self._done: torch.cuda.Event | None = None
 
-    def __enter__(self) -> _NextSurvey:
+    def __enter__(self) -> _SideWork:
         return self
 
     def __exit__(self, *_error: object) -> None:

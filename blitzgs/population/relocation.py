@@ -54,10 +54,10 @@ def relocate(
     the share `growth` of the population. Live Gaussians are drawn for copying in proportion to their opacity
     (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", section 3.4). A Gaussian and
     its copies have one position, and share opacity and size such that together they look like the Gaussian
-    before (`shared`). The copied Gaussian keeps its moments, scaled as its gradients are (`_keep_moments`),
-    and the copies begin with moments of zero. Copies have the level, phi and cull row of the
-    Gaussian that they copy, and no statistics. Draws and ids depend only on (seed, time, id), so the result
-    depends neither on the order of the rows nor on the number of ranks.
+    before (`shared_among_copies`). The copied Gaussian keeps its moments, scaled as its gradients are
+    (`_keep_moments`), and the copies begin with moments of zero. Copies have the level, phi and cull row of
+    the Gaussian that they copy, and no statistics. Draws and ids depend only on (seed, time, id), so the
+    result depends neither on the order of the rows nor on the number of ranks.
 
     Args:
         table: changed in place; the rows are those of `placement.place`.
@@ -84,7 +84,7 @@ def relocate(
     (_, n_dead, _), (population, deaths, total) = both.tolist()
     grown = math.floor(population * (1.0 + growth))
     wanted = max(population, grown if rules.max_gaussians is None else min(grown, rules.max_gaussians))
-    draws = draw(weights, total, wanted - population + deaths, table["id"], seed, time, ranks)
+    draws = draw_in_proportion(weights, total, wanted - population + deaths, table["id"], seed, time, ranks)
     # With a size that it knows, the host does not wait for the device.
     sources, gone = draws.nonzero().squeeze(1), torch.nonzero_static(dead, size=n_dead).squeeze(1)
     if pending is not None:
@@ -104,7 +104,7 @@ def relocate(
     return DensityReport(cloned=len(new["id"]), split=0, pruned=0, held_back=held_back, relocated=len(gone))
 
 
-def shared(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+def shared_among_copies(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     """Return opacity and scales for N Gaussians at one position that together look like one Gaussian.
 
     Along a line through the centre, the integral of what the N Gaussians composite equals that of the one
@@ -130,7 +130,9 @@ def shared(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, T
     return depth.expm1().log(), scales.double() + factor[:, None]
 
 
-def draw(weights: Tensor, total: int, count: int, ids: Tensor, seed: int, time: int, ranks: Ranks) -> Tensor:
+def draw_in_proportion(
+    weights: Tensor, total: int, count: int, ids: Tensor, seed: int, time: int, ranks: Ranks
+) -> Tensor:
     """Draw `count` times in proportion to weights, over all ranks.
 
     The expectation for each row is count w / sum(w), as in a multinomial draw. A row gets the integer part of
@@ -163,7 +165,7 @@ def draw(weights: Tensor, total: int, count: int, ids: Tensor, seed: int, time: 
 def _set_shares(table: GaussianTable, sources: Tensor, copies: Tensor, min_opacity: float) -> None:
     """Set opacities and scales of the rows `sources` to their shares, and scale their moments."""
     before = table["opacities"][sources]
-    opacities, scales = shared(before, table["scales"][sources], copies)
+    opacities, scales = shared_among_copies(before, table["scales"][sources], copies)
     # Sharing must not reduce the opacity below the limit, or the Gaussian would count as dead.
     table["opacities"][sources] = opacities.clamp(min=opacity_logit(min_opacity)).float()
     table["scales"][sources] = scales.float()

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.cameras import camera_centres
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, EXPOSURES, RunCameras, load_cameras
 from blitzgs.runs.evaluation import FOLDER, INDEX, METRICS, PARTS, preview_file
 from blitzgs.runs.folder import RunFolder, open_run

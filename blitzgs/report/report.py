@@ -23,7 +23,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.web_page import as_html, check_replaces_page
 from blitzgs.report import gather
 from blitzgs.report.gather import RunData, read_run
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import METRICS
 from blitzgs.util.output import write_file
 from blitzgs.viewer.studio import open_model

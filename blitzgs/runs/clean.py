@@ -18,10 +18,11 @@ from blitzgs.capture.cameras import downscaled_size, scaled_matrix
 from blitzgs.capture.pictures import encode_image, strip
 from blitzgs.config.fields import ScoreRule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.render import RenderOptions, Views
+from blitzgs.frame.render import RenderOptions
 from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.population import CELL_BITS, voxel_keys
+from blitzgs.ops.projection_types import Views
 from blitzgs.population.importance import Importance, ViewBatch, is_culled, sweep
 from blitzgs.runs.cameras import RunCamera, RunCameras
 from blitzgs.runs.evaluation import image_metrics

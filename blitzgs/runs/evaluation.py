@@ -116,7 +116,7 @@ def render_view(
     Returns float32 [H, W, 3] on rank `destination`, the same bits at any number of ranks; None elsewhere.
     """
     picked, ranks = views.pick([index]), owners.ranks
-    table, active, _ = finder.find(*picked.as_arguments(), options.limits)
+    table, active, _ = finder.find(picked, options.limits)
     try:
         if ranks.world_size == 1:
             return render_frame(table, picked, options, active).renders[0]
@@ -242,12 +242,12 @@ def _over_all_ranks(
 
 
 def worst_views(views: Mapping[str, Mapping[str, float]], count: int = 3) -> list[tuple[str, float]]:
-    """Return names and PSNR of the views of lowest PSNR, the worst first; none of a single view."""
+    """Return names and PSNR of views of the lower half by PSNR, the worst first."""
     ordered = sorted((view["psnr"], name) for name, view in views.items())
-    return [(name, psnr) for psnr, name in ordered[:count]] if len(ordered) > 1 else []
+    return [(name, psnr) for psnr, name in ordered[: min(count, len(ordered) // 2)]]
 
 
-def spread(indices: Sequence[int]) -> list[int]:
+def evenly_ordered(indices: Sequence[int]) -> list[int]:
     """Order indices such that the first few of them are spread evenly, however many are taken."""
     share = (math.sqrt(5) - 1) / 2
     return [index for _, index in sorted((k * share % 1, index) for k, index in enumerate(indices))]

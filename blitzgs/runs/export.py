@@ -22,10 +22,9 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats import gaussians
 from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource
-from blitzgs.formats.models import FORMATS, Format, check_replaces
+from blitzgs.formats.models import Format, check_replaces
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs import checkpoint
-from blitzgs.runs import files as run_files
+from blitzgs.runs import checkpoint, run_files
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.checkpoint_files import DAMAGE, Shard, header_of, read_rows, verified
 from blitzgs.runs.folder import Model
@@ -49,11 +48,6 @@ class Exported:
     offset: tuple[float, float, float] | None
     sidecar: Path | None  # file that has the offset
     rounding: float  # largest rounding error of a coordinate in float32, in the capture's unit
-
-
-def export_ply(model: Model, path: Path, coordinates: str = "auto", crs: str = "") -> Exported:
-    """Write a model in INRIA's layout; see `export`."""
-    return export(source_of(model), model.space, FORMATS["ply"], path, coordinates, crs)
 
 
 def export(

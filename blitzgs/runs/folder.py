@@ -22,7 +22,7 @@ from blitzgs.call import rasterization
 from blitzgs.config.fields import Config
 from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks, resolve_device
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.cameras import RunCamera, RunCameras, checked_camera, load_cameras
 from blitzgs.runs.lod import scene_gate
 from blitzgs.runs.log import LOG, records

@@ -7,7 +7,7 @@ import math
 
 from blitzgs.config.fields import FORK, Config
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.files import Progress
+from blitzgs.runs.run_files import Progress
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import LodGate, SceneGate
 from blitzgs.view.levels import FOOTPRINT_STEPS

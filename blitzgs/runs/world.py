@@ -15,32 +15,32 @@ from torch import Tensor
 
 from blitzgs.capture.cameras import Float64
 from blitzgs.capture.colmap import rotation_to_quat
-from blitzgs.capture.world import GEO, WorldFrame, read_frame
+from blitzgs.capture.world import GEO, WorldFrame, read_world_frame
 from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.models import offset_of
 from blitzgs.ops.harmonics import spherical_harmonics
-from blitzgs.runs.files import Progress, TrainedModel
 from blitzgs.runs.folder import Model
+from blitzgs.runs.run_files import Progress, TrainedModel
 from blitzgs.util.output import write_file
 from blitzgs.view.draw import table_of_parameters
 from blitzgs.view.gate import LodGate
 from blitzgs.view.views import Space
 
 
-def save_frame(folder: Path, frame: WorldFrame) -> Path:
+def save_world_frame(folder: Path, frame: WorldFrame) -> Path:
     """Write the frame of a run's capture into its folder; returns the file."""
     path = folder / GEO
     write_file(path, json.dumps(frame.as_json(), indent=1))
     return path
 
 
-def load_frame(folder: Path) -> WorldFrame | None:
+def load_world_frame(folder: Path) -> WorldFrame | None:
     """Return the frame of a run's capture (ValueError: its file is damaged); None: nothing says it."""
     path = folder / GEO
-    return read_frame(path) if path.is_file() else None
+    return read_world_frame(path) if path.is_file() else None
 
 
 @torch.no_grad()

@@ -100,7 +100,7 @@ class Photographs:
             path = folder / f"{name}.png"
             if path.exists():
                 continue
-            counted = np.ones((1, 1), np.uint8) if mask is None else decode_mask(read_whole(mask), str(mask))
+            counted = np.ones((1, 1), np.uint8) if mask is None else decode_mask(read_whole(mask))
             pixels = 255 * cv2.resize(counted, size, interpolation=cv2.INTER_NEAREST)
             path.parent.mkdir(parents=True, exist_ok=True)
             write_file(path, bytes(cv2.imencode(".png", pixels)[1]), sync=False)
@@ -135,7 +135,9 @@ def estimate(sizes: Sequence[tuple[int, int]]) -> str:
     seconds = (
         sum(width * height for width, height in sizes) / 1e6 * _FEATURES + pairs * _PAIR + count * _POSE
     ) / cores
-    return f"{max(1, round(seconds / 60)):,} minutes on {cores} CPU cores (rough: within a factor of 3)"
+    minutes = max(1, round(seconds / 60))
+    taken = "a minute" if minutes == 1 else f"{minutes:,} minutes"
+    return f"{taken} on {cores} CPU cores (rough: within a factor of 3)"
 
 
 # Seconds of a core: for a megapixel, a pair and a pose, measured on 75 photographs of 1.9 megapixels.

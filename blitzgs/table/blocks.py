@@ -23,7 +23,7 @@ from blitzgs.ops.blocks import (
     seen_blocks,
     update_block_bounds_,
 )
-from blitzgs.ops.projection_types import MAX_VIEWS
+from blitzgs.ops.projection_types import MAX_VIEWS, Views
 from blitzgs.table.table import GaussianTable
 
 # The columns of `PendingSteps`.
@@ -114,25 +114,21 @@ class BlockIndex:
     def active(
         self,
         table: GaussianTable,
-        viewmats: Tensor,
-        Ks: Tensor,
-        width: int,
-        height: int,
-        near_plane: float,
-        far_plane: float,
-        eps2d: float = 0.3,
+        views: Views,
+        limits: tuple[float, float, float],
         rules: GateRules | None = None,
         capacity_blocks: int | None = None,
     ) -> ActiveRows:
         """Return the rows that the views may see, and for each row the views that may see it.
 
         Whether a row is in the result depends on that row alone, not on the order of the rows or on their
-        division among ranks. Arguments as in `blitzgs.ops.blocks.cull_blocks`.
+        division among ranks. Arguments as in `blitzgs.ops.blocks.cull_blocks`; `limits` are its near_plane,
+        far_plane and eps2d.
         """
         pending = self._pending(table)
         return cull_blocks(
-            self.bounds, table["means"], table["scales"], viewmats, Ks, width, height, near_plane, far_plane,
-            eps2d, pending, self.level_ranges, rules, capacity_blocks,
+            self.bounds, table["means"], table["scales"], views.viewmats, views.Ks, views.width, views.height,
+            *limits, pending, self.level_ranges, rules, capacity_blocks,
         )  # fmt: skip
 
     def update(self, table: GaussianTable, ids: Tensor | None) -> None:

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from blitzgs.capture.images import ImageStore
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import Views
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
 from blitzgs.ops.host import current_stream
+from blitzgs.ops.projection_types import Views
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.view.views import VIEW_NUMBERS, ViewSet, unpack_views
 

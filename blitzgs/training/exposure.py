@@ -162,7 +162,7 @@ def track_gains(capture: Capture, images: ImageStore, ranks: Ranks) -> Tensor | 
     return torch.from_numpy(gains / gains.mean(0))
 
 
-def differ(gains: Tensor) -> bool:
+def exposures_differ(gains: Tensor) -> bool:
     """Tell whether photographs with these gains, [T, 3], have different exposures."""
     return float(gains.log().std(0, correction=0).mean()) >= LEAST_SPREAD
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.render import Frame, RenderOptions, ViewFilter
-from blitzgs.frame.transport import Mark, unmarked
+from blitzgs.frame.transport import stage_ended
 from blitzgs.ops.host import to_device
 from blitzgs.ops.projection_types import MAX_VIEWS
 from blitzgs.table.blocks import Cameras
@@ -102,7 +102,6 @@ class OffloadingStepper(Stepper):
         step: int,
         options: RenderOptions,
         batch: Batch,
-        mark: Mark = unmarked,
         view_filter: ViewFilter | None = None,
     ) -> tuple[Frame, LossTerms, HostSum]:
         """See `Stepper.forward`."""
@@ -111,15 +110,15 @@ class OffloadingStepper(Stepper):
         if view_filter is None or not view_filter.columns:
             cameras = cameras._replace(columns=None)
         self._blocks = self._pool.load_for_step(step, cameras, self._upcoming.batch_size)
-        mark("other")
-        rendered = super().forward(step, options, batch, mark, view_filter)
+        stage_ended("other")
+        rendered = super().forward(step, options, batch, view_filter)
         self._pool.prefetch(step + 1)
         return rendered
 
     def backward(
-        self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked, keep_means2d: bool = False
+        self, step: int, frame: Frame, terms: LossTerms, keep_means2d: bool = False
     ) -> Tensor | None:
         """See `Stepper.backward`."""
-        v_means2d = super().backward(step, frame, terms, mark, keep_means2d)
+        v_means2d = super().backward(step, frame, terms, keep_means2d)
         self._pool.store_bounds(self._blocks)
         return v_means2d

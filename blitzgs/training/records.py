@@ -5,19 +5,22 @@ from __future__ import annotations
 
 import contextlib
 import math
+import platform
+import resource
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
+import psutil
 import torch
 
+import blitzgs
 from blitzgs.config.files import config_hash
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.render import Frame
 from blitzgs.ops.host import HostCopy
-from blitzgs.runs.files import memory_bytes, peak_memory_bytes, versions
 from blitzgs.runs.guard import check_table, find_bad
 from blitzgs.runs.log import LOG, records
 from blitzgs.training.batches import Batch
@@ -162,3 +165,26 @@ def log_step(state: TrainingState, record: StepRecord) -> None:
     warning = None if math.isnan(psnr) else state.curve.add(state.images_seen, psnr)
     if warning is not None:
         state.log.event(state.images_seen, "warning", {"warning": warning}, f"warning: {warning}")
+
+
+def peak_memory_bytes(device: torch.device) -> int:
+    """Return this process's peak memory in bytes: allocated on a GPU, or resident on the CPU."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def memory_bytes(device: torch.device) -> int:
+    """Return this process's memory in bytes now: allocated on a GPU, or resident on the CPU."""
+    if device.type == "cuda":
+        # torch.cuda.memory_allocated reads the same, but copies all figures of the allocator first.
+        return int(torch.cuda.memory_stats_as_nested_dict(device)["allocated_bytes"]["all"]["current"])
+    return int(psutil.Process().memory_info().rss)
+
+
+def versions(device: torch.device) -> dict[str, str]:
+    """Return the versions of the software and the name of the device."""
+    found = {"blitzgs": blitzgs.__version__, "torch": torch.__version__, "python": platform.python_version()}
+    if device.type == "cuda":
+        found |= {"device": torch.cuda.get_device_name(device), "cuda": str(torch.version.cuda)}
+    return found | {"machine": platform.platform()}

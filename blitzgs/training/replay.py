@@ -39,7 +39,7 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import decimal_share, smallest
 from blitzgs.ops.counter_random import hash_keys
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.checkpoint_files import MANIFEST
 from blitzgs.runs.folder_checks import locked
 from blitzgs.spawn.candidates import Candidates, Veto

@@ -21,12 +21,12 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY, octree_gaussians
 from blitzgs.population.relocation import PositionNoise
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_cameras
-from blitzgs.runs.files import Progress
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
 from blitzgs.runs.log import LOG, RunLog
-from blitzgs.runs.world import save_frame, trained_columns
+from blitzgs.runs.run_files import Progress
+from blitzgs.runs.world import save_world_frame, trained_columns
 from blitzgs.spawn.gate import lineage_subject, open_spawn_gate
 from blitzgs.spawn.lineage import Ledger, Lineage, initial_births
 from blitzgs.table.blocks import sort_rows
@@ -35,7 +35,7 @@ from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.budget import extended
-from blitzgs.training.exposure import Exposures, differ, track_gains
+from blitzgs.training.exposure import Exposures, exposures_differ, track_gains
 from blitzgs.training.inputs import check_alike, check_capture, check_resolution
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
@@ -107,7 +107,7 @@ def set_up(
         if restored is None or not (folder / CAMERAS).exists():
             save_cameras(folder, capture, run_id)
             if restored is None and capture.about.source.frame is not None:
-                save_frame(folder, capture.about.source.frame)
+                save_world_frame(folder, capture.about.source.frame)
     optimiser = TableAdam(config.optimiser, schedule, space.extent, ranks.device)
     owners = _tile_owners(ranks, progress, restored)
     views = ViewSet(list(capture.cameras), space, ranks.device)
@@ -232,7 +232,7 @@ def _exposures(
     if gains is None:
         return exposures
     exposures.begin_with(gains)
-    return exposures if restored is not None or differ(gains) else None
+    return exposures if restored is not None or exposures_differ(gains) else None
 
 
 def _stepper(

@@ -21,9 +21,9 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.render import RenderOptions
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs.files import Progress
 from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.log import RunLog
+from blitzgs.runs.run_files import Progress
 from blitzgs.spawn.candidates import Veto
 from blitzgs.spawn.lineage import Lineage
 from blitzgs.table.blocks import sort_rows
@@ -94,7 +94,7 @@ def never() -> bool:
 
 @dataclass
 class TrainingState:
-    """One run on one rank; an event is a function `run(state, event)` that may change it."""
+    """One run on one rank; the functions of the events may change it."""
 
     config: Config
     capture: Capture  # cameras and points

@@ -11,7 +11,7 @@ from torch import Tensor
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.render import Frame, RenderOptions, ViewFilter, backward_splats, render_frame
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport import Mark, open_transport, unmarked
+from blitzgs.frame.transport import open_transport, stage_ended
 from blitzgs.ops.blocks import ActiveRows, gate_views_
 from blitzgs.ops.projection_types import Sizes
 from blitzgs.table.blocks import BlockIndex
@@ -78,7 +78,6 @@ class Stepper:
         step: int,
         options: RenderOptions,
         batch: Batch,
-        mark: Mark = unmarked,
         view_filter: ViewFilter | None = None,
     ) -> tuple[Frame, LossTerms, HostSum]:
         """Apply pending steps of the rows that the views may see, render, and compare with the photographs.
@@ -91,25 +90,22 @@ class Stepper:
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
         on_gpu = views.viewmats.is_cuda
 
-        def active(sizes: Sizes | None) -> ActiveRows:
+        def active(capacity: Sizes | None) -> ActiveRows:
             # On the CPU the number of blocks is known at once: lists of this size need no estimate, and are
             # complete at the first attempt.
-            capacity_blocks = sizes.blocks if sizes is not None and on_gpu else None
-            rows = self._blocks.active(
-                table, views.viewmats, views.Ks, views.width, views.height, options.near_plane,
-                options.far_plane, options.eps2d, rules, capacity_blocks,
-            )  # fmt: skip
+            capacity_blocks = capacity.blocks if capacity is not None and on_gpu else None
+            rows = self._blocks.active(table, views, options.limits, rules, capacity_blocks)
             if not on_gpu:
                 rows = rows._replace(blocks=None)
-            mark("other")
+            stage_ended("other")
             self._optimiser.catch_up(table, rows.ids, step - 1, rows.length)
-            mark("optimiser")
+            stage_ended("optimiser")
             if rules is not None:
                 gate_views_(rows, table["means"], views.viewmats, rules)
             return rows
 
         frame = render_frame(
-            table, views, options, active, assignment, self._transport, mark, backward_follows=True
+            table, views, options, active, assignment, self._transport, backward_follows=True
         )
         if self.exposures is None:
             terms = loss_terms(frame, batch, self._loss, self._extent)
@@ -119,24 +115,24 @@ class Stepper:
             shown = torch.addcmul(biases, frame.renders, gains)
             terms = loss_terms(frame, batch, self._loss, self._extent, shown)
             terms.v_renders.mul_(gains)
-        mark("loss")
+        stage_ended("loss")
         if batch.ranges is None:
             sums = HostSum(ranks, terms.parts)
         else:
             # The costs of tiles are sent together with the losses.
             sums = self._owners.record(batch.indices, frame.tile_work, batch.ranges, terms.parts)
-        mark("other")
+        stage_ended("other")
         return frame, terms, sums
 
     def backward(
-        self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked, keep_means2d: bool = False
+        self, step: int, frame: Frame, terms: LossTerms, keep_means2d: bool = False
     ) -> Tensor | None:
         """Propagate the gradients of `forward`'s loss to the Gaussians, and take an optimiser step.
 
         With `keep_means2d`, returns the gradient of the splats' means2d, [P, 2] per pixel.
         """
         table = self.table
-        gradients = backward_splats(frame, terms.v_renders, mark)
+        gradients = backward_splats(frame, terms.v_renders)
         v_means2d = means2d_sums = None
         if keep_means2d:
             v_means2d = gradients.means2d
@@ -146,7 +142,7 @@ class Stepper:
         self._optimiser.step(table, frame, gradients, terms.scale_reg, terms.opacity_reg, step, means2d_sums)
         if self._noise is not None:
             self._noise.add(table, frame.projected.visible_ids, step, self._optimiser.position_rate(step))
-        mark("optimiser")
+        stage_ended("optimiser")
         self._blocks.update(table, frame.projected.visible_ids)
-        mark("other")
+        stage_ended("other")
         return v_means2d

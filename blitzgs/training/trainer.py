@@ -22,7 +22,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.render import Frame
 from blitzgs.ops.population import density_stats_
 from blitzgs.population.importance import PHI
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.guard import LossGuard, ModelLostError
 from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.log import RunLog
@@ -39,8 +39,10 @@ from blitzgs.training.records import (
     describe,
     log_step,
     measure_step,
+    memory_bytes,
     population_report,
     run_figures,
+    versions,
     write_picture,
 )
 from blitzgs.training.setup import set_up
@@ -87,28 +89,11 @@ class Trainer:
         self._writes_late = ranks.device.type == "cuda"
         self._warned_of_masks = False
         self._watching: Watching | None = None
-        self._watched_on = False
         self.memory: list[int] = []  # samples of what this rank's GPU has allocated
 
-    def watch(self, watcher: Watcher | None, stays: bool = False) -> None:
-        """Let somebody watch the training; every rank calls this before `train`, rank 0 with a watcher.
-
-        After a whole training, a watcher that `stays` does so until `show_on` ends.
-        """
-        self._watching, self._watched_on = Watching(self.state, watcher), stays
-
-    @torch.no_grad()
-    def show_on(self) -> None:
-        """Serve a watcher that stays after the training, until a signal (Ctrl-C); every rank calls this."""
-        state, watching = self.state, self._watching
-        if watching is None or not self._watched_on:
-            return
-        try:
-            with StopRequest() as stop:
-                agreement = Agreement(state.ranks, stop, state.save_clock)
-                watching.serve_on(lambda: agreement.now(state.progress.step).signal is not None)
-        finally:
-            watching.close()
+    def watch(self, watcher: Watcher | None) -> None:
+        """Let somebody watch the training; every rank calls this before `train`, rank 0 with a watcher."""
+        self._watching = Watching(self.state, watcher)
 
     @torch.no_grad()
     def train(self) -> dict[str, Any] | None:
@@ -141,7 +126,7 @@ class Trainer:
                 state.stops = lambda: agreement.now(state.progress.step).signal is not None
                 self._announce()
                 if self._saves_first:  # so that --resume knows the longer schedule
-                    save.run(state)
+                    save.save_checkpoint(state)
                 budget, glances = Budget(state), Glances(state)
                 # What a stop kept from happening after the last step comes first.
                 if not handle_all(state, [Event(*entry) for entry in state.progress.events_left]):
@@ -178,10 +163,10 @@ class Trainer:
                         break
                     if decision.save:
                         with state.stage("checkpoint"):
-                            save.run(state)
+                            save.save_checkpoint(state)
                     if decision.written:
                         with state.stage("checkpoint"):
-                            save.finish(state)
+                            save.finish_checkpoint(state)
                     if decision.watched and watching is not None:
                         self._write_record()
                         watching.serve(state.stops)
@@ -225,15 +210,13 @@ class Trainer:
         """Write the log record of the last step, save a checkpoint, and log why the run stops."""
         if saves:
             self._write_record()
-            save.run_last(self.state, save.STOPPING_PATIENCE_SECONDS, lambda: False)
+            save.save_last(self.state, save.STOPPING_PATIENCE_SECONDS, lambda: False)
         self.state.log.event(self.state.images_seen, "stopped", {"reason": reason}, reason)
 
     def close(self) -> None:
         """Stop loading batches and close the log."""
         state = self.state
-        if self._watching is not None and not (
-            self._watched_on and state.progress.step >= state.schedule.steps
-        ):
+        if self._watching is not None:
             self._watching.close()
         for text in dict.fromkeys(self.warned):
             state.log.event(state.images_seen, "warned", {"warning": text})
@@ -272,7 +255,7 @@ class Trainer:
         state.log.advance(end)
         if is_logged:
             if state.ranks.device.type == "cuda":
-                self.memory.append(run_files.memory_bytes(state.ranks.device))
+                self.memory.append(memory_bytes(state.ranks.device))
             if not self._writes_late:
                 self._write_record()
         if is_logged or step == schedule.steps:
@@ -350,7 +333,7 @@ class Trainer:
             text += f"; {ranks.world_size} ranks, transport {ranks.transport}"
         if state.config.schedule.minutes > 0:
             text += f"; {state.config.schedule.minutes:g} minutes of training"
-        values = views | run_files.versions(ranks.device) | {"transport": ranks.transport}
+        values = views | versions(ranks.device) | {"transport": ranks.transport}
         state.log.event(
             state.images_seen, "start", {"origin": state.origin} | values, f"{state.origin}; {text}"
         )
@@ -368,13 +351,13 @@ class Trainer:
         if state.population() == 0:
             raise ModelLostError("no Gaussian is left: do the poses and the points belong together?")
         with state.stage("final_checkpoint"):
-            save.run_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
+            save.save_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
         population = population_report(state, self.memory)
         state.log.event(state.images_seen, "population", population, describe(population))
         images = state.images.memory()
         state.log.event(state.images_seen, "image_memory", dataclasses.asdict(images), str(images))
         with state.stage("evaluate"):
-            metrics = evaluate.run(state)
+            metrics = evaluate.evaluate_held_out(state)
         if not metrics:
             self._stop_by(agreement.now(step).signal, saves=False)
             return None

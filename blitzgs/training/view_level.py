@@ -10,8 +10,8 @@ import warnings
 from blitzgs.capture.capture import Capture, train_views_fingerprint
 from blitzgs.config.schedule import Event
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.files import Progress
 from blitzgs.runs.lod import level_fork, lod_gate, scene_gate
+from blitzgs.runs.run_files import Progress
 from blitzgs.table.layouts import CULL
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.state import TrainingState

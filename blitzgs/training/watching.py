@@ -51,11 +51,6 @@ class Watching:
             with self._state.stage("viewer"):
                 self._fulfil(wish)
 
-    def serve_on(self, stops: Callable[[], bool]) -> None:
-        """Fulfil what the watcher wants after the training, until `stops` or until the watcher is gone."""
-        self._asked(lambda watcher: watcher.stay(), None)
-        self.serve(stops)
-
     def close(self) -> None:
         """Tell the watcher that the training has ended."""
         self._asked(lambda watcher: watcher.close(), None)
@@ -67,9 +62,9 @@ class Watching:
 
     def _fulfil(self, wish: Wish) -> None:
         if wish.save:
-            save.run(self._state)
+            save.save_checkpoint(self._state)
             if wish.pause:  # no step comes after which it would be finished
-                save.finish(self._state)
+                save.finish_checkpoint(self._state)
         if wish.look is None:
             return
         begin, look = time.perf_counter(), wish.look

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import Frame, RenderOptions, Views, render_frame
+from blitzgs.frame.render import Frame, RenderOptions, render_frame
 from blitzgs.frame.tiles import TileAssignment, collect_images
 from blitzgs.frame.transport import LocalTransport
 from blitzgs.ops.blocks import BLOCK_ROWS, ActiveRows
 from blitzgs.ops.host import to_host
-from blitzgs.ops.projection_types import Sizes
+from blitzgs.ops.projection_types import Sizes, Views
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import PARAMETERS, GaussianTable, schema
@@ -161,8 +161,8 @@ class Drawer:
         active: ActiveRows | Callable[[Sizes | None], ActiveRows]
         if assignment is None and not isinstance(scene, Pool):
 
-            def active(sizes: Sizes | None) -> ActiveRows:
-                room = sizes.blocks if sizes is not None and scene.device.type == "cuda" else None
+            def active(capacity: Sizes | None) -> ActiveRows:
+                room = capacity.blocks if capacity is not None and scene.device.type == "cuda" else None
                 return self._together(lambda: self._found(look, views, options, room)).active
 
             table = scene
@@ -197,7 +197,7 @@ class Drawer:
     def _found(
         self, look: Look, views: Views, options: RenderOptions, room: int | None = None
     ) -> VisibleScene:
-        found = self._finder(look).find(*views.as_arguments(), options.limits, room)
+        found = self._finder(look).find(views, options.limits, room)
         if look.crop is None:
             return found
         return found._replace(active=_cropped(found.active, found.table["means"], look.crop))

@@ -114,8 +114,5 @@ class Watcher(Protocol):
     def told(self, t: int, values: Mapping[str, Any]) -> None:
         """Take a record of the run's log, at time `t` (images)."""
 
-    def stay(self) -> None:
-        """Learn that the training has ended, and go on with a pause that shows its model."""
-
     def close(self) -> None:
         """Learn that the training has ended."""

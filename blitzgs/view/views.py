@@ -14,7 +14,8 @@ from torch import Tensor
 
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.config.fields import Config
-from blitzgs.frame.render import RenderOptions, Views
+from blitzgs.frame.render import RenderOptions
+from blitzgs.ops.projection_types import Views
 from blitzgs.view.gate import LodGate, centres_of
 
 

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.frame.render import Views
 from blitzgs.ops.blocks import ActiveRows, gate_views_
+from blitzgs.ops.projection_types import Views
 from blitzgs.table.blocks import BlockIndex, Cameras
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
@@ -91,20 +91,14 @@ class VisibleFinder:
 
     def find(
         self,
-        viewmats: Tensor,
-        Ks: Tensor,
-        width: int,
-        height: int,
+        views: Views,
         limits: tuple[float, float, float],
         room: int | None = None,
     ) -> VisibleScene:
         """Find the Gaussians to render for a batch of views. Collective if there is a gate.
 
         Args:
-            viewmats: float32 [B, 4, 4], world to camera, B <= 32.
-            Ks: float32 [B, 3, 3], pixels.
-            width: pixels.
-            height: pixels.
+            views: at most 32 views.
             limits: near plane, far plane and eps2d.
             room: the lists have room for so many blocks and their number tells whether that sufficed; None:
                 for all.
@@ -114,21 +108,20 @@ class VisibleFinder:
         """
         scene, index = self._scene, self._index
         if isinstance(scene, Pool):
-            sizes = torch.tensor([[width, height]] * len(viewmats), dtype=torch.int32).to(viewmats.device)
-            index = scene.load_for_views(Cameras(viewmats, Ks, sizes, limits))
+            sizes = torch.tensor([[views.width, views.height]] * len(views), dtype=torch.int32)
+            cameras = Cameras(views.viewmats, views.Ks, sizes.to(views.viewmats.device), limits)
+            index = scene.load_for_views(cameras)
             table, rows_of = scene.held, scene.rows_of
         else:
             table, rows_of = scene, _same_rows
         assert index is not None
-        rules = None if self._lod is None else self._lod.rules(table["level"], viewmats)
+        rules = None if self._lod is None else self._lod.rules(table["level"], views.viewmats)
         # Either way, the host does not wait for the number of blocks.
-        active = index.active(
-            table, viewmats, Ks, width, height, *limits, rules, room or max(1, len(index.bounds))
-        )
+        active = index.active(table, views, limits, rules, room or max(1, len(index.bounds)))
         if room is None:
             active = active._replace(blocks=None)
         if rules is not None:
-            gate_views_(active, table["means"], viewmats, rules)
+            gate_views_(active, table["means"], views.viewmats, rules)
         return VisibleScene(table, active, rows_of)
 
 

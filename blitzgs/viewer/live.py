@@ -131,7 +131,7 @@ class Live:
         self._share, self._total = SHARE, total
         self._curves = Curves()
         self._count = 0
-        self._paused = self._saves = self._ended = False
+        self._paused = self._saves = False
         self._allowed, self._refreshed, self._left_alone = 0.0, 0.0, 0.0
         self._next: tuple[Visitor, Ask] | None = None  # to be drawn
         self._last: tuple[Visitor, Ask] | None = None  # being drawn
@@ -177,9 +177,9 @@ class Live:
             if now > self._left_alone + ALONE_SECONDS:
                 self._paused = False
         self._last, self._next = self._next, None
-        if self._last is None and (self._paused or self._ended) and self.page.visitors:
+        if self._last is None and self._paused and self.page.visitors:
             self._last = self._asked_for()
-        return Wish(None if self._last is None else self._last[1].look, self._paused or self._ended, saves)
+        return Wish(None if self._last is None else self._last[1].look, self._paused, saves)
 
     def show(self, picture: Picture, seconds: float) -> None:
         """Send a picture, and note what it cost."""
@@ -205,12 +205,6 @@ class Live:
         self._curves.add(t, values)
         if isinstance(count := values.get("gaussians"), (int, float)):
             self._count = int(count)
-
-    def stay(self) -> None:
-        """Show the trained model from now on."""
-        self._ended, self._saves = True, False
-        for visitor in list(self.page.visitors.values()):
-            visitor.refresh()
 
     def close(self) -> None:
         """Close the page."""

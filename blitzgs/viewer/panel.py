@@ -12,6 +12,8 @@ import numpy as np
 import torch
 
 from blitzgs.capture.pictures import encode_image
+from blitzgs.capture.world import GEOCENTRIC
+from blitzgs.view.draw import LEVEL_COLOURS
 from blitzgs.view.look import MODES
 from blitzgs.viewer import compare
 from blitzgs.viewer.frustums import Frustums
@@ -20,11 +22,12 @@ from blitzgs.viewer.settings import Triple
 from blitzgs.viewer.visitor import Shown, Visitor
 from blitzgs.viewer.world import SCALE
 
-HELP = (
-    "**Orbit**: drag turns around a point, right drag moves it, the wheel nears it. "
-    "**Fly**: drag turns your head. **Walk**: the same, at eye height above the ground. "
-    "Keys: W A S D move level, Q down, E up, arrows turn. Click a frustum to stand there."
-)
+MOTIONS = {
+    "orbit": "**Orbit**: drag turns around a point, right drag moves it, the wheel nears it.",
+    "fly": "**Fly**: drag turns your head.",
+    "walk": "**Walk**: drag turns your head, at eye height above the ground.",
+}
+KEYS = "Keys: W A S D move level, Q down, E up, arrows turn. Click a frustum to stand there."
 
 
 class Panel:
@@ -90,7 +93,7 @@ class Panel:
             hint="Where a photograph was trained on, show the render with its exposure",
         )  # fmt: skip
         exposure.on_update(lambda _: visitor.change(exposure=exposure.value))
-        wipe = gui.add_slider("Wipe", min=0.0, max=1.0, step=0.01, initial_value=0.5)
+        wipe = gui.add_slider("Wipe", min=0.0, max=1.0, step=0.01, initial_value=0.5, disabled=True)
 
         def stand(_: Any) -> None:
             if number.value < len(exhibit.cameras):
@@ -104,6 +107,7 @@ class Panel:
 
         def chosen(_: Any) -> None:
             visitor.change(comparison=choice.value)
+            wipe.disabled = choice.value != "wipe"
             if choice.value != "off" and visitor.standing is None:
                 stand(None)
 
@@ -115,8 +119,7 @@ class Panel:
 
     def _move(self) -> None:
         visitor, gui = self._visitor, self._gui
-        motion = gui.add_button_group("Motion", ("orbit", "fly", "walk"))
-        motion.on_click(lambda _: visitor.choose_motion(motion.value))
+        motion = gui.add_button_group("Motion", tuple(MOTIONS))
         fov = gui.add_slider(
             "Field of view", min=10, max=110, step=1, initial_value=50, hint="Vertical, degrees"
         )
@@ -127,7 +130,17 @@ class Panel:
         fov.on_update(turn)
         gui.add_button("Level the horizon").on_click(lambda _: visitor.go(visitor.stance))
         gui.add_button("Back to the start").on_click(lambda _: self._restart())
-        gui.add_markdown(HELP)
+        help_text = gui.add_markdown("")
+
+        def moves(_: Any) -> None:
+            visitor.choose_motion(motion.value)
+            tell()
+
+        def tell() -> None:  # the buttons do not show which is chosen
+            help_text.content = f"{MOTIONS[visitor.motion]} {KEYS}"
+
+        motion.on_click(moves)
+        tell()
 
     def _restart(self) -> None:
         world = self._visitor.world
@@ -231,8 +244,16 @@ def overlay(visitor: Visitor, shown: Shown, memory: str) -> str:
             f"{look.mode} {shown.low:.3g} <span style='display:inline-block;width:120px;height:9px;"
             f"background:{colours}'></span> {shown.high:.3g}"
         )
+    if look.mode == "level":
+        boxes = "".join(_level(k, colour) for k, colour in enumerate(LEVEL_COLOURS))
+        lines.append(f"level {boxes} (coarse to fine)")
     box = f"<style>{_NARROW}</style><div id='blitzgs-figures' style='{_BOX}'>"
     return f"{box}{scale_bar(visitor)}{'<br>'.join(lines)}</div>"
+
+
+def _level(level: int, colour: tuple[float, float, float]) -> str:
+    channels = ",".join(f"{255 * value:.0f}" for value in colour)
+    return f"<span style='background:rgb({channels});padding:0 4px'>{level}</span>"
 
 
 def scale_bar(visitor: Visitor) -> str:
@@ -241,17 +262,20 @@ def scale_bar(visitor: Visitor) -> str:
     distance = float(np.linalg.norm(np.array(camera.look_at) - np.array(camera.position)))
     if visitor.motion != "orbit":
         distance = float(np.linalg.norm(visitor.world.middle - visitor.stance.position))
-    # Width of the view at this distance in the capture's unit.
-    width = (
-        2 * distance * math.tan(visitor.stance.fov / 2) * camera.aspect / SCALE * visitor.exhibit.space.unit
-    )
-    if not (math.isfinite(width) and width > 0):
+    # Height of the view at this distance in the capture's unit, or in metres if these are known. The picture
+    # is as high as the page; beside the panel it is less wide.
+    frame, unit = visitor.exhibit.frame, visitor.exhibit.space.unit
+    in_metres = frame is not None and frame.crs == GEOCENTRIC
+    if frame is not None and in_metres:
+        unit *= frame.scale
+    height = 2 * distance * math.tan(visitor.stance.fov / 2) / SCALE * unit
+    if not (math.isfinite(height) and height > 0):
         return ""
-    length = round_length(width / 8)
-    share = 100 * length / width
+    length = round_length(height * camera.aspect / 8)
+    name = "m" if in_metres else "unit" if length == 1 else "units"
     return (
-        f"<div style='width:{share:.2f}vw;border:2px solid #fff;border-top:0;height:5px;margin:2px 0'></div>"
-        f"<div>{length:g} units at the orbit's centre</div>"
+        f"<div style='width:{100 * length / height:.2f}vh;border:2px solid #fff;border-top:0;height:5px;"
+        f"margin:2px 0'></div><div>{length:g} {name} at the orbit's centre</div>"
     )
 
 

@@ -96,8 +96,11 @@ class Route:
 
     def play(self) -> None:
         """Move the visitor along the path, or stop if it is being played."""
-        if not self.path.keyframes or self._playing.is_set():
+        if self._playing.is_set():
             self._playing.clear()
+            return
+        if not self.path.keyframes:
+            note(self._visitor, "add a viewpoint first")
             return
         self._playing.set()
         frames, begin = self._timed().frames(), time.monotonic()

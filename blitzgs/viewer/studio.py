@@ -19,10 +19,10 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import is_antialiased
 from blitzgs.formats.models import offset_of, read_gaussians
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, load_cameras
 from blitzgs.runs.folder import open_run
-from blitzgs.runs.world import gate_of, load_frame, trained_columns
+from blitzgs.runs.world import gate_of, load_world_frame, trained_columns
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.draw import Drawer, Subject, table_of_parameters
@@ -91,7 +91,7 @@ def open_model(
         photograph=photograph if stored is not None else None,
         exposures=_exposures(model.exposures, () if stored is None else stored.train),
         paths=paths or path / "paths",
-        frame=load_frame(path),
+        frame=load_world_frame(path),
     )
     return Opened(exhibit, subject, table, ranks)
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from blitzgs.capture.world import GEO, GEOCENTRIC, WorldFrame, converted, pyproj_module, read_frame
+from blitzgs.capture.world import GEO, GEOCENTRIC, WorldFrame, converted, pyproj_module, read_world_frame
 from blitzgs.config.fields import Config, ModelConfig
 from blitzgs.formats.gaussians import GaussianSource, is_antialiased
 from blitzgs.formats.models import offset_of
@@ -21,7 +21,7 @@ from blitzgs.formats.selection import opacity_length
 from blitzgs.formats.tiles import upright
 from blitzgs.formats.web_page import WebLevels, WebScene, WebSplats, estimated_bytes, frame_bytes, web_page
 from blitzgs.frame.render import RenderOptions
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, load_cameras
 from blitzgs.runs.clean import contributions as measured
 from blitzgs.runs.export import open_source
@@ -228,7 +228,7 @@ def open_city(path: Path) -> City:
         if (folder / CAMERAS).exists():
             cameras = load_cameras(folder).cameras
         if (folder / GEO).is_file():
-            frame = read_frame(folder / GEO)
+            frame = read_world_frame(folder / GEO)
     first = next(iter(source.blocks()), None)
     if first is None or len(first) == 0:
         raise ValueError(f"{path} holds no Gaussians")

@@ -12,6 +12,7 @@
 #include <memory>
 #include <new>
 #include <span>
+#include <sstream>
 #include <stdexcept>
 #include <string>
 #include <string_view>
@@ -21,8 +22,8 @@
 #include <vector>
 
 #include "io/colmap.h"
+#include "io/image_file.h"
 #include "io/image_header.h"
-#include "io/jpeg.h"
 #include "io/ply.h"
 #include "io/qoi.h"
 
@@ -48,6 +49,7 @@ enum blitzgs_io_status_code {
   BLITZGS_IO_VALUE_ERROR,   // arguments do not fit each other
   BLITZGS_IO_MEMORY_ERROR,
   BLITZGS_IO_ERROR,
+  BLITZGS_IO_SYSTEM_ERROR,  // the message is that of io::SystemError
 };
 
 // Contiguous values of one type, or the characters of a text. Texts are two columns: their characters, and
@@ -250,23 +252,32 @@ void read_ply(Arguments& arguments, Reply& reply) {
   reply.add_number(table.total);
 }
 
-void check_jpeg(Arguments& arguments, Reply&) {
-  const Bytes file = arguments.take<std::uint8_t>();
-  io::check_jpeg(file, arguments.text());
+std::string as_json(const io::ImageHeader& header) {
+  constexpr std::string_view kAlpha[] = {"", "straight", "associated"};
+  constexpr std::string_view kSamples[] = {"uint", "int", "float"};
+  std::ostringstream json;
+  json << std::boolalpha << R"({"format": ")" << header.format << R"(", "supported": )" << header.supported
+       << R"(, "width": )" << header.width << R"(, "height": )" << header.height << R"(, "orientation": )"
+       << header.orientation << R"(, "bits": )" << header.bits << R"(, "colors": )" << header.colors
+       << R"(, "extras": )" << header.extras << R"(, "samples": ")"
+       << kSamples[static_cast<int>(header.samples)] << R"(", "alpha": ")"
+       << kAlpha[static_cast<int>(header.alpha)] << R"(", "transparent_grey": )"
+       << (header.transparent_grey ? std::to_string(*header.transparent_grey) : "null")
+       << R"(, "is_planar": )" << header.is_planar << R"(, "is_white_zero": )" << header.is_white_zero
+       << R"(, "is_lossy": )" << header.is_lossy << "}";
+  return json.str();
 }
 
 void read_image_header(Arguments& arguments, Reply& reply) {
   const Bytes file = arguments.take<std::uint8_t>();
-  const io::ImageHeader header = io::read_image_header(file, arguments.text());
-  constexpr std::string_view kAlpha[] = {"", "straight", "associated"};
-  constexpr std::string_view kSamples[] = {"uint", "int", "float"};
-  reply.add_texts(std::vector<std::string_view>{header.format, kSamples[static_cast<int>(header.samples)],
-                                                kAlpha[static_cast<int>(header.alpha)]});
-  reply.add(std::vector<std::uint64_t>{header.width, header.height, header.orientation, header.bits,
-                                       header.colors, header.extras});
-  reply.add(
-      std::vector<std::uint8_t>{header.supported, header.is_white_zero, header.is_lossy, header.is_planar});
-  reply.add_number(header.transparent_grey ? std::int64_t{*header.transparent_grey} : std::int64_t{-1});
+  reply.add_text(as_json(io::read_image_header(file, arguments.text())));
+}
+
+void read_image_file(Arguments& arguments, Reply& reply) {
+  const std::string path = arguments.text();
+  std::vector<std::uint8_t> bytes = io::read_image_file(path);
+  reply.add_text(as_json(io::read_image_header(bytes, path)));
+  reply.add(std::move(bytes));
 }
 
 void tiff_as_stored(Arguments& arguments, Reply& reply) {
@@ -306,7 +317,7 @@ struct Function {
 constexpr Function kFunctions[] = {
     BLITZGS_IO_FUNCTION(camera_models),     BLITZGS_IO_FUNCTION(read_cameras),
     BLITZGS_IO_FUNCTION(read_images),       BLITZGS_IO_FUNCTION(read_points),
-    BLITZGS_IO_FUNCTION(read_ply),          BLITZGS_IO_FUNCTION(check_jpeg),
+    BLITZGS_IO_FUNCTION(read_ply),          BLITZGS_IO_FUNCTION(read_image_file),
     BLITZGS_IO_FUNCTION(read_image_header), BLITZGS_IO_FUNCTION(tiff_as_stored),
     BLITZGS_IO_FUNCTION(encode_qoi),        BLITZGS_IO_FUNCTION(decode_qoi),
     BLITZGS_IO_FUNCTION(set_flag),          BLITZGS_IO_FUNCTION(flag_is_set),
@@ -322,6 +333,8 @@ std::pair<int, std::string> run(std::string_view name, Arguments arguments, Repl
     return {BLITZGS_IO_OK, ""};
   } catch (const io::FormatError& error) {
     return {BLITZGS_IO_FORMAT_ERROR, error.what()};
+  } catch (const io::SystemError& error) {
+    return {BLITZGS_IO_SYSTEM_ERROR, error.what()};
   } catch (const std::logic_error& error) {  // std::invalid_argument, mostly
     return {BLITZGS_IO_VALUE_ERROR, error.what()};
   } catch (const std::bad_alloc& error) {

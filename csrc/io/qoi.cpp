@@ -85,6 +85,7 @@ std::vector<std::uint8_t> encode_qoi(const std::uint8_t* rgb, QoiSize size) {
     before = pixel;
   }
   out.insert(out.end(), kEnd.begin(), kEnd.end());
+  out.shrink_to_fit();  // it is kept
   return out;
 }
 

@@ -180,24 +180,14 @@ def test_a_capture_without_a_view_to_measure_is_named():
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_parts_make_up_the_grid_and_every_recipe_can_be_configured(tmp_path):
+def test_every_recipe_of_the_grid_can_be_configured(tmp_path):
     grid = quality_plan.stress_recipes(str(ROOT / "configs" / "aerial.yaml"))
     assert len(grid) == 9 * 4 * 3 and all(set(name) <= SAFE for name in grid)
-    parts = [quality_plan.part_of(grid, (k, 5)) for k in range(1, 6)]
-    assert {name: text for part in parts for name, text in part.items()} == grid
     some = dict(list(grid.items())[::17])
     specs = runs_of({"x": str(tmp_path)}, some, [0], [], None, "cpu")
     assert len(specs) == len(some)
-    doubled = quality_plan.stress_recipes(str(ROOT / "configs" / "aerial.yaml"))[
-        "position=200+schedule=25+B=1"
-    ]
+    doubled = grid["position=200+schedule=25+B=1"]
     assert "--optimiser.position=0.00032" in doubled and "--schedule.scale=0.25" in doubled
-
-
-def test_refuses_parts_that_there_are_not():
-    with pytest.raises(ValueError, match="3/2"):
-        quality_plan.parse_part("3/2")
-    assert quality_plan.parse_part("2/2") == (2, 2)
 
 
 def test_the_table_compares_the_worst_seed_with_its_column():

@@ -3,7 +3,7 @@
 
 import json
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import bm_accuracy
 import bm_host
@@ -18,8 +18,7 @@ from scenes import aerial
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.tiles import write_tiles
-from blitzgs.runs import files as run_files
-from blitzgs.runs import lod
+from blitzgs.runs import lod, run_files
 from blitzgs.training import setup
 from blitzgs.training.trainer import Trainer
 from tests.formats.test_tiles import SCENE, city
@@ -36,11 +35,7 @@ def test_every_call_is_measured(tmp_path, monkeypatch, capsys):
     assert [row["call"] for row in rows] == list(bm_host.CALLS)
     assert all(row["forward us"] > 0 and row["backward us"] > 0 for row in rows)
     assert "sparse, meta" in capsys.readouterr().out
-    *parts, count = steps
-    assert parts == ["render", "loss", "backward", "optimisers", "all"] and all(
-        steps[name] > 0 for name in parts
-    )
-    assert count.startswith("torch's operations") and steps[count] > 20
+    assert list(steps) == ["render", "loss", "backward", "optimisers", "all"] and min(steps.values()) > 0
     assert all(row["one optimiser, host us"] > 0 for row in written["steps"])
 
 
@@ -60,15 +55,10 @@ def test_the_loop_learns_with_each_arm(tmp_path, capsys):
     write_tiny_capture(tmp_path / "tiny")
     arguments = [str(tmp_path / "tiny"), "--steps", "60", "--arms", "import", "four", "--device", "cpu"]
     arguments += ["--one-thread"]
-    one, four = bm_drop_in.main([*arguments, "--profile", "--json", str(tmp_path / "found.json")])
+    one, four = bm_drop_in.main([*arguments, "--json", str(tmp_path / "found.json")])
     assert one["Gaussians"] == four["Gaussians"]
     assert abs(one["PSNR, dB"] - four["PSNR, dB"]) < 0.5
-    printed = capsys.readouterr().out
-    assert (
-        "gsplat's loop, 60 steps of tiny, autograd in one thread" in printed
-        and "four: work of a step" in printed
-    )
-    assert all(part in printed for part in ("render", "backward", "optimisers", "strategy, after"))
+    assert "gsplat's loop, 60 steps of tiny, autograd in one thread" in capsys.readouterr().out
     assert (tmp_path / "found.json").exists()
 
 
@@ -178,13 +168,10 @@ def test_windows_of_a_large_image_are_the_image(antialiased):
     assert image_error < 1e-12 and gradient_error < 1e-12
 
 
-def test_the_accuracy_report_is_written_and_bounds_are_required(scene, tmp_path):
+def test_bounds_are_required(scene):
     exact = bm_accuracy.Option("float64", dtype=torch.float64)
     figures = bm_accuracy.measure(exact, {1: scene}, repeats=1)
     assert figures.image_error < 1e-12 and figures.milliseconds > 0
-    bm_accuracy.write([figures], tmp_path)
-    assert (tmp_path / "accuracy.md").read_text().splitlines()[-1].startswith("| float64 |")
-    assert json.loads((tmp_path / "accuracy.json").read_text()) == [asdict(figures)]
     bm_accuracy.require_bounds(figures)
     figures.gradient_error = 2e-4
     with pytest.raises(SystemExit, match="gradients 2.0e-04 of 1e-04"):
@@ -199,13 +186,12 @@ def test_an_interrupted_run_keeps_its_measurements(scene, tmp_path, monkeypatch,
 
     monkeypatch.setattr(bm_accuracy, "measure", measure)
     monkeypatch.setattr(bm_accuracy, "aerial", lambda *_, **__: scene)
-    monkeypatch.setattr(sys, "argv", ["bm_accuracy.py", "--device", "cpu", "--out", str(tmp_path)])
+    path = tmp_path / "accuracy.json"
+    monkeypatch.setattr(sys, "argv", ["bm_accuracy.py", "--device", "cpu", "--json", str(path)])
     with pytest.raises(KeyboardInterrupt):
         bm_accuracy.main()
-    names = [row["name"] for row in json.loads((tmp_path / "accuracy.json").read_text())]
-    assert names == ["default", "antialiased"]
-    for text in ((tmp_path / "accuracy.md").read_text(), capsys.readouterr().out):
-        assert text.splitlines()[-1].startswith("| antialiased |")
+    assert [row["name"] for row in json.loads(path.read_text())["rows"]] == ["default", "antialiased"]
+    assert capsys.readouterr().out.splitlines()[-1].startswith("| antialiased |")
 
 
 @pytest.mark.parametrize("name", ["aerial", "garden_like"])

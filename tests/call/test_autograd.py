@@ -10,7 +10,7 @@ import torch.utils.checkpoint
 from torch._dynamo.testing import CompileCounterWithBackend
 
 import blitzgs
-from blitzgs.call.finite import _warn_of_gradient
+from blitzgs.call.bad_values import _warn_of_gradient
 from blitzgs.ops.photometric import photometric_loss
 from blitzgs.reference.projection import covariance_factors
 from tests.call.test_raw_rasterization import raw, raw_parameters

@@ -12,6 +12,7 @@ from blitzgs.capture.image_files import (
     check_photograph,
     decode_mask,
     decode_rgb,
+    described,
     read_header,
     read_whole,
 )
@@ -92,7 +93,7 @@ def test_files_without_an_image_are_called_what_they_are(tmp_path, data, message
 def test_a_mask_in_separate_bands_of_16_bits_is_refused():
     data = tiff(np.ones((8, 8, 3), dtype=np.uint16), t284=2)
     with pytest.raises(ValueError, match="m.tif: not supported: TIFF of 16 bits with separate bands"):
-        decode_mask(data, "m.tif")
+        decode_mask(described(data, "m.tif"))
 
 
 @pytest.mark.parametrize("kept", [0.2, 0.5, 0.8])
@@ -116,7 +117,7 @@ def test_damaged_files_leave_the_terminal_to_our_message(tmp_path, suffix, capfd
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(ValueError, match=rf"a\{suffix}: "):
         read_header(path)
-        decode_rgb(read_whole(path), str(path))
+        decode_rgb(read_whole(path))
     assert capfd.readouterr() == ("", "")
 
 
@@ -138,7 +139,7 @@ def test_a_png_with_damage_in_what_no_picture_needs_is_read(tmp_path):
     data = path.read_bytes()
     at = data.index(b"IDAT") - 4
     path.write_bytes(data[:at] + b"\0\0\0\4tEXtspam\0\0\0\0" + data[at:])
-    assert decode_rgb(read_whole(path), "a.png").shape == (8, 8, 3)
+    assert decode_rgb(read_whole(path)).shape == (8, 8, 3)
     for length in range(8, len(data)):
         path.write_bytes(data[:length])
         with pytest.raises(ValueError, match="truncated PNG"):
@@ -225,8 +226,8 @@ def test_bytes_after_the_last_block_of_a_jpeg_change_no_pixel(tmp_path, progress
     data = cv2.imencode(".jpg", smooth_image(96, 128), flags)[1].tobytes()
     more = np.random.default_rng(count).integers(1, 255, count, dtype=np.uint8).tobytes()
     (tmp_path / "a.jpg").write_bytes(data[:-2] + more + data[-2:])
-    shown = decode_rgb(read_whole(tmp_path / "a.jpg"), "a.jpg")
-    np.testing.assert_array_equal(shown, decode_rgb(data, "a.jpg"))
+    shown = decode_rgb(read_whole(tmp_path / "a.jpg"))
+    np.testing.assert_array_equal(shown, decode_rgb(described(data, "a.jpg")))
 
 
 def test_a_photograph_that_was_read_is_not_checked_again(tmp_path, monkeypatch):

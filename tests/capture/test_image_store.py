@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from blitzgs.capture.capture import load_capture
-from blitzgs.capture.image_files import decode_rgb, read_whole
+from blitzgs.capture.image_files import decode_rgb, described, read_whole
 from blitzgs.capture.images import BoundedCache, ImageStore
 from tests.capture.helpers import smooth_image, write_capture, write_image
 
@@ -229,7 +229,7 @@ def test_every_kind_of_whole_jpeg_passes(tmp_path, option, size):
         ok, data = cv2.imencode(".jpg", pixels, options)
         path = tmp_path / "a.jpg"
         path.write_bytes(data.tobytes() + b"trailing bytes")
-        assert decode_rgb(read_whole(path), "a.jpg").shape == (*size, 3)
+        assert decode_rgb(read_whole(path)).shape == (*size, 3)
         path.write_bytes(data.tobytes()[:-2])
         with pytest.raises(ValueError, match="end marker is missing"):
             read_whole(path)
@@ -239,11 +239,11 @@ def test_a_frame_of_motion_jpeg_has_no_huffman_tables(tmp_path):
     path = tmp_path / "a.jpg"
     write_image(path, smooth_image(48, 64))
     data = path.read_bytes()
-    expected = decode_rgb(data, "a.jpg")
+    expected = decode_rgb(described(data, "a.jpg"))
     while (at := data.find(b"\xff\xc4")) >= 0:
         data = data[:at] + data[at + 2 + int.from_bytes(data[at + 2 : at + 4]) :]
     path.write_bytes(data)
-    np.testing.assert_array_equal(decode_rgb(read_whole(path), "a.jpg"), expected)
+    np.testing.assert_array_equal(decode_rgb(read_whole(path)), expected)
     path.write_bytes(data[:-100] + data[-2:])
     with pytest.raises(ValueError, match="image data end before the last block"):
         read_whole(path)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from blitzgs.capture.capture import load_capture
-from blitzgs.capture.image_files import decode_mask, decode_rgb, read_header
+from blitzgs.capture.image_files import decode_mask, decode_rgb, described, read_header
 from blitzgs.capture.images import ImageStore
 from blitzgs.capture.masks import find_masks
 from tests.capture.helpers import png, smooth_image, tiff, write_capture, write_image
@@ -84,12 +84,13 @@ WAYS = {
 
 @pytest.mark.parametrize("way", WAYS)
 def test_every_way_to_write_a_mask(way):
-    np.testing.assert_array_equal(decode_mask(WAYS[way], "x"), COUNTS)
+    np.testing.assert_array_equal(decode_mask(described(WAYS[way], "x")), COUNTS)
 
 
 def test_labels_of_all_brightnesses_count_whatever_they_are():
     labels = np.arange(48 * 64).reshape(SHAPE) % 256
-    np.testing.assert_array_equal(decode_mask(coded(".png", labels.astype(np.uint8)), "x"), labels > 0)
+    mask = described(coded(".png", labels.astype(np.uint8)), "x")
+    np.testing.assert_array_equal(decode_mask(mask), labels > 0)
 
 
 @pytest.mark.parametrize(
@@ -238,7 +239,7 @@ def blended(fractions, background, associated=False):
 def check(data, fractions, associated=False, tolerance=0.0):
     for background in BACKGROUNDS:
         expected = blended(fractions, background, associated)
-        difference = np.abs(decode_rgb(data, "x", background).astype(float) - expected)
+        difference = np.abs(decode_rgb(described(data, "x"), background).astype(float) - expected)
         # float32 may round the other way at a half.
         assert difference.max() <= max(1, tolerance) and (difference > tolerance).mean() < 0.01
 
@@ -269,7 +270,7 @@ def test_a_band_that_a_tiff_does_not_call_alpha_is_not_used(tmp_path, dtype, ext
     data = tiff(pixels, extra)
     colours = pixels[..., :3] if bands == 4 else np.repeat(pixels[..., :1], 3, axis=2)
     for background in BACKGROUNDS:
-        shown = decode_rgb(data, "x", background)
+        shown = decode_rgb(described(data, "x"), background)
         assert np.abs(shown.astype(float) - colours / full * 255).max() <= 1
     (tmp_path / "a.tif").write_bytes(data)
     header = read_header(tmp_path / "a.tif")
@@ -303,7 +304,7 @@ def test_gif_with_a_transparent_colour():
     # The encoder has a palette of its own.
     pixels = np.zeros((SIZE, SIZE, 4), dtype=np.uint8)
     pixels[:, :8] = (255, 0, 0, 255)
-    shown = decode_rgb(encode(".gif", pixels), "x", (0.0, 0.0, 1.0))
+    shown = decode_rgb(described(encode(".gif", pixels), "x"), (0.0, 0.0, 1.0))
     assert shown[4, 2].tolist() == [252, 0, 0] and shown[4, 12].tolist() == [0, 0, 255]
 
 
@@ -358,9 +359,10 @@ def jp2_without_marks(associated=None):
 
 def test_the_channel_definition_of_jpeg_2000_decides():
     for background in BACKGROUNDS:
-        assert decode_rgb(jp2_without_marks(), "x", background)[5, 5].tolist() == [200, 100, 50]
+        assert decode_rgb(described(jp2_without_marks(), "x"), background)[5, 5].tolist() == [200, 100, 50]
         expected = blended(np.array([200, 100, 50, 128]) / 255, background, associated=True)
-        assert decode_rgb(jp2_without_marks(True), "x", background)[5, 5].tolist() == expected.tolist()
+        shown = decode_rgb(described(jp2_without_marks(True), "x"), background)
+        assert shown[5, 5].tolist() == expected.tolist()
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".webp", ".jp2"])
@@ -369,7 +371,7 @@ def test_files_without_alpha_are_the_same_over_every_background(tmp_path, suffix
     path = tmp_path / f"a{suffix}"
     assert cv2.imwrite(str(path), pixels)
     assert not read_header(path).has_alpha
-    shown = [decode_rgb(path.read_bytes(), "x", background) for background in (None, *BACKGROUNDS)]
+    shown = [decode_rgb(described(path.read_bytes(), "x"), background) for background in (None, *BACKGROUNDS)]
     assert all(np.array_equal(shown[0], other) for other in shown[1:])
 
 

@@ -18,7 +18,7 @@ from blitzgs.capture.world import (
     frame_beside,
     frame_in,
     geodetic,
-    read_frame,
+    read_world_frame,
 )
 from tests.capture import helpers as files
 
@@ -85,10 +85,10 @@ def test_a_damaged_file_is_refused_by_name(tmp_path, change, message):
     path = tmp_path / "geo.json"
     path.write_text(json.dumps(WorldFrame().as_json() | change))
     with pytest.raises(ValueError, match=f"geo.json is damaged .*{message}"):
-        read_frame(path)
+        read_world_frame(path)
     path.write_text("x" * ((1 << 20) + 1))
     with pytest.raises(ValueError, match="larger than 1,048,576 bytes"):
-        read_frame(path)
+        read_world_frame(path)
 
 
 @pytest.mark.parametrize("place", [(47.5, 8.25, 432.0), (-33.9, 151.2, -12.0), (0.0, -179.9, 9000.0)])

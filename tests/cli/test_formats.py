@@ -18,8 +18,8 @@ from blitzgs.capture.world import geodetic
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.models import FORMATS, read_gaussians
-from blitzgs.runs.files import open_model
-from blitzgs.runs.world import load_frame
+from blitzgs.runs.run_files import open_model
+from blitzgs.runs.world import load_world_frame
 from blitzgs.viewer.panel import overlay
 from blitzgs.viewer.studio import open_model as open_viewed
 from blitzgs.viewer.world import Stance, World
@@ -170,7 +170,7 @@ def test_control_points_give_the_world(trained, survey, tmp_path, capsys):
     out, err = capsys.readouterr()
     assert "6 of 7 points used; RMS 0.0000 horizontal, 0.0000 vertical" in out and "contradicts" in out
     assert "upside down" not in err
-    frame = load_frame(trained[1])
+    frame = load_world_frame(trained[1])
     assert frame.crs == "EPSG:32632" and frame.scale == pytest.approx(12.5, rel=1e-9)
     np.testing.assert_allclose(frame.to_world(np.ones(3)), 12.5 * TURN @ np.ones(3) + SHIFT, atol=1e-6)
     assert main(["export", str(trained[1]), "--ply", str(tmp_path / "m.ply"), "--coordinates", "world"]) == 0
@@ -179,7 +179,7 @@ def test_control_points_give_the_world(trained, survey, tmp_path, capsys):
     pytest.importorskip("pyproj")
     assert main(["align", str(trained[1]), "--crs", "EPSG:32633"]) == 0
     assert "is wrong by at most" in capsys.readouterr().out
-    moved = load_frame(trained[1])
+    moved = load_world_frame(trained[1])
     assert moved.crs == "EPSG:32633" and moved.scale == pytest.approx(12.5, rel=0.01)
     assert abs(moved.translation[0] - frame.translation[0]) > 1e5
 
@@ -205,7 +205,7 @@ def test_what_cannot_be_aligned_is_refused(trained, survey, tmp_path, capsys):
     assert "EPSG:4326 has angles" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["align", run])
-    assert load_frame(trained[1]) is None
+    assert load_world_frame(trained[1]) is None
 
 
 def test_positions_in_exif_give_the_world(trained, survey, tmp_path, monkeypatch, capsys):
@@ -226,7 +226,7 @@ def test_positions_in_exif_give_the_world(trained, survey, tmp_path, monkeypatch
     assert main(["align", str(trained[1]), "--gps", "--crs", "EPSG:32632", "--data", str(data)]) == 0
     out = capsys.readouterr().out
     assert "7 of 8 positions used" in out
-    frame = load_frame(trained[1])
+    frame = load_world_frame(trained[1])
     assert frame.scale == pytest.approx(12.5, rel=1e-3)
     centre = capture.offset
     np.testing.assert_allclose(frame.to_world(centre), 12.5 * TURN @ centre + SHIFT, atol=0.05)
@@ -238,7 +238,7 @@ def test_a_training_of_a_project_knows_its_world_and_resuming_keeps_an_alignment
     run = tmp_path / "run"
     flags = ["--out", str(run), "--schedule.scale=0.05", *as_flags("config=defaults", *OVERRIDES)]
     assert main(["train", "--data", str(tmp_path / "site" / "reconstruction.json"), *flags]) == 0
-    frame = load_frame(run)
+    frame = load_world_frame(run)
     assert frame.crs == "EPSG:4978" and frame.scale == 1
     place = frame.to_world(np.zeros(3))
     np.testing.assert_allclose(geodetic(place), [47.5, 8.25, 432.0], atol=1e-8)
@@ -257,7 +257,7 @@ def test_a_training_of_a_project_knows_its_world_and_resuming_keeps_an_alignment
     pytest.importorskip("pyproj")
     assert main(["align", str(run), "--crs", "EPSG:32632"]) == 0
     assert main(["train", "--out", str(run), "--extend", "1.2"]) == 0
-    assert load_frame(run).crs == "EPSG:32632"
+    assert load_world_frame(run).crs == "EPSG:32632"
 
 
 def dms(degrees):

@@ -234,8 +234,9 @@ def test_a_torch_that_does_not_load_is_named(code, state, text, tmp_path):
     facts += [f"Requires-Dist: {requirement}" for requirement in REQUIREMENTS]
     (fake.parent / "blitzgs-1.dist-info").mkdir()
     (fake.parent / "blitzgs-1.dist-info" / "METADATA").write_text("\n".join(facts))
-    command = "import sys; from blitzgs.cli import doctor; doctor._PACKAGE = doctor.Path(sys.path[1]) / 'b'; "
-    command += "from blitzgs.cli import main; sys.exit(main(['doctor', '--json', '--timeout', '3']))"
+    command = "import sys; from blitzgs.cli import doctor; doctor.TIMEOUT = 3; "
+    command += "doctor._PACKAGE = doctor.Path(sys.path[1]) / 'b'; "
+    command += "from blitzgs.cli import main; sys.exit(main(['doctor', '--json']))"
     environment = os.environ | {"PYTHONPATH": str(fake.parent)}
     begin = time.monotonic()
     done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, env=environment)
@@ -248,17 +249,18 @@ def test_a_torch_that_does_not_load_is_named(code, state, text, tmp_path):
 
 def test_a_library_that_does_not_load_is_named(tmp_path):
     (tmp_path / "libblitzgs_cpu.so").write_text("damaged")
-    status, lines = report("--timeout", "60", BLITZGS_LIBRARY_DIR=str(tmp_path))
+    status, lines = report(BLITZGS_LIBRARY_DIR=str(tmp_path))
     assert status == 1
     assert lines["lib cpu"]["state"] == "failed" and "libblitzgs_cpu.so" in lines["lib cpu"]["text"]
     assert lines["lib io"]["state"] == "missing" and "pip install" in lines["lib io"]["remedy"]
     assert lines["render cpu"]["state"] == "failed"
 
 
-def test_a_process_that_hangs_is_ended_with_its_children(tmp_path):
+def test_a_process_that_hangs_is_ended_with_its_children(tmp_path, monkeypatch):
+    monkeypatch.setattr(doctor, "TIMEOUT", 1)
     command = ["bash", "-c", f"sleep 300 & echo $! > {tmp_path}/child; wait"]
     with pytest.raises(doctor.ProbeError, match="no answer within 1 s"):
-        doctor.run_command(command, timeout=1)
+        doctor.run_command(command)
     child = int((tmp_path / "child").read_text())
     state = Path(f"/proc/{child}/stat")
     deadline = time.monotonic() + 10
@@ -276,8 +278,8 @@ def torch_of(version, **more):
 )
 def test_the_bounds_of_torch(version, state, monkeypatch):
     monkeypatch.setattr(doctor.metadata, "requires", lambda _: REQUIREMENTS)
-    monkeypatch.setattr(doctor, "probe", lambda *_, **__: torch_of(version))
-    assert doctor._torch(1).state == state
+    monkeypatch.setattr(doctor, "probe", lambda *_: torch_of(version))
+    assert doctor._torch().state == state
 
 
 @pytest.mark.parametrize(
@@ -295,7 +297,7 @@ def test_the_remedy_names_the_bounds_that_are_known(requirements, remedy, monkey
 
     monkeypatch.setattr(doctor.metadata, "requires", lambda _: requirements)
     monkeypatch.setattr(doctor, "probe", fails)
-    assert doctor._torch(1).remedy == remedy
+    assert doctor._torch().remedy == remedy
 
 
 @pytest.mark.parametrize(
@@ -303,13 +305,13 @@ def test_the_remedy_names_the_bounds_that_are_known(requirements, remedy, monkey
 )
 def test_a_wrong_rendering_fails(name, value, monkeypatch, capsys):
     monkeypatch.setattr(doctor, "probe", lambda *_, **__: GOOD | {name: value})
-    line = doctor._render("cpu", 1)
+    line = doctor._render("cpu")
     assert line.state == "failed" and line.remedy
     monkeypatch.setattr(doctor, "examine", lambda *_: [line])
     assert main(["doctor"]) == 1
     assert "1 faults" in capsys.readouterr().out
     monkeypatch.setattr(doctor, "probe", lambda *_, **__: GOOD)
-    assert doctor._render("cpu", 1).state == "ok"
+    assert doctor._render("cpu").state == "ok"
 
 
 def test_ranks_that_differ_fail(monkeypatch):
@@ -317,7 +319,7 @@ def test_ranks_that_differ_fail(monkeypatch):
     monkeypatch.setattr(
         doctor, "probe", lambda name, device, rank, *_, **__: part | {"differing_values": int(rank)}
     )
-    assert doctor._exchange("cpu", 1).state == "failed"
+    assert doctor._exchange("cpu").state == "failed"
 
 
 def test_a_gpu_that_the_library_was_not_built_for(monkeypatch, tmp_path):
@@ -325,14 +327,14 @@ def test_a_gpu_that_the_library_was_not_built_for(monkeypatch, tmp_path):
     monkeypatch.setattr(doctor, "LIBRARY_DIR", tmp_path)
     found = {"cuda": "13.0.88", "architectures": "80-real,86-real,90-real,120", "ops": "0"}
     monkeypatch.setattr(doctor, "probe", lambda *_, **__: dict(found))
-    states = [doctor._library("cuda", 1, [{"architecture": f"sm_{n}"}]).state for n in (80, 90, 120, 87)]
+    states = [doctor._library("cuda", [{"architecture": f"sm_{n}"}]).state for n in (80, 90, 120, 87)]
     assert states == ["ok", "ok", "ok", "warning"]
 
 
 def test_a_slow_disk_is_a_warning(monkeypatch):
     found = {"write_mb_s": 12.0, "read_mb_s": 200.0, "free_bytes": 10**9}
     monkeypatch.setattr(doctor, "probe", lambda *_, **__: found)
-    assert doctor._disk(Path("/"), 1).state == "warning"
+    assert doctor._disk(Path("/")).state == "warning"
 
 
 def test_optional_packages_name_their_extra(monkeypatch):

@@ -10,7 +10,7 @@ import torch
 from blitzgs import _library
 from blitzgs.frame.transport import Traffic
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, PeerBuffers
-from blitzgs.ops.exchange import runs_of
+from blitzgs.ops.exchange import place_runs
 from blitzgs.ops.host import HostCopy, PinnedNumbers, current_stream
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, splats_of
@@ -151,7 +151,7 @@ class Rank:
         sizes, rest = Sizes(*totals[:3].tolist()), everyone[:, VIEW_TOTALS + VIEWS :]
         most = max(everyone[:, 1].max(), rest[:, ::2].sum(0).max(), rest[:, ::2].sum(1).max())
         assert plan[0] == (rest[:, 2 * self.number].sum() if most <= capacity else 0)
-        return [*splats_of(splats, sizes)[:12], places[: runs_of(sizes.splats)]]
+        return [*splats_of(splats, sizes)[:12], places[: place_runs(sizes.splats)]]
 
 
 def exchange(counts, slack=0, capacity=None):

@@ -8,7 +8,7 @@ import torch
 
 import blitzgs
 from blitzgs.frame.render import backward_splats, render_frame, tile_grid
-from blitzgs.frame.transport import LocalTransport
+from blitzgs.frame.transport import LocalTransport, stages_told_to
 from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops import project, splat_gradients
 from blitzgs.ops.projection_types import Sizes, WeightedViews
@@ -214,11 +214,10 @@ def test_frames_do_not_depend_on_the_room_that_was_guessed():
     for sizes in [*rooms, (1, 1, 1)]:
         transport, attempts = LocalTransport(CapacityEstimate(Sizes(*sizes))), []
         enough = Sizes(*sizes).holds(needed)
-        frame = render_frame(
-            table, views, options, transport=transport, mark=attempts.append, backward_follows=True
-        )
+        with stages_told_to(attempts.append):
+            frame = render_frame(table, views, options, transport=transport, backward_follows=True)
         assert attempts.count("raster") == (1 if enough else 2)
-        assert transport.capacity.sizes.holds(needed)
+        assert transport.estimate.sizes.holds(needed)
         for x, y in zip(frame.projected, plain.projected, strict=True):
             assert torch.equal(x, y)
         for x, y in zip(frame.splats, plain.splats, strict=True):
@@ -241,10 +240,7 @@ def test_an_active_set_that_did_not_fit_is_found_again():
     def find(sizes):
         capacity_blocks = None if sizes is None else sizes.blocks
         asked.append(capacity_blocks)
-        return index.active(
-            table, views.viewmats, views.Ks, views.width, views.height, OPTIONS.near_plane,
-            OPTIONS.far_plane, capacity_blocks=capacity_blocks,
-        )  # fmt: skip
+        return index.active(table, views, OPTIONS.limits, capacity_blocks=capacity_blocks)
 
     def rendered(transport):
         asked.clear()

@@ -18,7 +18,7 @@ import blitzgs
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import mass_prefix, smallest
 from blitzgs.ops.counter_random import sampling_keys
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
 from tests.helpers import PARAMETERS, random_scene, rasterize_scene, relative_error
 from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
@@ -71,19 +71,6 @@ def test_selection_equals_sorting(name):
         assert got == brute_prefix(scores, ids, fraction)
 
 
-def test_segments_select_independently():
-    ids, columns = cases()
-    scores = columns["wide"]
-    segments = torch.arange(len(ids)) % 4
-    segments[segments == 2] = 1  # segment 2 is empty
-    scores[segments == 3] = 0
-    together = mass_prefix(scores, ids, 0.9, ALONE, segments, 4)
-    for segment in (0, 1, 3):
-        rows = segments == segment
-        assert torch.equal(together[rows], mass_prefix(scores[rows], ids[rows], 0.9, ALONE))
-    assert not together[segments == 3].any()
-
-
 def test_empty_and_invalid():
     none = torch.empty(0)
     no_ids = torch.empty(0, dtype=torch.int64)
@@ -125,13 +112,11 @@ def _select(ranks):
     if ranks.world_size == 4:
         mine = torch.tensor([0, 0, 0, 3])[torch.arange(len(ids)) % 4] == ranks.rank  # 3 : 0 : 0 : 1
     chosen = []
-    segments = torch.arange(len(ids)) % 3
     for scores in columns.values():
         own, own_ids = scores[mine], ids[mine]
         chosen.append(own_ids[smallest(own, own_ids, 217, ranks)])
         chosen.append(own_ids[smallest(sampling_keys(own, own_ids, 1, 2), own_ids, 217, ranks)])
         chosen.append(own_ids[mass_prefix(own, own_ids, 0.6, ranks)])
-        chosen.append(own_ids[mass_prefix(own, own_ids, 0.6, ranks, segments[mine], 3)])
     return chosen
 
 

@@ -77,7 +77,7 @@ def _both_ways(ranks):
             transport, before = PeerTransport(ranks, CapacityEstimate(given)), memory.generation
             again, _ = _exchange(table, ranks, transport)
             assert all(torch.equal(x, y) for x, y in zip(written, again, strict=True))
-            assert transport.capacity.sizes.holds(needed)
+            assert transport.estimate.sizes.holds(needed)
             enough = given.isects >= needed.isects
             assert memory.generation - before == (1 if enough else 2)
         carried, _ = _exchange(table, ranks, CollectiveTransport(ranks))

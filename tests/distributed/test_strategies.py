@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks

@@ -194,7 +194,7 @@ def test_all_ranks_repeat_a_frame_that_did_not_fit(sizes, frames, backward_follo
                 found = sum_of_ranks(gradients, len(frame.projected.depths))
                 ranks.memory.barrier()  # otherwise the next pass could write while other ranks read
         ids = part["id"][frame.projected.gaussian_ids.long()]
-        return _keys(ids, frame.projected.camera_ids), found, transport.capacity.sizes
+        return _keys(ids, frame.projected.camera_ids), found, transport.estimate.sizes
 
     results, logs = _on_all(3, rank)
     assert logs[0] == logs[1] == logs[2]

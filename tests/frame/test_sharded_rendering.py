@@ -12,10 +12,10 @@ import torch
 from blitzgs.config.fields import LossConfig
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import MAX_ATTEMPTS, RenderOptions, Views, render_frame, run_attempts
+from blitzgs.frame.render import MAX_ATTEMPTS, RenderOptions, render_frame, run_attempts
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges, collect_images
 from blitzgs.frame.transport.protocol import CapacityEstimate
-from blitzgs.ops.projection_types import Sizes
+from blitzgs.ops.projection_types import Sizes, Views
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batches import Batch
 from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term
@@ -225,9 +225,9 @@ class NeedsMemory:
     """A transport whose exchanges need the sizes that a function returns for each attempt."""
 
     def __init__(self, needed, sizes=None):
-        self.capacity, self._needed, self.given = CapacityEstimate(sizes), needed, []
+        self.estimate, self._needed, self.given = CapacityEstimate(sizes), needed, []
 
-    def project_and_send(self, inputs, assignment, sizes, mark):
+    def project_and_send(self, inputs, assignment, sizes):
         self.given.append(sizes)
         needed = self._needed(len(self.given))
         fits = sizes is not None and sizes.holds(needed)
@@ -271,7 +271,7 @@ def test_an_attempt_that_fails_leaves_the_estimate():
     transport = NeedsMemory(lambda _: Sizes(9, 9, 9), Sizes(1, 2, 3))
     with pytest.raises(MemoryError):
         run_attempts(transport, fail, None, lambda exchange: None)
-    assert transport.capacity.sizes == (1, 2, 3, 1)
+    assert transport.estimate.sizes == (1, 2, 3, 1)
 
 
 def test_threads_may_share_an_estimate():

@@ -20,10 +20,8 @@ from blitzgs.frame.transport.protocol import (
     CapacityEstimate,
     Exchange,
     ExchangeResult,
-    Mark,
     Traffic,
     Transport,
-    unmarked,
 )
 from blitzgs.ops.exchange import scatter_splats
 from blitzgs.ops.intersect import intersect
@@ -44,10 +42,10 @@ class RecordingTransport:
     """
 
     def __init__(
-        self, inner: Transport, too_small: int = 0, capacity: CapacityEstimate | None = None
+        self, inner: Transport, too_small: int = 0, estimate: CapacityEstimate | None = None
     ) -> None:
         """Wrap a transport; its first `too_small` exchanges do not finish."""
-        self.capacity = capacity or inner.capacity
+        self.estimate = estimate or inner.estimate
         self.inner, self.too_small = inner, too_small
         self.calls: list[tuple[str, Sizes | None]] = []
 
@@ -55,12 +53,11 @@ class RecordingTransport:
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
-        sizes: Sizes | None,
-        mark: Mark = unmarked,
+        capacity: Sizes | None,
     ) -> RecordingExchange:
         """See `Transport.project_and_send`."""
-        self.calls.append(("start", sizes))
-        return RecordingExchange(self, self.inner.project_and_send(inputs, assignment, sizes, mark))
+        self.calls.append(("start", capacity))
+        return RecordingExchange(self, self.inner.project_and_send(inputs, assignment, capacity))
 
 
 class RecordingExchange:

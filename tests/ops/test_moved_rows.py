@@ -10,6 +10,7 @@ from blitzgs.ops import host
 from blitzgs.ops.blocks import BLOCK_ROWS, rows_of_sectors, sectors_of_rows, seen_blocks, swap_blocks_
 from blitzgs.ops.counter_random import KEY_BITS, key_histogram, key_of_bits, sampling_keys, uniform
 from blitzgs.ops.host import PinnedNumbers
+from blitzgs.ops.projection_types import Views
 from blitzgs.ops.rows import put_rows_, take_rows
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.layouts import CULL, sectors_in
@@ -180,7 +181,7 @@ def test_blocks_that_no_view_sees_have_no_active_rows(device, seed):
     viewmats, Ks = make_views(4, device, seed + 20)
     index = BlockIndex(table)
     seen = seen_blocks(index.bounds, viewmats, Ks, sizes_of(4, device), NEAR, FAR)
-    ids, views = index.active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR).listed()
+    ids, views = index.active(table, Views(viewmats, Ks, WIDTH, HEIGHT), (NEAR, FAR, 0.3)).listed()
     assert (views & ~seen[ids.long() // BLOCK_ROWS] == 0).all()
     # Few blocks are seen that have no active rows.
     used = torch.unique(ids.long() // BLOCK_ROWS)

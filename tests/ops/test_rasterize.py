@@ -118,7 +118,7 @@ def test_absolute_gradients_sum_each_pixels_gradient():
     told = []
     renders, _ = rasterize(
         means2d, *splats.values()[1:], *lists(splats), n_cameras=1, width=WIDTH, height=HEIGHT,
-        tell_absgrad=told.append,
+        store_absgrad=told.append,
     )  # fmt: skip
     renders.backward(v_renders)
     (absolute,) = told

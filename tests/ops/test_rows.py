@@ -4,9 +4,9 @@
 import pytest
 import torch
 
-import blitzgs.call.finite  # noqa: F401  (registers the fake kernel)
+import blitzgs.call.bad_values  # noqa: F401  (registers the fake kernel)
 from blitzgs.call.layout import Places
-from blitzgs.ops.exchange import RUN, gather_splats, scatter_splats
+from blitzgs.ops.exchange import PLACE_SPLATS, gather_splats, scatter_splats
 from blitzgs.ops.projection_types import first_rows
 from blitzgs.ops.rows import KeptMarks, distinct_rows, sparse_rows
 from blitzgs.ops.splat_gradients import sum_splats
@@ -191,7 +191,7 @@ def on(device, tensors):
 def test_splats_reach_their_groups(n, device):
     data, (masks, sizes) = columns(n), destinations(n)
     packed, places = scatter_splats(on(device, data), masks.to(device), sizes)
-    assert packed.shape == (13 * sum(sizes),) and places.shape == (-(-n // RUN), RANKS)
+    assert packed.shape == (13 * sum(sizes),) and places.shape == (-(-n // PLACE_SPLATS), RANKS)
     received = gather_splats(packed, data, sizes)
     splats = received[2].cpu().long()  # the column of splat numbers
     begin = 0

@@ -17,7 +17,7 @@ from blitzgs.optim import table_adam
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.density import DensityRules
 from blitzgs.population.initialisation import octree_gaussians
-from blitzgs.population.relocation import draw, relocate, shared
+from blitzgs.population.relocation import draw_in_proportion, relocate, shared_among_copies
 from blitzgs.spawn.lineage import Cause
 from blitzgs.table.table import EXP_AVG_SQS, PARAMETERS, GaussianTable
 from blitzgs.view.levels import Levels, measure_levels
@@ -163,7 +163,7 @@ def by_the_double_sum(opacity: float, copies: int) -> tuple[float, float]:
 def test_the_closed_form_is_the_paper_s_double_sum(copies):
     opacities = torch.tensor([0.006, 0.1, 0.5, 0.9, 0.99, 0.999999], dtype=torch.float64)
     scales = torch.randn(len(opacities), 3, dtype=torch.float64)
-    logits, logarithms = shared(opacities.logit(), scales, torch.full((len(opacities),), copies))
+    logits, logarithms = shared_among_copies(opacities.logit(), scales, torch.full((len(opacities),), copies))
     for i, opacity in enumerate(opacities.tolist()):
         new, factor = by_the_double_sum(opacity, copies)
         assert math.isclose(float(logits[i].sigmoid()), new, rel_tol=1e-9)
@@ -173,11 +173,11 @@ def test_the_closed_form_is_the_paper_s_double_sum(copies):
 def test_the_copies_of_other_rows_change_no_bit():
     copies = torch.arange(1, MAX_COPIES + 1)
     opacities, scales = torch.linspace(-6, 9, MAX_COPIES), torch.zeros(MAX_COPIES, 3)
-    together = shared(opacities, scales, copies)
+    together = shared_among_copies(opacities, scales, copies)
     for i, count in enumerate(copies.tolist()):
-        alone = shared(opacities, scales, torch.full_like(copies, count))
+        alone = shared_among_copies(opacities, scales, torch.full_like(copies, count))
         assert all(torch.equal(x[i], y[i]) for x, y in zip(together, alone, strict=True))
-    none = shared(opacities[:0], scales[:0], copies[:0])
+    none = shared_among_copies(opacities[:0], scales[:0], copies[:0])
     assert [tuple(part.shape) for part in none] == [(0,), (0, 3)]
 
 
@@ -185,7 +185,9 @@ def test_the_copies_of_other_rows_change_no_bit():
 def test_copies_together_look_like_the_original(copies):
     """The opacity agrees at the centre, and integrated along a line through the centre."""
     opacity, x = torch.tensor([0.8], dtype=torch.float64), torch.linspace(-12, 12, 20001, dtype=torch.float64)
-    logits, logarithms = shared(opacity.logit(), torch.zeros(1, 3).double(), torch.tensor([copies]))
+    logits, logarithms = shared_among_copies(
+        opacity.logit(), torch.zeros(1, 3).double(), torch.tensor([copies])
+    )
     new, scale = logits.sigmoid(), logarithms.exp()[0, 0]
     assert torch.allclose(1 - (1 - new) ** copies, opacity)
     alone = torch.trapezoid(opacity * torch.exp(-(x**2) / 2), x)
@@ -199,15 +201,15 @@ def test_draws_follow_the_weights_and_are_as_many_as_asked():
     weights[::7] = 0
     ids, total = torch.randperm(5000, generator=g)[:500], torch.zeros(500).double()
     for event in range(400):
-        drawn = draw(weights, int(weights.sum()), 60, ids, SEED, event, Ranks())
+        drawn = draw_in_proportion(weights, int(weights.sum()), 60, ids, SEED, event, Ranks())
         assert int(drawn.sum()) == 60 and not drawn[weights == 0].any()
         total += drawn
     expected = 400 * 60 * weights / weights.sum()
     # A draw has a variance of at most its expectation.
     assert ((total - expected).abs() <= 5 * expected.sqrt() + 1).all()
-    assert draw(weights, int(weights.sum()), 0, ids, SEED, 0, Ranks()).sum() == 0
-    assert draw(torch.zeros_like(weights), 0, 60, ids, SEED, 0, Ranks()).sum() == 0
-    alone = draw(torch.tensor([5, 0]), 5, 1000, torch.tensor([1, 2]), SEED, 0, Ranks())
+    assert draw_in_proportion(weights, int(weights.sum()), 0, ids, SEED, 0, Ranks()).sum() == 0
+    assert draw_in_proportion(torch.zeros_like(weights), 0, 60, ids, SEED, 0, Ranks()).sum() == 0
+    alone = draw_in_proportion(torch.tensor([5, 0]), 5, 1000, torch.tensor([1, 2]), SEED, 0, Ranks())
     assert alone.tolist() == [MAX_COPIES - 1, 0]
 
 

@@ -25,10 +25,10 @@ from blitzgs.formats.ply import read_ply
 from blitzgs.reference.projection import rotation_matrices, sh_basis
 from blitzgs.runs import checkpoint
 from blitzgs.runs.evaluation import correct_colours, image_metrics, load_lpips
-from blitzgs.runs.export import export, export_ply, open_source, source_of
+from blitzgs.runs.export import export, open_source, source_of
 from blitzgs.runs.folder import open_run
-from blitzgs.runs.world import in_world, load_frame, rotated_harmonics, save_frame
-from tests.helpers import save_checkpoint
+from blitzgs.runs.world import in_world, load_world_frame, rotated_harmonics, save_world_frame
+from tests.helpers import export_ply, save_checkpoint
 
 
 def plain_ssim(x, y):
@@ -236,8 +236,8 @@ def test_the_command_needs_to_know_the_world(trained, tmp_path, capsys):
     assert (
         "has no geo.json, so its place in the world is unknown: use blitzgs align" in capsys.readouterr().err
     )
-    assert load_frame(trained[1]) is None
-    path = save_frame(trained[1], FRAME)
+    assert load_world_frame(trained[1]) is None
+    path = save_world_frame(trained[1], FRAME)
     try:
         assert main(["export", str(trained[1]), "--ply", str(tmp_path / "a.ply"), *flags]) == 0
         assert json.loads((tmp_path / "a.ply.offset.json").read_text())["crs"] == "EPSG:32633"

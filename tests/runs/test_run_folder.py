@@ -19,11 +19,10 @@ import blitzgs
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
-from blitzgs.runs import checkpoint
-from blitzgs.runs import files as run_files
-from blitzgs.runs.export import export_ply, without_antialiasing
+from blitzgs.runs import checkpoint, run_files
+from blitzgs.runs.export import without_antialiasing
 from blitzgs.training.trainer import Trainer
-from tests.helpers import save_checkpoint
+from tests.helpers import export_ply, save_checkpoint
 from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene
 
 

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from tests.distributed.rank_harness import CONTEXT
 from tests.training.tiny import OVERRIDES, as_flags, steps_of, write_tiny_capture
 

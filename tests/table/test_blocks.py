@@ -7,7 +7,7 @@ import torch
 from blitzgs.ops.blocks import cull_blocks, morton_keys
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_
 from blitzgs.ops.project import project
-from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
+from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Views
 from blitzgs.table.blocks import BlockIndex, morton_order
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from tests.helpers import DEVICES
@@ -61,7 +61,7 @@ def allowed(active):
 
 
 def active_of(index, table, viewmats, Ks):
-    return index.active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR).listed()
+    return index.active(table, Views(viewmats, Ks, WIDTH, HEIGHT), (NEAR, FAR, 0.3)).listed()
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -181,7 +181,7 @@ def test_the_active_set_is_used_with_its_count_on_the_device(device, n, ahead):
     if not ahead:  # no view sees the scene
         viewmats[:] = torch.eye(4, device=device)
         viewmats[:, 2, 3] = -1e5
-    active = BlockIndex(table).active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR)
+    active = BlockIndex(table).active(table, Views(viewmats, Ks, WIDTH, HEIGHT), (NEAR, FAR, 0.3))
     listed = active.listed()
     assert len(active.ids) == 256 * int(active.blocks) < n + 256
     assert (len(listed[0]) > 0) == ahead or n < 300
@@ -198,7 +198,7 @@ def test_too_small_a_capacity_gives_empty_lists_and_the_needed_number_of_blocks(
     table = make_table(max(n, 300), device)
     table.keep(torch.arange(len(table), device=device) < n)
     viewmats, Ks = make_views(device=device)
-    index, views = BlockIndex(table), (viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR)
+    index, views = BlockIndex(table), (Views(viewmats, Ks, WIDTH, HEIGHT), (NEAR, FAR, 0.3))
     exact = index.active(table, *views)
     needed = int(exact.blocks)
     assert len((exact.listed()[0] // 256).unique()) <= needed <= -(-n // 256)
@@ -331,7 +331,7 @@ def test_errors_name_the_value():
     with pytest.raises(RuntimeError, match="at most 32 views at once, got 33"):
         active_of(index, table, viewmats, Ks)
     with pytest.raises(RuntimeError, match="capacity_blocks must be for 1 block or more, got 0"):
-        index.active(table, *make_views(1), WIDTH, HEIGHT, NEAR, FAR, capacity_blocks=0)
+        index.active(table, Views(*make_views(1), WIDTH, HEIGHT), (NEAR, FAR, 0.3), capacity_blocks=0)
     table.keep(torch.arange(len(table)) < 100)
     with pytest.raises(RuntimeError, match=r"bounds must have shape \[1, 8\], got \[12, 8\]"):
         active_of(index, table, *make_views(1))

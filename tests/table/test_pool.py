@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from blitzgs.ops.blocks import BLOCK_ROWS, seen_blocks
+from blitzgs.ops.projection_types import Views
 from blitzgs.table import host_table
 from blitzgs.table.blocks import BlockIndex, BlockVisibility, Cameras, culled_blocks
 from blitzgs.table.host_table import HostMemoryError, HostTable
@@ -52,7 +53,7 @@ def assert_same(table, other):
 
 
 def active_rows(index, table, camera):
-    found = index.active(table, *(column[:1] for column in camera[:2]), WIDTH, HEIGHT, *LIMITS)
+    found = index.active(table, Views(*(column[:1] for column in camera[:2]), WIDTH, HEIGHT), LIMITS)
     return found.listed()[0]
 
 
@@ -217,7 +218,7 @@ def test_large_batches_do_without_a_look_ahead():
     views.Ks[:, :2, :2] *= 8
     for step in range(2):
         index = pool.load_for_step(step, first(views, 20 * step, 20), 20)
-        found = index.active(pool.held, *first(views, 20 * step, 20)[:2], WIDTH, HEIGHT, *LIMITS)
+        found = index.active(pool.held, Views(*first(views, 20 * step, 20)[:2], WIDTH, HEIGHT), LIMITS)
         assert int(found.length) > 0
         pool.prefetch(step + 1)
     assert pool.moved.needed > pool.moved.loaded

@@ -19,7 +19,7 @@ from blitzgs.config.files import ConfigError, load_config
 from blitzgs.config.ranges import problems
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.training.budget import Budget, extended
 from blitzgs.training.replay import replay
 from blitzgs.training.trainer import Trainer

@@ -18,7 +18,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.training.sampler import tour_of
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, Camera, as_flags, events_of, write_tiny_capture
 

@@ -10,8 +10,9 @@ import torch
 
 from blitzgs.config.files import ConfigError
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.render import Views, render_frame
+from blitzgs.frame.render import render_frame
 from blitzgs.ops.photometric import photometric_loss
+from blitzgs.ops.projection_types import Views
 from blitzgs.reference import render
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks

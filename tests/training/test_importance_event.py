@@ -18,8 +18,8 @@ from blitzgs.capture.images import PhotographError
 from blitzgs.config.files import ConfigError
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.importance import PHI, is_culled
-from blitzgs.runs import files as run_files
 from blitzgs.runs import log as run_log
+from blitzgs.runs import run_files
 from blitzgs.runs.guard import ModelLostError
 from blitzgs.spawn.candidates import FEATURES
 from blitzgs.spawn.fit import fit, read_spawns
@@ -179,7 +179,7 @@ def _passes_from(ranks, folder):
     state, out = trainer.state, []
     for event in state.schedule.events(0, 100):
         if event.kind.startswith("pass"):
-            importance.run(state, event)
+            importance.run_importance_pass(state, event)
             table = state.table
             out.append([table[name].cpu() for name in ("id", PHI, CULL, "means")])
             sizes = [int(n) for n in ranks.all_gather(torch.tensor([len(table)], device=ranks.device))]

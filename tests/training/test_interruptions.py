@@ -18,8 +18,7 @@ import torch
 
 from blitzgs.capture.images import PhotographError
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import checkpoint
-from blitzgs.runs import files as run_files
+from blitzgs.runs import checkpoint, run_files
 from blitzgs.runs.folder import open_run
 from blitzgs.runs.guard import NonFiniteError
 from blitzgs.spawn.lineage_parts import read_lineage

@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import render_view
 from blitzgs.runs.lod import scene_gate
 from blitzgs.table.blocks import morton_order

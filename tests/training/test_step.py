@@ -13,14 +13,16 @@ from blitzgs.config.fields import LossConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import RenderOptions, Views, render_frame
+from blitzgs.frame.render import RenderOptions, render_frame
+from blitzgs.frame.transport import stages_told_to
+from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY
 from blitzgs.runs.cameras import LEAST_SPREAD, stored_exposures
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batches import Batch
-from blitzgs.training.exposure import Exposures, _log_gains, differ, track_gains
+from blitzgs.training.exposure import Exposures, _log_gains, exposures_differ, track_gains
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.loss import loss_terms, opacity_term, photometric, scale_term, weighted
 from blitzgs.training.step import Stepper
@@ -39,7 +41,7 @@ from tests.training.tiny import (
 )
 
 
-def test_a_step_marks_its_stages_and_lowers_the_loss():
+def test_a_step_tells_its_stages_and_lowers_the_loss():
     config, table = tiny_config(), random_gaussians(300)
     optimiser = TableAdam(config.optimiser, Schedule(config.schedule), 1.0, "cpu")
     stepper = Stepper(table, optimiser, TileOwners(Ranks()), config.loss, 1.0)
@@ -51,10 +53,12 @@ def test_a_step_marks_its_stages_and_lowers_the_loss():
     losses = []
     for step in range(1, 30):
         stages = []
-        frame, terms, sums = stepper.forward(step, options, batch, stages.append)
+        with stages_told_to(stages.append):
+            frame, terms, sums = stepper.forward(step, options, batch)
         assert stages == ["other", "optimiser", "project", "exchange", "sort", "raster", "loss", "other"]
         stages.clear()
-        stepper.backward(step, frame, terms, stages.append)
+        with stages_told_to(stages.append):
+            stepper.backward(step, frame, terms)
         assert stages == ["raster back", "exchange back", "optimiser", "other"]
         losses.append(photometric(sums.read(), batch.samples, config.loss).item())
     assert losses[-1] < losses[0] - 0.01
@@ -316,4 +320,4 @@ def test_photographs_of_fields_differ_if_their_exposures_do(tmp_path, exposure):
     gains = track_gains(capture, images, Ranks())
     images.close()
     assert gains is not None and torch.allclose(gains.mean(0), torch.ones(3).double())
-    assert differ(gains) == (exposure > 0)
+    assert exposures_differ(gains) == (exposure > 0)

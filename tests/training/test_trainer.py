@@ -8,7 +8,7 @@ import torch
 
 from blitzgs.config.files import ConfigError, to_dict
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.guard import NonFiniteError
 from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
@@ -79,7 +79,7 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
     The first 50 are those of an earlier version, whose configuration has fields that are gone.
     """
     _, whole, _ = whole_run
-    for module in ("blitzgs.config.files", "blitzgs.runs.files"):
+    for module in ("blitzgs.config.files", "blitzgs.runs.run_files"):
         monkeypatch.setattr(f"{module}.to_dict", _of_an_earlier_version)
     stop_at(monkeypatch, 50)
     first, summary = train(tmp_path)

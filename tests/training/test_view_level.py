@@ -16,7 +16,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply, write_ply
 from blitzgs.frame.render import render_frame
 from blitzgs.population.importance import is_culled
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import image_metrics
 from blitzgs.runs.lod import lod_gate, scene_gate
 from blitzgs.table.layouts import CULL
@@ -57,7 +57,7 @@ def whole_run(tmp_path_factory):
     folder, steps = tmp_path_factory.mktemp("run"), {}
     forward = Stepper.forward
 
-    def watched(self, step, options, batch, mark=None, view_filter=None):
+    def watched(self, step, options, batch, view_filter=None):
         frame, *rest = forward(self, step, options, batch, view_filter=view_filter)
         table = {name: self.table[name].clone() for name in self.table}
         steps[step] = (view_filter, frame.projected, batch.indices, table)

@@ -2,8 +2,6 @@
 """What is seen of a training: a viewer on its state, glances, figures and curves."""
 
 import json
-import os
-import signal
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -14,7 +12,7 @@ from blitzgs.capture.images import PhotographError
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.guard import ModelLostError
 from blitzgs.training.events import evaluate as glances
-from blitzgs.training.events.evaluate import Glances, spread
+from blitzgs.training.events.evaluate import Glances, evenly_ordered
 from blitzgs.training.state import FALL, WINDOW, Curve
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.draw import intrinsics
@@ -31,7 +29,6 @@ class Recorder:
     def __init__(self, look=None, fails=None, pauses=0, saves=0):
         self.look, self.fails, self.pauses, self.saves = look, fails, pauses, saves
         self.pictures, self.records, self.closed, self.failures = [], [], 0, []
-        self.stays, self.shown_on = False, 0
 
     def wants(self):
         if self.fails == "wants":
@@ -42,11 +39,6 @@ class Recorder:
         if self.fails == "wish":
             raise KeyError("a fault of the viewer")
         pauses, self.pauses = self.pauses > 0, self.pauses - 1
-        if self.stays:
-            self.shown_on += 1
-            if self.shown_on == 3:
-                os.kill(os.getpid(), signal.SIGINT)
-            pauses = True
         saves, self.saves = self.saves > 0, 0
         return Wish(self.look, pauses, saves)
 
@@ -58,9 +50,6 @@ class Recorder:
 
     def failed(self, reason):
         self.failures.append(reason)
-
-    def stay(self):
-        self.stays = True
 
     def told(self, t, values):
         self.records.append((t, dict(values)))
@@ -162,18 +151,6 @@ def test_a_rank_that_cannot_draw_does_not_end_the_training(tmp_path):
     assert images == other == 20
 
 
-def test_a_watcher_may_stay_after_the_training(tmp_path):
-    trainer = Trainer(tiny_config("schedule.iterations=20"), *tiny_scene(), tmp_path, Ranks())
-    watcher = Recorder(some_look(trainer.state))
-    trainer.watch(watcher, stays=True)
-    trainer.train()
-    seen = len(watcher.pictures)
-    assert watcher.closed == 0
-    trainer.show_on()  # until the watcher sends a signal
-    assert watcher.closed == 1
-    assert len(watcher.pictures) >= seen + 2
-
-
 def test_intrinsics_are_centred():
     K = intrinsics(200, 100, np.pi / 2)  # noqa: N806
     np.testing.assert_allclose(K, [[50, 0, 100], [0, 50, 50], [0, 0, 1]])
@@ -236,7 +213,7 @@ def test_a_model_without_gaussians_is_no_result(tmp_path):
 
 @pytest.mark.parametrize("count", [1, 2, 7, 37])
 def test_the_first_views_are_spread(count):
-    order = spread(list(range(100, 100 + count)))
+    order = evenly_ordered(list(range(100, 100 + count)))
     assert sorted(order) == list(range(100, 100 + count))
     for few in range(2, count + 1):
         chosen = sorted(order[:few])

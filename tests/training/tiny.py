@@ -22,8 +22,9 @@ from blitzgs.capture.lengths import Sight
 from blitzgs.config.fields import Config
 from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.render import RenderOptions, Views, render_frame
+from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, lazy_adam_step_
+from blitzgs.ops.projection_types import Views
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.training.trainer import Trainer
 

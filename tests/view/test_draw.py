@@ -10,8 +10,9 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import RenderOptions, Views, render_frame
+from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.ops.blocks import BLOCK_ROWS
+from blitzgs.ops.projection_types import Views
 from blitzgs.population.initialisation import _seen_by_more
 from blitzgs.runs.folder import open_run
 from blitzgs.table.table import PARAMETERS, GaussianTable
@@ -115,9 +116,7 @@ def test_depths_divide_what_a_view_sees(scene):
     near, *inner, far = finder.depths(views, [0.01, 100.0], 2)
     assert (near, far) == (0.01, 100.0)
     layers = [near, *inner, far]
-    counts = [
-        int(finder.find(*views.as_arguments(), (*planes, 0.3)).active.length) for planes in pairwise(layers)
-    ]
+    counts = [int(finder.find(views, (*planes, 0.3)).active.length) for planes in pairwise(layers)]
     assert len(counts) >= 3
     assert max(counts) < 6 * BLOCK_ROWS
 
@@ -227,7 +226,7 @@ OPTIONS = RenderOptions(sh_degree=0, near_plane=NEAR, far_plane=FAR)
 @pytest.mark.parametrize("device", DEVICES)
 def test_rows_outside_the_views_are_left_out_and_the_image_stays_the_same(device):
     table, views = make_table(device=device), Views(*make_views(device=device), WIDTH, HEIGHT)
-    found = VisibleFinder(table).find(*views.as_arguments(), LIMITS)
+    found = VisibleFinder(table).find(views, LIMITS)
     ids, bits = found.active.listed()
     assert found.table is table and torch.equal(found.rows_of(ids), ids)
     assert seen(table, views.viewmats, views.Ks) <= allowed((ids, bits))
@@ -242,7 +241,7 @@ def test_the_gate_leaves_out_the_rows_that_it_leaves_out_of_the_whole_table(devi
     table["level"] = (torch.arange(len(table), device=device) % 6).to(torch.uint8)
     lod = SceneGate(LodGate(20.0, 2.0, 6, 4), 1.0, table, Ranks(device=torch.device(device)))
     gated = lod.active(table, views.viewmats)
-    found = VisibleFinder(table, lod).find(*views.as_arguments(), LIMITS).active
+    found = VisibleFinder(table, lod).find(views, LIMITS).active
     image, expected = (render_frame(table, views, OPTIONS, rows).renders for rows in (found, gated))
     assert torch.equal(image, expected)
     assert not torch.equal(image, render_frame(table, views, OPTIONS).renders)
@@ -254,6 +253,6 @@ def test_a_table_without_rows_is_found_empty(device):
     table = make_table(device=device)
     table.keep(torch.zeros(len(table), dtype=torch.bool, device=device))
     views = Views(*make_views(device=device), WIDTH, HEIGHT)
-    found = VisibleFinder(GaussianTable(table.columns)).find(*views.as_arguments(), LIMITS)
+    found = VisibleFinder(GaussianTable(table.columns)).find(views, LIMITS)
     assert len(found.active.listed()[0]) == 0
     assert not render_frame(found.table, views, OPTIONS, found.active).renders.any()

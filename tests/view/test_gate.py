@@ -11,9 +11,10 @@ import torch
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import RenderOptions, Views, render_frame
+from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.ops.blocks import ActiveRows, GateRules, gate_views_
+from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.importance import ViewBatch, is_culled, sweep
 from blitzgs.table.blocks import BlockIndex
@@ -120,7 +121,7 @@ def test_images_are_those_of_the_gaussians_that_are_kept_with_blocks_and_without
     table["scales"].clamp_(max=0.0)
     viewmats, Ks = make_views(device=device)
     gate = ViewGate(GATE.reach(), 0b1011, COLUMNS)
-    with_blocks = BlockIndex(table).active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR)
+    with_blocks = BlockIndex(table).active(table, Views(viewmats, Ks, WIDTH, HEIGHT), (NEAR, FAR, 0.3))
     count = len(table)
     without = ActiveRows(
         torch.arange(count, dtype=torch.int32, device=device),
@@ -218,8 +219,8 @@ def test_the_gated_active_set_covers_pending_steps(device):
     crossed, listed, without = 0, 0, 0
     for step in range(1, steps + 1):
         viewmats, Ks = views[step * 7 % len(views)]
-        rules, size = gate.rules(table), (WIDTH, HEIGHT, NEAR, FAR)
-        found = allowed(index.active(table, viewmats, Ks, *size, rules=rules).listed())
+        rules, seeing = gate.rules(table), (Views(viewmats, Ks, WIDTH, HEIGHT), (NEAR, FAR, 0.3))
+        found = allowed(index.active(table, *seeing, rules=rules).listed())
         if step % 20 == 0:
             dense = caught_up(table, schedule, step - 1)
             kept, close = kept_by_definition(dense, viewmats, GATE, (0,), (3, 40))
@@ -228,7 +229,7 @@ def test_the_gated_active_set_covers_pending_steps(device):
             early, _ = kept_by_definition(table, viewmats, GATE, (0,), (3, 40))
             crossed += int((early != kept).sum())
             listed += len(found)
-            without += len(allowed(index.active(table, viewmats, Ks, *size).listed()))
+            without += len(allowed(index.active(table, *seeing).listed()))
         ids = torch.tensor(sorted({r for r, _ in found}), dtype=torch.int32, device=device)
         index.update(table, step_some(table, ids, schedule, step, generator))
     assert crossed > 10  # pending steps move rows across the borders of the gate
@@ -240,8 +241,8 @@ def test_blocks_that_a_mask_leaves_out_are_dropped_unread(device):
     """Blocks from which the mask leaves nothing out are taken whole, as without a mask."""
     table = make_scene(30_000 + 100, device)
     viewmats, Ks = make_views(1, device)
-    size, blocks = (WIDTH, HEIGHT, NEAR, FAR), -(-len(table) // 256)
-    plain = BlockIndex(table).active(table, viewmats, Ks, *size)
+    seeing, blocks = (Views(viewmats, Ks, WIDTH, HEIGHT), (NEAR, FAR, 0.3)), -(-len(table) // 256)
+    plain = BlockIndex(table).active(table, *seeing)
     seen_blocks = (plain.listed()[0] // 256).unique()
     assert len(seen_blocks) > 8
     mask, none = torch.zeros_like(table[CULL]), torch.zeros(blocks, dtype=torch.bool, device=device)
@@ -251,7 +252,7 @@ def test_blocks_that_a_mask_leaves_out_are_dropped_unread(device):
     mask[:, 1] = torch.where(of_row, 1 << 5, 0).int()
     table[CULL] = mask
     rules = ViewGate([math.inf], 0, (37,)).rules(table)
-    found = BlockIndex(table).active(table, viewmats, Ks, *size, rules=rules)
+    found = BlockIndex(table).active(table, *seeing, rules=rules)
     assert int(found.blocks) <= int(plain.blocks) - len(seen_blocks[::2])
     kept = ~of_row[plain.listed()[0].long()]
     for a, b in zip(found.listed(), plain.listed(), strict=True):
@@ -268,9 +269,9 @@ def test_the_gated_set_does_not_depend_on_the_order_of_the_rows(device, columns)
     for _ in range(2):
         rules = gate.rules(table)
         index = BlockIndex(table)
-        with_gate = index.active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR, rules=rules)
+        with_gate = index.active(table, Views(viewmats, Ks, WIDTH, HEIGHT), (NEAR, FAR, 0.3), rules=rules)
         sets.append({(int(table["id"][row]), view) for row, view in allowed(with_gate.listed())})
-        plain = index.active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR)
+        plain = index.active(table, Views(viewmats, Ks, WIDTH, HEIGHT), (NEAR, FAR, 0.3))
         for active in (with_gate, plain):
             gate_views_(active, table["means"], viewmats, rules)
             exact.append({(int(table["id"][row]), view) for row, view in allowed(active.listed())})
@@ -311,7 +312,7 @@ def _gated_image(ranks):
     scene = SceneGate(GATE, 0.8, table, ranks)
     shares = scene.kept(centres_of(viewmats))
     images = []
-    masked = BlockIndex(table).active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR)
+    masked = BlockIndex(table).active(table, Views(viewmats, Ks, WIDTH, HEIGHT), (NEAR, FAR, 0.3))
     rules = ViewGate(GATE.reach(), 0b1101, COLUMNS).rules(table)
     gate_views_(masked, table["means"], viewmats, rules)
     smooth = replace(GATE, smooth=True)

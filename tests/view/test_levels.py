@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.render import Views, render_frame
+from blitzgs.frame.render import render_frame
 from blitzgs.ops.project import differentiable_splats, gaussian_tensors, project
-from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
+from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Views
 from blitzgs.reference.render import render as reference_render
 from blitzgs.view.gate import LodGate, SceneGate, centres_of
 from blitzgs.view.levels import FOOTPRINT_LEVELS, Levels, footprint_levels, footprint_sizes, measure_levels

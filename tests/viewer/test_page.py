@@ -4,6 +4,7 @@
 import contextlib
 import json
 import math
+import re
 import socket
 import threading
 import time
@@ -16,12 +17,13 @@ pytest.importorskip("viser", reason="the extra view is not installed")
 from blitzgs.cli.train import live_page
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.export import export_ply
 from blitzgs.runs.folder import open_run
 from blitzgs.training.trainer import Trainer
 from blitzgs.viewer.paths import from_json
 from blitzgs.viewer.studio import Studio, open_model
+from blitzgs.viewer.world import SCALE
 from tests.browser import Browser, needs_chromium, wait_for
+from tests.helpers import export_ply
 from tests.training.tiny import tiny_config, tiny_scene
 
 
@@ -84,9 +86,14 @@ def test_a_port_in_use_does_not_end_a_training(tmp_path, capsys):
 
 @needs_chromium
 def test_the_page_shows_the_model(studio, browser):
-    settled(studio)
+    visitor = settled(studio)
     wait_for(lambda: picture(browser).std() > 3, 60, "the picture is on the page")
-    assert "Gaussians in view" in browser.figures() and "units" in browser.figures()
+    assert "Gaussians in view" in browser.figures()
+    length = float(re.search(r"([\d.]+) unit", browser.figures())[1])
+    camera, unit = visitor.client.camera, visitor.exhibit.space.unit / SCALE
+    high = 2 * unit * np.linalg.norm(camera.look_at - camera.position) * math.tan(visitor.stance.fov / 2)
+    bar = browser.evaluate("document.querySelector('#blitzgs-figures div').offsetWidth")
+    assert bar == pytest.approx(720 * length / high, rel=0.02)
     assert browser.errors() == []
 
 

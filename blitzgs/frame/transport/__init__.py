@@ -11,16 +11,16 @@ from blitzgs.frame.transport.protocol import (
     Exchange,
     ExchangeResult,
     LocalTransport,
-    Mark,
     Traffic,
     Transport,
     WayBack,
-    unmarked,
+    stage_ended,
+    stages_told_to,
 )
 
 __all__ = [
-    "Arrived", "CollectiveTransport", "Exchange", "ExchangeResult", "LocalTransport", "Mark", "PeerTransport",
-    "Traffic", "Transport", "WayBack", "open_transport", "unmarked",
+    "Arrived", "CollectiveTransport", "Exchange", "ExchangeResult", "LocalTransport", "PeerTransport",
+    "Traffic", "Transport", "WayBack", "open_transport", "stage_ended", "stages_told_to",
 ]  # fmt: skip
 
 

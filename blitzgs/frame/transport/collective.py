@@ -15,11 +15,10 @@ from blitzgs.frame.transport.protocol import (
     Arrived,
     CapacityEstimate,
     ExchangeResult,
-    Mark,
     Traffic,
-    unmarked,
+    stage_ended,
 )
-from blitzgs.ops.exchange import RUN, gather_splats, scatter_splats, words_per_splat
+from blitzgs.ops.exchange import PLACE_SPLATS, gather_splats, scatter_splats, words_per_splat
 from blitzgs.ops.host import to_host
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats
 from blitzgs.ops.splat_gradients import SplatGradients
@@ -37,20 +36,19 @@ class CollectiveTransport:
 
     def __init__(self, ranks: Ranks) -> None:
         """Send splats between `ranks`."""
-        self.capacity = CapacityEstimate()
+        self.estimate = CapacityEstimate()
         self._ranks = ranks
 
     def project_and_send(
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
-        sizes: Sizes | None,
-        mark: Mark = unmarked,
+        capacity: Sizes | None,
     ) -> CollectiveExchange:
         """See `Transport.project_and_send`."""
         if assignment is None:
             raise ValueError("several ranks need an assignment of tiles")
-        return CollectiveExchange(self._ranks, inputs, assignment, sizes, mark)
+        return CollectiveExchange(self._ranks, inputs, assignment, capacity)
 
 
 class CollectiveExchange:
@@ -61,14 +59,13 @@ class CollectiveExchange:
         ranks: Ranks,
         inputs: ProjectionInputs,
         assignment: TileAssignment,
-        sizes: Sizes | None,
-        mark: Mark,
+        capacity: Sizes | None,
     ) -> None:
         """Project, exchange the numbers of splats, and send the splats."""
         tiles, n_views = assignment.composited_by_rank, assignment.ranges.n_views
-        # Without sizes the projection waits for the device, which may still wait for other ranks.
+        # Without capacity the projection waits for the device, which may still wait for other ranks.
         with ranks.watchdog.waiting("project"):
-            projected = inputs.project(sizes, tiles)
+            projected = inputs.project(capacity, tiles)
         everyone = projected.totals.repeat(ranks.world_size, 1)
         # Newer versions of torch have this function under another name and warn about the old one.
         gather = getattr(dist, "all_gather_single", dist.all_gather_into_tensor)
@@ -79,9 +76,9 @@ class CollectiveExchange:
             totals = to_host(everyone).tolist()
         traffic = Traffic.of(totals, n_views, ranks.rank)
         self._needed = needed = traffic.own._replace(blocks=traffic.most_blocks)
-        if sizes is not None and not sizes.holds(needed[:2]):
+        if capacity is not None and not capacity.holds(needed[:2]):
             projected = inputs.project(None, tiles)  # no queued work waits for another rank now
-        mark("project")
+        stage_ended("project")
         projected = projected.first(needed)
         own, sent = projected.splats, projected.for_compositing
         columns = [sent.means2d, sent.depths, sent.camera_ids, sent.ids]
@@ -97,10 +94,10 @@ class CollectiveExchange:
         self.arrived = Arrived(splats, None, traffic.n_isects)
         self._result: ExchangeResult | None = None
         # All ranks decide the same, because they have estimated the same number of blocks.
-        if sizes is None or needed.blocks <= sizes.blocks:
+        if capacity is None or needed.blocks <= capacity.blocks:
             way_back = CollectiveWayBack(ranks, traffic, places)
             self._result = ExchangeResult(own, splats, visible, traffic, way_back)
-        mark("exchange")
+        stage_ended("exchange")
 
     def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """See `Exchange.finish`; the host has known all numbers since the splats were sent."""
@@ -147,7 +144,7 @@ def return_sums(sums: Tensor, places: Tensor, traffic: Traffic, ranks: Ranks) ->
     """
     returned = ranks.all_to_all(sums, traffic.received, traffic.sent)
     total = sums.new_zeros(traffic.own.splats, sums.shape[1])
-    lanes = torch.arange(RUN, device=sums.device)
+    lanes = torch.arange(PLACE_SPLATS, device=sums.device)
     for group, runs in zip(returned.split(traffic.sent), places.unbind(1), strict=True):
         if group.shape[0] == 0:
             continue

@@ -52,11 +52,10 @@ from blitzgs.frame.transport.protocol import (
     Arrived,
     CapacityEstimate,
     ExchangeResult,
-    Mark,
     Traffic,
-    unmarked,
+    stage_ended,
 )
-from blitzgs.ops.exchange import runs_of
+from blitzgs.ops.exchange import place_runs
 from blitzgs.ops.host import current_stream
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, SplatGradients
@@ -118,11 +117,11 @@ class PeerBuffers:
 class PeerTransport:
     """The transport for ranks of one host whose GPUs can access each other's memory."""
 
-    def __init__(self, ranks: Ranks, capacity: CapacityEstimate | None = None) -> None:
+    def __init__(self, ranks: Ranks, estimate: CapacityEstimate | None = None) -> None:
         """Use the shared memory of `ranks`; the estimate must be the same on all ranks."""
         if ranks.memory is None:
             raise ValueError(f"the ranks share no memory; their transport is {ranks.transport}")
-        self.capacity = capacity or CapacityEstimate()
+        self.estimate = estimate or CapacityEstimate()
         self._ranks, self._memory = ranks, ranks.memory
         self._buffers: PeerBuffers | None = None
         # One event serves all exchanges. The host waits for it before it starts the next exchange; if an
@@ -133,21 +132,20 @@ class PeerTransport:
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
-        sizes: Sizes | None,
-        mark: Mark = unmarked,
+        capacity: Sizes | None,
     ) -> PeerExchange:
         """See `Transport.project_and_send`."""
         if assignment is None:
             raise ValueError("several ranks need an assignment of tiles")
-        if sizes is not None:
+        if capacity is not None:
             present = self._memory.buffers[0].shape[0]
-            words = room_for(sizes.splats, present)
+            words = room_for(capacity.splats, present)
             if words > present:
                 with self._ranks.watchdog.waiting("reserve"):
                     self._memory.reserve(words)
         if self._buffers is None or self._buffers.buffers[0] is not self._memory.buffers[0]:
             self._buffers = PeerBuffers(self._memory.buffers, self._ranks.rank)
-        return PeerExchange(self._ranks, self._buffers, self._counted, inputs, assignment, sizes, mark)
+        return PeerExchange(self._ranks, self._buffers, self._counted, inputs, assignment, capacity)
 
 
 class PeerExchange:
@@ -160,17 +158,16 @@ class PeerExchange:
         counted: torch.cuda.Event,
         inputs: ProjectionInputs,
         assignment: TileAssignment,
-        sizes: Sizes | None,
-        mark: Mark,
+        capacity: Sizes | None,
     ) -> None:
         """Queue the projection and the writing of the splats; record `counted` behind the counts."""
         assert ranks.memory is not None  # see `PeerTransport`
         self._memory = memory = ranks.memory
-        self._ranks, self._buffers, self._counted, self._sizes = ranks, buffers, counted, sizes
+        self._ranks, self._buffers, self._counted, self._capacity = ranks, buffers, counted, capacity
         self._n_views = inputs.n_views
         self._traffic: Traffic | None = None
-        capacity = Sizes(buffers.length, buffers.length, 0)
-        projected = inputs.project(capacity, assignment.composited_by_rank)
+        room = Sizes(buffers.length, buffers.length, 0)
+        projected = inputs.project(room, assignment.composited_by_rank)
         self._own = projected.splats
         self._shared = memory.share(projected.totals)  # barrier A
         counted.record(current_stream(ranks.device))
@@ -181,25 +178,25 @@ class PeerExchange:
         memory.barrier()  # B
         memory.generation += 1
         self._generation = memory.generation
-        mark("project")
-        n_isects = self._read().n_isects if sizes is None else sizes.isects
+        stage_ended("project")
+        n_isects = self._read().n_isects if capacity is None else capacity.isects
         self.arrived = Arrived(buffers.splats, plan[:1], n_isects)
         self.gradient_table: Tensor | None = buffers.tables[ranks.rank]
-        mark("exchange")
+        stage_ended("exchange")
 
     def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """See `Exchange.finish`."""
-        traffic, sizes = self._read(), self._sizes
+        traffic, capacity = self._read(), self._capacity
         fits = traffic.most <= self._buffers.length
-        if sizes is not None:
-            fits = fits and traffic.most_isects <= sizes.isects and traffic.most_blocks <= sizes.blocks
+        if capacity is not None:
+            fits = fits and traffic.most_isects <= capacity.isects and traffic.most_blocks <= capacity.blocks
         if not fits:
             return traffic.needed, None
         visible = self._shared.sums[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
         composited = self._buffers.splats.first(sum(traffic.received))
         way_back = PeerWayBack(
             self._ranks, self._memory, self._generation, self._buffers.tables, traffic,
-            self._places[: runs_of(traffic.own.splats)],
+            self._places[: place_runs(traffic.own.splats)],
         )  # fmt: skip
         own = splats_of(self._own, traffic.own)
         return traffic.needed, ExchangeResult(own, composited, visible, traffic, way_back)

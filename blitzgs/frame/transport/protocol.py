@@ -5,7 +5,7 @@ Every rank projects the Gaussians that it owns. Each splat (a Gaussian in a view
 that composite tiles which it touches, and its gradient is returned (BlitzGS, section 3.1). The calls of one
 frame, on every rank:
 
-    exchange = transport.project_and_send(inputs, assignment, sizes, mark)
+    exchange = transport.project_and_send(inputs, assignment, capacity)
     exchange.arrived, exchange.gradient_table                # for compositing
     needed, result = exchange.finish()                       # result None: the capacity was too small
     result.way_back.check_still_valid()                      # before the backward pass of compositing
@@ -17,8 +17,9 @@ the other transports.
 
 from __future__ import annotations
 
+import contextlib
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from torch import Tensor
@@ -31,12 +32,24 @@ if TYPE_CHECKING:
     from blitzgs.ops.splat_gradients import SplatGradients
 
 
-# Called at the end of each stage of a step with the stage's name, for benchmarks.
-Mark = Callable[[str], None]
+_listener: Callable[[str], object] | None = None
 
 
-def unmarked(stage: str) -> None:
-    """Do nothing at the end of a stage."""
+@contextlib.contextmanager
+def stages_told_to(listener: Callable[[str], object]) -> Iterator[None]:
+    """Call `listener` with the name of each stage of a step at its end, in this context; for benchmarks."""
+    global _listener
+    _listener = listener
+    try:
+        yield
+    finally:
+        _listener = None
+
+
+def stage_ended(stage: str) -> None:
+    """Tell the listener, if there is one, that the host has queued a stage of a step."""
+    if _listener is not None:
+        _listener(stage)
 
 
 class Traffic(NamedTuple):
@@ -139,7 +152,7 @@ class Exchange(Protocol):
         """Wait for the numbers.
 
         Returns:
-            The sizes that the frame needs, from which `Transport.capacity` learns; and the result, None if
+            The sizes that the frame needs, from which `Transport.estimate` learns; and the result, None if
             the capacity was too small and the frame must be started again.
         """
 
@@ -180,23 +193,21 @@ class Transport(Protocol):
     """Sends the splats of many frames, one after the other."""
 
     @property
-    def capacity(self) -> CapacityEstimate | None:
+    def estimate(self) -> CapacityEstimate | None:
         """Estimate of a frame's sizes, the same on ranks that need equal sizes; None: each frame waits."""
 
     def project_and_send(
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
-        sizes: Sizes | None,
-        mark: Mark = unmarked,
+        capacity: Sizes | None,
     ) -> Exchange:
         """Project this rank's Gaussians and send the splats to the ranks that composite them. Collective.
 
         Args:
             inputs: inputs of the projection, with the Gaussians' ids.
             assignment: the tiles of each rank; None: this rank composites all tiles.
-            sizes: the sizes to allocate; None: the host first waits for the numbers.
-            mark: called at the end of the stages "project" and "exchange".
+            capacity: the sizes to allocate; None: the host first waits for the numbers.
         """
 
 
@@ -232,21 +243,20 @@ class CapacityEstimate:
 class LocalTransport:
     """The transport for one rank; with an estimate, the host queues compositing before it waits."""
 
-    def __init__(self, capacity: CapacityEstimate | None = None, exact: bool = False) -> None:
-        """Use a capacity estimate; None: a new one without any sizes; or none at all if `exact`."""
-        self.capacity = None if exact else capacity or CapacityEstimate()
+    def __init__(self, estimate: CapacityEstimate | None = None, exact: bool = False) -> None:
+        """Use an estimate; None: a new one without any sizes; or none at all if `exact`."""
+        self.estimate = None if exact else estimate or CapacityEstimate()
 
     def project_and_send(
         self,
         inputs: ProjectionInputs,
         assignment: TileAssignment | None,
-        sizes: Sizes | None,
-        mark: Mark = unmarked,
+        capacity: Sizes | None,
     ) -> LocalExchange:
         """See `Transport.project_and_send`."""
         if assignment is not None:
             raise ValueError("a local transport serves one rank, which composites all tiles")
-        return LocalExchange(inputs, sizes, mark)
+        return LocalExchange(inputs, capacity)
 
 
 class LocalExchange:
@@ -257,23 +267,23 @@ class LocalExchange:
         totals: `ProjectionOutputs.totals`; None until the host has waited for them.
     """
 
-    def __init__(self, inputs: ProjectionInputs, sizes: Sizes | None, mark: Mark) -> None:
+    def __init__(self, inputs: ProjectionInputs, capacity: Sizes | None) -> None:
         """Project."""
         # On the CPU the sizes are known at once, so no estimate is needed.
-        self._capacity = sizes if inputs.gaussians[0].is_cuda else None
+        self._capacity = capacity if inputs.gaussians[0].is_cuda else None
         self.projected = projected = inputs.project(self._capacity)
         self.gradient_table: Tensor | None = None
         splats, host = projected.for_compositing, projected.totals
         self._copy = HostCopy(host) if host.is_cuda else None
         self.totals: list[int] | None = None
-        mark("project")
+        stage_ended("project")
         if self._capacity is None:
             self._host = host if self._copy is None else self._copy.read()
             self.totals = self._host.tolist()
             self.arrived = Arrived(splats, None, self.totals[2])
         else:
             self.arrived = Arrived(splats, projected.n_splats, self._capacity.isects)
-        mark("exchange")
+        stage_ended("exchange")
 
     def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """See `Exchange.finish`."""

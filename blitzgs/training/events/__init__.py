@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The events that happen between two steps, one file per event with a function `run(state, event)`.
+"""The events that happen between two steps, as functions of the state and the event.
 
 To add an event, name it in `blitzgs.config.schedule.EventKind`, say there when it happens, and list its
 function in `HANDLERS`.
@@ -18,13 +18,13 @@ from blitzgs.training.state import TrainingState
 from blitzgs.training.view_level import clear_cull
 
 HANDLERS: Mapping[EventKind, Callable[[TrainingState, Event], object]] = {
-    "densify": densify.run,
+    "densify": densify.run_density_event,
     "reset_opacities": densify.reset_opacities,
-    "pass_1": importance.run,
-    "pass_2": importance.run,
+    "pass_1": importance.run_importance_pass,
+    "pass_2": importance.run_importance_pass,
     "clear_cull": clear_cull,
-    "evaluate": evaluate.run,
-    "checkpoint": save.run,
+    "evaluate": evaluate.evaluate_held_out,
+    "checkpoint": save.save_checkpoint,
 }
 
 

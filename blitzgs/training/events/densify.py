@@ -26,7 +26,7 @@ from blitzgs.training.state import TrainingState
 MOST_SPREAD = 4.0
 
 
-def run(state: TrainingState, event: Event) -> None:
+def run_density_event(state: TrainingState, event: Event) -> None:
     """Run one density event and log what it did (errors: NonFiniteError, ModelLostError)."""
     state.stepper.write_back()
     # The largest column, sh, does not decide anything; it is checked with each record of the log.
@@ -39,14 +39,15 @@ def run(state: TrainingState, event: Event) -> None:
     if is_sorted:
         state.sort()
     state.stepper.reindex()
-    counts = _over_all_ranks(state, dataclasses.asdict(report) | {"gaussians": len(state.table)})
+    counts, spread_now = _over_all_ranks(state, dataclasses.asdict(report) | {"gaussians": len(state.table)})
     if counts["gaussians"] == 0:
         raise ModelLostError(
             f"the density event after {event.time:,} images pruned the last Gaussian: check that the poses "
             "and points belong together, or prune less (population.min_opacity, prune_screen_radius, "
             "prune_world_scale; schedule.size_prune_after)"
         )
-    _keep_sorted(state, event, counts, is_sorted)
+    if _keep_sorted(state, event, spread_now, is_sorted):
+        counts["sorted"] = 1
     if moved:
         counts["redistributed"] = 1
     peak = max(state.progress.peak_gaussians, counts["gaussians"])
@@ -60,23 +61,28 @@ def _spread(state: TrainingState) -> Tensor:
     return (spread(state.stepper.bounds, extent) * (1000 / extent)).long().to(state.ranks.device)
 
 
-def _keep_sorted(state: TrainingState, event: Event, counts: dict[str, int], is_sorted: bool) -> None:
+def _keep_sorted(state: TrainingState, event: Event, spread_now: int, is_sorted: bool) -> bool:
     """Sort the table if its blocks have become too large; no result depends on it. Every rank calls this.
 
-    After the last event the order stays for the rest of the run, so that sorting always pays. Of the counts
-    over all ranks, "spread" goes, and "sorted" comes if this sorts the table; `is_sorted`: the event has
-    sorted it.
+    After the last event the order stays for the rest of the run, so that sorting always pays.
+
+    Args:
+        spread_now: spread of the blocks of all ranks.
+        is_sorted: whether the event has sorted the table already.
+
+    Returns:
+        Whether this sorted the table.
     """
-    spread_now = counts.pop("spread")
-    if not is_sorted:
+    sorts = not is_sorted
+    if sorts:
         is_compact = spread_now <= MOST_SPREAD * state.progress.sorted_spread
         if is_compact and not state.schedule.is_last_density_event(event.time):
-            return
-        counts["sorted"] = 1
+            return False
         state.sort()
         state.stepper.reindex()
-        spread_now = _over_all_ranks(state, {})["spread"]
+        _, spread_now = _over_all_ranks(state, {})
     state.progress = dataclasses.replace(state.progress, sorted_spread=spread_now)
+    return sorts
 
 
 def population_limit(state: TrainingState) -> GrowthLimit | None:
@@ -92,11 +98,11 @@ def population_limit(state: TrainingState) -> GrowthLimit | None:
     )
 
 
-def _over_all_ranks(state: TrainingState, counts: dict[str, int]) -> dict[str, int]:
-    """Return the sums of named counts over all ranks, and of the "spread" of the blocks."""
+def _over_all_ranks(state: TrainingState, counts: dict[str, int]) -> tuple[dict[str, int], int]:
+    """Return the sums of named counts over all ranks, and that of the spread of their blocks."""
     own = torch.tensor(list(counts.values()), dtype=torch.int64, device=state.ranks.device)
-    values = state.ranks.all_reduce(torch.cat((own, _spread(state)[None])))
-    return dict(zip((*counts, "spread"), values.tolist(), strict=True))
+    *sums, spread_now = state.ranks.all_reduce(torch.cat((own, _spread(state)[None]))).tolist()
+    return dict(zip(counts, sums, strict=True)), spread_now
 
 
 def _log(state: TrainingState, event: Event, counts: dict[str, int], limit: GrowthLimit | None) -> None:

@@ -13,8 +13,8 @@ from typing import Any
 from blitzgs.capture.images import PhotographError
 from blitzgs.config.schedule import Event
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import files as run_files
-from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, spread, worst_views
+from blitzgs.runs import run_files
+from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, evenly_ordered, worst_views
 from blitzgs.runs.lod import scene_gate
 from blitzgs.training.state import TrainingState
 from blitzgs.util.output import write_file
@@ -25,7 +25,7 @@ PICTURES = 8
 TRAINED_SHARE, LEAST_TRAINED, MOST_TRAINED = 0.02, 8, 64
 
 
-def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
+def evaluate_held_out(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
     """Measure the held-out views, or the training views if none are held out; the training clock pauses.
 
     Returns the mean of each metric, and under "split" which views were measured; nothing if the run has to
@@ -42,7 +42,8 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
                 count = int(
                     min(MOST_TRAINED, max(LEAST_TRAINED, TRAINED_SHARE * state.progress.seconds / cost))
                 )
-                _write_trained(state, spread(capture.train)[: state.ranks.broadcast_object(count)], folder)
+                count = state.ranks.broadcast_object(count)
+                _write_trained(state, evenly_ordered(capture.train)[:count], folder)
         except EvaluationStoppedError:
             text = "evaluation given up: the run has to stop"
             state.log.event(state.images_seen, "evaluation stopped", {}, text)
@@ -113,7 +114,7 @@ class Glances:
         self._state = state
         self._begin = state.progress.seconds
         self._spent, self._cost = 0.0, 0.0  # seconds in all, and the largest so far for a view
-        self._order = spread(state.capture.test)
+        self._order = evenly_ordered(state.capture.test)
         if state.config.schedule.evaluate_every > 0:
             self._order = []
 

@@ -26,7 +26,7 @@ from blitzgs.util.progress import Report
 LEAST_VIEWS = 4
 
 
-def run(state: TrainingState, event: Event) -> None:
+def run_importance_pass(state: TrainingState, event: Event) -> None:
     """Score all Gaussians, store phi and the cull mask, prune by the scores and redistribute the rows.
 
     Errors are NonFiniteError, ModelLostError, and SweepStoppedError if the run has to stop: the pass has then

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from blitzgs.config.files import save_config
 from blitzgs.config.schedule import Event
-from blitzgs.runs import files as run_files
+from blitzgs.runs import run_files
 from blitzgs.runs.cameras import save_cameras
 from blitzgs.runs.checkpoint import CheckpointError, Saving
 from blitzgs.training.state import TrainingState
@@ -29,18 +29,18 @@ PATIENCE_SECONDS = 24 * 3600.0
 STOPPING_PATIENCE_SECONDS = 15.0
 
 
-def run(state: TrainingState, event: Event | None = None) -> None:
-    """Begin to write a checkpoint while training goes on; all ranks `finish` it.
+def save_checkpoint(state: TrainingState, event: Event | None = None) -> None:
+    """Begin to write a checkpoint while training goes on; all ranks `finish_checkpoint`.
 
     If it cannot be written, the run continues and tries again a minute later. If a value is not finite,
     NonFiniteError is raised, and earlier checkpoints are kept.
     """
-    finish(state)
+    finish_checkpoint(state)
     with _reported(state):
         state.save_clock.saving = _write(state, in_background=True)
 
 
-def finish(state: TrainingState) -> None:
+def finish_checkpoint(state: TrainingState) -> None:
     """Wait for the checkpoint that is being written, if there is one. Collective."""
     saving, state.save_clock.saving = state.save_clock.saving, None
     if saving is not None:
@@ -58,14 +58,14 @@ def _reported(state: TrainingState) -> Iterator[None]:
         _report(state, error, f"Training goes on; trying again in {RETRY_SECONDS:.0f} s.")
 
 
-def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[], bool]) -> None:
+def save_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[], bool]) -> None:
     """Write the checkpoint at the end of a run; if there is no space for it, wait and try again.
 
     `gives_up`, the same on every rank, is asked before each wait. If it cannot be written for another reason,
     which waiting does not change, the model is saved elsewhere. CheckpointError: it could not be written in
     time, or not at all; the message says whether and where the model was saved instead.
     """
-    finish(state)
+    finish_checkpoint(state)
     waited, pause = 0.0, FIRST_WAIT_SECONDS
     while True:
         try:

@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "io/colmap.h"
+#include "io/image_file.h"
 #include "io/image_header.h"
 #include "io/jpeg.h"
 #include "io/ply.h"
@@ -44,6 +45,7 @@ std::istringstream stream_of(Input input) {
 [[maybe_unused]] void image_header(Input input) {
   const io::ImageHeader header = io::read_image_header(input, "f");
   if (header.orientation < 1 || header.orientation > 8) __builtin_trap();
+  io::check_image(input, "f");
   if (header.format != "TIFF") return;
   const std::vector<std::uint8_t> stored = io::tiff_as_stored(input, "f");
   if (!stored.empty() && stored.size() != input.size()) __builtin_trap();

@@ -4,18 +4,14 @@
 from __future__ import annotations
 
 import dataclasses
-import platform
-import resource
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import psutil
 import torch
 
-import blitzgs
 from blitzgs.config.fields import Config
 from blitzgs.config.files import ConfigError, changed, flat, from_dict, load_config, to_dict
 from blitzgs.config.schedule import Schedule
@@ -319,26 +315,3 @@ def _differences(saved: Config, found: Config) -> list[tuple[str, Any, Any]]:
     """Return the name and both values of the fields that differ."""
     old, new = flat(to_dict(saved)), flat(to_dict(found))
     return [(name, old[name], new[name]) for name in old if old[name] != new[name]]
-
-
-def peak_memory_bytes(device: torch.device) -> int:
-    """Return this process's peak memory in bytes: allocated on a GPU, or resident on the CPU."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-
-
-def memory_bytes(device: torch.device) -> int:
-    """Return this process's memory in bytes now: allocated on a GPU, or resident on the CPU."""
-    if device.type == "cuda":
-        # torch.cuda.memory_allocated reads the same, but copies all figures of the allocator first.
-        return int(torch.cuda.memory_stats_as_nested_dict(device)["allocated_bytes"]["all"]["current"])
-    return int(psutil.Process().memory_info().rss)
-
-
-def versions(device: torch.device) -> dict[str, str]:
-    """Return the versions of the software and the name of the device."""
-    found = {"blitzgs": blitzgs.__version__, "torch": torch.__version__, "python": platform.python_version()}
-    if device.type == "cuda":
-        found |= {"device": torch.cuda.get_device_name(device), "cuda": str(torch.version.cuda)}
-    return found | {"machine": platform.platform()}

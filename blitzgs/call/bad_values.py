@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What calls say about input that has no effect on a picture.
+"""What calls say about values that have no effect on an image.
 
 Gaussians and views that are NaN or infinite are not rendered; intrinsics with a skew are refused, and get no
 gradient.
@@ -167,7 +167,7 @@ def _rows_not_finite(values: Tensor) -> Tensor:
 
 
 def watch_for_non_finite(
-    gaussians: Gaussians, layout: Layout, function: str, colours: Sequence[Tensor], suspects_cameras: bool
+    gaussians: Gaussians, layout: Layout, function: str, nan_marks: Sequence[Tensor], suspects_cameras: bool
 ) -> None:
     """Warn about arguments of a renderer with values that are not finite, after a cheap check for any.
 
@@ -178,7 +178,7 @@ def watch_for_non_finite(
         gaussians: the arguments of a call.
         layout: its splats.
         function: name of the public function.
-        colours: a value for each Gaussian, NaN if its colours are values that are not finite, or its extra
+        nan_marks: a value for each Gaussian, NaN if its colours are values that are not finite, or its extra
             signals are not.
         suspects_cameras: whether a camera may be not finite.
     """
@@ -190,7 +190,7 @@ def watch_for_non_finite(
         columns, opacities = [*named["viewmats"], *named["Ks"]], []
     else:
         columns = [t for name, given in named.items() if name not in (*COLOURS, SIGNALS) for t in given]
-        columns += colours
+        columns += nan_marks
         # Splats whose SH are not finite have no opacity, and no other splat is below 1/255.
         opacities = [layout.splats.opacities]
     # One pass over the columns tells whether a closer check is needed.

@@ -1,0 +1,127 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "io/image_file.h"
+
+#include <fcntl.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <array>
+#include <bit>
+#include <cerrno>
+#include <cstring>
+#include <string_view>
+
+#include "io/jpeg.h"
+
+namespace blitzgs::io {
+
+namespace {
+
+using namespace std::string_view_literals;
+using Bytes = std::span<const std::uint8_t>;
+
+constexpr std::string_view kPngStart = "\x89PNG\r\n\x1a\n"sv;
+constexpr std::size_t kReadAhead = 1 << 16;
+
+std::string_view text(Bytes bytes) { return {reinterpret_cast<const char*>(bytes.data()), bytes.size()}; }
+
+// Tables of the checksum of a byte that k zero bytes follow, for the polynomial of PNG (ISO/IEC 15948, D).
+constexpr auto kChecksums = [] {
+  std::array<std::array<std::uint32_t, 256>, 8> tables{};
+  for (std::uint32_t byte = 0; byte < 256; ++byte) {
+    std::uint32_t value = byte;
+    for (int bit = 0; bit < 8; ++bit) value = value >> 1 ^ (value & 1 ? 0xedb88320u : 0u);
+    tables[0][byte] = value;
+  }
+  for (std::size_t k = 1; k < tables.size(); ++k) {
+    for (std::size_t byte = 0; byte < 256; ++byte) {
+      const std::uint32_t before = tables[k - 1][byte];
+      tables[k][byte] = before >> 8 ^ tables[0][before & 0xff];
+    }
+  }
+  return tables;
+}();
+
+// Eight bytes at a time, because a step of one byte waits for the one before.
+std::uint32_t checksum(Bytes bytes) {
+  std::uint32_t value = ~0u;
+  for (; bytes.size() >= 8; bytes = bytes.subspan(8)) {
+    std::uint64_t word = 0;
+    std::memcpy(&word, bytes.data(), 8);
+    word ^= value;
+    value = 0;
+    for (std::size_t k = 0; k < 8; ++k) value ^= kChecksums[7 - k][word >> 8 * k & 0xff];
+  }
+  for (const std::uint8_t byte : bytes) value = value >> 8 ^ kChecksums[0][(value ^ byte) & 0xff];
+  return ~value;
+}
+
+std::uint32_t big_endian(Bytes bytes) {
+  return std::uint32_t{bytes[0]} << 24 | std::uint32_t{bytes[1]} << 16 | std::uint32_t{bytes[2]} << 8 |
+         bytes[3];
+}
+
+void check_png(Bytes file, const std::string& name) {
+  bool has_pixels = false;
+  for (std::size_t at = kPngStart.size();;) {
+    const auto fail = [&](const char* reason) {
+      throw FormatError(name + ": at byte " + std::to_string(at), reason);
+    };
+    const Bytes rest = file.subspan(at);
+    if (rest.size() < 12 || rest.size() - 12 < big_endian(rest)) {
+      fail("truncated PNG: it ends before its last chunk");
+    }
+    const Bytes chunk = rest.subspan(4, 4 + std::size_t{big_endian(rest)});
+    const std::string_view kind = text(chunk.first(4));
+    // The names of chunks that a picture needs begin with a capital letter. Others may be damaged.
+    const bool is_needed = !(chunk[0] & 0x20) || kind == "tRNS";
+    if (is_needed && checksum(chunk) != big_endian(rest.subspan(4 + chunk.size()))) {
+      fail("damaged PNG: the checksum of a chunk is wrong");
+    }
+    has_pixels |= kind == "IDAT";
+    if (kind == "IEND") break;
+    at += 8 + chunk.size();
+  }
+  if (!has_pixels) throw FormatError(name, "damaged PNG: it has no image data");
+}
+
+// Closes a file at the end of its scope.
+struct File {
+  int number;
+  ~File() { ::close(number); }
+};
+
+std::vector<std::uint8_t> read_file(const std::string& path) {
+  const File file{::open(path.c_str(), O_RDONLY | O_CLOEXEC)};
+  struct stat about{};
+  if (file.number < 0 || ::fstat(file.number, &about) != 0) throw SystemError(errno, path);
+  // One byte more than the file has, so that the read that fills the memory also finds the end.
+  std::vector<std::uint8_t> bytes(static_cast<std::size_t>(std::max<off_t>(about.st_size, 0)) + 1);
+  std::size_t size = 0;
+  while (true) {
+    const ssize_t count = ::read(file.number, bytes.data() + size, bytes.size() - size);
+    if (count < 0 && errno == EINTR) continue;
+    if (count < 0) throw SystemError(errno, path);
+    if (count == 0) break;
+    size += static_cast<std::size_t>(count);
+    if (size == bytes.size()) bytes.resize(size + kReadAhead);
+  }
+  bytes.resize(size);
+  return bytes;
+}
+
+}  // namespace
+
+void check_image(Bytes file, const std::string& name) {
+  if (text(file).starts_with("\xff\xd8"sv)) check_jpeg(file, name);
+  if (text(file).starts_with(kPngStart)) check_png(file, name);
+}
+
+std::vector<std::uint8_t> read_image_file(const std::string& path) {
+  std::vector<std::uint8_t> bytes = read_file(path);
+  check_image(bytes, path);
+  return bytes;
+}
+
+}  // namespace blitzgs::io
