@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.utils._pytree import tree_map
 
-from blitzgs.call import finite
+from blitzgs.call import bad_values
 from blitzgs.call.meta import LATER, LateMapping, LazyDict
 from tests.helpers import DEVICES, random_scene, rasterize_scene, reference_images, relative_error
 
@@ -17,7 +17,7 @@ from tests.helpers import DEVICES, random_scene, rasterize_scene, reference_imag
 @pytest.fixture(autouse=True)
 def _first_calls():
     """Forget the calls of other tests: on CUDA, the first call with a number of Gaussians checks them."""
-    finite._calls.cache_clear()
+    bad_values._calls.cache_clear()
 
 
 @pytest.mark.parametrize("packed", [True, False])
@@ -229,7 +229,7 @@ def test_what_is_not_finite_is_named(device, name):
     seen = int(rasterize_scene(scene)[2]["gaussian_ids"][0])
     at = 1 if name in ("viewmats", "Ks") else seen
     getattr(scene, name)[at] = torch.nan
-    finite._calls.cache_clear()  # so that the next call checks the Gaussians on CUDA, too
+    bad_values._calls.cache_clear()  # so that the next call checks the Gaussians on CUDA, too
     with pytest.warns(RuntimeWarning, match=rf"NaN or infinite values in {name};"):
         image, _, meta = rasterize_scene(scene)
     assert image.isfinite().all()

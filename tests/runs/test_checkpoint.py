@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import load_file
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import checkpoint, checkpoint_files, files
+from blitzgs.runs import checkpoint, checkpoint_files, run_files
 from tests.distributed.rank_harness import CONTEXT, RankError, run_ranks
 from tests.helpers import save_checkpoint
 from tests.training.tiny import random_gaussians, tiny_config
@@ -322,11 +322,11 @@ def test_shared_columns_are_saved_and_checked(tmp_path):
 def test_ranks_that_share_a_memory_need_room_for_all_their_copies(tmp_path, monkeypatch, ranks, copies):
     gaussians, written = random_gaussians(), []
     job = SimpleNamespace(world_size=ranks, watchdog=SimpleNamespace(working=lambda what: nullcontext()))
-    monkeypatch.setattr(files, "check_before_saving", lambda *_: None)
-    monkeypatch.setattr(files, "available_bytes", lambda: 5 * gaussians.memory_bytes)
+    monkeypatch.setattr(run_files, "check_before_saving", lambda *_: None)
+    monkeypatch.setattr(run_files, "available_bytes", lambda: 5 * gaussians.memory_bytes)
     monkeypatch.setattr(
         checkpoint, "Saving", lambda folder, columns, *_: written.append(columns) or SimpleNamespace(wait=int)
     )
-    progress, space = files.Progress(1, 0, 1, 1, 0.0), files.Space((0.0, 0.0, 0.0), 1.0, 1.0)
-    files.save(tmp_path, gaussians, progress, space, tiny_config(), job, in_background=True)
+    progress, space = run_files.Progress(1, 0, 1, 1, 0.0), run_files.Space((0.0, 0.0, 0.0), 1.0, 1.0)
+    run_files.save(tmp_path, gaussians, progress, space, tiny_config(), job, in_background=True)
     assert (written[0]["means"].data_ptr() != gaussians["means"].data_ptr()) == copies
