@@ -27,14 +27,13 @@ import json
 import re
 import signal
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import quality_report
 import torch
-from bm_quality import Pool, positive
+from bm_quality import Pool, positive, work
 from city_report import TABLES
 from city_run import RESERVE, CityRun
 from harness import ROOT, command_line, make_parser, markdown_table, write_json
@@ -52,9 +51,26 @@ Json = dict[str, Any]
 
 
 class CityPool(Pool):
-    """Runs the trainings of the city."""
+    """Runs the trainings of the city.
+
+    Attributes:
+        args: of the command line.
+    """
 
     worker = "city_run.py"
+
+    def __init__(self, args: Any, ranks: int) -> None:
+        """Make a slot for each group of `ranks` GPUs."""
+        super().__init__(args.out, args.gpus, 1, ranks)
+        self.args = args
+
+    def report(self) -> None:
+        """Write the tables."""
+        collect(self.args)
+
+    def summary(self, result: Json) -> str:
+        """Return a run's result as one line."""
+        return str({key: result.get(key) for key in ("status", "finished", "psnr", "images_per_second")})
 
 
 def held_out(city: Path, count: int, path: Path) -> None:
@@ -101,7 +117,6 @@ def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
                     **dataclasses.asdict(spec),
                     limit=args.seconds_per_run,
                     popping=frames,
-                    shown=str((args.out / "popping").resolve()),
                     command=command_line(),
                 )
             )
@@ -162,25 +177,6 @@ def collect(args: Any) -> str:
     return text
 
 
-def work(runs: Sequence[CityRun], pool: Pool, args: Any) -> None:
-    """Do the runs that are not done, and write the tables whenever one ends."""
-    left = [run for run in runs if not quality_report.is_done(pool.out, run.name)]
-    begin = time.monotonic()
-    try:
-        while left or pool.jobs:
-            while left and pool.slots:
-                pool.result_path(left[0]).unlink(missing_ok=True)
-                pool.start(left.pop(0))
-            for job in pool.ended():
-                result = json.loads(pool.result_path(job.spec).read_text())
-                shown = {key: result.get(key) for key in ("status", "finished", "psnr", "images_per_second")}
-                print(f"[{time.monotonic() - begin:.0f} s] {job.spec.name}: {shown}", flush=True)
-                collect(args)
-            time.sleep(0.1)
-    finally:
-        pool.stop()
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark; returns the exit status: 1 when a planned run is not done."""
     parser = make_parser(__doc__, device=None)
@@ -224,7 +220,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         for ranks in dict.fromkeys(args.ranks):
             group = [run for run in runs if run.ranks == ranks]
-            work(group, CityPool(args.out, args.gpus, 1, ranks), args)
+            work(group, CityPool(args, ranks), None)
     finally:
         print(collect(args))
     return int(not all(quality_report.is_done(args.out, run.name) for run in runs))

@@ -12,11 +12,7 @@ A recipe is a configuration file or "defaults", with overrides; or one of gsplat
 of its trainer (`benchmarks/opponents/gsplat_training.py`): gsplat-default (as in its wheel),
 gsplat-default-reset (with the resets of opacities that 1.5.3 skips by mistake) and gsplat-mcmc; or
 "partition-4x5:" before a configuration, for blocks that are trained separately and then merged
-(`benchmarks/opponents/spatial_partition.py`). A --plan has the same in YAML:
-
-    captures: {park: DATA/park}
-    recipes: {aerial: configs/aerial.yaml, mcmc: gsplat-mcmc --cap_max=2000000}
-    seeds: [0, 1, 2]
+(`benchmarks/opponents/spatial_partition.py`).
 
 --stress YAML runs the stress grid of a configuration (`benchmarks/quality_plan.py`) instead of recipes, and
 writes stress.md.
@@ -51,7 +47,6 @@ from quality_plan import (
     STRESS_SEEDS,
     RunSpec,
     parse_named,
-    read_plan,
     runs_of,
     stress_markdown,
     stress_recipes,
@@ -148,6 +143,21 @@ class Pool:
             result = describe(job.spec) | {"status": "failed", "error": error}
         write(path, result | {"per_gpu": self.per_gpu, "side_by_side": max(self.gpus, 1) * self.per_gpu})
 
+    def report(self) -> None:
+        """Write the tables."""
+        quality_report.report(self.out)
+
+    def summary(self, result: dict[str, Any]) -> str:
+        """Return a run's result as one line."""
+        if result["status"] != "done":
+            return f"FAILED: {result['error']}"
+        last = result["evaluations"][-1]
+        metrics = last.get("test", last.get("train"))
+        return (
+            f"{metrics['psnr']:.2f} dB / {metrics['ssim']:.4f}, training views {last['train']['psnr']:.2f}, "
+            f"{result['seconds']:.1f} s, {result['gaussians']:,} Gaussians"
+        )
+
     def stop(self) -> None:
         """End all present runs; the next call of this program repeats them."""
         for job in self.jobs:
@@ -155,18 +165,6 @@ class Pool:
         for job in self.jobs:
             job.process.wait()
             job.log.close()
-
-
-def summary(result: dict[str, Any]) -> str:
-    """Return a run's result as one line."""
-    if result["status"] != "done":
-        return f"FAILED: {result['error']}"
-    last = result["evaluations"][-1]
-    metrics = last.get("test", last.get("train"))
-    return (
-        f"{metrics['psnr']:.2f} dB / {metrics['ssim']:.4f}, training views {last['train']['psnr']:.2f}, "
-        f"{result['seconds']:.1f} s, {result['gaussians']:,} Gaussians"
-    )
 
 
 def last_line(job: Job) -> str:
@@ -194,8 +192,10 @@ def work(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> None:
             for job in pool.ended():
                 count += 1
                 result = json.loads(pool.result_path(job.spec).read_text())
-                print(f"[{count}/{total}, {elapsed:.0f} s] {job.spec.name}: {summary(result)}", flush=True)
-                quality_report.report(pool.out)
+                print(
+                    f"[{count}/{total}, {elapsed:.0f} s] {job.spec.name}: {pool.summary(result)}", flush=True
+                )
+                pool.report()
             if elapsed > printed + PRINT_EVERY:
                 printed = elapsed
                 for job in pool.jobs:
@@ -227,8 +227,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")
     parser.add_argument("--capture", action="append", default=[], metavar='"NAME=DIR [--data.FIELD=VALUE]"')
     parser.add_argument("--recipe", action="append", default=[], metavar='"NAME=SOURCE [--FIELD=VALUE]"')
-    parser.add_argument("--seeds", type=int, nargs="+", help="of the trainings (default: the plan's, or 0)")
-    parser.add_argument("--plan", type=Path, metavar="YAML", help="captures, recipes and seeds")
+    parser.add_argument("--seeds", type=int, nargs="+", help="of the trainings (default: 0)")
     parser.add_argument("--stress", metavar="YAML", help="run the stress grid of this configuration")
     parser.add_argument(
         "--evaluate-at",
@@ -263,11 +262,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
-        plan = {"captures": {}, "recipes": {}} if args.plan is None else read_plan(args.plan)
-        captures = plan["captures"] | dict(map(parse_named, args.capture))
-        recipes = plan["recipes"] | dict(map(parse_named, args.recipe))
-        seeds = args.seeds or plan.get("seeds") or [0]
-        evaluate_at = args.evaluate_at
+        captures, recipes = dict(map(parse_named, args.capture)), dict(map(parse_named, args.recipe))
+        seeds, evaluate_at = args.seeds or [0], args.evaluate_at
         if args.stress is not None:
             recipes |= stress_recipes(args.stress)
             seeds, evaluate_at = args.seeds or STRESS_SEEDS, []

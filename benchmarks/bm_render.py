@@ -30,8 +30,9 @@ from blitzgs.frame.render import (
     backward_splats,
     inputs_of,
     render_frame,
+    stage_ended,
 )
-from blitzgs.frame.transport import LocalTransport, stage_ended, stages_told_to
+from blitzgs.frame.transport import LocalTransport, stages_told_to
 from blitzgs.ops.projection_types import Views, WeightedViews
 from blitzgs.table.table import GaussianTable
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,14 @@ import torch
 from harness import make_parser, report
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 from blitzgs import rasterization
 from blitzgs.viewer.world import looking
+from tests.formats.helpers import read_glb
 
 # The flight begins and ends at these multiples of the distance of the page's first view.
 FARTHEST, NEAREST = 4.0, 0.05
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 @dataclass
@@ -40,21 +43,6 @@ class Tile:
     children: list[Tile]
     rows: slice
     bytes: int
-
-
-def read_glb(path: Path) -> dict[str, np.ndarray]:
-    """Return the float32 attributes of a file of ours by their names."""
-    data = path.read_bytes()
-    size = int.from_bytes(data[12:16], "little")
-    content, found = json.loads(data[20 : 20 + size]), {}
-    for name, index in content["meshes"][0]["primitives"][0]["attributes"].items():
-        accessor = content["accessors"][index]
-        if accessor["componentType"] == 5126:
-            start = 28 + size + content["bufferViews"][accessor["bufferView"]].get("byteOffset", 0)
-            count = accessor["count"] * _WIDTHS[accessor["type"]]
-            values = np.frombuffer(data, "<f4", count, start).reshape(accessor["count"], -1)
-            found[name.removeprefix("KHR_gaussian_splatting:")] = values
-    return found
 
 
 class City:
@@ -84,7 +72,8 @@ class City:
         start, size = self._count, 0
         if "content" in node:
             path = self._folder / node["content"]["uri"]
-            self._parts.append(read_glb(path))
+            attributes = read_glb(path)[1].items()
+            self._parts.append({name.rpartition(":")[2]: values for name, values in attributes})
             self._count += len(self._parts[-1]["POSITION"])
             size = path.stat().st_size
         rows = slice(start, self._count)

@@ -55,13 +55,11 @@ class CityRun(RunSpec):
     Attributes:
         limit: seconds after which the process ends itself, whatever it does.
         popping: number of frames of the flight after the evaluation, 0: none.
-        shown: folder for the chart and the clip of the popping.
         command: command of the benchmark that started the run.
     """
 
     limit: float = 100.0
     popping: int = 0
-    shown: str = ""
     command: str = ""
 
 
@@ -214,18 +212,9 @@ def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float)
         if spec.popping and ranks.world_size == 1:
             state.catch_up()
             model = TrainedModel(state.config, state.progress, state.space, state.table)
-            result["popping"] = popping(spec, model, capture.cameras, ranks)
+            result["popping"] = bm_popping.popping_of(model, capture.cameras, ranks, frames=spec.popping)
             note("popped")
     result["status"] = "done" if is_done else "stopped"
-
-
-def popping(spec: CityRun, model: TrainedModel, cameras: Any, ranks: Ranks) -> Record:
-    """Measure popping; where OpenCV cannot write a clip, without clip and chart."""
-    try:
-        return bm_popping.popping_of(model, cameras, ranks, Path(spec.shown), spec.popping)
-    except OSError as error:
-        print(f"no clip and no chart: {error}", flush=True)
-        return bm_popping.popping_of(model, cameras, ranks, None, spec.popping)
 
 
 def main(arguments: Sequence[str]) -> int:

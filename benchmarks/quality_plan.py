@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lists the runs of `bm_quality.py`: captures x recipes x seeds, from the command line and a YAML file.
+"""Lists the runs of `bm_quality.py`: captures x recipes x seeds.
 
 The stress grid says how far a recipe is from losing what it has learnt: every capture x schedule x change of
 one value x batch size; a column has one capture and one value of the grid's other axes. A cell has the
@@ -148,27 +148,6 @@ def parse_named(text: str) -> tuple[str, str]:
     if not equals or not name or not set(name) <= SAFE or not rest.strip():
         raise ValueError(f"'{text}': write NAME=..., with a name of letters, digits and _-+")
     return name, rest
-
-
-def read_plan(path: Path) -> dict[str, Any]:
-    """Read a YAML plan: mappings `captures` and `recipes` (name: text) and a list `seeds`, each optional.
-
-    Raises:
-        ValueError: the file has another content.
-    """
-    try:
-        plan = yaml.safe_load(path.read_text()) or {}
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path}: not valid YAML: {error}") from error
-    if not isinstance(plan, dict) or (unknown := set(plan) - {"captures", "recipes", "seeds"}):
-        found = sorted(unknown) if isinstance(plan, dict) else type(plan).__name__
-        raise ValueError(f"{path}: a plan has captures, recipes and seeds, got {found}")
-    for key in ("captures", "recipes"):
-        for name, text in plan.setdefault(key, {}).items():
-            if not isinstance(text, str):
-                raise ValueError(f"{path}: {key}.{name}: must be text as on the command line, got {text!r}")
-            parse_named(f"{name}={text}")
-    return plan
 
 
 def runs_of(

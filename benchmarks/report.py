@@ -29,7 +29,6 @@ TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end: \2 -->)", re.DOTALL)
 Results = dict[str, Json]
 
 # File in benchmarks/results (without .json) -> the command that writes it.
-PLAN = "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml"
 COMMANDS = {
     "gpu_record": "make gpu-record",
     "render": "python benchmarks/bm_render.py",
@@ -47,8 +46,6 @@ COMMANDS = {
         '--recipe aerial=configs/aerial.yaml --recipe "aerial_half=configs/aerial.yaml --schedule.scale=0.5" '
         "--seeds 0 1 2"
     ),
-    "compact": f'{PLAN} --out runs/compact --capture "NAME=CAPTURE --schedule.scale=0.5"',
-    "town_parts": f"{PLAN} --out runs/town_parts --capture town=DATA/town --seeds 0 1 2",
     "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 --popping --scale 0.6",
     "city_ranks": (
         "python benchmarks/bm_city.py CITY --out RESULTS --gpus 4 --ranks 1 4 --arms all_off "
@@ -59,14 +56,13 @@ COMMANDS = {
 # trainings take many minutes and depend on the recipe more than on the kernels, and the city has a page of
 # its own.
 GROUPS = (
-    ("quality",), ("compact",), ("town_parts",), ("exchange", "drop_in_full"), ("city_ranks",), ("city",),
-    ("gpu_record",),
+    ("quality",), ("exchange", "drop_in_full"), ("city_ranks",), ("city",), ("gpu_record",),
 )  # fmt: skip
 # After commands that take no --json: gpu_record.py writes its file itself, bm_quality.py collects all of its
 # runs in one file.
-COPIED = {"gpu_record": "python benchmarks/report.py"} | {
-    name: f"cp runs/{name}/quality.json benchmarks/results/{name}.json"
-    for name in ("quality", "compact", "town_parts")
+COPIED = {
+    "gpu_record": "python benchmarks/report.py",
+    "quality": "cp runs/quality/quality.json benchmarks/results/quality.json",
 }
 
 

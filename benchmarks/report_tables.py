@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import city_report
@@ -30,9 +29,6 @@ class Section:
 
 QUALITY_COLUMNS = (
     "recipe", "images", "PSNR", "SSIM", "corrected", "training PSNR / SSIM", "seconds",
-)  # fmt: skip
-ABLATION_COLUMNS = (
-    "scene", "arm", "seeds", "PSNR", "corrected PSNR", "SSIM", "peak M", "final M", "peak GB"
 )  # fmt: skip
 OFFLOAD_COLUMNS = {
     "arm": "arm", "order": "views in order", "pool_gb": "GB on the GPU", "step_ms": "ms a step",
@@ -181,36 +177,6 @@ def quality_lines(quality: Json) -> list[str]:
     return table(["capture", *QUALITY_COLUMNS], rows)
 
 
-def arms_of(table: str) -> dict[str, Json]:
-    """Return the arms of a table of the paper."""
-    import yaml
-
-    plan = yaml.safe_load((Path(__file__).parent / "paper_tables.yaml").read_text())
-    arms: dict[str, Json] = plan[table]["arms"]
-    return arms
-
-
-def arm_lines(file: Json, arms: dict[str, Json], columns: Iterable[str]) -> list[str]:
-    """Tabulate arms by capture: medians over the seeds, the worst in brackets."""
-    import tables_report  # needs the package, which the other tables do not
-
-    done = [run for run in file["runs"] if run["status"] == "done"]
-    rows, _ = tables_report.arm_rows(done, arms)
-    return table(columns, ([str(row[column]) for column in columns] for row in rows))
-
-
-def compact_lines(compact: Json) -> list[str]:
-    """Tabulate configs/density.yaml against the whole model level and against none of it, with times."""
-    arms = {"half": {"title": "density.yaml"}, "full": {"title": "full"}, "all_off": {"title": "all off"}}
-    return arm_lines(compact, arms, (*ABLATION_COLUMNS, "seconds"))
-
-
-def town_parts_lines(town: Json) -> list[str]:
-    """Tabulate the arms of the model level on the town, with times."""
-    columns = ("arm", "seeds", "PSNR", "SSIM", "peak M", "final M", "seconds")
-    return arm_lines(town, arms_of("ablation"), columns)
-
-
 def offload_lines(offload: Json) -> list[str]:
     """Tabulate steps with all Gaussians on the GPU, and with a pool."""
     rows = []
@@ -287,8 +253,6 @@ SECTIONS = {
     "drop_in_full": Section(("drop_in_full",), row_lines),
     "accuracy": Section(("accuracy",), accuracy_lines),
     "quality": Section(("quality",), quality_lines),
-    "compact": Section(("compact",), compact_lines),
-    "town_parts": Section(("town_parts",), town_parts_lines),
     "offload": Section(("offload",), offload_lines),
     "summary": Section(("render", "step_4", "exchange"), summary_lines),
 }

@@ -93,6 +93,17 @@ def _project_bwd(a: Arguments) -> tuple[Tensor, ...]:
     return (*_columns(means, rows, ((3,), (4,), (3,), (), (coefficients, 3))), v_viewmats)
 
 
+def _unscented_fwd(a: Arguments) -> tuple[Tensor, ...]:
+    means, P = a.gaussians[0], len(a.gaussian_ids)
+    colors = means.new_empty(P if len(a.gaussians) > 4 else 0, 3)
+    return (*_columns(means, P, ((2,), (3,), (), ())), colors, _ints(means, P, 2), _ints(means, P))
+
+
+def _unscented_bwd(a: Arguments) -> tuple[Tensor, ...]:
+    means, coefficients = a.gaussians[0], a.gaussians[4].shape[1] if len(a.gaussians) > 4 else 0
+    return tuple(_columns(means, len(means), ((3,), (4,), (3,), (), (coefficients, 3))))
+
+
 def _intersect(a: Arguments) -> tuple[Tensor, Tensor]:
     tiles = a.n_cameras * -(-a.width // a.tile_size) * -(-a.height // a.tile_size)
     return _ints(a.means2d, a.n_isects if a.n_isects >= 0 else _unknown()), _longs(a.means2d, tiles + 1)
@@ -196,5 +207,10 @@ _FAKES: dict[str, Callable[[Arguments], Any]] = {
         t.new_empty(len(a.places[0]), *t.shape[len(a.shape) :]) for t in a.arranged
     ],
     "sum_splats": lambda a: [a.values.new_empty(a.splats, width) for width in a.widths],
+    "unscented_bwd": _unscented_bwd,
+    "unscented_fwd": _unscented_fwd,
+    "unscented_visible": lambda a: a.viewmats.new_empty(
+        len(a.gaussians[0]), len(a.viewmats), dtype=torch.bool
+    ),
     "tree_sums": lambda a: _longs(a.features, a.features.shape[0]),
 }

@@ -77,6 +77,28 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "int width, int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, "
       "float radius_clip, bool antialiased, bool raw, float[] fade, "
       "Tensor[] v_splats, Tensor? places=None, Tensor(b!)? means2d_sums=None) -> ()");
+  // The unscented projection (csrc/project/unscented.h), with the options of the projection. lenses [B, 13]:
+  // k1 to k6, p1, p2, s1 to s4, the largest angle of a fisheye; shutter: 0 to 4, and viewmats_rs unless it is
+  // 4 (global); transform: alpha, beta, kappa, margin, all_valid. unscented_visible finds which Gaussians
+  // have splats in which views, [N, B]; splat_offsets [N + 1] counts these, which unscented_bwd alone reads.
+  // v_splats: the gradients of means2d, conics, depths, splat_opacities[, colors].
+  m.def(
+      "unscented_visible(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor lenses, Tensor? viewmats_rs, "
+      "bool fisheye, int shutter, float[] transform, int width, int height, int tile_size, int sh_degree, "
+      "float near_plane, float far_plane, float eps2d, float radius_clip, bool antialiased, bool raw) -> "
+      "Tensor");
+  m.def(
+      "unscented_fwd(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor lenses, Tensor? viewmats_rs, "
+      "bool fisheye, int shutter, float[] transform, int width, int height, int tile_size, int sh_degree, "
+      "float near_plane, float far_plane, float eps2d, float radius_clip, bool antialiased, bool raw, "
+      "Tensor gaussian_ids, Tensor camera_ids, Tensor splat_offsets) -> (Tensor means2d, Tensor conics, "
+      "Tensor depths, Tensor splat_opacities, Tensor colors, Tensor radii, Tensor tiles_touched)");
+  m.def(
+      "unscented_bwd(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor lenses, Tensor? viewmats_rs, "
+      "bool fisheye, int shutter, float[] transform, int width, int height, int tile_size, int sh_degree, "
+      "float near_plane, float far_plane, float eps2d, float radius_clip, bool antialiased, bool raw, "
+      "Tensor camera_ids, Tensor splat_offsets, Tensor[] v_splats) -> (Tensor v_means, Tensor v_quats, "
+      "Tensor v_scales, Tensor v_opacities, Tensor v_sh)");
   // The offsets of mean2d, conic, opacity, color and mean2d_abs in the floats of a splat gradient, then the
   // number of these floats.
   m.def("splat_gradient_layout() -> int[]");

@@ -17,9 +17,11 @@ from blitzgs.call.covariances import Decomposed, decompose
 from blitzgs.call.extras import NORMAL_CHANNELS, Signals, checked_signals
 from blitzgs.capture.cameras import MAX_SIDE
 from blitzgs.ops.harmonics import MAX_SH_DEGREE, colors_of_views
+from blitzgs.ops.unscented import Lenses
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
+CAMERA_MODELS = ("pinhole", "fisheye")
 # What the kernels evaluate; torch evaluates other SH before them.
 KERNEL_SH_DEGREE, KERNEL_SH_CHANNELS = 3, 3
 DEFAULT_TILE_SIZE = 16
@@ -27,10 +29,8 @@ DEFAULT_TILE_SIZE = 16
 _MAX_CHANNELS = 4096
 # Further arguments of gsplat's calls (1.5.3 and later) and their defaults; no other values are supported.
 GSPLAT_DEFAULTS: dict[str, Any] = {
-    "with_ut": False, "with_eval3d": False, "global_z_order": True, "rays": None, "radial_coeffs": None,
-    "tangential_coeffs": None, "thin_prism_coeffs": None, "ftheta_coeffs": None, "lidar_coeffs": None,
-    "external_distortion_coeffs": None, "rolling_shutter": None, "viewmats_rs": None, "ut_params": None,
-    "renderer_config": None,
+    "with_eval3d": False, "global_z_order": True, "rays": None, "ftheta_coeffs": None, "lidar_coeffs": None,
+    "external_distortion_coeffs": None, "renderer_config": None,
 }  # fmt: skip
 # Whole numbers: the least, the largest, and what an error says.
 _WHOLE = {
@@ -44,7 +44,9 @@ _ANY = object()  # in place of a default: no value changes the result
 RAW_DEFAULTS: dict[str, Any] = {
     **GSPLAT_DEFAULTS, "packed": True, "distributed": False, "camera_model": "pinhole", "covars": None,
     "return_normals": False, "extra_signals": None, "extra_signals_sh_degree": None, "return_median": False,
-    "pixels": None, "image_ids": None, "channel_chunk": _ANY, "segmented": _ANY,
+    "pixels": None, "image_ids": None, "channel_chunk": _ANY, "segmented": _ANY, "with_ut": False,
+    "radial_coeffs": None, "tangential_coeffs": None, "thin_prism_coeffs": None, "rolling_shutter": None,
+    "viewmats_rs": None, "ut_params": None,
 }  # fmt: skip
 
 
@@ -62,6 +64,7 @@ class Scene(NamedTuple):
         extra_signals: values [N, E] or [C, N, E], or SH [N, K, E], see `Signals`; None: none.
         covariances: covariances given instead of quats and scales; quats and scales then are their
             decomposition.
+        lenses: lenses and shutters of the views; None: pinhole cameras.
     """
 
     means: Tensor
@@ -73,6 +76,7 @@ class Scene(NamedTuple):
     Ks: Tensor
     extra_signals: Tensor | None = None
     covariances: Decomposed | None = None
+    lenses: Lenses | None = None
 
 
 @dataclass(frozen=True)
@@ -189,10 +193,8 @@ def check_options(
         raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}")
     if rasterize_mode not in RASTERIZE_MODES:
         raise ValueError(f"rasterize_mode must be 'classic' or 'antialiased', got {rasterize_mode!r}")
-    if camera_model != "pinhole":
-        raise ValueError(
-            f"blitzgs.rasterization does not support camera_model={camera_model!r}; leave it out"
-        )
+    if camera_model not in CAMERA_MODELS:
+        raise ValueError(f"camera_model must be 'pinhole' or 'fisheye', got {camera_model!r}")
 
 
 def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]) -> None:
@@ -274,7 +276,7 @@ def gaussians_of(
         ("Ks", Ks, (C, 3, 3), "C, 3, 3"),
     ):
         if tensor.shape != (*batch, *last):
-            _refuse_shape(name, tensor, (*batch, *last), described)
+            refuse_shape(name, tensor, (*batch, *last), described)
     with_colors = "RGB" in render_mode
     if colors is None and with_colors:
         raise ValueError("colors may be None for the render modes D and ED alone")
@@ -324,7 +326,7 @@ def with_covariances(gaussians: Gaussians, covars: Tensor) -> Gaussians:
     batch = gaussians.lead[:-1]
     wanted = (*batch, gaussians.count, 3, 3)
     if covars.shape != wanted:
-        _refuse_shape("covars", covars, wanted, "N, 3, 3")
+        refuse_shape("covars", covars, wanted, "N, 3, 3")
     scenes, uppers = [], []
     for scene, own in zip(
         gaussians.scenes, covars.reshape(len(gaussians.scenes), *covars.shape[-3:]).unbind(0), strict=True
@@ -370,5 +372,6 @@ def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree:
     return shape != (*batch, N)
 
 
-def _refuse_shape(name: str, tensor: Tensor, shape: tuple[int, ...], described: str) -> NoReturn:
+def refuse_shape(name: str, tensor: Tensor, shape: tuple[int, ...], described: str) -> NoReturn:
+    """Raise a ValueError that names a tensor, the shape that it must have, and its own."""
     raise ValueError(f"{name} must be [..., {described}] = {[*shape]}, got {list(tensor.shape)}")

@@ -29,6 +29,7 @@ from blitzgs.ops.projection_types import (
     ProjectionOptions,
     first_rows,
 )
+from blitzgs.ops.unscented import Lenses, project_unscented
 
 # The tile size of the CUDA kernels. If the caller asks for another one, only meta's lists have it.
 CUDA_TILE_SIZE = 16
@@ -42,12 +43,14 @@ class Group(NamedTuple):
         first_image: number of its first view among the images of the call.
         covariances: the covariances that the caller gave instead of quats and scales; None: none.
         rows: the rows that `inputs` were gathered from, as long as these; None: `inputs` are the tables.
+        lenses: lenses and shutters of the views; None: pinhole cameras.
     """
 
     inputs: ProjectionInputs
     first_image: int
     covariances: Decomposed | None
     rows: Gathered | None = None
+    lenses: Lenses | None = None
 
 
 class Gathered(NamedTuple):
@@ -80,7 +83,8 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
             harmonics = sh[part]
             own = [means, quats, scales, opacities, *([] if harmonics is None else [harmonics])]
             inputs = ProjectionInputs(own, (viewmats, Ks), options)
-            groups.append(Group(inputs, s * n_views + part * most, scene.covariances))
+            lenses = scene.lenses and scene.lenses.rows(part * most, (part + 1) * most)
+            groups.append(Group(inputs, s * n_views + part * most, scene.covariances, lenses=lenses))
     return groups
 
 
@@ -126,7 +130,10 @@ def project_groups(groups: Sequence[Group], sparse_grad: bool) -> ProjectedSplat
     for group in groups:
         done = () if group.rows is None else _splats_of_rows(group)
         tables = group.inputs if group.rows is None else group.rows.tables
-        splats = differentiable_splats(tables, sparse_grad, *done)
+        if group.lenses is not None:
+            splats = project_unscented(group.inputs, group.lenses)
+        else:
+            splats = differentiable_splats(tables, sparse_grad, *done)
         if group.covariances is not None:
             splats = shaped_by(splats, group.inputs, group.covariances)
         parts.append(splats)
@@ -161,7 +168,7 @@ def _splats_of_rows(group: Group) -> tuple[ProjectedSplats, TableRows]:
 
 def groups_may_be_queued(groups: Sequence[Group]) -> bool:
     """Tell whether the work of a call may be queued before the host knows the number of splats."""
-    if len(groups) > 1 or groups[0].covariances is not None:
+    if len(groups) > 1 or groups[0].covariances is not None or groups[0].lenses is not None:
         return False
     means, options = groups[0].inputs.gaussians[0], groups[0].inputs.options
     return means.shape[0] > 0 and (not means.is_cuda or options.tile_size == CUDA_TILE_SIZE)

@@ -67,8 +67,8 @@ def gather_views(
         return gaussians, None
     job = CallRanks(dist.get_rank(), dist.get_world_size(), gaussians.views)
     scene, recorded = gaussians.scenes[0], torch.is_grad_enabled()
-    inputs = scene._replace(Ks=scene.means, covariances=None)  # Ks get no gradient
-    need = recorded and any(t is not None and t.requires_grad for t in inputs[:-1])
+    inputs = scene._replace(Ks=scene.means)  # Ks get no gradient
+    need = recorded and any(t is not None and t.requires_grad for t in inputs[:8])
     need_poses = recorded and scene.viewmats.requires_grad
     _require_same((gaussians.views, *same, need, need_poses), scene.viewmats.device)
     viewmats = _all_poses(scene.viewmats, job)

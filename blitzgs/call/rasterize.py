@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blitzgs.rasterization`: gsplat's call for pinhole 3DGS, over the ops of BlitzGS."""
+"""`blitzgs.rasterization`: gsplat's call, over the ops of BlitzGS."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from blitzgs.call.bad_values import warn_of_gradient
 from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.extras import checked_pixels
 from blitzgs.call.images import render
+from blitzgs.call.lenses import check_with_ut, check_without_ut, with_lenses
 from blitzgs.call.ranks import gather_views
 from blitzgs.ops.projection_types import ProjectionOptions
 from blitzgs.util.errors import explain_memory
@@ -63,9 +64,16 @@ def rasterization(
     return_median: bool = False,
     pixels: Tensor | None = None,
     image_ids: Tensor | None = None,
+    with_ut: bool = False,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    rolling_shutter: Any = None,
+    viewmats_rs: Tensor | None = None,
+    ut_params: Any = None,
     **further: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render N Gaussians into C pinhole views; the argument names, shapes and meta keys are gsplat's.
+    """Render N Gaussians into C views; the argument names, shapes and meta keys are gsplat's.
 
     docs/image.md defines the image (EWA splatting, Zwicker et al. 2001; 3DGS, Kerbl et al. 2023). It differs
     from gsplat 1.5.3's in the cap of alpha, which is 0.99 here and 0.999 there. Differentiable, once, in
@@ -117,7 +125,7 @@ def rasterization(
             its own views, which show the Gaussians of all ranks. Every rank must make this call and run its
             backward pass. As in gsplat, meta's splats are those of this rank's Gaussians in the views of all
             ranks, and its tile lists belong to this rank's images.
-        camera_model: only "pinhole" is supported.
+        camera_model: "pinhole", or with `with_ut` OpenCV's "fisheye".
         segmented: accepted and not needed: it selects a sort in gsplat, never the result.
         covars: [..., N, 3, 3] covariances instead of quats and scales; only their upper triangles are read.
             They are decomposed, which costs more than the rest of the call; quats and scales are faster.
@@ -136,6 +144,19 @@ def rasterization(
             one get lists and are composited, but buffers are as large as for the whole images.
         image_ids: integers [M], the image of each of the pixels, counted through all batch dimensions; None:
             there is one image.
+        with_ut: project by the unscented transform (docs/design.md), as in gsplat's main branch: images
+            are distorted as their lenses are. Every Gaussian is projected into every view. Not with covars,
+            sparse_grad, distributed, torch.compile or gradients of viewmats.
+        radial_coeffs: OpenCV's k1 to k6, [..., C, 6], or of a fisheye k1 to k4, [..., C, 4]; None: zeros, as
+            of the next two. Lenses and viewmats_rs get no gradient.
+        tangential_coeffs: p1 and p2, [..., C, 2].
+        thin_prism_coeffs: s1 to s4, [..., C, 4].
+        rolling_shutter: gsplat's `RollingShutterType`, or its name: which row or column is exposed first;
+            None: "GLOBAL".
+        viewmats_rs: poses at the end of a rolling shutter's frame, [..., C, 4, 4]; at its begin the camera is
+            at viewmats, from where colours are seen.
+        ut_params: gsplat's `UnscentedTransformParameters`, or an object with its attributes alpha (0.1), beta
+            (2), kappa (0), in_image_margin_factor (0.1) and require_all_sigma_points_valid (False).
         further: gsplat's arguments that are not supported; only their default values are accepted.
 
     Returns:
@@ -176,13 +197,25 @@ def rasterization(
     required: dict[str, object] = {"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks}
     if covars is None:
         required |= {"quats": quats, "scales": scales}
+    lens = {
+        "radial_coeffs": radial_coeffs,
+        "tangential_coeffs": tangential_coeffs,
+        "thin_prism_coeffs": thin_prism_coeffs,
+        "viewmats_rs": viewmats_rs,
+    }
     optional = {
         "colors": colors,
         "backgrounds": backgrounds,
         "covars": covars,
         "extra_signals": extra_signals,
+        **lens,
     }
     check_tensors(required, optional)
+    if with_ut:
+        given = {"covars": covars is not None, "sparse_grad": sparse_grad, "distributed": distributed}
+        check_with_ut(viewmats, given)
+    else:
+        check_without_ut(camera_model, rolling_shutter, {**lens, "ut_params": ut_params})
     if Ks.requires_grad:
         warn_of_gradient("rasterization")
     if covars is not None:
@@ -202,6 +235,8 @@ def rasterization(
         raise ValueError("extra_signals_sh_degree needs extra_signals; give both")
     if covars is not None:
         gaussians = with_covariances(gaussians, covars)
+    if with_ut:
+        gaussians = with_lenses(gaussians, camera_model, rolling_shutter, ut_params, **lens)
     antialiased = rasterize_mode == "antialiased"
     projection = ProjectionOptions(
         width,

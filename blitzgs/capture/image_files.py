@@ -187,11 +187,14 @@ def read_whole(path: Path) -> ImageFile:
     return described(data, name, header)
 
 
-def decode_rgb(file: ImageFile, background: tuple[float, float, float] | None = None) -> UInt8:
+def decode_rgb(
+    file: ImageFile, background: tuple[float, float, float] | None = None, place: UInt8 | None = None
+) -> UInt8:
     """Decode to RGB uint8 [H, W, 3] as stored (EXIF orientation not applied).
 
     If the file says that it has alpha, colours are composited over `background` (0 to 1); None: they are used
-    as they are stored. ValueError: the file cannot be decoded, or is of a kind that is not supported.
+    as they are stored. The result is in `place`, if it fits there. ValueError: the file cannot be decoded, or
+    is of a kind that is not supported.
     """
     _check_supported(file)
     header = file.header
@@ -202,9 +205,10 @@ def decode_rgb(file: ImageFile, background: tuple[float, float, float] | None = 
         if pixels.ndim == 3 and pixels.shape[2] == 4:
             return _over(pixels, background, _full(pixels, header), header["alpha"] == "associated")
     pixels = _imdecode(file, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    rgb = np.empty_like(pixels)  # OpenCV would take the GIL once more to make it
-    cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB, rgb)
-    return rgb
+    if place is None or place.shape != pixels.shape:
+        place = np.empty_like(pixels)  # OpenCV would take the GIL once more to make it
+    cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB, place)
+    return place
 
 
 def check_photograph(path: Path) -> bool:

@@ -171,7 +171,7 @@ class ImageStore:
             factor: by which images and masks are reduced.
         """
         wanted = [("mask", index, 1) for index in masks if has_mask(self.capture.cameras[index])]
-        planned, budget = 0, self._room()
+        planned, budget = 0, self.room()
         for kind, index, channels in [*wanted, *(("image", index, 3) for index in indices)]:
             camera = self.capture.cameras[index]
             planned += channels * (camera.width // factor) * (camera.height // factor)
@@ -183,7 +183,7 @@ class ImageStore:
         """Return the memory that images have taken so far."""
         decoded = self.decoded.most_bytes if self._shared is None else self._shared.bytes
         return ImageMemory(
-            self.compressed.most_bytes, self.compressed.budget, decoded, self._room(), self._times_decoded
+            self.compressed.most_bytes, self.compressed.budget, decoded, self.room(), self._times_decoded
         )
 
     def check_files(self, indices: Iterable[int]) -> FileCheck:
@@ -208,7 +208,8 @@ class ImageStore:
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._quiet.close()
 
-    def _room(self) -> int:
+    def room(self) -> int:
+        """Return the limit of the bytes of decoded images at present."""
         # All images have a place in shared memory, so there this limit is never reached.
         return self.decoded.budget + (0 if self._shared is None else self._shared.size)
 
@@ -298,7 +299,11 @@ class ImageStore:
         camera = self.capture.cameras[index]
         lens = camera.rectification.lens
         if camera.rectification.is_identity and (lens.width, lens.height) == (camera.width, camera.height):
-            return self._decode(camera, self._read(camera.image_path))
+            # Pixels that are turned later must not be there, even for a moment: another process may have put
+            # the image there meanwhile.
+            shared = self._shared if camera.orientation == 1 else None
+            place = None if shared is None else shared.place(("image", index, 1))
+            return self._decode(camera, self._read(camera.image_path), place)
         packed = self.compressed.get(index)
         if packed is not None:
             return _uint8(native.decode_qoi(packed))
@@ -319,12 +324,15 @@ class ImageStore:
     def _make_mask(self, index: int) -> UInt8:
         camera = self.capture.cameras[index]
         lens = camera.rectification.lens
-        mask = np.ones((lens.height, lens.width), dtype=np.uint8)
-        if camera.mask_path is not None:
+        if camera.mask_path is None:
+            mask = np.ones((lens.height, lens.width), dtype=np.uint8)
+        else:
             mask = self._file_mask(camera, camera.mask_path)
         if not camera.rectification.is_identity:
             columns, rows, seen = self._maps_of(camera.rectification)
             mask = _uint8(cv2.remap(mask, columns, rows, cv2.INTER_NEAREST)) * seen
+        if mask.shape == (camera.height, camera.width):
+            return mask
         return _uint8(_shrunk(mask * np.uint8(255), camera) == 255)
 
     def _file_mask(self, camera: Camera, path: Path) -> UInt8:
@@ -346,9 +354,9 @@ class ImageStore:
             mask = _uint8(cv2.resize(mask, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST))
         return mask
 
-    def _decode(self, camera: Camera, file: ImageFile) -> UInt8:
+    def _decode(self, camera: Camera, file: ImageFile, place: UInt8 | None = None) -> UInt8:
         lens, path = camera.rectification.lens, camera.image_path
-        pixels = apply_orientation(decode_rgb(file, self._background), camera.orientation)
+        pixels = apply_orientation(decode_rgb(file, self._background, place), camera.orientation)
         if pixels.shape[:2] != (lens.height, lens.width):
             raise ValueError(
                 f"{path} is {pixels.shape[1]} x {pixels.shape[0]} now but was {lens.width} x {lens.height} "

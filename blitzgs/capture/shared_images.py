@@ -137,10 +137,15 @@ class SharedImages:
                 found = self._found[key] = pixels
         return found
 
+    def place(self, key: Hashable) -> UInt8:
+        """Return the place of an image, to make it there for `put`."""
+        return self._places[key][1]
+
     def put(self, key: Hashable, pixels: UInt8) -> UInt8:
-        """Copy an image to its place, and return it there."""
+        """Copy an image to its place if it is not there, and return it there."""
         number, place = self._places[key]
-        np.copyto(place, pixels)
+        if pixels is not place:
+            np.copyto(place, pixels)
         native.set_flag(self._flags, number)
         return place
 

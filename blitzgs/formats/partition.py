@@ -30,7 +30,10 @@ REACH = math.sqrt(2 * math.log(255))
 # The picture for which the geometric errors are: a viewer that refines at 16 pixels shows each level from the
 # distance on from which the LOD gate shows it.
 _PIXELS, _HEIGHT, _FOV = 16, 1080, math.radians(60)
-_SIZE_CLASSES = 8
+# Gaussians of trained level 0, or of a model without levels, are in classes of opacity times sqrt(a b) of the
+# largest two scales, each half of the one before (docs/decisions.md). A viewer that refines at
+# `_PIXELS` leaves one out where it is smaller than so many pixels.
+_CLASSES, _FOOTPRINT = 8, 0.1
 _PLACE = np.dtype([("mean", "<f4", 3), ("size", "<f4"), ("level", "u1")])
 _CHUNK, _SAMPLE = 1 << 17, 1 << 17
 _LOD = re.compile(r"comment lod reference_distance (\S+) fork (\S+) levels (\d+) .*")
@@ -89,14 +92,14 @@ class Partition:
             for block in source.blocks():
                 block.check()
                 places = np.zeros(len(block), _PLACE)
-                places["mean"], places["size"] = block.means.numpy(), block.scales.amax(1).exp().numpy()
+                places["mean"], places["size"] = block.means.numpy(), _sizes(block)
                 if block.levels is not None:
                     places["level"] = block.levels.numpy()
                 file.write(places.data)
         self._measure()
 
     def _measure(self) -> None:
-        """Choose the grid, and how levels follow from sizes where the model has none."""
+        """Choose the grid and the classes, which are levels coarser than the trained ones."""
         step = max(1, -(-len(self._source) // _SAMPLE))
         some = np.concatenate([chunk[::step] for chunk in self._chunks()])
         means = some["mean"].astype(np.float64)
@@ -105,20 +108,23 @@ class Partition:
         # A flat scene is not cut along its short side.
         self._origin, self._cell = low - 0.02 * side, side / 2**BITS
         self.box = np.stack([low, high])
-        self._largest = float(np.quantile(some["size"].astype(np.float64), 0.99))
-        self._by_size = not self._source.has_levels
+        largest = max(float(np.quantile(some["size"].astype(np.float64), 0.99)), 1e-30)
         lod = next((found for line in self._source.comments if (found := _LOD.fullmatch(line.strip()))), None)
-        if self._by_size or lod is None:
-            # What is left out after size class l is narrower than two of its standard deviations.
-            self._by_size = True
-            errors = [2 * self._largest * 2.0**-level for level in range(_SIZE_CLASSES)]
-        else:
+        errors, self._merged, self._classes = [], 0, _CLASSES
+        if self._source.has_levels and lod is not None:
             distance, fork, levels = float(lod[1]), float(lod[2]), int(lod[3])
             angle = _PIXELS * 2 * math.tan(_FOV / 2) / _HEIGHT
             # Finer levels than those of an octree are taken together, or viewers would switch all the time.
             self._merged = max(1, round(math.log(2) / math.log(fork)))
             last = range(0, levels + self._merged - 1, self._merged)
             errors = [angle * distance * fork ** (-0.5 - level) for level in last]
+            # Level 0 has everything that is large enough at the largest distance of training.
+            smallest = max(errors[0] * _FOOTPRINT / _PIXELS, 1e-30)
+            self._classes = min(max(1, math.ceil(math.log2(largest / smallest))), _CLASSES // 2)
+            largest = smallest * 2**self._classes
+        first = largest * _PIXELS / _FOOTPRINT
+        self._largest = largest
+        errors = [first * 2.0**-index for index in range(1, self._classes + (not errors))] + errors
         # The coarsest level is shown at any distance at which the scene is larger than that.
         self._errors, self._whole_error = errors, max(side, 2 * errors[0])
 
@@ -132,13 +138,12 @@ class Partition:
         last = 2**BITS - 1
         index = np.floor((places["mean"] - self._origin) / self._cell).clip(0, last).astype(np.int64)
         codes = interleaved(index, BITS)
-        if self._by_size:
-            with np.errstate(divide="ignore"):
-                classes = np.floor(np.log2(self._largest / places["size"].astype(np.float64)))
-            levels = classes.clip(0, _SIZE_CLASSES - 1).astype(np.int64)
-        else:
-            levels = -(-places["level"].astype(np.int64) // self._merged)
-            levels = levels.clip(0, len(self._errors) - 1)
+        with np.errstate(divide="ignore"):
+            levels = np.floor(np.log2(self._largest / places["size"].astype(np.float64)))
+        levels = levels.clip(0, self._classes - 1).astype(np.int64)
+        if self._merged:
+            trained = -(-places["level"].astype(np.int64) // self._merged)
+            levels = np.where(trained > 0, trained + self._classes - 1, levels).clip(0, len(self._errors) - 1)
         return codes << 8 | levels
 
     def count(self) -> Counts:
@@ -175,7 +180,8 @@ class Partition:
                 rows = np.empty((len(block), self._width), "<f4")
                 rows[:, 0:3], rows[:, 3:7] = block.means.numpy(), block.quats.numpy()
                 rows[:, 7:10], rows[:, 10] = block.scales.numpy(), block.opacities.numpy()
-                rows[:, 11], rows[:, 12:] = codes & 255, block.sh.reshape(len(block), -1).numpy()
+                rows[:, 11] = 0 if block.levels is None else block.levels.numpy()
+                rows[:, 12:] = block.sh.reshape(len(block), -1).numpy()
                 by_group = np.argsort(found, kind="stable")
                 present, starts = np.unique(found[by_group], return_index=True)
                 for one, some in zip(present, np.split(by_group, starts[1:]), strict=True):
@@ -185,7 +191,7 @@ class Partition:
         self._places.unlink()
         ends = np.cumsum(totals)[np.flatnonzero(np.diff(groups >> 8, append=-1))]
         starts = np.concatenate([[0], ends])
-        return Parts(self._rows, self._width, self._source.comments, not self._by_size, starts)
+        return Parts(self._rows, self._width, self._source.comments, self._source.has_levels, starts)
 
 
 class _Cursor:
@@ -235,6 +241,12 @@ class Parts:
             sh=rows[:, 12:].reshape(len(rows), -1, 3), comments=self.comments,
             levels=rows[:, 11] if self.has_levels else None,
         )  # fmt: skip
+
+
+def _sizes(block: Gaussians) -> Array:
+    """Return opacity times the square root of the product of the largest two scales, float64 [N]."""
+    broad = block.scales.double().sum(1) - block.scales.double().amin(1)
+    return (broad / 2 + torch.nn.functional.logsigmoid(block.opacities.double())).exp().numpy()
 
 
 def interleaved(index: Ints, bits: int) -> Ints:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs._library import below_autograd
 from blitzgs.ops.derivatives import first_only
 
 
@@ -90,7 +90,6 @@ def photometric_sums(
     )
 
 
-@torch.no_grad()
 def photometric_fwd_bwd(
     renders: Tensor,
     targets: Tensor,
@@ -133,10 +132,12 @@ def photometric_fwd_bwd(
     Raises:
         RuntimeError: wrong shapes or dtypes.
     """
-    return torch.ops.blitzgs.photometric_fwd_bwd(
-        renders, targets, _as_bytes(masks), l1_weights, ssim_weights, tile_size, tile_begin, tile_end,
-        samples, visible, scale_weight, opacity_weight,
-    )  # fmt: skip
+    with below_autograd():
+        found: tuple[Tensor, Tensor, Tensor, Tensor] = torch.ops.blitzgs.photometric_fwd_bwd(
+            renders, targets, _as_bytes(masks), l1_weights, ssim_weights, tile_size, tile_begin, tile_end,
+            samples, visible, scale_weight, opacity_weight,
+        )  # fmt: skip
+    return found
 
 
 def _as_bytes(masks: Tensor | None) -> Tensor | None:

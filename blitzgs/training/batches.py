@@ -255,7 +255,7 @@ class BatchLoader:
         """Tell whether this number of batches takes at most half of the memory for decoded images."""
         width, height = self._views.size(plan.indices, plan.reduction)
         size = 4 * width * height * len(plan.indices)  # images and masks
-        return 2 * batches * size <= self._images.memory().decoded_budget
+        return 2 * batches * size <= self._images.room()
 
     def _load(self, plan: _Plan) -> tuple[Batch, _Slot]:
         # Read before taking a slot, so that an unreadable image does not occupy one.

@@ -103,6 +103,21 @@ BLITZGS_HD std::int32_t pixel_radius(T extent) {
   return static_cast<std::int32_t>(std::ceil(smaller(extent, T(1 << 30))));
 }
 
+// Sets the extent of a splat whose other values are known. Returns false if the splat does not exist.
+template <class T>
+BLITZGS_HD bool bound_splat(const Footprint<T>& footprint, const ProjectOptions<T>& options,
+                            Splat<T>* splat) {
+  const T sigmas = visible_sigmas(splat->opacity);
+  if (sigmas < T(0) || !is_finite(footprint.conic[0] + footprint.conic[1] + footprint.conic[2])) return false;
+  splat->extent[0] = sigmas * std::sqrt(footprint.cov_xx);
+  splat->extent[1] = sigmas * std::sqrt(footprint.cov_yy);
+  // As in gsplat, the rounded radius counts, the one that callers see.
+  const T extent = larger(splat->extent[0], splat->extent[1]);
+  if (options.radius_clip > T(0) && !(T(pixel_radius(extent)) > options.radius_clip)) return false;
+  // The factor 1.0001 makes sure that an extent that was rounded down loses no pixel at the border.
+  return touches_image(splat->mean2d, T(1.0001) * splat->extent[0], T(1.0001) * splat->extent[1], options);
+}
+
 // Projects a Gaussian into a view (docs/image.md, section 2). Returns false if the splat does not exist, by
 // the rules at the top of project.h.
 template <class T>
@@ -116,15 +131,7 @@ BLITZGS_HD bool project_splat(const Camera<T>& camera, const ActivatedGaussian<T
   store_conic(footprint, splat->conic);
   splat->opacity = level_weight(camera, gaussian, options.fade_slope) * gaussian.opacity;
   if (options.antialiased) splat->opacity *= compensation(footprint);
-  const T sigmas = visible_sigmas(splat->opacity);
-  if (sigmas < T(0) || !is_finite(footprint.conic[0] + footprint.conic[1] + footprint.conic[2])) return false;
-  splat->extent[0] = sigmas * std::sqrt(footprint.cov_xx);
-  splat->extent[1] = sigmas * std::sqrt(footprint.cov_yy);
-  // As in gsplat, the rounded radius counts, the one that callers see.
-  const T extent = larger(splat->extent[0], splat->extent[1]);
-  if (options.radius_clip > T(0) && !(T(pixel_radius(extent)) > options.radius_clip)) return false;
-  // The factor 1.0001 makes sure that an extent that was rounded down loses no pixel at the border.
-  return touches_image(splat->mean2d, T(1.0001) * splat->extent[0], T(1.0001) * splat->extent[1], options);
+  return bound_splat(footprint, options, splat);
 }
 
 // Returns the number of tiles that a splat touches and sets *ranks to the ranks (as bits) that composite some

@@ -285,14 +285,9 @@ def test_an_argument_that_gsplat_has_not_is_refused(value):
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"camera_model": "fisheye"}, "does not support camera_model='fisheye'"),
-        ({"with_ut": True}, "does not support with_ut=True"),
+        ({"with_eval3d": True}, "does not support with_eval3d=True"),
         ({"global_z_order": False}, "does not support global_z_order=False"),
-        (
-            {"rolling_shutter": RollingShutterType.ROLLING_TOP_TO_BOTTOM},
-            "does not support rolling_shutter=<RollingShutterType.ROLLING_TOP_TO_BOTTOM",
-        ),
-        ({"radial_coeffs": torch.zeros(1)}, r"does not support radial_coeffs=a tensor \[1\]; leave it out"),
+        ({"rays": torch.zeros(1)}, r"does not support rays=a tensor \[1\]; leave it out"),
         ({"covars": torch.zeros(4, 6)}, r"covars must be \[..., N, 3, 3\] = \[4, 3, 3\], got \[4, 6\]"),
         ({"render_mode": "N"}, "render_mode must be one of"),
         ({"rasterize_mode": "fast"}, "rasterize_mode must be"),

@@ -84,6 +84,19 @@ def test_stores_with_shared_memory_return_the_same_images_and_decode_each_once(t
     assert ImageStore(capture, shared=shared).get(3).sum() == alone.get(3).sum()
 
 
+def test_turned_photographs_are_shared_too(tmp_path):
+    capture = load_capture(write_capture(tmp_path, NAMES[:2]))
+    turned = [dataclasses.replace(capture.cameras[0], orientation=3), capture.cameras[1]]
+    stored = ImageStore(capture).get(0)
+    capture = dataclasses.replace(capture, cameras=turned)
+    shared, offer = SharedImages.create(decoded_shapes(capture))
+    first = ImageStore(capture, shared=shared)
+    second = ImageStore(capture, shared=SharedImages.join(offer, decoded_shapes(capture)))
+    for store in (first, second):
+        assert torch.equal(store.get(0), stored.flip(0, 1))
+        assert torch.equal(store.get(1), ImageStore(capture).get(1))
+
+
 def test_masks_are_shared_too(tmp_path):
     capture = load_capture(write_capture(tmp_path, NAMES[:2]))
     mask = tmp_path / "mask.png"

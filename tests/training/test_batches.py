@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs.capture.images import ImageMemory
 from blitzgs.config.fields import ScheduleConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.training.batches import BatchLoader
@@ -132,7 +131,7 @@ def test_photographs_are_decoded_before_their_batches_are_assembled(capture, bat
     cameras, images = capture
     wanted = []
     budget = batches * 2 * 4 * 48 * 32  # images and masks of batches of two views
-    monkeypatch.setattr(images, "memory", lambda: ImageMemory(0, 0, 0, budget, 0))
+    monkeypatch.setattr(images, "room", lambda: budget)
     monkeypatch.setattr(images, "prefetch", lambda indices, masks, factor: wanted.append((indices, masks)))
     loader, sampler, _ = make_loader(cameras, images, torch.device("cpu"), ahead=2, train=range(5))
     try:

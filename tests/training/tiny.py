@@ -88,6 +88,9 @@ class Images:
     def prefetch(self, indices, masks=(), factor=1):
         pass
 
+    def room(self):
+        return 0
+
     def memory(self):
         return ImageMemory(0, 0, 0, 0, 0)
 
