@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A progress bar for work on a sequence of images, and the seconds of the parts of a work."""
+"""Long work: a progress bar, the seconds of its parts, and processes that end with their parent."""
 
 from __future__ import annotations
 
+import ctypes
+import multiprocessing
+import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -74,3 +78,16 @@ class Laps:
         """Return all parts in a line."""
         parts = ", ".join(f"{name} {seconds:.1f}" for name, seconds in self.seconds.items())
         return f"set-up {sum(self.seconds.values()):.1f} s: {parts}"
+
+
+_PR_SET_PDEATHSIG = 1  # of prctl(2)
+
+
+def follow_parent() -> None:
+    """Make this process leave interrupts to the one that started it, and end with it, however that ends."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    parent = multiprocessing.parent_process()
+    if parent is not None and os.getppid() != parent.pid:  # it has ended before this process asked to know
+        os._exit(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
