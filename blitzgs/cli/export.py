@@ -23,14 +23,26 @@ from blitzgs.formats.models import FORMATS, Format, check_replaces, offset_of, o
 from blitzgs.formats.selection import Selected, Selection, read_polygon
 from blitzgs.formats.web_page import check_replaces_page
 from blitzgs.runs.clean import cleaned
-from blitzgs.runs.export import COORDINATES, Exported, export, open_source, source_of, without_antialiasing
+from blitzgs.runs.export import (
+    COORDINATES,
+    Exported,
+    Watched,
+    export,
+    export_file,
+    open_source,
+    source_of,
+    without_antialiasing,
+)
 from blitzgs.runs.folder import Model, open_run
 from blitzgs.runs.run_files import run_and_checkpoint
 from blitzgs.runs.world import in_world, load_world_frame
 from blitzgs.util.output import write_file
+from blitzgs.util.progress import image_progress
 
 # Default of --max-mb, and the largest file whose text browsers still hold in one piece.
 MAX_MB, LARGEST_MB = 50, 500
+# Fewer bytes than a Gaussian of SH degree 0 has in an HTML file: half, so that views decide which go.
+_LEAST_BYTES = 10
 
 HELP = """\
 Write a model in a format of other programs, or as one HTML file to send:
@@ -177,18 +189,22 @@ def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
     from blitzgs.formats.tiles import TILE, write_tiles
     from blitzgs.viewer.web import open_city
 
-    start, city = time.monotonic(), open_city(args.model)
+    start, city = time.monotonic(), open_city(args.model, checked=selection is None)
     source, path = city.source, args.tiles or args.streamed_sog
-    if selection is not None:
-        source = Selected(source, selection, tuple(city.offset.tolist()))
     sizes = {
         "most": args.tile_gaussians or TILE,
         "processes": args.processes or len(os.sched_getaffinity(0)),
     }
-    if args.tiles:
-        written = write_tiles(path, source, city.transform(), city.scene, city.title, **sizes)
-    else:
-        written = write_streamed_sog(path, source, **sizes)
+    with image_progress("Exporting", unit="") as report:
+        source = Watched(source, report)
+        if selection is not None:
+            source = Selected(source, selection, tuple(city.offset.tolist()))
+        if args.tiles:
+            written = write_tiles(
+                path, source, city.transform(), city.scene, city.title, report=report, **sizes
+            )
+        else:
+            written = write_streamed_sog(path, source, **sizes, report=report)
     print(
         f"{path}: {written.gaussians:,} Gaussians in {written.tiles:,} tiles, {written.bytes / 1e6:.1f} MB, "
         f"{time.monotonic() - start:.0f} s"
@@ -208,8 +224,9 @@ def _export_html(args: argparse.Namespace) -> int:
     if path.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"{path}: choose a --html that ends in .html")
     check_replaces_page(path)
+    most = round(1e6 * (args.max_mb or MAX_MB))
     with Ranks.from_environment(args.device) as ranks:
-        page = web_file(open_model(args.model, ranks), round(1e6 * (args.max_mb or MAX_MB)))
+        page = web_file(open_model(args.model, ranks, most=most // _LEAST_BYTES), most)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, page.text)
     size = path.stat().st_size / 1e6
@@ -229,11 +246,14 @@ def _export_file(args: argparse.Namespace) -> int:
     if args.model.is_file():
         flags = ("classic", "clean", "coordinates")
         _refuse(args, flags, f"needs the folder of a run, and {args.model} is a file")
-        source = open_gaussians(args.model)
-        if selection is not None:
-            source = Selected(source, selection, offset_of(source.comments))
-        kind.write(path, source)
-        written = Exported(None, None, 0.0)
+        if path.exists() and path.samefile(args.model):
+            raise ValueError(f"{path} is the model itself, which would be lost: choose another name")
+        source = open_gaussians(args.model, checked=selection is None)
+        with image_progress("Exporting", unit="Gaussians") as report:
+            source = Watched(source, report)
+            if selection is not None:
+                source = Selected(source, selection, offset_of(source.comments))
+            written = export_file(source, kind, path)
     else:
         source, written = _export_run(args, kind, path, selection)
     print(f"{path}: {len(source):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB")
@@ -252,10 +272,11 @@ def _export_run(
     in_memory = args.classic or args.clean is not None or args.most is not None or coordinates == "world"
     opened = open_source(run_folder, checkpoint)
     if not in_memory:
-        source: GaussianSource = (
-            opened if selection is None else Selected(opened, selection, opened.space.offset)
-        )
-        return source, export(source, opened.space, kind, path, coordinates)
+        with image_progress("Exporting", unit="Gaussians") as report:
+            source: GaussianSource = Watched(opened, report)
+            if selection is not None:
+                source = Selected(source, selection, opened.space.offset)
+            return source, export(source, opened.space, kind, path, coordinates)
     flags = "--classic, --clean, --most and --coordinates world need the model in memory"
     check_memory(f"{flags}; {run_folder} holds", len(opened), opened.degree)
     from blitzgs.viewer.studio import open_model

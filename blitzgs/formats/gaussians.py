@@ -17,6 +17,8 @@ from blitzgs.util.errors import check_tensor
 BLOCK = 1 << 18
 # Name of a header line that viewers look for (Brush, PlayCanvas and others).
 MIP = "comment SplatRenderMode: mip"
+# Logarithm of a scale that float32 cannot hold.
+_LARGEST_SCALE = 88.0
 
 
 class GaussianSource(Protocol):
@@ -93,12 +95,19 @@ class Gaussians:
         for start in range(0, len(self), BLOCK):
             yield self.rows(slice(start, start + BLOCK))
 
+    def sound(self) -> Tensor:
+        """Tell which Gaussians have values that a viewer can show, bool [N]; see `check`."""
+        bad = torch.zeros(len(self), dtype=torch.bool)
+        for name in ("means", "quats", "scales", "opacities", "sh"):
+            bad |= _bad_rows(name, getattr(self, name))
+        return ~bad
+
     def check(self) -> None:
         """Check shapes and values.
 
         Raises:
             TypeError: a field is not a tensor.
-            ValueError: shapes disagree, or a value is NaN (or a mean infinite).
+            ValueError: shapes disagree, or a viewer cannot show a value: NaN, infinite.
         """
         n, k = len(self.means), self.sh.shape[1] if isinstance(self.sh, Tensor) and self.sh.ndim == 3 else 0
         shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}
@@ -136,16 +145,40 @@ def check_memory(holds: str, count: int, degree: int) -> None:
         )
 
 
+def joined(parts: list[Gaussians]) -> Gaussians:
+    """Return parts of a model, at least one, as one; normals are left out."""
+    levels = [part.levels for part in parts if part.levels is not None]
+    return replace(
+        parts[0],
+        means=torch.cat([part.means for part in parts]),
+        quats=torch.cat([part.quats for part in parts]),
+        scales=torch.cat([part.scales for part in parts]),
+        opacities=torch.cat([part.opacities for part in parts]),
+        sh=torch.cat([part.sh for part in parts]),
+        normals=None,
+        levels=torch.cat(levels) if levels else None,
+    )
+
+
 def is_antialiased(source: GaussianSource) -> bool:
     """Tell whether the Gaussians are to be shown with the compensation of the screen-space blur."""
     return any(line.strip() == MIP for line in source.comments)
 
 
+def _bad_rows(name: str, tensor: Tensor) -> Tensor:
+    """Tell which rows no viewer can show, bool [N]: not finite; scales may be 0, opacities 0 or 1."""
+    bad = ~tensor.isfinite()
+    if name == "opacities":
+        bad = tensor.isnan()
+    if name == "scales":
+        bad = ~(tensor < _LARGEST_SCALE)
+    return bad.flatten(1).any(dim=1) if bad.dim() > 1 else bad
+
+
 def _check_values(name: str, tensor: Tensor) -> None:
-    """Refuse values that no viewer can show: NaN, and positions at infinity."""
-    bad = ~tensor.isfinite() if name == "means" else tensor.isnan()
-    if bool(bad.any()):
-        rows = bad.flatten(1).any(dim=1) if bad.dim() > 1 else bad
+    """Refuse values that no viewer can show."""
+    rows = _bad_rows(name, tensor)
+    if bool(rows.any()):
         first = int(rows.nonzero()[0])
         raise ValueError(
             f"{name} has NaN or infinite values in {int(rows.sum()):,} Gaussians, the first is number "

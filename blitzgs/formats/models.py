@@ -84,8 +84,10 @@ def check_replaces(path: Path, kind: Format) -> None:
         raise ValueError(f"{path}: the file will be {kind.title}: choose a name that ends in {kind.suffix}")
 
 
-def open_gaussians(path: Path) -> GaussianSource:
+def open_gaussians(path: Path, checked: bool = True) -> GaussianSource:
     """Open a model that any program wrote; one in INRIA's layout is read block by block, others at once.
+
+    Without `checked`, the blocks have values that cannot be shown, which a `Selected` leaves out.
 
     Raises:
         ValueError, ImportError: see `read_gaussians`.
@@ -93,7 +95,7 @@ def open_gaussians(path: Path) -> GaussianSource:
     with open(path, "rb") as file:
         header = file.read(_HEADER).partition(b"end_header")[0]
     is_inria = header.startswith(b"ply") and b" packed_position" not in header
-    return PlySource(path) if is_inria else read_gaussians(path)
+    return PlySource(path, checked) if is_inria else read_gaussians(path)
 
 
 def read_gaussians(path: Path | str) -> Gaussians:

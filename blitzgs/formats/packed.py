@@ -31,6 +31,7 @@ from blitzgs.formats.gaussians import (
     GaussianSource,
     check_memory,
     is_antialiased,
+    joined,
     unit_quats,
 )
 from blitzgs.util.output import new_file
@@ -72,24 +73,15 @@ def unit_blocks(source: GaussianSource) -> Iterator[Gaussians]:
     waiting: list[Gaussians] = []
     for block in source.blocks():
         block.check()
-        waiting.append(replace(block, quats=unit_quats(block.quats).float(), normals=None, levels=None))
+        # A scale of 0 has no logarithm that a codebook could hold.
+        quats, scales = unit_quats(block.quats).float(), block.scales.clamp(min=-30)
+        waiting.append(replace(block, quats=quats, scales=scales, normals=None, levels=None))
         if sum(map(len, waiting)) >= BLOCK:
-            model = _joined(waiting)
+            model = joined(waiting)
             yield model.rows(slice(0, BLOCK))
             waiting = [model.rows(slice(BLOCK, None))]
-    if (model := _joined(waiting)) and len(model):
+    if (model := joined(waiting)) and len(model):
         yield model
-
-
-def _joined(parts: list[Gaussians]) -> Gaussians:
-    return replace(
-        parts[0],
-        means=torch.cat([part.means for part in parts]),
-        quats=torch.cat([part.quats for part in parts]),
-        scales=torch.cat([part.scales for part in parts]),
-        opacities=torch.cat([part.opacities for part in parts]),
-        sh=torch.cat([part.sh for part in parts]),
-    )
 
 
 # --- gsply ---

@@ -43,13 +43,13 @@ def _read_table(path: Path) -> tuple[list[str], npt.NDArray[np.void]]:
 class PlySource:
     """The Gaussians of a PLY file, a `GaussianSource` that reads a block at a time."""
 
-    def __init__(self, path: Path) -> None:
-        """Read the header.
+    def __init__(self, path: Path, checked: bool = True) -> None:
+        """Read the header; without `checked`, `blocks` yields values that cannot be shown.
 
         Raises:
             ValueError: see `read_ply`.
         """
-        self._path = path
+        self._path, self._checked = path, checked
         found, self._count = self._read(0, 0)
         self.comments, self.degree, self.has_levels = found.comments, found.degree, found.has_levels
 
@@ -65,9 +65,11 @@ class PlySource:
         for first in range(0, self._count, BLOCK):
             block, _ = self._read(first, BLOCK)
             try:
-                block.check()
+                if self._checked:
+                    block.check()
             except ValueError as error:
-                raise ValueError(f"{self._path}, from Gaussian {first:,} on: {error}") from error
+                remedy = "as flags that choose Gaussians do, such as --min-opacity 0"
+                raise ValueError(f"{self._path}, from Gaussian {first:,} on: {error}, {remedy}") from error
             yield block
 
     def _read(self, first: int, most: int) -> tuple[Gaussians, int]:

@@ -41,13 +41,13 @@ class Selection:
     most: int | None = None
 
     def meets(self, block: Gaussians, origin: Array) -> Tensor:
-        """Tell which Gaussians meet the conditions but `most`, bool [N].
+        """Tell which Gaussians can be shown and meet the conditions but `most`, bool [N].
 
         Args:
             block: the Gaussians.
             origin: the capture's coordinates of their origin, [3].
         """
-        met = torch.ones(len(block), dtype=torch.bool)
+        met = block.sound()
         if self.min_opacity > 0:
             met &= block.opacities.sigmoid() >= self.min_opacity
         if self.levels is not None:

@@ -23,6 +23,7 @@ from blitzgs.formats.partition import BITS, Counts, Partition, Parts, extents, i
 from blitzgs.formats.sog import write_sog
 from blitzgs.formats.tiles import TILE, Written, each_part, new_folder
 from blitzgs.util.output import write_file
+from blitzgs.util.progress import Report
 
 META = "lod-meta.json"
 
@@ -36,7 +37,13 @@ class _Leaf:
     by_level: list[int]  # number of Gaussians of each level
 
 
-def write_streamed_sog(path: Path, source: GaussianSource, most: int = TILE, processes: int = 1) -> Written:
+def write_streamed_sog(
+    path: Path,
+    source: GaussianSource,
+    most: int = TILE,
+    processes: int = 1,
+    report: Report = lambda done, total: None,
+) -> Written:
     """Write a streamed SOG; its folder appears under its name only when it is complete.
 
     Args:
@@ -44,6 +51,7 @@ def write_streamed_sog(path: Path, source: GaussianSource, most: int = TILE, pro
         source: at least one Gaussian; read twice, block by block.
         most: Gaussians of a leaf, as for `write_tiles`.
         processes: that encode.
+        report: as for `write_tiles`.
 
     Raises:
         ValueError: there is no Gaussian, or a value is not finite.
@@ -67,7 +75,7 @@ def write_streamed_sog(path: Path, source: GaussianSource, most: int = TILE, pro
         ]
         boxes, size = {}, 0
         for (part, lod, _), (box, written) in zip(
-            jobs, each_part(_encode, parts, partial, processes, jobs), strict=True
+            jobs, each_part(_encode, parts, partial, processes, report, jobs), strict=True
         ):
             size += written
             if lod == 0:

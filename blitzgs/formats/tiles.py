@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from blitzgs.formats.partition import BITS, Counts, Partition, Parts, extents
 from blitzgs.formats.web_page import WebScene, tiles_page
 from blitzgs.util.output import sync_to_disk, write_file
 from blitzgs.util.processes import follow_parent
+from blitzgs.util.progress import Report
 
 TILESET, PAGE = "tileset.json", "index.html"
 # Gaussians of a tile: 8 MB at SH degree 3.
@@ -83,6 +85,7 @@ def write_tiles(
     title: str,
     most: int = TILE,
     processes: int = 1,
+    report: Report = lambda done, total: None,
 ) -> Written:
     """Write a tileset; its folder appears under its name only when it is complete.
 
@@ -94,19 +97,20 @@ def write_tiles(
         title: heading of the page.
         most: Gaussians of a tile; a tile that would be smaller than a 256th of the region may have more.
         processes: that encode tiles.
+        report: called with the number of tiles written, and of all.
 
     Raises:
         ValueError: there is no Gaussian, or a value is not finite.
         FileExistsError: the folder has files.
         OSError: the disk is full, or `path` cannot be written; nothing is left.
     """
-    with new_folder(path) as partial:
-        partition = Partition(source, partial)
+    with new_folder(path) as folder:
+        partition = Partition(source, folder)
         counts = partition.count()
         root, parts_of_entries = tree(counts, most)
         parts = partition.place(parts_of_entries, counts.counts)
-        (partial / "tiles").mkdir()
-        encoded = list(each_part(_encode, parts, partial / "tiles", processes))
+        (folder / "tiles").mkdir()
+        encoded = list(each_part(_encode, parts, folder / "tiles", processes, report))
         parts.file.unlink()
         content, _ = _node(root, [(box, count) for box, count, _ in encoded])
         content["transform"] = transform.T.ravel().tolist()
@@ -124,8 +128,8 @@ def write_tiles(
                 "view": asdict(scene),
             },
         }  # fmt: skip
-        write_file(partial / PAGE, tiles_page(title))
-        write_file(partial / TILESET, json.dumps(tileset, allow_nan=False))
+        write_file(folder / PAGE, tiles_page(title))
+        write_file(folder / TILESET, json.dumps(tileset, allow_nan=False))
     return Written(len(encoded), sum(size for *_, size in encoded), len(source))
 
 
@@ -145,15 +149,15 @@ def new_folder(path: Path) -> Iterator[Path]:
     for left in path.parent.glob(f".{glob.escape(path.name)}.{'[0-9a-f]' * 8}.partial"):
         with suppress(OSError), _locked(left):
             shutil.rmtree(left)
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    partial.mkdir()
+    unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    unfinished.mkdir()
     held = ExitStack()
     with suppress(OSError):  # some file systems of networks have no locks
-        held.enter_context(_locked(partial))
+        held.enter_context(_locked(unfinished))
     try:
-        yield partial
-        sync_to_disk(partial)
-        os.rename(partial, path)
+        yield unfinished
+        sync_to_disk(unfinished)
+        os.rename(unfinished, path)
         sync_to_disk(path.parent)
     except OSError as error:
         # A write to a full disk names no file, or one that is gone when the user reads this.
@@ -161,7 +165,7 @@ def new_folder(path: Path) -> Iterator[Path]:
             error.filename, error.filename2 = str(path), None
         raise
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(unfinished, ignore_errors=True)
         held.close()
 
 
@@ -223,20 +227,26 @@ def _tile(counts: Counts, entries: npt.NDArray[np.int64], depth: int, above: int
 
 
 def each_part(
-    work: Any, parts: Parts, folder: Path, processes: int, numbers: list[Any] | None = None
+    work: Any,
+    parts: Parts,
+    folder: Path,
+    processes: int,
+    report: Report,
+    numbers: list[Any] | None = None,
 ) -> Iterator[Any]:
     """Yield `work(parts, folder, number)` for all parts in order, computed by several processes."""
     chosen = list(range(len(parts.starts) - 1)) if numbers is None else numbers
-    if processes == 1:
-        for number in chosen:
-            yield work(parts, folder, number)
-        return
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, _prepare)
-    try:
-        yield from pool.map(work, [parts] * len(chosen), [folder] * len(chosen), chosen)
-    finally:
-        pool.shutdown(cancel_futures=True)
+    with ExitStack() as stack:
+        if processes == 1:
+            found: Iterator[Any] = map(partial(work, parts, folder), chosen)
+        else:
+            context = multiprocessing.get_context("spawn")
+            pool = ProcessPoolExecutor(processes, context, _prepare)
+            stack.callback(pool.shutdown, cancel_futures=True)
+            found = pool.map(partial(work, parts, folder), chosen)
+        for done, one in enumerate(found, 1):
+            report(done, len(chosen))
+            yield one
 
 
 def _prepare() -> None:

@@ -21,17 +21,22 @@ from blitzgs.config.files import changed
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats import gaussians
-from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource
-from blitzgs.formats.models import Format, check_replaces
+from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource, joined
+from blitzgs.formats.models import Format, check_replaces, offset_of
+from blitzgs.formats.selection import Selected, Selection
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint, run_files
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.checkpoint_files import DAMAGE, Shard, header_of, read_rows, verified
 from blitzgs.runs.folder import Model
 from blitzgs.runs.folder_checks import check_own
-from blitzgs.runs.lod import lod_gate
-from blitzgs.table.table import GaussianTable
+from blitzgs.runs.lod import lod_gate, scene_gate
+from blitzgs.runs.run_files import Progress
+from blitzgs.runs.world import trained_columns
+from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.util.output import write_file
+from blitzgs.util.progress import Report
+from blitzgs.view.draw import table_of_parameters
 from blitzgs.view.gate import LodGate
 from blitzgs.view.views import CameraLike, Space
 
@@ -79,18 +84,9 @@ def export(
     centred = coordinates == "centred" or (coordinates == "auto" and rounding > _MAX_ROUNDING * middle)
     if coordinates == "auto" and kind.quantised:
         centred |= float(np.linalg.norm(offset)) > 2 * space.extent * space.unit
-    sidecar = path.with_name(path.name + ".offset.json")
+    sidecar = _sidecar(path)
     if centred:
-        if os.path.lexists(sidecar) and not _has_offset(sidecar):
-            raise FileExistsError(
-                f"{sidecar} exists and is not the offset of an exported model: choose another name"
-            )
-        x, y, z = space.offset
-        lines = [*source.comments, f"comment offset {x!r} {y!r} {z!r}"]
-        kind.write(path, Changed(source, lambda block: block, lines))
-        meaning = "capture coordinates = coordinates in the file + offset"
-        content = {"file": path.name, "offset": space.offset, "meaning": meaning}
-        write_file(sidecar, json.dumps(content | ({"crs": crs} if crs else {}), indent=1))
+        _write_centred(source, space.offset, kind, path, crs)
         return Exported(space.offset, sidecar, _spacing(reach[0]))
     shift = torch.from_numpy(offset)
     moved = Changed(
@@ -101,6 +97,53 @@ def export(
     if _has_offset(sidecar):
         sidecar.unlink()
     return Exported(None, None, rounding)
+
+
+def export_file(source: GaussianSource, kind: Format, path: Path) -> Exported:
+    """Write the model of a file, with its offset; where it is far from the origin, with one that is near it.
+
+    Raises:
+        ValueError, OSError: as `export`.
+    """
+    check_replaces(path, kind)
+    offset, shift = np.array(offset_of(source.comments)), np.zeros(3)
+    if kind.quantised and len(source):
+        some = torch.cat([block.means[::64] for block in source.blocks()]).double()
+        low, high = (some.sort(dim=0).values[int(share * (len(some) - 1))].numpy() for share in (0.01, 0.99))
+        if np.linalg.norm(low + high) > 2 * np.linalg.norm(high - low) + 200:
+            shift = np.round((low + high) / 2)
+    if not (offset.any() or shift.any()):
+        kind.write(path, source)
+        if _has_offset(_sidecar(path)):
+            _sidecar(path).unlink()
+        return Exported(None, None, 0.0)
+    lines = [line for line in source.comments if offset_of([line]) == (0, 0, 0)]
+    back = torch.from_numpy(shift)
+    moved = Changed(source, lambda block: replace(block, means=(block.means.double() - back).float()), lines)
+    x, y, z = (offset + shift).tolist()
+    _write_centred(moved, (x, y, z), kind, path)
+    return Exported((x, y, z), _sidecar(path), 0.0)
+
+
+def _write_centred(
+    source: GaussianSource, offset: tuple[float, float, float], kind: Format, path: Path, crs: str = ""
+) -> None:
+    """Write a model around an offset, which goes into the header and a file beside."""
+    sidecar = _sidecar(path)
+    if os.path.lexists(sidecar) and not _has_offset(sidecar):
+        raise FileExistsError(
+            f"{sidecar} exists and is not the offset of an exported model: choose another name"
+        )
+    x, y, z = offset
+    lines = [*source.comments, f"comment offset {x!r} {y!r} {z!r}"]
+    kind.write(path, Changed(source, lambda block: block, lines))
+    meaning = "capture coordinates = coordinates in the file + offset"
+    content = {"file": path.name, "offset": offset, "meaning": meaning}
+    write_file(sidecar, json.dumps(content | ({"crs": crs} if crs else {}), indent=1))
+
+
+def _sidecar(path: Path) -> Path:
+    return path.with_name(path.name + ".offset.json")
 
 
 def _measured(source: GaussianSource, offset: npt.NDArray[np.float64]) -> tuple[tuple[float, float], float]:
@@ -173,11 +216,34 @@ class Changed:
             yield dataclasses.replace(self._change(block), comments=self.comments)
 
 
+class Watched(Changed):
+    """A source that reports how many Gaussians of how many a reader has taken, anew for each reading."""
+
+    def __init__(self, source: GaussianSource, report: Report) -> None:
+        super().__init__(source, lambda block: block, source.comments)
+        self._report = report
+
+    def blocks(self) -> Iterator[Gaussians]:
+        """Yield all Gaussians."""
+        done = 0
+        for block in super().blocks():
+            yield block
+            done += len(block)
+            self._report(done, len(self))
+
+
 class RunSource(Changed):
     """The Gaussians of a run; the unit is a power of two, so that positions keep their bits."""
 
-    def __init__(self, trained: GaussianSource, space: Space, comments: list[str], config: Config) -> None:
-        self.space, self.config = space, config
+    def __init__(
+        self,
+        trained: GaussianSource,
+        space: Space,
+        comments: list[str],
+        config: Config,
+        progress: Progress | None = None,
+    ) -> None:
+        self.space, self.config, self.progress = space, config, progress
         super().__init__(trained, self._scaled, comments)
 
     def _scaled(self, block: Gaussians) -> Gaussians:
@@ -198,6 +264,29 @@ def source_of(model: Model) -> RunSource:
     gate = None if model.lod is None else model.lod.gate
     lines = _comments(model.config, model.space, gate, model.exposures is not None)
     return RunSource(found, model.space, lines, model.config)
+
+
+def largest_of_run(source: RunSource, most: int, device: torch.device) -> Model:
+    """Return a model of so many Gaussians of a checkpoint, those of the largest opacity times length.
+
+    It has no SH beyond the DC. Memory holds no others.
+    """
+    assert source.progress is not None
+    chosen = joined(list(Selected(source, Selection(most=most, sh_degree=0)).blocks()))
+    x, y, z = source.space.offset
+    found = replace(chosen, comments=[f"comment offset {x!r} {y!r} {z!r}"])
+    columns = trained_columns(found, source.space, Ranks())
+    table = table_of_parameters({name: column.to(device) for name, column in columns.items()})
+    return Model(
+        **{name: table[name] for name in (*PARAMETERS, "level")},
+        lod=scene_gate(source.config, source.progress, table, Ranks()),
+        space=source.space,
+        sh_degree=0,
+        config=source.config,
+        images_seen=source.progress.step * source.config.schedule.batch_size,
+        exposures=None,
+        run=None,
+    )
 
 
 def open_source(folder: Path, only: str | None = None) -> RunSource:
@@ -224,7 +313,7 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
         gate = lod_gate(config, progress)
         trained = _Shards(path, manifest.shards, config, progress.step, space.extent, gate is not None)
         exposed = manifest.shared is not None and "exposures" in header_of(path / manifest.shared.file)
-        return RunSource(trained, space, _comments(config, space, gate, exposed), config)
+        return RunSource(trained, space, _comments(config, space, gate, exposed), config, progress)
     if refused:
         raise CheckpointError(f"no sound checkpoint in {folder}: {'; '.join(refused)}")
     raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")

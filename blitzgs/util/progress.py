@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,25 +13,41 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 Report = Callable[[int, int], None]
+# Least seconds between two lines about long work, without a terminal's bar.
+LINE_SECONDS = 30.0
+
+
+def lines(say: Callable[[str], None]) -> Report:
+    """Return a function to call with (number done, number of all), which says both now and then."""
+    said = time.monotonic()
+
+    def report(done: int, total: int) -> None:
+        nonlocal said
+        if time.monotonic() >= said + LINE_SECONDS:
+            said = time.monotonic()
+            say(f"{done:,} of {total:,}")
+
+    return report
 
 
 @contextmanager
-def image_progress(what: str, shown: bool = True) -> Iterator[Report]:
-    """Show a bar on standard error while the context lasts, if standard error is a terminal.
+def image_progress(what: str, shown: bool = True, unit: str = "images") -> Iterator[Report]:
+    """Show a bar on standard error while the context lasts; if it is no terminal, a line now and then.
 
-    Yields a function to call with (images done, number of images).
+    Yields a function to call with (images done, number of images), or so many of another unit.
     """
     console = Console(stderr=True)
+    if shown and not console.is_terminal:
+        yield lines(lambda text: print(f"{what}: {text} {unit}", file=sys.stderr, flush=True))
+        return
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("images"),
+        TextColumn(unit),
         TimeRemainingColumn(),
     )
-    with Progress(
-        *columns, console=console, disable=not (shown and console.is_terminal), transient=True
-    ) as bar:
+    with Progress(*columns, console=console, disable=not shown, transient=True) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 

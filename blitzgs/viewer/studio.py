@@ -16,11 +16,13 @@ from torch import Tensor
 
 from blitzgs.config.fields import Config, ModelConfig
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.gaussians import is_antialiased
-from blitzgs.formats.models import offset_of, read_gaussians
+from blitzgs.formats.gaussians import Gaussians, is_antialiased, joined
+from blitzgs.formats.models import offset_of, open_gaussians
+from blitzgs.formats.selection import Selected, Selection
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, load_cameras
+from blitzgs.runs.export import largest_of_run, open_source
 from blitzgs.runs.folder import open_run
 from blitzgs.runs.world import gate_of, load_world_frame, trained_columns
 from blitzgs.table.blocks import morton_order
@@ -36,12 +38,13 @@ Photograph = Callable[[int], npt.NDArray[np.uint8]]
 
 @dataclass(frozen=True)
 class Opened:
-    """A model on its device, ready to be shown."""
+    """A model on its device, ready to be shown, without `unread` Gaussians (`open_model`)."""
 
     exhibit: Exhibit
     subject: Subject
     table: GaussianTable
     ranks: Ranks
+    unread: int = 0
 
     @property
     def bytes(self) -> int:
@@ -50,7 +53,11 @@ class Opened:
 
 
 def open_model(
-    path: Path, ranks: Ranks, photograph: Photograph | None = None, paths: Path | None = None
+    path: Path,
+    ranks: Ranks,
+    photograph: Photograph | None = None,
+    paths: Path | None = None,
+    most: int | None = None,
 ) -> Opened:
     """Open the folder of a run, a checkpoint in it, or a file of Gaussians.
 
@@ -59,15 +66,23 @@ def open_model(
         ranks: the device.
         photograph: returns the photograph of a camera of the run; None: there are none.
         paths: folder for camera paths and screenshots; None: RUN/paths, or the folder of the file.
+        most: Gaussians to read. Of a larger model, these are those of the largest opacity times length,
+            without colours by direction; None: all.
 
     Raises:
         FileNotFoundError: there is no such file, or no run or checkpoint in the folder.
         ValueError: the file is damaged.
     """
     if path.is_file():
-        return _open_file(path, ranks, paths or path.parent)
+        return _open_file(path, ranks, paths or path.parent, most)
     path, checkpoint = run_files.run_and_checkpoint(path)
-    model = open_run(path).model(str(ranks.device), checkpoint)
+    source = None if most is None else open_source(path, checkpoint)
+    if source is None or most is None or len(source) <= most:
+        model = open_run(path).model(str(ranks.device), checkpoint)
+        count, degree = len(model), model.sh_degree
+    else:
+        model = largest_of_run(source, most, ranks.device)
+        count, degree = len(source), source.degree
     columns = {name: getattr(model, name) for name in (*PARAMETERS, "level")}
     table = table_of_parameters(columns)
     options = render_options(
@@ -78,7 +93,7 @@ def open_model(
     exhibit = Exhibit(
         title=path.resolve().name + (f" {checkpoint}" if checkpoint else ""),
         space=model.space,
-        sh_degree=model.sh_degree,
+        sh_degree=degree,
         near=options.near_plane,
         far=options.far_plane,
         background=options.background,
@@ -93,7 +108,7 @@ def open_model(
         paths=paths or path / "paths",
         frame=load_world_frame(path),
     )
-    return Opened(exhibit, subject, table, ranks)
+    return Opened(exhibit, subject, table, ranks, count - len(table))
 
 
 def _exposures(found: Tensor | None, train: Sequence[int]) -> dict[int, npt.NDArray[np.float64]]:
@@ -103,10 +118,14 @@ def _exposures(found: Tensor | None, train: Sequence[int]) -> dict[int, npt.NDAr
     return dict(zip(train, found.double().cpu().numpy(), strict=True))
 
 
-def _open_file(path: Path, ranks: Ranks, paths: Path) -> Opened:
-    found = read_gaussians(path)
-    if len(found.means) == 0:
+def _open_file(path: Path, ranks: Ranks, paths: Path, most: int | None) -> Opened:
+    source = open_gaussians(path)
+    if len(source) == 0:
         raise ValueError(f"{path} holds no Gaussians")
+    count, full_degree = len(source), source.degree
+    if most is not None and count > most:
+        source = Selected(source, Selection(most=most, sh_degree=0))
+    found = source if isinstance(source, Gaussians) else joined(list(source.blocks()))
     box = box_of(found.means)
     middle, extent = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
     # Centred, so that float32 resolves the positions of a georeferenced model as finely as the file does.
@@ -116,13 +135,12 @@ def _open_file(path: Path, ranks: Ranks, paths: Path) -> Opened:
     table = table_of_parameters({name: column[order].to(ranks.device) for name, column in columns.items()})
     config = Config(model=ModelConfig(antialiased=is_antialiased(found), near=1e-3))
     gate = gate_of(found, space.unit)
-    degree = round(found.sh.shape[1] ** 0.5) - 1
-    options = render_options(config, space, degree, gate)
+    options = render_options(config, space, found.degree, gate)
     lod = None if gate is None else SceneGate(gate, math.inf if gate.smooth else 0.95, table, ranks)
     exhibit = Exhibit(
         title=path.name,
         space=space,
-        sh_degree=degree,
+        sh_degree=full_degree,
         near=options.near_plane,
         far=options.far_plane,
         background=options.background,
@@ -132,7 +150,7 @@ def _open_file(path: Path, ranks: Ranks, paths: Path) -> Opened:
         box=(box - middle) / space.unit,
         paths=paths,
     )
-    return Opened(exhibit, Subject(table, options, space.unit, lod), table, ranks)
+    return Opened(exhibit, Subject(table, options, space.unit, lod), table, ranks, count - len(table))
 
 
 def box_of(means: Tensor) -> npt.NDArray[np.float64]:

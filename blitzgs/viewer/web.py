@@ -69,8 +69,8 @@ def web_file(opened: Opened, max_bytes: int) -> WebFile:
     Raises:
         ValueError: the model has no visible Gaussian, or none fits.
     """
-    table, exhibit, full_degree = opened.table, opened.exhibit, opened.subject.options.sh_degree
-    degree, space = full_degree, max_bytes - frame_bytes()
+    table, exhibit, full_degree = opened.table, opened.exhibit, opened.exhibit.sh_degree
+    degree, space = opened.subject.options.sh_degree, max_bytes - frame_bytes()
     rows = _seen(table)
     if len(rows) == 0:
         raise ValueError(f"{exhibit.title} has no Gaussian that can be seen")
@@ -90,13 +90,14 @@ def web_file(opened: Opened, max_bytes: int) -> WebFile:
             splats = _splats(table, rows[:kept], degree, levels)
         parts = []
         if kept < visible:
-            parts.append(f"{visible - kept:,} of {visible:,} Gaussians, those that contribute least")
+            left, whole = visible - kept + opened.unread, visible + opened.unread
+            parts.append(f"{left:,} of {whole:,} Gaussians, those that contribute least")
         if degree < full_degree:
             parts.append(f"colours by direction beyond SH degree {degree} of {full_degree}")
         left_out = f"Left out to stay below {max_bytes / 1e6:g} MB: {'; '.join(parts)}." if parts else ""
         text = web_page(splats, scene, exhibit.title, left_out)
         if len(text.encode()) <= max_bytes:
-            return WebFile(text, kept, len(table), left_out)
+            return WebFile(text, kept, len(table) + opened.unread, left_out)
         kept = int(0.98 * kept)
 
 
@@ -209,8 +210,10 @@ class City:
         return to_globe(self.frame, self.offset)
 
 
-def open_city(path: Path) -> City:
+def open_city(path: Path, checked: bool = True) -> City:
     """Open a run, a checkpoint in it or a PLY file, without reading its Gaussians into memory.
+
+    `checked` is as for `blitzgs.formats.models.open_gaussians`.
 
     Raises:
         FileNotFoundError: there is no such file, or no run or checkpoint in the folder.
@@ -219,7 +222,7 @@ def open_city(path: Path) -> City:
     cameras: Sequence[CameraLike] = ()
     run, frame = None, None
     if path.is_file():
-        source: GaussianSource = PlySource(path)
+        source: GaussianSource = PlySource(path, checked)
         offset = np.array(offset_of(source.comments))
     else:
         folder, checkpoint = run_files.run_and_checkpoint(path)
@@ -232,7 +235,7 @@ def open_city(path: Path) -> City:
     first = next(iter(source.blocks()), None)
     if first is None or len(first) == 0:
         raise ValueError(f"{path} holds no Gaussians")
-    box = box_of(first.means)
+    box = box_of(first.means[first.sound()])
     if run is None:
         extent = float(np.linalg.norm(box[1] - box[0])) / 2
         space = Space.of(offset, extent)

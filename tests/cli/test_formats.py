@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Models of files and for files, and the place of a run in the world, from the command line."""
 
+import dataclasses
 import json
 import os
 import re
@@ -18,6 +19,7 @@ from blitzgs.capture.world import geodetic
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.models import FORMATS, read_gaussians
+from blitzgs.formats.ply import write_ply
 from blitzgs.runs.run_files import open_model
 from blitzgs.runs.world import load_world_frame
 from blitzgs.viewer.panel import overlay
@@ -95,6 +97,40 @@ def test_selections_of_a_run(trained, whole, tmp_path):
     region.write_text(f"{x - 100} {y - 100}\n{x - 100} {y}\n{x + 100} {y}\n{x + 100} {y - 100}\n")
     assert main([*run, "--crop-polygon", str(region)]) == 0
     assert len(read_gaussians(path)) == int((expected.means[:, 1] <= y).sum())
+
+
+def test_files_keep_their_place_in_the_world(whole, tmp_path, capsys):
+    model = read_gaussians(whole)
+    far, near = torch.tensor([500_000.0, 4_600_000.0, 100.0]), tmp_path / "near.ply"
+    rounded = (model.means + far).double()
+    write_ply(tmp_path / "far.ply", **vars(dataclasses.replace(model, means=rounded.float(), comments=[])))
+    comments = ["comment offset 500000.0 4600000.0 100.0"]
+    write_ply(near, **vars(dataclasses.replace(model, comments=comments)))
+    for kind in ("spz", "sog"):
+        path = tmp_path / f"model.{kind}"
+        for source, means in (("far.ply", rounded), ("near.ply", model.means + far.double())):
+            assert main(["export", str(tmp_path / source), f"--{kind}", str(path)]) == 0
+            assert "coordinates are relative to" in capsys.readouterr().out
+            offset = json.loads((tmp_path / f"model.{kind}.offset.json").read_text())["offset"]
+            found = read_gaussians(path).means.double() + torch.tensor(offset, dtype=torch.float64)
+            assert (found - means).abs().max() < 0.02
+        assert main(["export", str(whole), f"--{kind}", str(path)]) == 0
+        assert not (tmp_path / f"model.{kind}.offset.json").exists()
+
+
+def test_bad_gaussians_are_left_out_by_choice_and_no_model_replaces_itself(whole, tmp_path, capsys):
+    table, path = bytearray(whole.read_bytes()), tmp_path / "nan.ply"
+    start = table.index(b"end_header\n") + len(b"end_header\n")
+    table[start : start + 4] = np.float32(np.nan).tobytes()
+    path.write_bytes(table)
+    out = ["--ply", str(tmp_path / "out.ply")]
+    assert main(["export", str(path), *out]) == 1
+    error = capsys.readouterr().err
+    assert "nan.ply" in error and "--min-opacity 0" in error and not (tmp_path / "out.ply").exists()
+    assert main(["export", str(path), *out, "--min-opacity", "0"]) == 0
+    assert len(read_gaussians(tmp_path / "out.ply")) == len(read_gaussians(whole)) - 1
+    assert main(["export", str(path), "--compressed-ply", str(path)]) == 1
+    assert "choose another name" in capsys.readouterr().err and path.read_bytes() == table
 
 
 def test_clean_shows_and_measures_what_goes(trained, whole, tmp_path, capsys):

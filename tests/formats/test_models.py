@@ -1,5 +1,6 @@
 """Every format against a reader that shares nothing with its writer, and damaged files of each."""
 
+import dataclasses
 import io
 import json
 import os
@@ -228,6 +229,21 @@ def test_lower_degrees_and_single_gaussians(tmp_path, name, degree):
     np.testing.assert_allclose(found.means[:1].norm(), found.means[:1].norm())
     with pytest.raises(ValueError, match="no Gaussian"):
         written(tmp_path, name, some_gaussians(0, degree))
+
+
+@pytest.mark.parametrize("name", ["compressed-ply", "spz", "sog", "splat"])
+def test_flat_gaussians_are_written_and_infinite_ones_are_not(tmp_path, name):
+    model = some_gaussians(5, 1)
+    flat = dataclasses.replace(model, scales=model.scales.clone())
+    flat.scales[2, 1] = -torch.inf
+    found = read_gaussians(written(tmp_path, name, flat))
+    assert found.scales[2, 1] <= -10
+    np.testing.assert_allclose(found.means, model.means, atol=0.02)
+    for column in ("scales", "quats", "sh"):
+        bad = dataclasses.replace(model, **{column: getattr(model, column).clone()})
+        getattr(bad, column).view(5, -1)[3, 0] = torch.inf
+        with pytest.raises(ValueError, match=f"{column} has NaN or infinite values in 1 Gaussians"):
+            written(tmp_path, name, bad)
 
 
 @pytest.mark.parametrize(("name", "kind"), [("spz", "spz"), ("sog", "sog"), ("splat", "splat")])

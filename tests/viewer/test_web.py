@@ -2,6 +2,7 @@
 """The HTML file of a model in a headless Chromium, opened from the disk, against our own renderer."""
 
 import json
+import math
 import re
 import shutil
 
@@ -11,8 +12,10 @@ import torch
 
 import blitzgs
 from blitzgs.cli import main
+from blitzgs.cli.export import MAX_MB
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import write_ply
+from blitzgs.formats.selection import opacity_length
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs.folder import open_run
 from blitzgs.view.draw import Drawer, intrinsics
@@ -177,6 +180,26 @@ def test_a_run_and_its_checkpoints_are_exported(browser, trained, tmp_path, caps
     assert main(["export", str(checkpoint), "--html", str(file)]) == 0
     assert f"<title>{trained[1].name} {checkpoint.name}</title>" in file.read_text()
     assert browser.errors() == []
+
+
+def test_of_a_large_model_the_largest_gaussians_are_read(trained, tmp_path, monkeypatch, capsys):
+    whole = open_model(trained[1], Ranks())
+    ply, page = tmp_path / "a.ply", tmp_path / "a.html"
+    assert main(["export", str(trained[1]), "--ply", str(ply)]) == 0
+    size = opacity_length(whole.table["opacities"], whole.table["scales"])
+    least = float(size.sort(descending=True).values[99])
+    monkeypatch.setattr("blitzgs.cli.export._LEAST_BYTES", MAX_MB * 10_000)
+    for source in (trained[1], ply):
+        opened = open_model(source, Ranks(), most=100)
+        table = opened.table
+        assert len(table) == 100 and opened.unread == len(whole.table) - 100
+        assert table["sh"].shape[1] == 1 and opened.exhibit.sh_degree == whole.exhibit.sh_degree
+        found = opacity_length(table["opacities"], table["scales"])
+        assert float(found.min()) + math.log(opened.subject.unit) == pytest.approx(
+            least + math.log(whole.subject.unit), abs=1e-4
+        )
+        assert main(["export", str(source), "--html", str(page)]) == 0
+        assert re.search(rf"a.html: \d+ of {len(whole.table):,} Gaussians", capsys.readouterr().out)
 
 
 def test_wrong_flags_are_named(trained, tmp_path, capsys):
