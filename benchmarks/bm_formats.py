@@ -3,7 +3,9 @@
 
 python benchmarks/bm_formats.py RUN --json formats.json
 
-PSNR is that of the held-out views rendered from the file, against those rendered from the run.
+PSNR is that of the held-out views rendered from the file, against those rendered from the run. With --memory,
+each export is a command of its own, and what counts is the memory that it and its processes have for
+themselves at most, without pages of files; RUN may be a PLY file.
 """
 
 from __future__ import annotations
@@ -11,11 +13,13 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+import psutil
 import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -44,11 +48,45 @@ def read(path: Path) -> Gaussians:
     )  # fmt: skip
 
 
+def memory(model: Path) -> list[dict[str, object]]:
+    rows = []
+    kinds = {name: kind.suffix for name, kind in FORMATS.items()} | {"html": ".html", "tiles": ""}
+    for name, suffix in kinds.items():
+        with tempfile.TemporaryDirectory() as folder:
+            path, begin, most = Path(folder) / f"model{suffix}", time.perf_counter(), 0
+            command = [sys.executable, "-m", "blitzgs", "export", str(model), f"--{name}", str(path)]
+            process = subprocess.Popen(command)
+            while process.poll() is None:
+                family = [process.pid, *(child.pid for child in psutil.Process(process.pid).children(True))]
+                most = max(most, sum(map(own_bytes, family)))
+                time.sleep(0.2)
+            seconds = time.perf_counter() - begin
+            files = [file for file in (path, *path.rglob("*")) if file.is_file()]
+            size = sum(file.stat().st_size for file in files)
+            rows.append({"format": name, "seconds": seconds, "memory": most, "bytes": size})
+            print(rows[-1], flush=True)
+    return rows
+
+
+def own_bytes(process: int) -> int:
+    try:
+        lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    except OSError:  # it has ended
+        return 0
+    return sum(1024 * int(line.split()[1]) for line in lines if line.startswith(("RssAnon", "RssShmem")))
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--memory", action="store_true")
     args = parser.parse_args()
+    if args.memory:
+        rows = memory(args.run)
+        if args.json:
+            args.json.write_text(json.dumps(rows, indent=1) + "\n")
+        return 0
     run = open_run(args.run)
     # Views without the gate of the levels, which most formats cannot hold.
     model = dataclasses.replace(run.model(), lod=None)

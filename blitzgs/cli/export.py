@@ -37,7 +37,7 @@ from blitzgs.runs.folder import Model, open_run
 from blitzgs.runs.run_files import run_and_checkpoint
 from blitzgs.runs.world import in_world, load_world_frame
 from blitzgs.util.output import write_file
-from blitzgs.util.progress import image_progress
+from blitzgs.util.progress import ending_by_exception, image_progress
 
 # Default of --max-mb, and the largest file whose text browsers still hold in one piece.
 MAX_MB, LARGEST_MB = 50, 500
@@ -169,10 +169,11 @@ def run(args: argparse.Namespace) -> int:
     """Export a model; returns the exit status."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise ValueError("export writes one file from one process: run it without torchrun")
-    if args.tiles or args.streamed_sog:
-        return _export_tiles(args, _selection(args))
-    _refuse(args, ("tile_gaussians", "processes"), f"is for {_TILES}")
-    return _export_html(args) if args.html else _export_file(args)
+    with ending_by_exception():
+        if args.tiles or args.streamed_sog:
+            return _export_tiles(args, _selection(args))
+        _refuse(args, ("tile_gaussians", "processes"), f"is for {_TILES}")
+        return _export_html(args) if args.html else _export_file(args)
 
 
 def _refuse(args: argparse.Namespace, flags: Iterable[str], reason: str) -> None:
@@ -278,7 +279,8 @@ def _export_run(
                 source = Selected(source, selection, opened.space.offset)
             return source, export(source, opened.space, kind, path, coordinates)
     flags = "--classic, --clean, --most and --coordinates world need the model in memory"
-    check_memory(f"{flags}; {run_folder} holds", len(opened), opened.degree)
+    # The model is read with the optimiser's two moments, and copied.
+    check_memory(f"{flags}; {run_folder} holds", len(opened), opened.degree, copies=4)
     from blitzgs.viewer.studio import open_model
     from blitzgs.viewer.web import contributions
 

@@ -125,18 +125,19 @@ class Gaussians:
                 raise ValueError(f"{name} has the shape {list(tensor.shape)}, expected {list(shapes[name])}")
 
 
-def check_memory(holds: str, count: int, degree: int) -> None:
-    """Refuse a number of Gaussians that the free memory cannot hold twice, as readers need it.
+def check_memory(holds: str, count: int, degree: int, copies: int = 2) -> None:
+    """Refuse a number of Gaussians that the free memory cannot hold so often; readers need it twice.
 
     Args:
         holds: what has them, as the beginning of the sentence, for example "FILE holds".
         count: number of Gaussians.
         degree: their spherical-harmonics degree.
+        copies: how often.
 
     Raises:
         ValueError: it cannot; names both amounts.
     """
-    needed = 2 * 4 * count * (11 + 3 * (degree + 1) ** 2)
+    needed = copies * 4 * count * (11 + 3 * (degree + 1) ** 2)
     free = psutil.virtual_memory().available
     if needed > free:
         raise ValueError(

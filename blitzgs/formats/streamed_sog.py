@@ -75,7 +75,7 @@ def write_streamed_sog(
         ]
         boxes, size = {}, 0
         for (part, lod, _), (box, written) in zip(
-            jobs, each_part(_encode, parts, partial, processes, report, jobs), strict=True
+            jobs, each_part(_encode, parts, partial, processes, jobs, report), strict=True
         ):
             size += written
             if lod == 0:

@@ -109,7 +109,7 @@ def write_tiles(
         root, parts_of_entries = tree(counts, most)
         parts = partition.place(parts_of_entries, counts.counts)
         (folder / "tiles").mkdir()
-        encoded = list(each_part(_encode, parts, folder / "tiles", processes, report))
+        encoded = list(each_part(_encode, parts, folder / "tiles", processes, report=report))
         parts.file.unlink()
         content, _ = _node(root, [(box, count) for box, count, _ in encoded])
         content["transform"] = transform.T.ravel().tolist()
@@ -230,8 +230,8 @@ def each_part(
     parts: Parts,
     folder: Path,
     processes: int,
-    report: Report,
     numbers: list[Any] | None = None,
+    report: Report = lambda done, total: None,
 ) -> Iterator[Any]:
     """Yield `work(parts, folder, number)` for all parts in order, computed by several processes."""
     chosen = list(range(len(parts.starts) - 1)) if numbers is None else numbers

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -16,6 +17,7 @@ from blitzgs.formats import gaussians as blocks
 from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.tiles import new_folder, upright, write_tiles
 from blitzgs.formats.web_page import WebScene
+from blitzgs.util.progress import ending_by_exception
 from tests.formats.helpers import read_glb
 
 LOD = "comment lod reference_distance 40.0 fork 2.0 levels 4 finest 3"
@@ -306,6 +308,14 @@ def test_a_killed_export_leaves_no_tileset(tmp_path):
             raise KeyError(folder.stat())  # a folder in use is not removed
         (folder / "x").write_text("x")
     assert (tmp_path / "t" / "x").exists()
+
+
+def test_an_export_that_is_told_to_end_leaves_nothing(tmp_path):
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        with pytest.raises(SystemExit), ending_by_exception(), new_folder(tmp_path / "t"):
+            os.kill(os.getpid(), number)
+            time.sleep(10)
+        assert list(tmp_path.iterdir()) == [] and signal.getsignal(number) == signal.SIG_DFL
 
 
 def ready_for_long(*_: object) -> None:
