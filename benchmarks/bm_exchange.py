@@ -32,7 +32,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import torch
-from harness import make_parser, write_json
+from harness import Clock, make_parser, write_json
 from scenes import aerial
 
 from blitzgs.capture.capture import load_capture
@@ -57,33 +57,6 @@ from blitzgs.view.views import Space, ViewSet, render_options, trained_centres
 STAGES = (
     "project", "exchange", "sort", "raster", "loss", "raster back", "exchange back", "optimiser", "other",
 )  # fmt: skip
-
-
-class Clock:
-    """Sums the time between marks by the name of the second, on the device's own clock."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.cuda = device.type == "cuda"
-        self.marks: list[tuple[str, Any]] = []
-        self.mark("start")
-
-    def mark(self, stage: str) -> None:
-        """End a stage."""
-        if self.cuda:
-            event = torch.cuda.Event(enable_timing=True)
-            event.record()
-            self.marks.append((stage, event))
-        else:
-            self.marks.append((stage, time.perf_counter()))
-
-    def milliseconds(self) -> list[float]:
-        """Return the time of each of `STAGES`."""
-        if self.cuda:
-            torch.cuda.synchronize()
-        times = dict.fromkeys(STAGES, 0.0)
-        for (_, a), (stage, b) in zip(self.marks, self.marks[1:], strict=False):
-            times[stage] += a.elapsed_time(b) if self.cuda else 1000 * (b - a)
-        return list(times.values())
 
 
 class Inputs(NamedTuple):
@@ -179,7 +152,10 @@ class Workload:
             clock = Clock(self.ranks.device)
             with stages_told_to(clock.mark):
                 result = self.step(batch)
-            yield clock.milliseconds(), result
+            times = dict.fromkeys(STAGES, 0.0)
+            for stage, ms in clock.stages():
+                times[stage] += ms
+            yield list(times.values()), result
 
     def in_a_row(self) -> float:
         """Visit all batches without a barrier; return ms per step."""

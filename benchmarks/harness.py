@@ -184,23 +184,29 @@ def median_ms(
 
 
 class Clock:
-    """Time between marks on the device."""
+    """Time between marks, on the device's own clock."""
 
-    def __init__(self) -> None:
-        self.marks: list[tuple[str, torch.cuda.Event]] = []
+    def __init__(self, device: torch.device | str = "cuda") -> None:
+        self._cuda = torch.device(device).type == "cuda"
+        self._marks: list[tuple[str, Any]] = []
         self.mark("")
 
     def mark(self, stage: str) -> None:
         """End a stage."""
-        event = torch.cuda.Event(enable_timing=True)
-        event.record()
-        self.marks.append((stage, event))
+        at: Any = time.perf_counter()
+        if self._cuda:
+            at = torch.cuda.Event(enable_timing=True)
+            at.record()
+        self._marks.append((stage, at))
 
     def stages(self) -> list[tuple[str, float]]:
-        """Return name and time of each stage, in order."""
-        torch.cuda.synchronize()
-        return [(name, begin.elapsed_time(end))
-                for (_, begin), (name, end) in zip(self.marks, self.marks[1:], strict=False)]  # fmt: skip
+        """Return name and milliseconds of each stage, in order."""
+        if self._cuda:
+            torch.cuda.synchronize()
+        return [
+            (name, begin.elapsed_time(end) if self._cuda else 1000 * (end - begin))
+            for (_, begin), (name, end) in zip(self._marks, self._marks[1:], strict=False)
+        ]
 
 
 def _flatten(value: Any) -> list[Any]:

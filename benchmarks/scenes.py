@@ -5,13 +5,10 @@ Both return a `BenchmarkScene` whose parameters are activated (what `rasterizati
 `raw()` gives the same Gaussians as the trainer stores them (log scales, logit opacities).
 The numbers depend on the seed and on the kind of device, because CPU and CUDA generators differ;
 the distribution does not.
-
-Run as a script, the module prints the share of each scene that the camera sees.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 from dataclasses import dataclass, replace
 
@@ -284,20 +281,3 @@ def _pinhole(width: int, height: int, horizontal_fov_degrees: float, views: int)
     focal = 0.5 * width / math.tan(math.radians(horizontal_fov_degrees) / 2)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return K.expand(views, 3, 3).clone()
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--count", type=int, default=200_000)
-    args = parser.parse_args()
-    for scene in (
-        aerial(args.count, args.device, views=4),
-        garden_like(args.count, args.device, views=4),
-    ):
-        seen = ", ".join(f"{100 * f:.1f} %" for f in scene.centres_in_view().tolist())
-        print(f"{scene.name}: {scene.width} x {scene.height}, centres in view: {seen}")
-
-
-if __name__ == "__main__":
-    main()

@@ -14,8 +14,7 @@ if TYPE_CHECKING:
         rasterize_num_contributing_gaussians,
         rasterize_top_contributing_gaussian_ids,
     )
-    from blitzgs.call.gaussians import knn, position_noise, quat_scale_to_covar_preci, relocate
-    from blitzgs.call.losses import l1_ssim
+    from blitzgs.call.gaussians import knn, l1_ssim, position_noise, quat_scale_to_covar_preci, relocate
     from blitzgs.ops.harmonics import spherical_harmonics
     from blitzgs.runs.folder import open_run
     from blitzgs.table.blocks import morton_order
@@ -42,7 +41,7 @@ __all__ = [
 _MODULES = {
     "contributions": "blitzgs.call",
     "knn": "blitzgs.call.gaussians",
-    "l1_ssim": "blitzgs.call.losses",
+    "l1_ssim": "blitzgs.call.gaussians",
     "morton_order": "blitzgs.table.blocks",
     "open_run": "blitzgs.runs.folder",
     "position_noise": "blitzgs.call.gaussians",

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from dataclasses import fields
 from pathlib import Path
@@ -75,13 +74,7 @@ def run(args: argparse.Namespace) -> int:
         value = getattr(args, field.name)
         chosen[field.name] = getattr(preset, field.name) if value is None else value
     started = time.monotonic()
-    with image_progress("Photographing the city") as bar:
-
-        def progress(done: int, total: int) -> None:
-            bar(done, total)
-            if not sys.stderr.isatty() and 10 * done // total > 10 * (done - 1) // total:
-                print(f"{done:,} of {total:,} images, {time.monotonic() - started:.0f} s", file=sys.stderr)
-
+    with image_progress("Photographing the city") as progress:
         out = generate_city(
             args.out,
             **chosen,

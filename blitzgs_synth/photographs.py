@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from blitzgs.util.output import write_file
-from blitzgs.util.processes import follow_parent
+from blitzgs.util.progress import follow_parent
 from blitzgs_synth.arrays import Bytes
 from blitzgs_synth.flight import View
 from blitzgs_synth.options import CityOptions

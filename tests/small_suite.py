@@ -128,7 +128,7 @@ def _pieces(text: str) -> int:
 def kernels_in_source() -> dict[Kernel, str]:
     """Every kernel of csrc and its file."""
     found = {}
-    for path in sorted((ROOT / "csrc").rglob("*.cu*")):
+    for path in sorted((ROOT / "csrc").rglob("*.[ch]*")):
         text, file = path.read_text(), str(path.relative_to(ROOT))
         found |= {(name, _pieces(parameters)): file for name, parameters in _KERNEL.findall(text)}
         # One kernel does the rows of several structs, each of which counts.

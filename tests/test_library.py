@@ -323,7 +323,7 @@ def test_every_test_of_the_list_exists(request):
 
 
 def test_every_kernel_of_the_sources_is_found_and_has_a_name_of_its_own():
-    text = "".join(path.read_text() for path in (ROOT / "csrc").rglob("*.cu*"))
+    text = "".join(path.read_text() for path in (ROOT / "csrc").rglob("*.[ch]*"))
     declared, structs = text.count("__global__"), text.count("template void for_each_row(")
     assert len(kernels_in_source()) == declared - 1 + structs > 40
 

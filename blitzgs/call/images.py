@@ -23,8 +23,7 @@ from blitzgs.call.groups import (
     project_groups,
     render_queued,
 )
-from blitzgs.call.layout import Layout
-from blitzgs.call.lists import Lists, lists_of, lists_of_pixels
+from blitzgs.call.layout import Layout, Lists, lists_of, lists_of_pixels
 from blitzgs.call.meta import make_meta
 from blitzgs.call.ranks import CallRanks, send_splats
 from blitzgs.ops.importance import pixel_splats

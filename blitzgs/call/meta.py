@@ -13,8 +13,7 @@ from torch import Tensor
 from blitzgs._torch import register_mapping
 from blitzgs.call.arguments import Gaussians
 from blitzgs.call.bad_values import non_finite
-from blitzgs.call.layout import Layout
-from blitzgs.call.lists import Lists
+from blitzgs.call.layout import Layout, Lists
 from blitzgs.ops.projection_types import ProjectedSplats
 
 # In place of a value that is computed when it is first read.

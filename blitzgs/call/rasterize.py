@@ -214,7 +214,7 @@ def rasterization(
     if with_ut:
         given = {"covars": covars is not None, "sparse_grad": sparse_grad, "distributed": distributed}
         check_with_ut(viewmats, given)
-    else:
+    elif camera_model != "pinhole" or (rolling_shutter, ut_params, *lens.values()) != (None,) * 6:
         check_without_ut(camera_model, rolling_shutter, {**lens, "ut_params": ut_params})
     if Ks.requires_grad:
         warn_of_gradient("rasterization")

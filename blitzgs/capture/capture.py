@@ -37,7 +37,7 @@ from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_ext
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.masks import check_masks, find_masks
 from blitzgs.capture.names import MissingImagesError as MissingImagesError
-from blitzgs.capture.names import check_inside, existing
+from blitzgs.capture.names import check_inside, existing, to_convert
 from blitzgs.capture.points import SourcePoints
 from blitzgs.capture.projects.find import FoundProject, folder_of, project_at
 from blitzgs.capture.usable import (
@@ -254,7 +254,7 @@ def _root_of(path: Path, images: str) -> tuple[Path, FoundProject | None]:
     if project is None:
         raise FileNotFoundError(
             f"{path} is no project that can be read (docs/captures.md lists them): name the folder of the "
-            "capture (images and a COLMAP model) with --data"
+            f"capture (images and a COLMAP model) with --data{to_convert([path.name])}"
         )
     return folder_of(path, images), project
 

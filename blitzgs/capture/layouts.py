@@ -9,14 +9,14 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 
 from blitzgs.capture import colmap, transforms
 from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.names import ImageFinder
+from blitzgs.capture.names import ImageFinder, to_convert
 from blitzgs.capture.points import SourcePoints, file_points, transforms_points
 from blitzgs.capture.projects.find import FoundProject, find_project, read_project
 from blitzgs.capture.world import WorldFrame, frame_beside
@@ -109,11 +109,12 @@ def _hint(root: Path) -> str:
             f"; there is a COLMAP model in {min(models)}: name the folder above its sparse/0 with --data, or "
             f"move the model to {root / 'sparse' / '0'}"
         )
-    if any(path.suffix.lower() in _PHOTOGRAPH_SUFFIXES for path in [*root.glob("*"), *root.glob("*/*")]):
+    names = [path.name for path in (*root.glob("*"), *root.glob("*/*"))]
+    if any(PurePath(name).suffix.lower() in _PHOTOGRAPH_SUFFIXES for name in names):
         return (
             f"; it has images but not their cameras: blitzgs sfm {shlex.quote(str(root))} CAPTURE finds these"
         )
-    return ""
+    return to_convert(names)
 
 
 def _model_in(root: Path) -> Path:

@@ -22,6 +22,7 @@ from blitzgs.capture.lens import Lens
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".avif", ".jp2", ".gif")
 # Of photographs that have to be converted; the cameras may have been found before that.
 _CONVERTED_SUFFIXES = (".heic", ".heif", ".dng", ".arw", ".cr2", ".cr3", ".nef", ".orf", ".rw2", ".jxl")
+_VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mts", ".insv", ".360")
 # Folders of what belongs to photographs and has their names, but shows something else.
 _BY_PRODUCT = re.compile(r"(?i)(^|/)(depth|normal|disp|mask|alpha|segmentation|semantic)[^/]*/")
 # Of folders in each other.
@@ -134,6 +135,17 @@ def files_below(folder: Path) -> list[str]:
         visible = (name for name in files if not name.startswith("."))
         out += [name if base == "." else f"{base}/{name}" for name in visible]
     return sorted(out)
+
+
+def to_convert(names: Iterable[str]) -> str:
+    """Return, as the end of an error, what to do with files that are no readable photographs; "": nothing."""
+    found = {PurePosixPath(name).suffix.lower() for name in names} & {*_CONVERTED_SUFFIXES, *_VIDEO_SUFFIXES}
+    if not found:
+        return ""
+    return (
+        f"; {', '.join(sorted(found))} cannot be read: convert photographs to JPEG, and take frames from a "
+        "video (ffmpeg -i VIDEO -vf fps=2 -q:v 2 FRAMES/%05d.jpg)"
+    )
 
 
 def what_is_at(path: Path) -> str | None:

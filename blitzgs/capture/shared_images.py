@@ -133,7 +133,8 @@ class SharedImages:
         found = self._found.get(key)  # a step asks for each of its images several times
         if found is None:
             number, pixels = self._places[key]
-            if native.flag_is_set(self._flags, number):
+            # An array's element is read sooner, but only the function also orders what is read after it.
+            if self._flags[number] and native.flag_is_set(self._flags, number):
                 found = self._found[key] = pixels
         return found
 

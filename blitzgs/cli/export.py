@@ -37,8 +37,7 @@ from blitzgs.runs.folder import Model, open_run
 from blitzgs.runs.run_files import run_and_checkpoint
 from blitzgs.runs.world import in_world, load_world_frame
 from blitzgs.util.output import write_file
-from blitzgs.util.processes import ending_by_exception
-from blitzgs.util.progress import image_progress
+from blitzgs.util.progress import ending_by_exception, image_progress
 
 # Default of --max-mb, and the largest file whose text browsers still hold in one piece.
 MAX_MB, LARGEST_MB = 50, 500

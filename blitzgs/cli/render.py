@@ -115,6 +115,9 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     )
 
 
+_OTHER_FILMS = (".gif", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".webp")
+
+
 def run(args: argparse.Namespace) -> int:
     """Render views; returns the exit status."""
     film = _film(args)
@@ -136,6 +139,8 @@ def run(args: argparse.Namespace) -> int:
 def _film(args: argparse.Namespace) -> Film | None:
     """Return what --path asks for; None: the command has no --path."""
     is_film = args.out.suffix.lower() == SUFFIX
+    if args.out.suffix.lower() in _OTHER_FILMS:
+        raise ValueError(f"{args.out}: a film's name ends in {SUFFIX}, and pictures need a folder")
     if args.path is None:
         for name in ("size", "fps", "seconds", "dataparser"):
             if getattr(args, name) is not None:

@@ -33,7 +33,7 @@ def _system_error(message: str) -> OSError:
     return OSError(int(number), os.strerror(int(number)), path)
 
 
-# In the order of blitzgs_io_type and blitzgs_io_status_code of csrc/io/io_api.h.
+# In the order of blitzgs_io_type and blitzgs_io_status_code of csrc/io/io_api.cpp.
 _TYPES = tuple(np.dtype(name) for name in ("u1", "u4", "i8", "u8", "f8"))
 _ERRORS: tuple[Callable[[str], Exception] | None, ...] = (
     None, FormatError, ValueError, MemoryError, RuntimeError, _system_error,

@@ -34,8 +34,7 @@ from blitzgs.formats.glb import write_glb
 from blitzgs.formats.partition import BITS, Counts, Partition, Parts, extents
 from blitzgs.formats.web_page import WebScene, tiles_page
 from blitzgs.util.output import sync_to_disk, write_file
-from blitzgs.util.processes import follow_parent
-from blitzgs.util.progress import Report
+from blitzgs.util.progress import Report, follow_parent
 
 TILESET, PAGE = "tileset.json", "index.html"
 # Gaussians of a tile: 8 MB at SH degree 3.

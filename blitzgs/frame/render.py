@@ -272,11 +272,11 @@ def backward_splats(frame: Frame, v_renders: Tensor) -> SplatGradients:
     if way_back is not None:
         way_back.check_still_valid()
     if v_renders.is_cuda:
-        packed = frame.gradients.take(frame.splats.means2d)
+        table = frame.gradients.take(frame.splats.means2d)
         torch.ops.blitzgs.rasterize_bwd(
-            *frame.saved, v_renders, None, *grid, False, options.deterministic, packed
+            *frame.saved, v_renders, None, *grid, False, options.deterministic, table
         )
-        gradients = SplatGradients([packed])
+        gradients = SplatGradients([table])
     else:
         *parts, _ = torch.ops.blitzgs.rasterize_bwd(
             *frame.saved, v_renders, None, *grid, False, options.deterministic

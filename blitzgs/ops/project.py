@@ -21,7 +21,7 @@ from blitzgs.ops.projection_types import (
     splats_of,
 )
 from blitzgs.ops.rows import full_gradients
-from blitzgs.ops.splat_gradients import packed_table
+from blitzgs.ops.splat_gradients import gradient_table_of
 
 
 class TableRows(NamedTuple):
@@ -154,7 +154,7 @@ def _first_gradients(
 def _splat_gradients(saved: _Saved, v: _Differentiable) -> list[Tensor]:
     """Return the gradients of means2d, conics, opacities and colors as `project_bwd` takes them."""
     columns = [v.means2d, v.conics, v.opacities] + ([v.colors] if len(saved.gaussians) > 4 else [])
-    if v.depths is None and len(columns) == 4 and (table := packed_table(columns)) is not None:
+    if v.depths is None and len(columns) == 4 and (table := gradient_table_of(columns)) is not None:
         return [table]
     if all(column is not None for column in columns):
         return columns

@@ -128,14 +128,14 @@ def rasterize(
     else:
         geometry = (means2d, conics, splat_opacities) if meta_geometry is None else meta_geometry.columns
         arrange = None if meta_geometry is None else meta_geometry.arrange
-        # Whether gradients will be packed, see `_gradients`.
-        packed = (
+        # Whether a table for the gradients is prepared, see `_gradients`.
+        backward_follows = (
             composited is None
             and store_absgrad is None
             and torch.is_grad_enabled()
             and any(x.requires_grad for x in (*geometry, colors))
         )
-        call = _Call(splats, grid, store_absgrad, arrange, packed, composited)
+        call = _Call(splats, grid, store_absgrad, arrange, backward_follows, composited)
         renders, alphas = _Rasterize.apply(*geometry, colors, backgrounds, call)  # type: ignore[no-untyped-call]
     if (tile_begin, tile_end) != (0, -1):
         end = sys.maxsize if tile_end < 0 else tile_end
@@ -178,20 +178,20 @@ def _backward(
 
 
 def _gradients(
-    ctx: Any, v_renders: Tensor | None, v_alphas: Tensor | None, absgrad: bool, may_pack: bool = False
+    ctx: Any, v_renders: Tensor | None, v_alphas: Tensor | None, absgrad: bool, may_be_table: bool = False
 ) -> Sequence[Tensor | None]:
     """Return the gradients of means2d, conics, splat_opacities, colors and backgrounds.
 
     A sixth value follows: the sum over pixels of the absolute gradient of means2d; None without `absgrad`.
-    With `may_pack`, the gradients of the splats may, on CUDA, be columns of one table, which `project_bwd`
-    reads without copying.
+    With `may_be_table`, the gradients of the splats may, on CUDA, be columns of one table, which
+    `project_bwd` reads without copying.
     """
     if v_renders is None and v_alphas is None:
         return (None,) * 6
     saved = _saved(ctx)
     return first_only(
         "rasterize",
-        lambda: _first_gradients(ctx, saved, v_renders, v_alphas, absgrad, may_pack),
+        lambda: _first_gradients(ctx, saved, v_renders, v_alphas, absgrad, may_be_table),
         (*saved.splats, saved.backgrounds, v_renders, v_alphas),
     )
 
@@ -202,7 +202,7 @@ def _first_gradients(
     v_renders: Tensor | None,
     v_alphas: Tensor | None,
     absgrad: bool,
-    may_pack: bool,
+    may_be_table: bool,
 ) -> tuple[Tensor | None, ...]:
     (means2d, _, _, colors), (transmittances, *_) = saved.splats, saved.composited
     if v_renders is None:
@@ -210,10 +210,10 @@ def _first_gradients(
     deterministic = torch.are_deterministic_algorithms_enabled()
     v_abs = v_backgrounds = None
     v_splats: Sequence[Tensor]
-    if may_pack and colors.is_cuda and colors.shape[1] == 3 and v_alphas is None and not absgrad:
-        packed = ctx.gradients.take(means2d)
-        torch.ops.blitzgs.rasterize_bwd(*saved, v_renders, None, *ctx.grid, False, deterministic, packed)
-        v_splats = gradient_columns(packed)
+    if may_be_table and colors.is_cuda and colors.shape[1] == 3 and v_alphas is None and not absgrad:
+        table = ctx.gradients.take(means2d)
+        torch.ops.blitzgs.rasterize_bwd(*saved, v_renders, None, *ctx.grid, False, deterministic, table)
+        v_splats = gradient_columns(table)
     else:
         *v_splats, v_abs = torch.ops.blitzgs.rasterize_bwd(
             *saved, v_renders, v_alphas, *ctx.grid, absgrad, deterministic
@@ -257,7 +257,7 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *v_output: Tensor | None) -> tuple[Tensor | None, ...]:
         v_renders, v_alphas = v_output
         store = ctx.store_absgrad
-        *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, store is not None, may_pack=True)
+        *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, store is not None, may_be_table=True)
         if v_abs is not None:
             store(v_abs.detach())
         if ctx.arrange is not None and splat_gradients[0] is not None:

@@ -27,24 +27,24 @@ _COLUMNS: tuple[tuple[int, tuple[int, ...], tuple[int, ...]], ...] = (
 )
 
 
-def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def gradient_columns(table: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """View a table of splat gradients as columns.
 
     Args:
-        packed: [P, 12], as the op `rasterize_bwd` fills it.
+        table: [P, 12], as the op `rasterize_bwd` fills it.
 
     Returns:
         Gradients of means2d [P, 2], conics [P, 3], opacities [P] and colors [P, 3].
     """
     return (
-        packed[:, _MEAN2D : _MEAN2D + 2],
-        packed[:, _CONIC : _CONIC + 3],
-        packed[:, _OPACITY],
-        packed[:, _COLOR : _COLOR + 3],
+        table[:, _MEAN2D : _MEAN2D + 2],
+        table[:, _CONIC : _CONIC + 3],
+        table[:, _OPACITY],
+        table[:, _COLOR : _COLOR + 3],
     )
 
 
-def packed_table(columns: Sequence[Tensor | None]) -> Tensor | None:
+def gradient_table_of(columns: Sequence[Tensor | None]) -> Tensor | None:
     """Return the table of which `columns` are the `gradient_columns`; None if they are not of one table.
 
     The table may be the first rows of a longer one, because memory is allocated for more splats than there

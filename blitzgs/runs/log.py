@@ -19,9 +19,10 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Column
 
 from blitzgs.util.output import write_file
-from blitzgs.util.progress import Report
+from blitzgs.util.progress import Report, lines
 from blitzgs.util.terminal import printable
 
 LOG = "log.jsonl"
@@ -29,9 +30,8 @@ BOARD = "tensorboard"
 # Largest number of records that are kept while the disk is full; then the oldest are dropped.
 _MAX_WAITING = 10_000
 
-# Least seconds between two moves of a terminal's bar and, without one, between two lines about long work.
+# Least seconds between two moves of a terminal's bar.
 _BAR_SECONDS = 0.5
-_LINE_SECONDS = 30.0
 
 # The loss and the PSNR that are shown are means over this number of records; the file has each record's own.
 _MEAN_RECORDS = 20
@@ -93,10 +93,12 @@ class RunLog:
         if tensorboard:
             self._board = _Board(folder / BOARD, done, self._failures)
         if self.console.is_terminal:
+            bar = [BarColumn(bar_width=8)] if self.console.width >= 60 else []
             self._progress = Progress(
                 TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
-                BarColumn(bar_width=8),
-                TextColumn("{task.description}  ETA"),
+                *bar,
+                TextColumn("{task.description}", table_column=Column()),  # may wrap, the others do not
+                TextColumn("ETA"),
                 TimeRemainingColumn(compact=True),
                 console=self.console,
             )
@@ -126,15 +128,7 @@ class RunLog:
             finally:
                 bar.remove_task(task)
             return
-        printed = time.monotonic()
-
-        def report(done: int, total: int) -> None:
-            nonlocal printed
-            if self._file is not None and time.monotonic() >= printed + _LINE_SECONDS:
-                printed = time.monotonic()
-                self._print(f"        {done:,} of {total:,} {what}")
-
-        yield report
+        yield lines(lambda text: self._print(f"        {text} {what}") if self._file is not None else None)
 
     def scalars(self, t: int, values: Mapping[str, float]) -> None:
         """Record numbers at time `t` (images)."""

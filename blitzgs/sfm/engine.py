@@ -78,6 +78,8 @@ _MATCHERS = {"gps": "spatial", "sequence": "sequential", "exhaustive": "exhausti
 # Photographs up to which every pair is matched, and poses are found one after the other.
 MOST_IN_ALL_PAIRS, _MOST_ONE_BY_ONE = 300, 500
 _MANY = 15
+# Bytes; with fewer, a failure may be that of the disk.
+_LEAST_SPACE = 50e6
 MISSING = (
     "COLMAP finds out where photographs were taken from, and it is not installed: pip install 'blitzgs[sfm]' "
     "(pycolmap; with an NVIDIA GPU also pycolmap-cuda12), or install the program colmap"
@@ -156,8 +158,12 @@ def _run(command: list[str], log: Path, lock: int, heard: Callable[[str], None])
             raise
     if process.returncode:
         how = f"signal {-process.returncode}" if process.returncode < 0 else f"status {process.returncode}"
-        memory = " (the memory may not suffice: use smaller photographs)" if process.returncode == -9 else ""
-        raise StageError(f"COLMAP ended with {how}{memory}: {last} ({log} has all that it said)")
+        why, free = "", shutil.disk_usage(log.parent).free
+        if process.returncode == -9:
+            why = " (the memory may not suffice: use smaller photographs)"
+        elif free < _LEAST_SPACE:
+            why = f" (the disk is nearly full: {free / 1e6:.1f} MB are free)"
+        raise StageError(f"COLMAP ended with {how}{why}: {last} ({log} has all that it said)")
 
 
 def _progress(line: str, photographs: int, report: Report) -> None:

@@ -16,7 +16,7 @@ from blitzgs.capture.check_files import damaged
 from blitzgs.capture.colmap import Float64, find_incomplete_model, find_models
 from blitzgs.capture.image_files import decode_mask, read_header, read_whole
 from blitzgs.capture.masks import find_masks
-from blitzgs.capture.names import IMAGE_SUFFIXES, files_below
+from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, to_convert
 from blitzgs.capture.transforms import find_transforms
 from blitzgs.sfm.engine import MOST_IN_ALL_PAIRS
 from blitzgs.util.output import write_file
@@ -70,14 +70,15 @@ class Photographs:
         """
         names = find_photographs(folder) if folder.is_dir() else []
         if not names:
-            raise FileNotFoundError(f"{folder} has no photographs ({', '.join(IMAGE_SUFFIXES)})")
+            others = to_convert(files_below(folder) if folder.is_dir() else [folder.name])
+            raise FileNotFoundError(f"{folder} has no photographs ({', '.join(IMAGE_SUFFIXES)}){others}")
         root = folder if (folder / "masks").is_dir() else folder.parent
         masks = find_masks(root, None, names, [None] * len(names))
         problems = damaged([(folder / name, mask) for name, mask in zip(names, masks, strict=True)])
         sound = [i for i in range(len(names)) if i not in problems]
         if len(sound) < 3:
             why = f"; {next(iter(problems.values()))}" if problems else ""
-            raise ValueError(f"{folder}: {len(sound)} photographs can be used, 3 are needed{why}")
+            raise ValueError(f"{folder}: 3 photographs are needed, {len(sound)} can be used{why}")
         headers = [read_header(folder / names[i]) for i in sound]
         return cls(
             folder,

@@ -20,7 +20,7 @@ from blitzgs.formats.models import read_gaussians, with_degree
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY, octree_gaussians
-from blitzgs.population.position_noise import PositionNoise
+from blitzgs.population.relocation import PositionNoise
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_cameras
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from blitzgs.config.fields import LossConfig
     from blitzgs.frame.ownership import TileOwners
     from blitzgs.optim.table_adam import TableAdam
-    from blitzgs.population.position_noise import PositionNoise
+    from blitzgs.population.relocation import PositionNoise
     from blitzgs.table.table import GaussianTable
     from blitzgs.training.batches import Batch
     from blitzgs.training.exposure import Exposures

@@ -5,7 +5,6 @@
 #include <vector>
 
 #include "active/blocks.h"
-#include "active/cull_mask.h"
 #include "active/pool.h"
 #include "active/view_gate.h"
 #include "common/parallel.h"

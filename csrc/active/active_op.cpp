@@ -6,7 +6,6 @@
 #include <tuple>
 #include <vector>
 
-#include "active/cull_mask.h"
 #include "active/pool.h"
 #include "active/view_gate.h"
 #include "common/op.h"

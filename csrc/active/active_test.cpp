@@ -3,7 +3,7 @@
 #include <vector>
 
 #include "active/blocks.h"
-#include "active/cull_mask.h"
+#include "active/view_gate.h"
 #include "common/catch.h"
 
 using namespace blitzgs;

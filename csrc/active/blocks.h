@@ -18,7 +18,7 @@
 //
 // A gate on the views (view_gate.h) drops rows by the same principle: the distances of a box from the camera
 // decide first for blocks and then for rows. A row for which they do not decide stays active; the exact test
-// follows when the row has caught up. A cull mask (cull_mask.h) that drops all rows of a block drops the
+// follows when the row has caught up. A cull mask (view_gate.h) that drops all rows of a block drops the
 // block without reading its rows.
 //
 // The test is conservative: every row that the projection would project is in the set

@@ -4,7 +4,7 @@
 #include "active/blocks.h"
 #include "active/view_gate.h"
 #include "common/cuda.cuh"
-#include "math/morton_cuda.cuh"
+#include "math/morton.h"
 
 namespace blitzgs::cuda {
 

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 
-#include "active/cull_mask.h"
 #include "active/view_gate.h"
 #include "common/cuda.cuh"
 
@@ -20,7 +19,7 @@ __device__ std::uint32_t transpose_bits(std::uint32_t word, int lane) {
   return own;
 }
 
-// Converts a mask by rows to sectors or back (cull_mask.h). A CUDA block handles a block of 256 rows; each of
+// Converts a mask by rows to sectors or back (view_gate.h). A CUDA block handles a block of 256 rows; each of
 // its warps handles 32 of these rows, which are one word of each sector.
 template <bool kToSectors>
 __global__ void __launch_bounds__(kBlockRows) transpose_kernel(const CullMask mask) {

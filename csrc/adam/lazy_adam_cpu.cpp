@@ -4,7 +4,6 @@
 
 #include "adam/lazy_adam.h"
 #include "adam/lazy_adam_lanes.h"
-#include "common/cpu_features.h"
 #include "common/parallel.h"
 
 namespace blitzgs::cpu {

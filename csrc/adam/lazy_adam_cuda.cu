@@ -7,7 +7,7 @@
 #include "adam/pending_rows.cuh"
 #include "adam/position_noise.h"
 #include "common/cuda.cuh"
-#include "common/rows.cuh"
+#include "common/rows.h"
 
 namespace blitzgs::cuda {
 

@@ -50,7 +50,7 @@ struct AdamRowJob {
 template <class T>
 using AdamRowUpdate = void (*)(const AdamRowJob<T>& job);
 
-// Defined in lazy_adam_avx2.cpp; call only where the processor has AVX2 and FMA.
+// Defined in common/kernels_avx2.cpp; call only where the processor has AVX2 and FMA.
 AdamRowUpdate<float> avx2_adam_row_update();
 
 namespace {

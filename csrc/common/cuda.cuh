@@ -16,7 +16,7 @@
 // The GPU and the size of the work decide which code runs. A test build takes the other branches on the same
 // machine: BLITZGS_SM80_BRANCHES compiles the code for GPUs before sm_90 for all GPUs, and
 // BLITZGS_SMALL_STATES lowers the number of items from which sorts take 64-bit states (CONTRIBUTING.md).
-// Tests ask the library for both settings (branches_cuda.cu).
+// Tests ask the library for both settings (build_cuda.cu).
 
 #ifndef BLITZGS_SM80_BRANCHES
 #define BLITZGS_SM80_BRANCHES 0

@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// Threads for the CPU kernels, which do not include torch. The library links the torch thread pool
-// (parallel_torch.cpp), so torch.set_num_threads applies to the kernels. The Catch2 tests link plain threads
-// (parallel_std.cpp).
+// Threads for the CPU kernels, which do not include torch, and their vector instructions. The library links
+// the torch thread pool (parallel_torch.cpp), so torch.set_num_threads applies to the kernels. The Catch2
+// tests link plain threads (parallel_std.cpp).
 #pragma once
 #include <atomic>
 #include <cstdint>
+#include <cstdlib>
 
 namespace blitzgs {
 
@@ -41,6 +42,14 @@ void parallel_tasks(std::int64_t n, const F& f) {
   parallel_for(0, num_threads(), 1, [&](std::int64_t begin, std::int64_t) {
     for (std::int64_t task = next++; task < n; task = next++) f(task, static_cast<int>(begin));
   });
+}
+
+// Whether to use AVX2 and FMA: true where the processor has them, unless BLITZGS_NO_AVX2 is set in the
+// environment (read once). The plain code gives the same bits, and a test compares both.
+inline bool use_avx2() {
+  static const bool use = std::getenv("BLITZGS_NO_AVX2") == nullptr && __builtin_cpu_supports("avx2") &&
+                          __builtin_cpu_supports("fma");
+  return use;
 }
 
 }  // namespace blitzgs

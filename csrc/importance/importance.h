@@ -15,6 +15,7 @@
 // pixels fits. CPU and CUDA agree to the rounding of alpha. The cost is O(entries processed x pixels of the
 // splat).
 #pragma once
+#include <cmath>
 #include <cstdint>
 
 #include "common/kernel.h"
@@ -46,5 +47,92 @@ namespace BLITZGS_BACKEND {
 template <class T>
 void contributions(const ContributionInput<T>& in, const ContributionSums& sums, Workspace&, CudaStream);
 }  // namespace BLITZGS_BACKEND
+
+// The sums of the importance sweep (BlitzGS, section 3.2: the score s, c_rad, c_vis and the cull matrix) for
+// a batch of at most kMaxViews views. For each visible Gaussian g the op adds over its consecutive splats i
+// (g in the view v_i):
+//
+//   score[g]   += round(w / (a + eps)^p / unit)   w = weights[i] / 2^32, a = pixels[i]; p is 1, 1/2 or 0; in
+//                                                 float64, to the nearest integer, ties to even
+//   seen[g]    += whether the splat has a radius
+//   counted[g] += counts[i]
+//   cull[g]     : the bit columns[v_i] is cleared if counts[i]; bit c is bit c % 32 of word c / 32
+//
+//   weights int64 [P], pixels int32 [P], radii int32 [P, 2], camera_ids int32 [P], counts bool [P],
+//   visible_ids int32 [U], splat_offsets int32 [U + 1]; score int64 [N], seen and counted int32 [N],
+//   cull int32 [N, words]
+//
+// counts[i]: the splat is in its view's mass cut (mass_cut.h). The sums are integers, and one thread computes
+// those of a Gaussian, so they are exact and need no atomics. The cost is O(P).
+
+enum class ScoreRule : int { kWeight = 0, kRoot = 1, kDensity = 2 };
+
+// Clears the bits of one word of a Gaussian's row of the cull matrix after the other. It stores a word only
+// when the next bit is in another one, because stores would keep the loads of later splats waiting.
+struct CullRow {
+  std::uint32_t* words;
+  std::int32_t word = 0;
+  std::uint32_t bits = 0;
+
+  BLITZGS_HD void clear(std::int32_t column) {
+    if (column / 32 != word) store();
+    word = column / 32;
+    bits |= 1u << column % 32;
+  }
+  BLITZGS_HD void store() {
+    if (bits != 0) words[word] &= ~bits;
+    bits = 0;
+  }
+};
+
+struct ViewSums {
+  const std::int64_t* weights;
+  const std::int32_t* pixels;
+  const std::int32_t* radii;
+  const std::int32_t* camera_ids;
+  const bool* counts;
+  const std::int32_t* visible_ids;
+  const std::int32_t* splat_offsets;
+  std::int64_t n, words;
+  std::int64_t* score;
+  std::int32_t* seen;
+  std::int32_t* counted;
+  std::uint32_t* cull;
+  ScoreRule rule;
+  double eps, unit;
+  std::int32_t columns[kMaxViews];
+
+  BLITZGS_HD void operator()(std::int64_t u) const {
+    const std::int32_t id = visible_ids[u];
+    std::int64_t sum = 0;
+    std::int32_t views = 0, views_counted = 0;
+    CullRow row{cull + id * words};
+    for (std::int64_t i = splat_offsets[u]; i < splat_offsets[u + 1]; ++i) {
+      sum += score_term(i);
+      views += radii[2 * i] > 0 || radii[2 * i + 1] > 0;
+      if (!counts[i]) continue;
+      ++views_counted;
+      row.clear(columns[camera_ids[i]]);
+    }
+    row.store();
+    score[id] += sum;
+    seen[id] += views;
+    counted[id] += views_counted;
+  }
+
+ private:
+  // The summand of a splat, in units of the score, rounded to the nearest integer, ties to even.
+  BLITZGS_HD std::int64_t score_term(std::int64_t splat) const {
+    double term = static_cast<double>(weights[splat]) / 4294967296.0;
+    const double area = static_cast<double>(pixels[splat]) + eps;
+    if (rule == ScoreRule::kDensity) term = term / area;
+    if (rule == ScoreRule::kRoot) term = term / std::sqrt(area);
+#ifdef __CUDA_ARCH__
+    return __double2ll_rn(term / unit);
+#else
+    return static_cast<std::int64_t>(std::nearbyint(term / unit));
+#endif
+  }
+};
 
 }  // namespace blitzgs

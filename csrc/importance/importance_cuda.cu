@@ -5,8 +5,7 @@
 #include <type_traits>
 
 #include "common/cuda.cuh"
-#include "common/rows.cuh"
-#include "importance/view_sums.h"
+#include "common/rows.h"
 #include "rasterize/forward.cuh"
 
 namespace blitzgs::cuda {

@@ -7,7 +7,6 @@
 
 #include "common/rows.h"
 #include "importance/mass_cut.h"
-#include "importance/view_sums.h"
 #include "rasterize/rasterize_op.h"
 
 namespace blitzgs {

@@ -2,8 +2,8 @@
 #include <algorithm>
 #include <limits>
 
+#include "io/byte_reader.h"
 #include "io/colmap.h"
-#include "io/text_reader.h"
 
 namespace blitzgs::io {
 

@@ -9,7 +9,7 @@
 #include <type_traits>
 
 #include "common/catch.h"
-#include "io/text_reader.h"
+#include "io/byte_reader.h"
 
 using namespace blitzgs::io;
 

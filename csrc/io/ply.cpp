@@ -8,7 +8,7 @@
 #include <sstream>
 #include <string>
 
-#include "io/text_reader.h"
+#include "io/byte_reader.h"
 
 namespace blitzgs::io {
 

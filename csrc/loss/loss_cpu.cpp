@@ -2,14 +2,13 @@
 #include <algorithm>
 #include <type_traits>
 
-#include "common/cpu_features.h"
 #include "common/parallel.h"
+#include "loss/photometric.h"
 #include "loss/photometric_strip.h"
-#include "loss/report.h"
 
 namespace blitzgs::cpu {
 
-// photometric_avx2.cpp
+// common/kernels_avx2.cpp
 void photometric_strips_avx2(const PhotometricArgs<float>& args, const std::int64_t* strips,
                              std::int64_t begin, std::int64_t end, double* sums);
 

@@ -7,7 +7,6 @@
 #include <vector>
 
 #include "common/op.h"
-#include "loss/report.h"
 
 namespace blitzgs {
 namespace {

@@ -4,7 +4,6 @@
 
 #include "common/catch.h"
 #include "loss/photometric.h"
-#include "loss/report.h"
 
 using namespace blitzgs;
 

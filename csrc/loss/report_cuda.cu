@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/cuda.cuh"
-#include "loss/report.h"
+#include "loss/photometric.h"
 
 namespace blitzgs::cuda {
 
@@ -8,8 +8,8 @@ namespace {
 
 constexpr int kReportThreads = 256;
 
-// Writes the report (report.h). Each of the first B blocks sums the parts of a view; in the others a thread
-// copies the cost of a tile.
+// Writes the report (photometric.h). Each of the first B blocks sums the parts of a view; in the others a
+// thread copies the cost of a tile.
 __global__ void __launch_bounds__(kReportThreads)
     report_kernel(const __grid_constant__ Report<float> report) {
   const std::int64_t view = blockIdx.x;
@@ -48,7 +48,7 @@ namespace {
 
 constexpr int kLossThreads = 512;
 
-// The loss (report.h), by one block.
+// The loss (photometric.h), by one block.
 __global__ void __launch_bounds__(kLossThreads) loss_of_sums_kernel(const LossOfSums<float> args) {
   double l1 = 0, ssim = 0;
   for (std::int64_t i = threadIdx.x; i < args.n; i += kLossThreads) {

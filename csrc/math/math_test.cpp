@@ -6,7 +6,6 @@
 #include <vector>
 
 #include "common/catch.h"
-#include "math/exp.h"
 #include "math/gaussian.h"
 #include "math/lanes.h"
 #include "math/projection.h"

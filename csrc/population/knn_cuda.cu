@@ -2,7 +2,7 @@
 #include <cub/cub.cuh>
 
 #include "common/cuda.cuh"
-#include "math/morton_cuda.cuh"
+#include "math/morton.h"
 #include "population/knn.h"
 
 namespace blitzgs::cuda {

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+
 #include "common/cuda.cuh"
-#include "common/rows.cuh"
-#include "population/density_stats.h"
-#include "population/find_non_finite.h"
-#include "population/spawn_features.h"
-#include "population/tree_sums.h"
+#include "common/rows.h"
+#include "population/columns.h"
+#include "population/density.h"
 
 namespace blitzgs::cuda {
 
@@ -46,7 +46,7 @@ struct StridedRow {
   __device__ float operator[](int feature) const { return first[feature * kThreads]; }
 };
 
-// sums [M] (tree_sums.h), one thread per row. All threads of a block take the same tree at a time, so that
+// sums [M] (density.h), one thread per row. All threads of a block take the same tree at a time, so that
 // its nodes stay in the L1 cache.
 __global__ void __launch_bounds__(kThreads) tree_sums_kernel(const TreeSumsArgs args) {
   extern __shared__ float shared[];
@@ -70,5 +70,95 @@ void tree_sums(const TreeSumsArgs& args, CudaStream stream) {
 
 template void for_each_row(const DensityStats<float>&, CudaStream);
 template void for_each_row(const SpawnFeatures&, CudaStream);
+
+namespace {
+
+// out (columns.h). A block copies kThreads rows, a thread one word at a time. units: the words in a row.
+template <class Word>
+__global__ void __launch_bounds__(kThreads) copy_rows_kernel(const CopyRows copy, std::uint32_t units) {
+  __shared__ std::int64_t from[kThreads], to[kThreads];
+  const std::int64_t first = blockIdx.x * std::int64_t{kThreads};
+  const auto n = static_cast<std::uint32_t>(copy.n - first < kThreads ? copy.n - first : kThreads);
+  if (threadIdx.x < n) {
+    const std::int64_t i = first + threadIdx.x;
+    from[threadIdx.x] = copy.from ? copy.from[i] : i;
+    to[threadIdx.x] = copy.to ? copy.to[i] : i;
+  }
+  __syncthreads();
+  const auto* column = reinterpret_cast<const Word*>(copy.column);
+  Word* out = reinterpret_cast<Word*>(copy.out);
+#pragma unroll 4
+  for (std::uint32_t i = threadIdx.x; i < n * units; i += kThreads) {
+    const std::uint32_t place = i / units;
+    const std::int64_t k = i - place * units;
+    out[to[place] * units + k] = column ? column[from[place] * units + k] : Word{};
+  }
+}
+
+// Launches the kernel and returns true if the rows are whole, aligned numbers of words of this type.
+template <class Word>
+bool launch_if_whole(const CopyRows& copy, CudaStream stream) {
+  const auto places =
+      reinterpret_cast<std::uintptr_t>(copy.column) | reinterpret_cast<std::uintptr_t>(copy.out);
+  if (copy.row_bytes % sizeof(Word) != 0 || places % sizeof(Word) != 0) return false;
+  copy_rows_kernel<Word><<<blocks_for(copy.n, kThreads), kThreads, 0, stream>>>(
+      copy, static_cast<std::uint32_t>(copy.row_bytes / sizeof(Word)));
+  check_launch("copy_rows");
+  return true;
+}
+
+}  // namespace
+
+void copy_rows(const CopyRows& copy, CudaStream stream) {
+  if (copy.n == 0 || copy.row_bytes == 0) return;
+  if (launch_if_whole<uint4>(copy, stream) || launch_if_whole<uint2>(copy, stream)) return;
+  if (launch_if_whole<std::uint32_t>(copy, stream)) return;
+  launch_if_whole<std::uint8_t>(copy, stream);
+}
+
+namespace {
+
+constexpr int kKeyThreads = 512, kResident = 4;  // blocks per multiprocessor
+
+// keys [n] (columns.h), one thread per item.
+__global__ void __launch_bounds__(kKeyThreads) sampling_keys_kernel(const SamplingKeys args) {
+  const std::int64_t i = blockIdx.x * std::int64_t{kKeyThreads} + threadIdx.x;
+  if (i < args.n) args.keys[i] = sampling_key(args, i);
+}
+
+// Adds to counts [2^width] (columns.h), one thread per key in a grid-stride loop. A block counts in shared
+// memory first.
+__global__ void __launch_bounds__(kKeyThreads) key_histogram_kernel(const KeyHistogram args) {
+  __shared__ unsigned counts[1 << kMaxDigitBits];
+  const int digits = 1 << args.width;
+  for (int i = threadIdx.x; i < digits; i += kKeyThreads) counts[i] = 0;
+  __syncthreads();
+  const std::int64_t prefix = *args.prefix, stride = gridDim.x * std::int64_t{kKeyThreads};
+  for (std::int64_t i = blockIdx.x * std::int64_t{kKeyThreads} + threadIdx.x; i < args.n; i += stride) {
+    const int digit = digit_of(args, prefix, args.keys[i]);
+    if (digit >= 0) atomicAdd(counts + digit, 1u);
+  }
+  __syncthreads();
+  for (int i = threadIdx.x; i < digits; i += kKeyThreads) {
+    if (counts[i] > 0) atomicAdd(reinterpret_cast<unsigned long long*>(args.counts + i), counts[i]);
+  }
+}
+
+}  // namespace
+
+void sampling_keys(const SamplingKeys& args, CudaStream stream) {
+  if (args.n == 0) return;
+  sampling_keys_kernel<<<blocks_for(args.n, kKeyThreads), kKeyThreads, 0, stream>>>(args);
+  check_launch("sampling_keys");
+}
+
+void key_histogram(const KeyHistogram& args, CudaStream stream) {
+  check(cudaMemsetAsync(args.counts, 0, sizeof(*args.counts) << args.width, stream), "key_histogram");
+  if (args.n == 0) return;
+  const auto blocks =
+      std::min(blocks_for(args.n, kKeyThreads), static_cast<unsigned>(kResident * multiprocessors()));
+  key_histogram_kernel<<<blocks, kKeyThreads, 0, stream>>>(args);
+  check_launch("key_histogram");
+}
 
 }  // namespace blitzgs::cuda

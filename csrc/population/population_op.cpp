@@ -1,14 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "population/density_stats.h"
+#include "population/density.h"
 
 #include "common/op.h"
 #include "common/rows.h"
-#include "population/copy_rows.h"
-#include "population/find_non_finite.h"
+#include "population/columns.h"
 #include "population/knn.h"
-#include "population/sampling.h"
-#include "population/spawn_features.h"
-#include "population/tree_sums.h"
 
 namespace blitzgs {
 namespace {
@@ -62,7 +58,7 @@ std::int64_t row_elements(const Tensor& column) {
   return elements;
 }
 
-// Copies rows of `column` (absent: zeros) to `out`; from and to (copy_rows.h) are absent or int64 [n].
+// Copies rows of `column` (absent: zeros) to `out`; from and to (columns.h) are absent or int64 [n].
 void copy_rows(const char* op, Tensor& out, const std::optional<Tensor>& to, const Tensor* column,
                const std::optional<Tensor>& from, std::int64_t n) {
   const std::int64_t row_bytes = row_elements(out) * static_cast<std::int64_t>(out.element_size());

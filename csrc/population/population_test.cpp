@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "common/catch.h"
-#include "population/density_stats.h"
+#include "population/density.h"
 #include "population/knn.h"
 
 using namespace blitzgs;

@@ -2,7 +2,7 @@
 // Compiled without FMA contraction (cmake/cuda.cmake), so that tiles are counted as they are listed.
 #include "project/unscented.h"
 
-#include "common/rows.cuh"
+#include "common/rows.h"
 
 namespace blitzgs::cuda {
 

@@ -9,7 +9,6 @@
 #include <cmath>
 #include <cstdint>
 
-#include "math/exp.h"
 #include "math/lanes.h"
 #include "rasterize/tile_kernels_api.h"
 

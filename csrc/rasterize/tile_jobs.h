@@ -5,7 +5,6 @@
 #include <cmath>
 #include <type_traits>
 
-#include "common/cpu_features.h"
 #include "common/parallel.h"
 #include "rasterize/rasterize.h"
 #include "rasterize/tile_kernels.h"

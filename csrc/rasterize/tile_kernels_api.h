@@ -78,7 +78,7 @@ struct TileKernels {
   void (*list_splats)(const TileJob<T>&, const PixelSplats<T>&);   // writes the rows of the tile's pixels
 };
 
-// Defined in rasterize_avx2.cpp; call only where the processor has AVX2 and FMA.
+// Defined in common/kernels_avx2.cpp; call only where the processor has AVX2 and FMA.
 TileKernels<float> avx2_tile_kernels(int n_channels, bool absgrad);
 
 }  // namespace blitzgs::cpu

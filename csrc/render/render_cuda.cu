@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/cuda.cuh"
-#include "common/rows.cuh"
+#include "common/rows.h"
 #include "project/project_device.cuh"
 #include "render/render.h"
 

@@ -30,6 +30,10 @@ def test_nothing_to_load_is_said_clearly(tmp_path):
     with pytest.raises(FileNotFoundError, match="is not a folder"):
         load_capture(tmp_path / "nowhere")
     (tmp_path / "photographs").mkdir()
+    (tmp_path / "photographs" / "DJI_0001.DNG").touch()
+    (tmp_path / "photographs" / "DJI_0002.MP4").touch()
+    with pytest.raises(FileNotFoundError, match=r"\.dng, \.mp4 cannot be read: convert"):
+        load_capture(tmp_path)
     (tmp_path / "photographs" / "DJI_0001.JPG").touch()
     (tmp_path / "photographs" / "cameras.json").touch()  # a run has such a file, and it is no model
     with pytest.raises(FileNotFoundError, match="has images but not their cameras: blitzgs sfm"):

@@ -141,11 +141,11 @@ def test_gradients_of_splats_stay_in_their_table(monkeypatch):
     # The capacity exceeds the number of splats, so the table is the first part of its memory.
     scene, found = random_scene(400, cameras=1, device="cuda"), []
 
-    def packed_table(columns):
-        found.append(splat_gradients.packed_table(columns))
+    def gradient_table_of(columns):
+        found.append(splat_gradients.gradient_table_of(columns))
         return found[-1]
 
-    monkeypatch.setattr(project, "packed_table", packed_table)
+    monkeypatch.setattr(project, "gradient_table_of", gradient_table_of)
     for _ in range(3):
         leaves = scene.leaves()
         renders, _, meta = blitzgs.rasterization(*leaves.arguments(), sh_degree=scene.sh_degree)

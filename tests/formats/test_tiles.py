@@ -17,7 +17,7 @@ from blitzgs.formats import gaussians as blocks
 from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.tiles import new_folder, upright, write_tiles
 from blitzgs.formats.web_page import WebScene
-from blitzgs.util.processes import ending_by_exception
+from blitzgs.util.progress import ending_by_exception
 from tests.formats.helpers import read_glb
 
 LOD = "comment lod reference_distance 40.0 fork 2.0 levels 4 finest 3"

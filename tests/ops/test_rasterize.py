@@ -10,7 +10,7 @@ import torch
 from blitzgs.ops.intersect import intersect, tile_counts
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.ops.rasterize import rasterize
-from blitzgs.ops.splat_gradients import GradientBuffer, gradient_columns, packed_table
+from blitzgs.ops.splat_gradients import GradientBuffer, gradient_columns, gradient_table_of
 from tests.ops.splats import Splats, dense_composite, kept_by, near_a_cut, random_splats
 from tests.ops.test_photometric import images
 
@@ -331,7 +331,7 @@ def test_a_table_of_gradients_is_found_again_behind_autograd(capacity):
 
         @staticmethod
         def backward(ctx, *v_columns):
-            found.append(packed_table(v_columns))
+            found.append(gradient_table_of(v_columns))
 
     class Composited(torch.autograd.Function):
         @staticmethod
@@ -350,12 +350,12 @@ def test_a_table_of_gradients_is_found_again_behind_autograd(capacity):
 def test_columns_of_no_table_are_not_one():
     table = torch.zeros(5, 12)
     means2d, conics, opacities, colors = gradient_columns(table)
-    assert packed_table((means2d, conics.clone(), opacities, colors)) is None
-    assert packed_table((means2d, conics, opacities, None)) is None
-    assert packed_table((colors[:, :2], conics, opacities, colors)) is None
-    assert packed_table((means2d[:3], conics, opacities, colors)) is None
-    assert packed_table([column[1:] for column in gradient_columns(table)]) is None
-    assert packed_table([column.clone() for column in gradient_columns(table)]) is None
+    assert gradient_table_of((means2d, conics.clone(), opacities, colors)) is None
+    assert gradient_table_of((means2d, conics, opacities, None)) is None
+    assert gradient_table_of((colors[:, :2], conics, opacities, colors)) is None
+    assert gradient_table_of((means2d[:3], conics, opacities, colors)) is None
+    assert gradient_table_of([column[1:] for column in gradient_columns(table)]) is None
+    assert gradient_table_of([column.clone() for column in gradient_columns(table)]) is None
 
 
 def test_the_images_do_not_depend_on_a_backward_pass_to_follow():

@@ -18,6 +18,7 @@ from blitzgs.runs.folder_checks import FolderError, check_room, check_writable, 
 from blitzgs.runs.guard import LossGuard, NonFiniteError
 from blitzgs.runs.log import LOG, RunLog
 from blitzgs.training.trainer import Trainer
+from blitzgs.util import progress
 from tests.distributed.rank_harness import RankError, run_ranks
 from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene, write_tiny_capture
 
@@ -79,14 +80,14 @@ def test_the_remaining_time_follows_a_change_of_speed(tmp_path, monkeypatch, cap
 def test_elsewhere_long_work_prints_a_line_now_and_then(tmp_path, monkeypatch, capsys):
     work_on(tmp_path, monkeypatch, terminal=False)
     assert "views measured" not in capsys.readouterr().out
-    monkeypatch.setattr(run_log, "_LINE_SECONDS", 0.0)
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
     work_on(tmp_path, monkeypatch, terminal=False)
     assert "1 of 2 views measured" in capsys.readouterr().out
     assert [record["t"] for record in records(tmp_path)] == [3, 3]
 
 
 def test_other_ranks_show_nothing(monkeypatch, capsys):
-    monkeypatch.setattr(run_log, "_LINE_SECONDS", 0.0)
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
     monkeypatch.setenv("FORCE_COLOR", "1")
     log = RunLog(None, 40, 0, tensorboard=False)
     log.advance(1)

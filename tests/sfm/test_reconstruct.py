@@ -2,6 +2,7 @@
 """Photographs with known poses become a capture with these poses, also before a training."""
 
 import json
+import math
 import os
 import shutil
 import sqlite3
@@ -253,16 +254,19 @@ def test_what_cannot_work_is_said(tmp_path, monkeypatch, capsys):
         patch.setenv("PATH", "")
         assert "pip install 'blitzgs[sfm]'" in message("photos", "capture")
     (tmp_path / "photos/view_1.jpg").write_bytes(b"hello")
-    assert "2 photographs can be used, 3 are needed" in message("photos", "capture")
+    assert "3 photographs are needed, 2 can be used" in message("photos", "capture")
 
 
-def test_a_failing_stage_shows_colmaps_last_words(tmp_path):
+def test_a_failing_stage_shows_colmaps_last_words(tmp_path, monkeypatch):
     log = tmp_path / "log.txt"
     with log.open("w") as lock, pytest.raises(engine.StageError, match="status 3: it is dark") as error:
         engine._run(
             ["sh", "-c", "echo start; echo it is dark; exit 3"], log, lock.fileno(), lambda line: None
         )
     assert str(log) in str(error.value) and log.read_text() == "start\nit is dark\n"
+    monkeypatch.setattr(engine, "_LEAST_SPACE", math.inf)
+    with log.open("w") as lock, pytest.raises(engine.StageError, match="the disk is nearly full"):
+        engine._run(["false"], log, lock.fileno(), lambda line: None)
 
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -18,7 +18,6 @@ from blitzgs.capture.images import PhotographError
 from blitzgs.config.files import ConfigError
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.importance import PHI, is_culled
-from blitzgs.runs import log as run_log
 from blitzgs.runs import run_files
 from blitzgs.runs.guard import ModelLostError
 from blitzgs.spawn.candidates import FEATURES
@@ -37,6 +36,7 @@ from blitzgs.spawn.lineage_parts import read_lineage
 from blitzgs.table.layouts import CULL
 from blitzgs.training.events import importance
 from blitzgs.training.trainer import Trainer
+from blitzgs.util import progress
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training import tiny
 from tests.training.tiny import (
@@ -86,7 +86,7 @@ def test_how_many_gaussians_the_importance_passes_keep(whole_run):
 
 
 def test_a_pass_says_how_many_views_are_done(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(run_log, "_LINE_SECONDS", 0.0)
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
     train(tmp_path)
     shown = capsys.readouterr().out
     views = len(tiny_scene()[0].train)

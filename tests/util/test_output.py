@@ -12,6 +12,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from blitzgs.util import progress
 from blitzgs.util.charts import line_chart
 from blitzgs.util.output import OutputFolder, new_file, write_file
 from blitzgs.util.progress import Laps, image_progress
@@ -223,6 +224,11 @@ def test_a_terminal_shows_how_far_the_work_is(capsys, monkeypatch):
 def test_a_file_gets_no_bar(capsys, monkeypatch):
     monkeypatch.delenv("FORCE_COLOR", raising=False)
     count(True)
+    assert not capsys.readouterr().err
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
+    count(True)
+    assert "Counting: 3 of 3 images\n" in capsys.readouterr().err
+    count(False)
     assert not capsys.readouterr().err
 
 

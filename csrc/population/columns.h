@@ -1,4 +1,62 @@
 // SPDX-License-Identifier: Apache-2.0
+// Work on columns of a table: copies of rows, checks, and sampling without replacement.
+#pragma once
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+
+#include "common/kernel.h"
+#include "math/counter_random.h"
+
+// Copies rows between columns of a table: row to[i] of `out` becomes row from[i] of `column`.
+//
+// Rows are `row_bytes` bytes each. from, to int64 [n]; null: i. column null: the rows become zeros. No row of
+// `out` may be written twice, or be read. Each row is read and written once.
+namespace blitzgs {
+
+struct CopyRows {
+  const std::byte* column;
+  const std::int64_t* from;
+  std::byte* out;
+  const std::int64_t* to;
+  std::int64_t n, row_bytes;
+};
+
+namespace BLITZGS_BACKEND {
+void copy_rows(const CopyRows&, CudaStream);
+}  // namespace BLITZGS_BACKEND
+
+// Looks for values that are not finite in some columns, and for zeros in others, in one pass without memory
+// of their size: `bad` becomes 1 if there is one, and else keeps its value.
+
+constexpr int kMaxCheckedColumns = 16;
+
+// values [length] of n columns. zero_is_bad: look for zeros instead.
+template <class T>
+struct CheckedColumns {
+  struct Column {
+    const T* values;
+    std::int64_t length;
+    bool zero_is_bad;
+  };
+  Column columns[kMaxCheckedColumns];
+  int n;
+  std::int32_t* bad;
+};
+
+template <class T>
+BLITZGS_HD bool is_bad(T value, bool zero_is_bad) {
+  // A number that is not finite, times zero, is NaN.
+  return zero_is_bad ? value == T(0) : !(value * T(0) == T(0));
+}
+
+namespace BLITZGS_BACKEND {
+void clear_flag(std::int32_t* bad, CudaStream);
+template <class T>
+void check_columns(const CheckedColumns<T>&, CudaStream);
+}  // namespace BLITZGS_BACKEND
+
 // Sampling without replacement in proportion to weights, by exponential races (Efraimidis and Spirakis 2006):
 // each item has the key -log(u) / weight, u uniform in (0, 1), and those with the smallest keys are chosen.
 //
@@ -11,15 +69,6 @@
 // counts the keys with ordered bits b, b >> (shift + width) = prefix, by the digit (b >> shift) mod 2^width;
 // blitzgs/distributed/selection.py finds the k-th smallest key over all ranks by such counts. Each op reads
 // its inputs once.
-#pragma once
-#include <cmath>
-#include <cstdint>
-#include <cstring>
-
-#include "common/kernel.h"
-#include "math/counter_random.h"
-
-namespace blitzgs {
 
 struct SamplingKeys {
   const float* weights;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Functions that tell tests which branches of cuda.cuh the loaded library takes.
+// How this library was built: for `blitzgs doctor`, and for tests, which branches of cuda.cuh it takes.
 #include <cuda_runtime.h>
 
 #include "common/cuda.cuh"
@@ -10,6 +10,9 @@ __device__ const int sm90_branches = BLITZGS_SM90;
 }  // namespace
 
 extern "C" {
+
+// Returns the version of CUDA and the GPUs (cmake/cuda.cmake).
+__attribute__((visibility("default"))) const char* blitzgs_cuda_build() { return BLITZGS_CUDA_BUILD; }
 
 // Returns 1 if the code that the current device runs has the branches for sm_90, otherwise 0; -1 without a
 // device.
