@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import hmac
 import ipaddress
+import os
 import threading
 from urllib.parse import urlsplit
 
@@ -49,7 +50,8 @@ class Door:
         self._thread.start()
         ready.wait()
         if started[0] is not None:
-            raise OSError(f"the viewer cannot listen on {host}:{port}: {started[0]}") from started[0]
+            why = os.strerror(started[0].errno) if started[0].errno else started[0]
+            raise OSError(f"the viewer cannot listen on {host}:{port}: {why}") from started[0]
 
     def close(self) -> None:
         """Stop listening and end all connections."""
