@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.cameras import camera_centres
+from blitzgs.capture.world import GEO, GEOCENTRIC, WorldFrame, read_world_frame
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, EXPOSURES, RunCameras, load_cameras
 from blitzgs.runs.evaluation import FOLDER, INDEX, METRICS, PARTS, preview_file
@@ -45,6 +46,7 @@ class RunData:
     measured: Path | None  # folder of the newest evaluation of the held-out views, or None
     views: dict[str, dict[str, float]]  # metrics of each view, by its name
     problems: list[str] = field(default_factory=list)  # what could not be read, as sentences
+    frame: WorldFrame | None = None  # where the capture lies in the world
 
     @property
     def is_test(self) -> bool:
@@ -65,11 +67,13 @@ def read_run(path: Path) -> RunData:
         (record.get("run") for record in reversed(records) if record.get("event") == "start"), None
     )
     data.log = [record for record in records if record.get("run") == identity]
-    if (path / CAMERAS).exists():
-        try:
+    try:
+        if (path / CAMERAS).exists():
             data.cameras = load_cameras(path)
-        except ValueError as error:
-            data.problems.append(f"{error}.")
+        if (path / GEO).exists():
+            data.frame = read_world_frame(path / GEO)
+    except ValueError as error:
+        data.problems.append(f"{error}.")
     evaluations = path / run_files.EVALUATION
     found = [
         file
@@ -152,12 +156,18 @@ def environment(data: RunData) -> dict[str, object]:
 
 
 def plan(data: RunData) -> dict[str, Any] | None:
-    """Return the cameras from above: (x, y, held out, PSNR or None, name) of each, in the capture's unit."""
+    """Return the cameras from above: (x, y, held out, PSNR or None, name) of each.
+
+    In metres where GPS gave the world, else in the capture's unit.
+    """
     cameras = data.cameras
     if cameras is None or not cameras.cameras:
         return None
     poses = [np.asarray(camera.world_to_camera, dtype=np.float64) for camera in cameras.cameras]
     flat = camera_centres(np.stack(poses)) @ np.stack(horizontal(up_direction(poses)), axis=1)
+    metres = data.frame is not None and data.frame.crs == GEOCENTRIC
+    if data.frame is not None and metres:
+        flat *= data.frame.scale
     step = max(1e-9, float(np.ptp(flat, axis=0).max())) / 5000
     decimals = max(0, math.ceil(-math.log10(step)))
     others = _other_views(data)
@@ -173,7 +183,7 @@ def plan(data: RunData) -> dict[str, Any] | None:
             (*place, int(index in held), None if psnr is None else round(psnr, 2), short_name(name))
         )
     measured = bool(train) and all(cameras.cameras[index].name in known for index in train)
-    return {"points": points, "trained_known": measured}
+    return {"points": points, "trained_known": measured, "unit": "m" if metres else "unit"}
 
 
 def _other_views(data: RunData) -> dict[str, dict[str, float]]:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs.capture.world import GEO, GEOCENTRIC, WorldFrame
 from blitzgs.cli import main
 from blitzgs.cli.report import kept_warnings
 from blitzgs.report.gather import MAX_POINTS
@@ -102,6 +103,20 @@ def test_the_plan_is_seen_from_above(trained):
     space = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     assert (flat <= space + 1e-3 * size).all()
     assert flat.max() > 0.5 * size
+
+
+def test_the_plan_is_in_metres_where_gps_gave_the_world(trained, tmp_path):
+    folder = copied(trained, tmp_path / "run")
+    plain = data_of(report(folder))["cameras"]
+    (folder / GEO).write_text(json.dumps(WorldFrame(GEOCENTRIC, scale=2.0).as_json()))
+    metres = data_of(report(folder))["cameras"]
+    assert (plain["unit"], metres["unit"]) == ("unit", "m")
+    np.testing.assert_allclose(
+        [p[:2] for p in metres["points"]], [[2 * x for x in p[:2]] for p in plain["points"]], atol=0.02
+    )
+    (folder / GEO).write_text("{")
+    data = data_of(report(folder))
+    assert data["cameras"] == plain and GEO in json.dumps(data)
 
 
 def test_measured_training_views_are_coloured_too(trained, tmp_path):

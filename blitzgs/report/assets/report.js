@@ -110,7 +110,7 @@ function plan(open) {
     pen.lineTo(12 + round * scale, height - 12);
     pen.stroke();
     pen.font = "11px system-ui";
-    pen.fillText(`${short(round)} unit${round === 1 ? "" : "s"}`, 12, height - 17);
+    pen.fillText(`${short(round)} ${cameras.unit === "unit" && round !== 1 ? "units" : cameras.unit}`, 12, height - 17);
   }
   function nearest(event) {
     let best = null, least = 14;
