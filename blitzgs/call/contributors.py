@@ -12,7 +12,7 @@ from torch import Tensor
 from blitzgs.call.arguments import check_options, check_tensors, gaussians_of
 from blitzgs.call.bad_values import check_intrinsics, warn_of_gradient, warn_of_non_finite
 from blitzgs.call.extras import checked_pixels
-from blitzgs.call.groups import CUDA_TILE_SIZE
+from blitzgs.call.layout import CUDA_TILE_SIZE
 from blitzgs.ops.importance import UNITS, PixelSplats, pixel_splats, splat_contributions
 from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.project import project_splats

@@ -18,6 +18,7 @@ from blitzgs._torch import hooks_on_saved_tensors
 from blitzgs.call.arguments import Gaussians, Scene
 from blitzgs.call.channels import ImageOptions, channels_of
 from blitzgs.call.covariances import Decomposed, shaped_by
+from blitzgs.call.layout import CUDA_TILE_SIZE, Lists
 from blitzgs.frame.render import run_attempts
 from blitzgs.frame.transport.protocol import Exchange, LocalExchange, LocalTransport
 from blitzgs.ops.project import TableRows, differentiable_splats, project_splats
@@ -30,9 +31,6 @@ from blitzgs.ops.projection_types import (
     first_rows,
 )
 from blitzgs.ops.unscented import Lenses, project_unscented
-
-# The tile size of the CUDA kernels. If the caller asks for another one, only meta's lists have it.
-CUDA_TILE_SIZE = 16
 
 
 class Group(NamedTuple):
@@ -184,16 +182,14 @@ class Rendered(NamedTuple):
 
     Attributes:
         splats: the splats.
-        isect_splats: the tiles' lists.
-        tile_offsets: where they begin.
+        lists: the tiles' lists.
         composited: what `rasterize_fwd` returned, and alphas.
         rows: the visible rows, if the SH are in tables of which only these are read.
         has_blank_view: whether some view sees no Gaussian.
     """
 
     splats: ProjectedSplats
-    isect_splats: Tensor
-    tile_offsets: Tensor
+    lists: Lists
     composited: Sequence[Tensor]
     rows: TableRows | None
     has_blank_view: bool
@@ -271,7 +267,8 @@ def render_queued(
         splats = splats._replace(colors=colors)
         rows = TableRows(inputs._replace(gaussians=found), numbers, indices, sh)
     has_blank_view = 0 in rest[VIEW_TOTALS - 3 :]
-    return Rendered(splats, isect_splats, tile_offsets, images, rows, has_blank_view)
+    lists = Lists(isect_splats, tile_offsets, options.width, options.height, options.tile_size)
+    return Rendered(splats, lists, images, rows, has_blank_view)
 
 
 @lru_cache(maxsize=16)
