@@ -30,7 +30,7 @@ from blitzgs.runs.folder import Model
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.util.output import write_file
 from blitzgs.view.draw import table_of_parameters
-from blitzgs.view.gate import SceneGate
+from blitzgs.view.gate import ModelGate
 from blitzgs.view.views import CameraLike, Space, render_options, viewmat
 
 # Contributions are measured, and pictures drawn, at most so wide.
@@ -45,7 +45,7 @@ def contributions(
     space: Space,
     options: RenderOptions,
     ranks: Ranks,
-    lod: SceneGate | None,
+    lod: ModelGate | None,
     rule: ScoreRule = "weight",
 ) -> Importance:
     """Measure what each Gaussian contributes to views of these cameras, in small pictures."""

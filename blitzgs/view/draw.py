@@ -24,9 +24,9 @@ from blitzgs.ops.projection_types import Sizes, Views
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import PARAMETERS, GaussianTable, schema
-from blitzgs.view.gate import SceneGate
+from blitzgs.view.gate import ModelGate
 from blitzgs.view.look import Look, Mode, Picture
-from blitzgs.view.visible import Scene, VisibleFinder, VisibleScene
+from blitzgs.view.visible import TableOrPool, VisibleFinder, VisibleRows
 
 T = TypeVar("T")
 
@@ -52,17 +52,17 @@ class Subject:
     """The model that is drawn, as it is at one moment.
 
     Attributes:
-        scene: this rank's Gaussians. Pending optimiser steps are not applied, so that looking at a training
-            does not change it; the rows that wait for them are off by far less than a pixel.
+        gaussians: this rank's. Pending optimiser steps are not applied, so that looking at a training does
+            not change it; the rows that wait for them are off by far less than a pixel.
         options: how the model is rendered, at its present spherical-harmonics degree.
         unit: length of a trained unit in the capture's unit.
         lod: the LOD gate; None: there is none.
     """
 
-    scene: Scene
+    gaussians: TableOrPool
     options: RenderOptions
     unit: float
-    lod: SceneGate | None
+    lod: ModelGate | None
 
 
 def table_of_parameters(columns: Mapping[str, Tensor]) -> GaussianTable:
@@ -119,7 +119,7 @@ class Drawer:
         options = self._options(look)
         ranges = assignment = None
         if ranks.world_size > 1:
-            self._together(lambda: _reserve(subject.scene, look, device))
+            self._together(lambda: _reserve(subject.gaussians, look, device))
             ranges = self._owners.divide([None], look.width, look.height, options.tile_size)
             assignment = TileAssignment(ranks, ranges)
         depths = [options.near_plane, options.far_plane]
@@ -156,16 +156,16 @@ class Drawer:
             How many are seen, int64 [1]; what is composited by now, float32 [1, H, W, C], and the light that
             still comes through it, [1, H, W].
         """
-        scene, painted = self._subject.scene, look.mode == "level"
+        gaussians, painted = self._subject.gaussians, look.mode == "level"
         table: GaussianTable
         active: ActiveRows | Callable[[Sizes | None], ActiveRows]
-        if assignment is None and not isinstance(scene, Pool):
+        if assignment is None and not isinstance(gaussians, Pool):
 
             def active(capacity: Sizes | None) -> ActiveRows:
-                room = capacity.blocks if capacity is not None and scene.device.type == "cuda" else None
+                room = capacity.blocks if capacity is not None and gaussians.device.type == "cuda" else None
                 return self._together(lambda: self._found(look, views, options, room)).active
 
-            table = scene
+            table = gaussians
         else:
             # All ranks find their rows before any projects: an error of one rank is one of all.
             table, active, _ = self._together(lambda: self._found(look, views, options))
@@ -196,7 +196,7 @@ class Drawer:
 
     def _found(
         self, look: Look, views: Views, options: RenderOptions, room: int | None = None
-    ) -> VisibleScene:
+    ) -> VisibleRows:
         found = self._finder(look).find(views, options.limits, room)
         if look.crop is None:
             return found
@@ -214,7 +214,7 @@ class Drawer:
             fade=() if gate is None else gate.gate.fade(),
         )
 
-    def _gate(self, look: Look) -> SceneGate | None:
+    def _gate(self, look: Look) -> ModelGate | None:
         """Return the gate of a look, with the levels cut off or faded as it asks."""
         lod = self._subject.lod if look.lod else None
         if lod is None or look.smooth is None or look.smooth == lod.gate.smooth:
@@ -224,18 +224,18 @@ class Drawer:
     def _finder(self, look: Look) -> VisibleFinder:
         key = (look.lod, look.smooth)
         if key not in self._finders:
-            self._finders[key] = VisibleFinder(self._subject.scene, self._gate(look))
+            self._finders[key] = VisibleFinder(self._subject.gaussians, self._gate(look))
         return self._finders[key]
 
 
-def _reserve(scene: Scene, look: Look, device: torch.device) -> None:
+def _reserve(gaussians: TableOrPool, look: Look, device: torch.device) -> None:
     """Allocate the memory of a frame, which torch keeps for it: without, one rank would fail in its middle.
 
     Raises:
         RuntimeError: it cannot.
     """
     if device.type == "cuda":
-        rows = len(scene.held if isinstance(scene, Pool) else scene)
+        rows = len(gaussians.held if isinstance(gaussians, Pool) else gaussians)
         size = rows * _ROW_BYTES + look.width * look.height * _PIXEL_BYTES
         torch.empty(size, dtype=torch.uint8, device=device)
 

@@ -28,7 +28,7 @@ from blitzgs.runs.world import gate_of, load_world_frame, trained_columns
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.draw import Drawer, Subject, table_of_parameters
-from blitzgs.view.gate import SceneGate
+from blitzgs.view.gate import ModelGate
 from blitzgs.view.views import Space, render_options
 from blitzgs.viewer.page import Page
 from blitzgs.viewer.world import Exhibit
@@ -136,7 +136,7 @@ def _open_file(path: Path, ranks: Ranks, paths: Path, most: int | None) -> Opene
     config = Config(model=ModelConfig(antialiased=is_antialiased(found), near=1e-3))
     gate = gate_of(found, space.unit)
     options = render_options(config, space, found.degree, gate)
-    lod = None if gate is None else SceneGate(gate, math.inf if gate.smooth else 0.95, table, ranks)
+    lod = None if gate is None else ModelGate(gate, math.inf if gate.smooth else 0.95, table, ranks)
     exhibit = Exhibit(
         title=path.name,
         space=space,

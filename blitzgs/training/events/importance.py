@@ -15,7 +15,7 @@ from blitzgs.config.schedule import Event
 from blitzgs.population.importance import Importance, ViewBatch, sample_by_score, sweep, top_by_score
 from blitzgs.population.redistribution import redistribute
 from blitzgs.runs.guard import ModelLostError, check_table
-from blitzgs.runs.lod import scene_gate
+from blitzgs.runs.lod import model_gate
 from blitzgs.spawn.lineage import Cause
 from blitzgs.table.table import opacity_logit
 from blitzgs.training import view_level
@@ -39,14 +39,14 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
     views = len(state.capture.train)
     with state.log.work("views surveyed") as report:
         found = sweep(
-            state.stepper.scene,
+            state.stepper.gaussians,
             _reported(view_batches(state), report, views),
             views,
             state.render_options,
             state.ranks,
             state.owners,
             cast(ScoreRule, state.config.population.score),
-            scene_gate(state.config, state.progress, state.table, state.ranks),
+            model_gate(state.config, state.progress, state.table, state.ranks),
             state.stops,
         )
     found.store(state.table, state.config.view.cull)
