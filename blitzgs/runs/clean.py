@@ -29,7 +29,6 @@ from blitzgs.runs.evaluation import image_metrics
 from blitzgs.runs.folder import Model
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.util.output import write_file
-from blitzgs.view.draw import table_of_parameters
 from blitzgs.view.gate import ModelGate
 from blitzgs.view.views import CameraLike, Space, render_options, viewmat
 
@@ -85,7 +84,7 @@ def cleaned(
 
     `photograph` returns the photograph of a camera; None: there are none.
     """
-    table = table_of_parameters({name: getattr(model, name) for name in (*PARAMETERS, "level")})
+    table = GaussianTable.of_parameters({name: getattr(model, name) for name in (*PARAMETERS, "level")})
     gate = None if model.lod is None else model.lod.gate
     options = render_options(model.config, model.space, model.sh_degree, gate)
     views = [cameras.cameras[index] for index in cameras.train]

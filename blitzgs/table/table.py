@@ -170,6 +170,22 @@ class GaussianTable:
         table.append(first | dict(rows))
         return table
 
+    @classmethod
+    def of_parameters(cls, columns: Mapping[str, Tensor]) -> GaussianTable:
+        """Build a table for rendering only: the columns of the optimiser are zeros that take no memory.
+
+        Args:
+            columns: `PARAMETERS`, and "level" and "id" if known.
+        """
+        sh = columns["sh"]
+        count, known = len(sh), dict(columns)
+        if "id" not in known:
+            known["id"] = torch.arange(count, device=sh.device)
+        for name, column in schema(round(sh.shape[1] ** 0.5) - 1).items():
+            if name not in known:
+                known[name] = sh.new_zeros((), dtype=column.dtype).expand(count, *column.shape)
+        return cls(known)
+
     def __len__(self) -> int:
         return int(self.columns["means"].shape[0])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TypeVar, cast
@@ -23,7 +23,7 @@ from blitzgs.ops.host import to_host
 from blitzgs.ops.projection_types import Sizes, Views
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.table.pool import Pool
-from blitzgs.table.table import PARAMETERS, GaussianTable, schema
+from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.gate import ModelGate
 from blitzgs.view.look import Look, Mode, Picture
 from blitzgs.view.visible import TableOrPool, VisibleFinder, VisibleRows
@@ -63,23 +63,6 @@ class Subject:
     options: RenderOptions
     unit: float
     lod: ModelGate | None
-
-
-def table_of_parameters(columns: Mapping[str, Tensor]) -> GaussianTable:
-    """Return a table for rendering only: the columns of the optimiser take no memory.
-
-    Args:
-        columns: `PARAMETERS`, and "level" and "id" if known.
-    """
-    sh = columns["sh"]
-    count, degree = len(sh), round(sh.shape[1] ** 0.5) - 1
-    known = dict(columns)
-    if "id" not in known:
-        known["id"] = torch.arange(count, device=sh.device)
-    for name, column in schema(degree).items():
-        if name not in known:
-            known[name] = sh.new_zeros((), dtype=column.dtype).expand(count, *column.shape)
-    return GaussianTable(known)
 
 
 class DrawingError(RuntimeError):
@@ -257,7 +240,7 @@ def _painted(table: GaussianTable) -> GaussianTable:
     levels = table["level"].int() % len(colours)
     sh = ((colours - 0.5) / _SH_0)[levels][:, None]
     columns = {name: table[name] for name in (*PARAMETERS[:4], "level", "id")}
-    return table_of_parameters(columns | {"sh": sh})
+    return GaussianTable.of_parameters(columns | {"sh": sh})
 
 
 def _channels(frame: Frame, mode: Mode) -> Tensor:
