@@ -103,26 +103,17 @@ def set_up(
 
     run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
     if ranks.rank == 0:
-        save_config(config, folder / run_files.CONFIG)
-        if restored is None or not (folder / CAMERAS).exists():
-            save_cameras(folder, capture, run_id)
-            if restored is None and capture.about.source.frame is not None:
-                save_world_frame(folder, capture.about.source.frame)
+        _describe(folder, config, capture, run_id, is_new=restored is None)
     optimiser = TableAdam(config.optimiser, schedule, space.extent, ranks.device)
     owners = _tile_owners(ranks, progress, restored)
     views = ViewSet(list(capture.cameras), space, ranks.device)
-    sizes = [(capture.cameras[i].width, capture.cameras[i].height) for i in capture.train]
-    tour = None
-    if config.memory.resident_gb > 0 and config.memory.tour:
-        tour = tour_of([capture.cameras[i] for i in capture.train], capture.points)
-    sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed, schedule, tour)
+    sampler = _sampler(config, capture, schedule)
     if config.memory.resident_gb > 0:
         if restored is not None and restored.config.memory.resident_gb == 0:
             sort_rows(table)  # as events do for a table in host memory
         table = HostTable(table.release(), pinned=ranks.device.type == "cuda")
-    stepper = _stepper(
-        config, table, optimiser, owners, space.extent, UpcomingCameras(sampler, capture.train, views)
-    )
+    upcoming = UpcomingCameras(sampler, capture.train, views)
+    stepper = _stepper(config, table, optimiser, owners, space.extent, upcoming)
     if config.model.exposure:
         stepper.exposures = _exposures(capture, images, ranks, progress, restored)
     lineage = _start_lineage(config, capture, folder, table, progress, ranks)
@@ -164,6 +155,15 @@ def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
         raise FileExistsError(
             f"{folder} already holds a run: add --resume to continue it, or choose another --out"
         )
+
+
+def _describe(folder: Path, config: Config, capture: Capture, run_id: str, is_new: bool) -> None:
+    """Write what the folder of a run tells of its configuration, its cameras and its world."""
+    save_config(config, folder / run_files.CONFIG)
+    if is_new or not (folder / CAMERAS).exists():
+        save_cameras(folder, capture, run_id)
+    if is_new and capture.about.source.frame is not None:
+        save_world_frame(folder, capture.about.source.frame)
 
 
 def _resolved(config: Config, capture: Capture, restored: run_files.Restored | None) -> Config:
@@ -235,6 +235,16 @@ def _exposures(
     return exposures if restored is not None or exposures_differ(gains) else None
 
 
+def _sampler(config: Config, capture: Capture, schedule: Schedule) -> BatchSampler:
+    """Return the sampler of batches, with a tour of the views if the Gaussians are in a pool."""
+    cameras = [capture.cameras[i] for i in capture.train]
+    tour = None
+    if config.memory.resident_gb > 0 and config.memory.tour:
+        tour = tour_of(cameras, capture.points)
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    return BatchSampler(sizes, config.schedule.batch_size, config.seed, schedule, tour)
+
+
 def _stepper(
     config: Config,
     table: GaussianTable,
@@ -244,26 +254,15 @@ def _stepper(
     upcoming: UpcomingCameras,
 ) -> Stepper:
     """Return a stepper for a table on the device, or one with a pool for a table on the host."""
-    shared = (
-        optimiser,
-        owners,
-        config.loss,
-        extent,
-        _position_noise(config, extent),
-    )
+    noise, factor = None, config.optimiser.position_noise
+    if factor > 0:
+        noise = PositionNoise(factor, extent, config.population.min_opacity, config.seed)
+    shared = (optimiser, owners, config.loss, extent, noise)
     if not isinstance(table, HostTable):
         return Stepper(table, *shared)
     budget = int(config.memory.resident_gb * 1e9)
     pool = Pool(table, owners.ranks.device, budget, optimiser.pending_table)
     return OffloadingStepper(pool, upcoming, *shared)
-
-
-def _position_noise(config: Config, extent: float) -> PositionNoise | None:
-    """Return the noise of `optimiser.position_noise`; None if it is 0."""
-    factor = config.optimiser.position_noise
-    if factor == 0:
-        return None
-    return PositionNoise(factor, extent, config.population.min_opacity, config.seed)
 
 
 def _start_lineage(
