@@ -19,7 +19,7 @@ from torch import Tensor
 import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.call.extras import Pixels
 from blitzgs.ops.derivatives import linear_map
-from blitzgs.ops.intersect import TileGrid
+from blitzgs.ops.intersect import TileGrid, tile_counts
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import MetaGeometry
 
@@ -224,12 +224,12 @@ class Lists:
     @property
     def tiles_x(self) -> int:
         """Number of tiles in a row."""
-        return -(-self.width // self.tile_size)
+        return tile_counts(self.width, self.height, self.tile_size)[0]
 
     @property
     def tiles_y(self) -> int:
         """Number of tiles in a column."""
-        return -(-self.height // self.tile_size)
+        return tile_counts(self.width, self.height, self.tile_size)[1]
 
     def listed(self) -> Tensor:
         """Return `splats` without the undefined entries, which exist if splats are hidden."""
@@ -273,7 +273,7 @@ def _lists(splats: ProjectedSplats, grid: TileGrid, n_isects: int) -> Lists:
 
 def _lists_of_pixels(splats: ProjectedSplats, grid: TileGrid, pixels: Pixels) -> Lists:
     edge = grid.tile_size
-    rows, columns = -(-grid.height // edge), -(-grid.width // edge)
+    columns, rows = tile_counts(grid.width, grid.height, edge)
     wanted = torch.zeros(grid.n_cameras, rows, columns, dtype=torch.bool, device=splats.means2d.device)
     wanted[pixels.images, pixels.rows // edge, pixels.columns // edge] = True
     near = _splats_near(splats, wanted, edge)

@@ -17,6 +17,7 @@ from blitzgs.population.redistribution import redistribute
 from blitzgs.runs.guard import ModelLostError, check_table
 from blitzgs.runs.lod import model_gate
 from blitzgs.spawn.lineage import Cause
+from blitzgs.table.blocks import sort_rows
 from blitzgs.table.table import opacity_logit
 from blitzgs.training import view_level
 from blitzgs.training.state import TrainingState
@@ -60,7 +61,7 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
     if after == 0:
         raise ModelLostError(_nothing_kept(state, event, before))
     redistribute(state.table, state.ranks, max_imbalance=0)
-    state.sort()
+    sort_rows(state.table)
     state.stepper.reindex()
     progress = state.progress
     milestones = progress.milestones | {f"before_{event.kind}": before, f"after_{event.kind}": after}
