@@ -78,6 +78,7 @@ def render(
     lead = gaussians.lead
     if job is not None:
         (rendered, channels), lead = send_splats(rendered, channels, job), (job.views,)
+    images = math.prod(lead)
     if queued is not None:
         lists = composited_lists = queued.lists
     else:
@@ -85,10 +86,10 @@ def render(
         # of covariances differ from the projection's by rounding: their tiles have to be counted again.
         uncounted = compiling or job is not None or groups[0].covariances is not None
         count = -1 if uncounted else int(splats.counts[2])
-        lists, composited_lists = lists_of(rendered, math.prod(lead), projection, count, image.pixels)
+        lists, composited_lists = lists_of(rendered, images, projection, count, image.pixels)
     renders, alphas = rasterize(
         rendered.means2d, rendered.conics, rendered.opacities, channels,
-        composited_lists.splats, composited_lists.offsets, n_cameras=math.prod(lead), width=projection.width,
+        composited_lists.splats, composited_lists.offsets, n_cameras=images, width=projection.width,
         height=projection.height, tile_size=composited_lists.tile_size, backgrounds=image.backgrounds,
         store_absgrad=layout.absgrad_store(arranged["means2d"]) if image.absgrad else None,
         composited=None if queued is None else queued.composited, meta_geometry=meta_geometry,
@@ -96,14 +97,12 @@ def render(
     if not compiling:
         # A view with a bad camera sees no Gaussian. Reading `cameras` does not wait: the host has waited for
         # the projection, which was queued after their copy.
-        suspects_cameras = not cameras.are_finite() if cameras is not None else False
+        suspects_cameras = cameras is not None and not cameras.are_finite()
         if queued is not None and queued.has_blank_view:
             check_intrinsics(gaussians.named["Ks"])
             suspects_cameras = True
         watch_for_non_finite(gaussians, layout, function, nan_marks, suspects_cameras)
-    median = None
-    if image.median:
-        median = _median_depths(rendered, composited_lists, math.prod(lead), image.pixels)
+    median = _median_depths(rendered, composited_lists, images, image.pixels) if image.median else None
     renders, alphas, others = _images_of_caller(renders, alphas, median, gaussians, image, lead)
     arrived = None if job is None else rendered
     return renders, alphas, make_meta(gaussians, layout, {**arranged, **others}, lists, lead, arrived)
