@@ -7,8 +7,7 @@ painted by procedural materials (`materials`, `ground`), photographed with Embre
 (`tracks`, `generate`).
 """
 
-from blitzgs_synth.command import add_arguments, run
-from blitzgs_synth.generate import generate_city
-from blitzgs_synth.options import PRESETS, CityOptions
+from blitzgs_synth.generate import add_arguments, generate_city, run
+from blitzgs_synth.plan import PRESETS, CityOptions
 
 __all__ = ["PRESETS", "CityOptions", "add_arguments", "generate_city", "run"]

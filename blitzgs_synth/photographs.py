@@ -19,7 +19,7 @@ from blitzgs.util.output import write_file
 from blitzgs.util.progress import follow_parent
 from blitzgs_synth.arrays import Bytes
 from blitzgs_synth.flight import View
-from blitzgs_synth.options import CityOptions
+from blitzgs_synth.plan import CityOptions
 from blitzgs_synth.render import City
 from blitzgs_synth.tracks import Corners, find_corners
 

@@ -59,7 +59,6 @@ target_compile_options(
 set_source_files_properties(
   ${CMAKE_SOURCE_DIR}/csrc/project/project_cuda.cu
   ${CMAKE_SOURCE_DIR}/csrc/project/write_splats_cuda.cu
-  ${CMAKE_SOURCE_DIR}/csrc/project/unscented_cuda.cu
   ${CMAKE_SOURCE_DIR}/csrc/intersect/intersect_cuda.cu
   PROPERTIES COMPILE_OPTIONS "-fmad=false"
 )

@@ -49,9 +49,9 @@ def add_command(
 
 def add_synth(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add `blitzgs synth`, a package of its own."""
-    from blitzgs_synth import command
+    import blitzgs_synth
 
-    command.add_arguments(add_command(commands, "synth", command.run, summary))
+    blitzgs_synth.add_arguments(add_command(commands, "synth", blitzgs_synth.run, summary))
 
 
 def named_path(text: str) -> Path:

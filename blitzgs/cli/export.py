@@ -79,7 +79,7 @@ A city that no browser holds at once is written as a folder that viewers load pi
   blitzgs export RUN|CHECKPOINT|FILE.ply --tiles CITY       # 3D Tiles 1.1; then blitzgs view CITY
   blitzgs export RUN|CHECKPOINT|FILE.ply --streamed-sog CITY  # for SuperSplat
 
-Memory does not grow with the model; the disk needs twice the size of the model. See docs/guide/tiles.md.
+Memory does not grow with the model; the disk needs twice the size of the model. See docs/guide/formats.md.
 """
 _TILES = "--tiles and --streamed-sog"
 _COUNT = arguments.number(int, lambda value: value >= 1, "a whole number from 1 on")

@@ -28,7 +28,7 @@ from blitzgs.util.output import check_replaceable
 BLOCK = 256
 # Value of one step of a quantised SH coefficient. Coefficients beyond 127 steps are cut off.
 HARMONIC = 1 / 64
-_PARTS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag", "sorter.js", "viewer.js", "file.js")
+_PARTS = ("splat.vert", "sorter.js", "viewer.js", "file.js")
 # Gaussians of which the size of all is estimated.
 _SAMPLE = 1 << 16
 

@@ -43,7 +43,6 @@ def page(
     assets = files("blitzgs.report") / "assets"
     values = {
         "@TITLE@": as_html(title),
-        "@STYLE@": (assets / "style.css").read_text(encoding="utf-8"),
         "@SCRIPT@": "\n".join((assets / name).read_text(encoding="utf-8") for name in scripts),
         "@DATA@": _json(data),
         "@LOOK@": _json(look),

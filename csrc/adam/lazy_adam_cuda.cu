@@ -4,7 +4,6 @@
 #include <type_traits>
 
 #include "adam/lazy_adam_device.cuh"
-#include "adam/pending_rows.cuh"
 #include "adam/position_noise.h"
 #include "common/cuda.cuh"
 #include "common/rows.h"
@@ -14,7 +13,7 @@ namespace blitzgs::cuda {
 namespace {
 
 // The lazy optimiser (lazy_adam.h) on CUDA. Catching up takes three kernels: prepare computes the rules and
-// list_pending_rows lists the rows with pending steps (pending_rows.cuh), and catch_up_kernel moves their
+// list_pending_rows lists the rows with pending steps (lazy_adam_device.cuh), and catch_up_kernel moves their
 // parameters. step_kernel then takes the step with gradients. A parameter that is stepped alone has kernels
 // of its own.
 

@@ -5,6 +5,7 @@
 #include <cstdint>
 
 #include "adam/lazy_adam.h"
+#include "common/cuda.cuh"
 
 namespace blitzgs::cuda {
 
@@ -63,5 +64,116 @@ class StepPack {
   std::int64_t at_;
   int pack_;
 };
+
+// The first two kernels of catching up, for lazy_adam_cuda.cu: prepare computes the rules by which rows catch
+// up, and list_pending_rows lists the rows with pending steps.
+
+inline constexpr int kPrepareLanes = 8, kPrepareThreads = 64, kListThreads = 256;
+static_assert(kPrepareLanes > kAdamGroups);
+
+// The rules and decays by which rows catch up. All rows of a launch catch up to the same step, so the rules
+// depend on the row's last_step alone and are computed once for each such step. If final rules are tabulated,
+// only those of the last explicit_steps steps are computed.
+struct Prepared {
+  PendingSteps<float>* pending;  // [target - first], for parameters at the steps first, first + 1, ...
+  Decay* decays;                 // [n_decays], the decay of the moments over i steps
+  bool* any_pending;             // whether any row has pending steps
+  const PendingSteps<float>* final_rules;  // for parameters at the steps before `first`
+  std::int32_t first, n_decays;
+
+  __device__ const PendingSteps<float>& of(std::int32_t from) const {
+    return from < first ? final_rules[from] : pending[from - first];
+  }
+};
+
+// Computes prepared.pending and prepared.decays. kPrepareLanes lanes per step, one for each learning-rate
+// group, because the kernel's time is that of a chain of divisions.
+static __global__ void __launch_bounds__(kPrepareThreads)
+    prepare(const __grid_constant__ AdamArgs<float> args, const Prepared prepared) {
+  wait_for_earlier_kernels();
+  const auto thread = static_cast<std::int32_t>(blockIdx.x * kPrepareThreads + threadIdx.x);
+  const std::int32_t i = thread / kPrepareLanes, t = prepared.first + i, target = args.target();
+  const int group = thread % kPrepareLanes;
+  if (thread == 0) *prepared.any_pending = false;
+  if (i < prepared.n_decays && group == kPrepareLanes - 1) prepared.decays[i] = make_decay(args, i);
+  double error = 0;
+  if (t < target && group < kAdamGroups)
+    prepared.pending[i].rules[group] = adam_rule(args, t, target, group, error);
+#pragma unroll
+  for (int step = 1; step < kPrepareLanes; step *= 2) {
+    error = fmax(error, __shfl_xor_sync(kFullWarp, error, step));
+  }
+  if (t >= target || group != 0) return;
+  PendingSteps<float>& steps = prepared.pending[i];
+  steps.from = t;
+  steps.to = target;
+  steps.explicit_up_to = adam_explicit_up_to(args, t, target, error);
+}
+
+// A row with pending steps.
+struct alignas(16) PendingRow {
+  std::int32_t id;    // -1: the row has no pending steps, or has taken them already
+  std::int32_t from;  // the step of its parameters
+  Decay here;         // the decay of its moments up to that step
+};
+
+// One column of a row catches up if the rules are not exact enough for all its elements. All lanes of the
+// warp call this, each for some elements of the row.
+template <int Column>
+__device__ void catch_up_elements(const AdamArgs<float>& args, const PendingSteps<float>& steps,
+                                  const Decay& here, std::int64_t row) {
+  const AdamColumn<float>& column = args.columns[Column];
+  for (int j = threadIdx.x % 32; j < column.width; j += 32) {
+    const std::int64_t at = row * column.width + j;
+    column.param[at] -= adam_drift(args, steps, adam_group(Column, j), column.exp_avg[at] * here.first,
+                                   column.exp_avg_sq[at] * here.second);
+  }
+}
+
+// The number of valid rows in the list. A count above n says that the caller had too little room for the list
+// and will repeat its work; the n rows that are there are valid.
+__device__ inline std::int64_t listed(const AdamArgs<float>& args) {
+  return args.count && *args.count < args.n ? *args.count : args.n;
+}
+
+// Writes the pending rows [n], one thread per listed row, and sets last_step to the target, as if the rows
+// had caught up. Rows for which the rules are not exact enough, which occur only early in a schedule, catch
+// up here, each by a whole warp.
+static __global__ void __launch_bounds__(kListThreads)
+    list_pending_rows(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
+                      PendingRow* pending_rows) {
+  wait_for_earlier_kernels();
+  const std::int64_t n = listed(args);
+  for (std::int64_t first = blockIdx.x * std::int64_t{kListThreads}; first < n;
+       first += gridDim.x * std::int64_t{kListThreads}) {
+    const std::int64_t i = first + threadIdx.x;
+    PendingRow mine{-1, 0, {}};
+    bool explicitly = false;
+    if (i < n) {
+      const std::int32_t row = static_cast<std::int32_t>(args.row(i));
+      const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
+      if (adam_moves(args, from, stand)) {
+        mine = {row, from, prepared.decays[from - stand]};
+        explicitly = prepared.of(from).explicit_up_to >= 0;
+      }
+      if (from < args.step) args.last_step[row] = args.step;
+    }
+    for (unsigned left = __ballot_sync(kFullWarp, explicitly); left; left &= left - 1) {
+      const int lane = __ffs(left) - 1;
+      const std::int64_t row = __shfl_sync(kFullWarp, mine.id, lane);
+      const PendingSteps<float>& steps = prepared.of(__shfl_sync(kFullWarp, mine.from, lane));
+      const Decay here{__shfl_sync(kFullWarp, mine.here.first, lane),
+                       __shfl_sync(kFullWarp, mine.here.second, lane)};
+      catch_up_elements<0>(args, steps, here, row);
+      catch_up_elements<1>(args, steps, here, row);
+      catch_up_elements<2>(args, steps, here, row);
+      catch_up_elements<3>(args, steps, here, row);
+      catch_up_elements<4>(args, steps, here, row);
+    }
+    if (explicitly) mine.id = -1;
+    if (i < n) pending_rows[i] = mine;
+    if (__any_sync(kFullWarp, mine.id >= 0) && threadIdx.x % 32 == 0) *prepared.any_pending = true;
+  }
+}
 
 }  // namespace blitzgs::cuda

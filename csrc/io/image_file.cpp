@@ -12,8 +12,6 @@
 #include <cstring>
 #include <string_view>
 
-#include "io/jpeg.h"
-
 namespace blitzgs::io {
 
 namespace {

@@ -25,7 +25,6 @@
 #include "io/image_file.h"
 #include "io/image_header.h"
 #include "io/ply.h"
-#include "io/qoi.h"
 
 // The interface. Only these types and functions cross the border of the library, so that it contains the C++
 // library that it was built with.

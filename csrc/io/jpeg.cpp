@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "io/jpeg.h"
+#include "io/image_file.h"
 
 #include <algorithm>
 #include <array>
@@ -26,7 +26,7 @@ constexpr unsigned kMaxComponents = 4;
 // More bytes than these after the last block of a scan are image data.
 constexpr std::size_t kMaxForeignBytes = 4096;
 
-// The check of one file (jpeg.h).
+// The check of one file (image_file.h).
 class Checker {
  public:
   Checker(std::span<const std::uint8_t> file, const std::string& name) : file_(file), name_(name) {}

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "io/qoi.h"
+#include "io/image_file.h"
 
 #include <array>
 #include <cstring>

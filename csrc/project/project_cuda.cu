@@ -3,8 +3,10 @@
 // (kernel 3), and project(), which queues the three kernels. Compiled without FMA contraction
 // (cmake/cuda.cmake), as write_splats_cuda.cu.
 #include "common/cuda.cuh"
+#include "common/rows.h"
 #include "math/frustum.h"
 #include "project/project_device.cuh"
+#include "project/unscented.h"
 
 #include <algorithm>
 
@@ -241,5 +243,10 @@ void color_splats<float>(const Inputs& in, const ProjectCapacity& capacity,
                          const ProjectColumns<float>& columns, Workspace&, CudaStream stream) {
   write_colors(in, capacity, columns, stream);
 }
+
+// The unscented projection.
+template void for_each_row(const UnscentedVisible<float>&, CudaStream);
+template void for_each_row(const UnscentedSplats<float>&, CudaStream);
+template void for_each_row(const UnscentedGradients<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda

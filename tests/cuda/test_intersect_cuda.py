@@ -8,7 +8,7 @@ from blitzgs.ops.blocks import ActiveRows, gate_views_
 from blitzgs.ops.importance import STEPS, MassCut
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import ViewGate
-from tests.cuda.scenes import Scene, ops, relative_error
+from tests.cuda.conftest import Scene, ops, relative_error
 from tests.table.test_blocks import make_views
 from tests.view.test_gate import GATE, bits, kept_by_definition, make_scene
 

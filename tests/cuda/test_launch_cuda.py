@@ -15,7 +15,7 @@ from blitzgs.ops.host import HostCopy, PinnedNumbers, current_stream
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, splats_of
 from blitzgs.ops.splat_gradients import SplatGradients
-from tests.cuda.scenes import Scene, ops
+from tests.cuda.conftest import Scene, ops
 from tests.helpers import sum_of_ranks
 
 SIZES = (3000, 40, 30_000, 700)

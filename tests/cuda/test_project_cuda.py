@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, WeightedViews, splats_of
 from blitzgs.ops.rasterize import RasterizeSaved
-from tests.cuda.scenes import Scene, ops, relative_error
+from tests.cuda.conftest import Scene, ops, relative_error
 from tests.ops.splats import kept_by
 
 NAMES = ("gaussian_ids", "camera_ids", "visible_ids", "splat_offsets")

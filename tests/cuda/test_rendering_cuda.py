@@ -15,7 +15,7 @@ from blitzgs.ops.projection_types import Sizes, WeightedViews
 from blitzgs.ops.splat_gradients import gradient_columns
 from blitzgs.table.blocks import BlockIndex, morton_order
 from blitzgs.table.table import GaussianTable
-from tests.cuda.scenes import ops
+from tests.cuda.conftest import ops
 from tests.frame.test_sharded_rendering import OPTIONS, cameras
 from tests.helpers import PARAMETERS, parameter_gradients, random_scene, relative_error
 from tests.training.tiny import random_gaussians

@@ -12,7 +12,7 @@ from blitzgs.ops.importance import CHOICE_STEP, ROUNDS, STEPS, TIES_STEP, UNITS,
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project
 from blitzgs.ops.rasterize import rasterize
-from blitzgs.reference.importance import contributions as by_definition
+from blitzgs.reference.render import contributions as by_definition
 from blitzgs.spawn.candidates import FEATURES, spawn_features
 from blitzgs.table.table import GaussianTable
 from tests.helpers import BACKENDS, DEVICES, random_scene

@@ -11,8 +11,7 @@ import torch
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
 from blitzgs.ops.unscented import GLOBAL_SHUTTER, Lenses, largest_angles, project_unscented
-from blitzgs.reference.projection import sh_colors
-from blitzgs.reference.unscented import View, lens_pixels, unscented_splats
+from blitzgs.reference.projection import View, lens_pixels, sh_colors, unscented_splats
 from tests.helpers import BACKENDS, random_scene, relative_error
 
 BROWN = (-0.1, 0.02, 0.003, 0.01, 0.02, 0.001, 0.003, -0.004, 0.001, 0.002, -0.002, 0.003)

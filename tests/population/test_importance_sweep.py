@@ -25,8 +25,8 @@ from blitzgs.population.importance import (
     sweep,
     top_by_score,
 )
-from blitzgs.reference.importance import scores as by_definition
-from blitzgs.reference.importance import top_mass
+from blitzgs.reference.render import scores as by_definition
+from blitzgs.reference.render import top_mass
 from blitzgs.table.table import GaussianTable
 from tests.distributed.rank_harness import on_cuda, on_each_device, run_ranks
 from tests.helpers import DEVICES, needs_cuda

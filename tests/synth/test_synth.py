@@ -19,9 +19,8 @@ from blitzgs_synth import add_arguments, generate_city, run
 from blitzgs_synth.city import tower_height
 from blitzgs_synth.flight import CLIMB, flight_height, plan_flight
 from blitzgs_synth.materials import Noise, cell_random, inside, stripes
-from blitzgs_synth.options import PRESETS, CityOptions
 from blitzgs_synth.photographs import each
-from blitzgs_synth.plan import Plan
+from blitzgs_synth.plan import PRESETS, CityOptions, Plan
 from blitzgs_synth.render import RayCaster
 from blitzgs_synth.tracks import ball, may_see
 

@@ -13,9 +13,7 @@
 #include "io/colmap.h"
 #include "io/image_file.h"
 #include "io/image_header.h"
-#include "io/jpeg.h"
 #include "io/ply.h"
-#include "io/qoi.h"
 
 namespace io = blitzgs::io;
 

@@ -1,17 +1,37 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "io/jpeg.h"
-
+#include <algorithm>
+#include <string_view>
 #include <vector>
 
 #include "common/catch.h"
+#include "io/image_file.h"
+#include "io/image_header.h"
 
 using namespace blitzgs::io;
+using namespace std::string_view_literals;
 
 namespace {
 
 using Bytes = std::vector<std::uint8_t>;
 
 void append(Bytes& out, const Bytes& more) { out.insert(out.end(), more.begin(), more.end()); }
+
+// The reason that a reader gives for refusing a file, or an empty string.
+template <class F>
+std::string refusal(const F& read, const Bytes& file) {
+  try {
+    read(file);
+    return "";
+  } catch (const FormatError& error) {
+    return error.what();
+  }
+}
+
+}  // namespace
+
+// JPEG
+
+namespace {
 
 Bytes segment(std::uint8_t marker, const Bytes& payload) {
   const std::size_t length = payload.size() + 2;
@@ -64,14 +84,8 @@ Bytes progressive(const Bytes& dc, const Bytes& first, const Bytes& refinement) 
   return out;
 }
 
-// The reason a file is refused, or an empty string.
 std::string problem(const Bytes& file) {
-  try {
-    check_jpeg(file, "f");
-    return "";
-  } catch (const FormatError& error) {
-    return error.what();
-  }
+  return refusal([](const Bytes& jpeg) { check_jpeg(jpeg, "f"); }, file);
 }
 
 bool mentions(const Bytes& file, const char* reason) {
@@ -200,4 +214,152 @@ TEST_CASE("JPEGs with wrong bytes pass or are refused, never worse") {
     }
   }
   REQUIRE(refusals > 0);
+}
+
+// QOI
+
+namespace {
+
+std::uint32_t next_random(std::uint32_t& state) {
+  state = state * 1664525u + 1013904223u;
+  return state >> 16;
+}
+
+// An image that needs every kind of code: flat runs, gentle ramps, noise, and pixels that occur again.
+Bytes some_image(QoiSize size) {
+  Bytes rgb(3 * std::size_t{size.width} * size.height);
+  std::uint32_t state = 7;
+  for (std::size_t i = 0; i < rgb.size(); ++i) {
+    const std::size_t pixel = i / 3;
+    const std::uint32_t kind = (pixel / 97) % 4;
+    if (kind == 0) rgb[i] = 200;
+    if (kind == 1) rgb[i] = static_cast<std::uint8_t>(pixel);
+    if (kind == 2) rgb[i] = static_cast<std::uint8_t>(next_random(state));
+    if (kind == 3)
+      rgb[i] = static_cast<std::uint8_t>(40 * (pixel % 3) + 9 * (i % 3) + next_random(state) % 7);
+  }
+  return rgb;
+}
+
+Bytes decoded(const Bytes& file) {
+  const QoiSize size = qoi_size(file);
+  Bytes rgb(3 * std::size_t{size.width} * size.height);
+  decode_qoi(file, rgb.data());
+  return rgb;
+}
+
+bool refused(const Bytes& file) { return !refusal(decoded, file).empty(); }
+
+}  // namespace
+
+TEST_CASE("QOI gives back every pixel") {
+  for (const QoiSize size :
+       {QoiSize{0, 0}, QoiSize{1, 1}, QoiSize{62, 1}, QoiSize{63, 1}, QoiSize{131, 37}}) {
+    const Bytes rgb = some_image(size);
+    const Bytes file = encode_qoi(rgb.data(), size);
+    REQUIRE(qoi_size(file).width == size.width);
+    REQUIRE(qoi_size(file).height == size.height);
+    REQUIRE(decoded(file) == rgb);
+  }
+}
+
+TEST_CASE("QOI codes are those of the format") {
+  // A run of two black pixels (the start value), (1, 0, 255) as a difference, (11, 12, 13) led by green,
+  // another in full, and the second colour again by its hash.
+  const Bytes rgb = {0, 0, 0, 0, 0, 0, 1, 0, 255, 11, 12, 13, 100, 200, 30, 1, 0, 255};
+  const Bytes file = encode_qoi(rgb.data(), {6, 1});
+  const unsigned hash = (1 * 3 + 0 * 5 + 255 * 7 + 255 * 11) % 64;
+  const Bytes codes = {0xc1, 0x79, 0x80 | 44, (10 - 12 + 8) << 4 | (14 - 12 + 8), 0xfe,
+                       100,  200,  30,        static_cast<std::uint8_t>(hash)};
+  REQUIRE(Bytes(file.begin() + 14, file.end() - 8) == codes);
+  REQUIRE(decoded(file) == rgb);
+}
+
+TEST_CASE("damaged QOI files are refused or decoded, never worse") {
+  const QoiSize size{61, 13};
+  const Bytes file = encode_qoi(some_image(size).data(), size);
+  for (std::size_t n = 0; n < file.size(); ++n) REQUIRE(refused(Bytes(file.begin(), file.begin() + n)));
+  std::uint32_t state = 3;
+  int refusals = 0;
+  for (int round = 0; round < 3000; ++round) {
+    Bytes damaged = file;
+    damaged[next_random(state) % damaged.size()] = static_cast<std::uint8_t>(next_random(state));
+    refusals += refused(damaged);
+  }
+  REQUIRE(refusals > 0);
+  Bytes huge = file;
+  std::fill(huge.begin() + 4, huge.begin() + 12, 0xff);
+  REQUIRE(refused(huge));
+}
+
+// Headers
+
+namespace {
+
+Bytes bytes(std::string_view text) { return {text.begin(), text.end()}; }
+
+// A directory entry of a little-endian TIFF with one SHORT.
+Bytes entry(std::uint16_t tag, std::uint16_t value) {
+  return {static_cast<std::uint8_t>(tag),   static_cast<std::uint8_t>(tag >> 8),   3, 0, 1, 0, 0, 0,
+          static_cast<std::uint8_t>(value), static_cast<std::uint8_t>(value >> 8), 0, 0};
+}
+
+Bytes tiff(const std::vector<std::pair<std::uint16_t, std::uint16_t>>& tags) {
+  Bytes out = {'I', 'I', 42, 0, 8, 0, 0, 0, static_cast<std::uint8_t>(tags.size()), 0};
+  for (const auto& [tag, value] : tags) append(out, entry(tag, value));
+  append(out, {0, 0, 0, 0});
+  return out;
+}
+
+Bytes rgba(std::uint16_t extra, std::uint16_t orientation = 1) {
+  return tiff({{256, 3}, {257, 2}, {258, 8}, {262, 2}, {274, orientation}, {277, 4}, {338, extra}});
+}
+
+ImageHeader read(const Bytes& file) { return read_image_header(file, "f"); }
+
+std::string header_problem(const Bytes& file) { return refusal(read, file); }
+
+}  // namespace
+
+TEST_CASE("the fourth band of a TIFF is alpha if the file says so") {
+  REQUIRE(read(rgba(0)).alpha == Alpha::kNone);
+  REQUIRE(read(rgba(0)).extras == 1);
+  REQUIRE(read(rgba(1)).alpha == Alpha::kAssociated);
+  REQUIRE(read(rgba(2)).alpha == Alpha::kStraight);
+  REQUIRE(read(rgba(2)).extras == 0);
+  REQUIRE(read(tiff({{256, 3}, {257, 2}, {262, 2}, {277, 4}})).alpha == Alpha::kNone);
+  REQUIRE(read(rgba(2, 6)).orientation == 6);
+  REQUIRE(read(rgba(2, 9)).orientation == 1);
+}
+
+TEST_CASE("a TIFF is changed where a decoder would change its pixels") {
+  REQUIRE(tiff_as_stored(rgba(0), "f").empty());
+  REQUIRE(tiff_as_stored(rgba(1), "f").empty());
+  REQUIRE(tiff_as_stored(rgba(2), "f") == rgba(1));
+  REQUIRE(tiff_as_stored(rgba(0, 5), "f") == rgba(0));
+  REQUIRE(tiff_as_stored(rgba(2, 5), "f") == rgba(1));
+}
+
+TEST_CASE("damaged and cut headers are refused") {
+  const Bytes file = rgba(2);
+  for (std::size_t n = 10; n < file.size() - 4; ++n) {
+    REQUIRE_FALSE(header_problem(Bytes(file.begin(), file.begin() + static_cast<std::ptrdiff_t>(n))).empty());
+  }
+  REQUIRE(header_problem(tiff({{262, 2}})) == "f: damaged TIFF: it has no size");
+  REQUIRE(header_problem(tiff({{256, 3}, {257, 2}, {262, 2}, {277, 1}})).find("too few bands") !=
+          std::string::npos);
+  REQUIRE(header_problem(bytes("\xff\xd8\xff"sv)) == "f: truncated JPEG: the file ends inside its header");
+  REQUIRE(header_problem(bytes("\x89PNG\r\n\x1a\n\0\0\0\x0d"sv)).find("truncated PNG") != std::string::npos);
+}
+
+TEST_CASE("formats are known by their content") {
+  const auto format = [](std::string_view text) { return read(bytes(text)).format; };
+  REQUIRE(format("8BPS\0\1"sv) == "Photoshop");
+  REQUIRE(format("\0\0\0\x10"
+                 "ftypheic\0\0\0\0"sv) == "HEIC");
+  REQUIRE(format("\0\0\0\x14"
+                 "ftypmif1\0\0\0\0avif"sv) == "AVIF");
+  REQUIRE(format("RIFF\0\0\0\0WEBPVP8 "sv) == "WebP");
+  REQUIRE(format("anything"sv).empty());
+  REQUIRE(format(""sv).empty());
 }
