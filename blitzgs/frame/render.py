@@ -23,7 +23,6 @@ from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import (
     Arrived,
     Exchange,
-    LocalTransport,
     Traffic,
     Transport,
     WayBack,
@@ -166,8 +165,7 @@ def render_frame(
         The frame; its images do not depend on the order of the table's rows, on inactive rows, or on how many
         ranks shared the work.
     """
-    if transport is None:
-        transport = LocalTransport() if assignment is None else open_transport(assignment.ranks)
+    transport = transport or open_transport(None if assignment is None else assignment.ranks)
     grid = tile_grid(views, options, assignment)
     backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
 

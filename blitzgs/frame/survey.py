@@ -10,7 +10,7 @@ from torch import Tensor
 
 from blitzgs.frame.render import RenderOptions, inputs_of, run_attempts, tile_grid, tile_lists
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport import Exchange, LocalTransport, Transport, open_transport
+from blitzgs.frame.transport import Exchange, Transport, open_transport
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.projection_types import ProjectedSplats, Sizes, Views
 from blitzgs.table.table import GaussianTable
@@ -56,8 +56,7 @@ def survey(
         The splats of this rank's Gaussians with the sums over the tiles of all ranks; the bits do not depend
         on the number of ranks.
     """
-    if transport is None:
-        transport = LocalTransport() if assignment is None else open_transport(assignment.ranks)
+    transport = transport or open_transport(None if assignment is None else assignment.ranks)
     inputs = inputs_of(table, views, options, active, colored=False)
     grid = tile_grid(views, options, assignment)
 

@@ -92,7 +92,7 @@ class Stepper:
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
         on_gpu = views.viewmats.is_cuda
 
-        def active(capacity: Sizes | None) -> ActiveRows:
+        def active(capacity: Sizes | None) -> ActiveRows:  # an attempt that lacks room repeats this
             # On the CPU the number of blocks is known at once: lists of this size need no estimate, and are
             # complete at the first attempt.
             capacity_blocks = capacity.blocks if capacity is not None and on_gpu else None

@@ -24,13 +24,9 @@ __all__ = [
 ]  # fmt: skip
 
 
-def open_transport(ranks: Ranks) -> Transport:
-    """Return the fastest transport of a job.
-
-    Args:
-        ranks: the job; the transport is valid until it ends.
-    """
-    if ranks.world_size == 1:
+def open_transport(ranks: Ranks | None) -> Transport:
+    """Return the fastest transport of a job, valid until it ends; None: a job of one rank."""
+    if ranks is None or ranks.world_size == 1:
         return LocalTransport()
     if ranks.memory is None:
         return CollectiveTransport(ranks)
