@@ -29,6 +29,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
@@ -39,7 +40,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.config.fields import FORK, Config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.ownership import TILE_COST, TileOwners, cost_balance
+from blitzgs.frame.ownership import TILE_COST, TileOwners
 from blitzgs.frame.render import RenderOptions
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
 from blitzgs.frame.transport import Traffic, stages_told_to
@@ -172,8 +173,9 @@ def balance_of(result: dict[str, Any]) -> float:
     if result["ranges"] is None:
         return 1.0
     ranges = result["ranges"]
-    work = result["work"].read()[-ranges.n_views * ranges.tiles_per_view :].double().numpy()
-    return cost_balance(work + TILE_COST, ranges.bounds)
+    cost = result["work"].read()[-ranges.n_views * ranges.tiles_per_view :].double() + TILE_COST
+    parts = [cost[begin:end].sum().item() for begin, end in pairwise(ranges.bounds)]
+    return max(parts) / statistics.mean(parts)
 
 
 def _sent_elsewhere(traffic: Traffic, rank: int) -> int:

@@ -10,9 +10,7 @@ from functools import partial
 from itertools import groupby, islice, repeat
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
@@ -191,10 +189,3 @@ class TileOwners:
         """Return the stored costs of the latest views with this number of tiles, the latest first."""
         alike = (cost.pieces for cost in reversed(self._costs.values()) if cost.tiles == tiles)
         return list(islice(alike, _SIMILAR))
-
-
-def cost_balance(cost: NDArray[np.float64], bounds: Sequence[int]) -> float:
-    """Return the ratio of the largest part's cost to the mean of the parts; 1 is best."""
-    ends = np.concatenate(([0.0], np.cumsum(cost)))
-    parts = np.diff(ends[list(bounds)])
-    return float(parts.max() / parts.mean()) if ends[-1] > 0 else 1.0
