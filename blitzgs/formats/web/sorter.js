@@ -38,7 +38,7 @@ function squared(i, centre) {
   return x * x + y * y + z * z;
 }
 
-// Whether a view from here leaves out Gaussians by their octree levels; see blitzgs.view.gate.SceneGate.
+// Whether a view from here leaves out Gaussians by their octree levels; see blitzgs.view.gate.ModelGate.
 function gate(centre) {
   let inside = 0;
   for (let i = 0; i < levels.length; i++) if (squared(i, centre) <= lod.squares[levels[i]]) inside++;
