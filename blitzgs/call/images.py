@@ -125,7 +125,6 @@ def _images_of_caller(
         lead: batch dimensions, and the number of views that are rendered here.
     """
     alphas = alphas.unsqueeze(-1)
-    shape = (*lead, *renders.shape[1:3])
     if image.pixels is not None:
         renders, alphas = (t.flatten(0, 2).index_select(0, image.pixels.numbers) for t in (renders, alphas))
     others: dict[str, Tensor] = {}
@@ -138,6 +137,7 @@ def _images_of_caller(
         covered = alphas.clone().clamp_(min=1e-10)
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / covered], dim=-1)
     if len(lead) > 1 and image.pixels is None:
+        shape = (*lead, *renders.shape[1:3])
         renders, alphas = renders.view(*shape, renders.shape[-1]), alphas.view(*shape, 1)
         others = {key: values.view(*shape, values.shape[-1]) for key, values in others.items()}
     return renders, alphas, others
