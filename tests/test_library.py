@@ -77,6 +77,13 @@ assert "torch" not in sys.modules and "blitzgs._library" not in sys.modules
 for name in blitzgs.__all__:
     assert getattr(blitzgs, name) is not None
 assert issubclass(blitzgs.optim.LazyAdam, object)
+
+import contextlib
+import torch
+from blitzgs.distributed.shared_memory import symmetric_words
+with contextlib.suppress(RuntimeError):  # torch has no such memory on the CPU
+    symmetric_words(8, torch.int64, torch.device("cpu"))
+assert "sympy" not in sys.modules  # it takes seconds
 """
 
 ENVIRONMENT = """

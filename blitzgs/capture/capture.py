@@ -371,7 +371,8 @@ def capture_fingerprint(capture: Capture) -> str:
     for camera in capture.cameras:
         digest.update(os.fsencode(f"{camera.name} {camera.width} {camera.height}"))
         digest.update(camera.K.tobytes() + camera.world_to_camera.tobytes())
-    digest.update(capture.points.tobytes() + capture.colors.tobytes())
+    digest.update(np.ascontiguousarray(capture.points).data)  # without a copy of them
+    digest.update(np.ascontiguousarray(capture.colors).data)
     digest.update(repr((capture.train, capture.test)).encode())
     return digest.hexdigest()[:12]
 

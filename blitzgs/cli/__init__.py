@@ -7,6 +7,7 @@ A command's file is imported when the command is used: `blitzgs --help` needs no
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import signal
 import sys
@@ -95,7 +96,7 @@ def _run(given: list[str]) -> int:
     # Our warnings are about the user's data, so they are shown without the line of code that raised them.
     warnings.formatwarning = lambda message, *_, **__: printable(f"{name}: warning: {message}\n")
     try:
-        with _quiet_interrupt(name):
+        with _importing(name):
             parser, commands = parser_of([chosen])
         command = commands.get(chosen)
         if not given:
@@ -148,8 +149,11 @@ def parser_of(chosen: Container[str]) -> tuple[Parser, dict[str, Parser]]:
 
 
 @contextmanager
-def _quiet_interrupt(name: str) -> Iterator[None]:
-    """End the process at once on Ctrl-C while modules are imported, which may not be interrupted halfway."""
+def _importing(name: str) -> Iterator[None]:
+    """End the process at once on Ctrl-C while modules are imported, which may not be interrupted halfway.
+
+    Modules are no garbage: searching them for it takes a tenth of their imports' time, and 0.1 s later.
+    """
     usual = threading.current_thread() is threading.main_thread() and (
         signal.getsignal(signal.SIGINT) is signal.default_int_handler
     )
@@ -160,9 +164,13 @@ def _quiet_interrupt(name: str) -> Iterator[None]:
 
     if usual:
         signal.signal(signal.SIGINT, end)
+    gc.disable()
     try:
         yield
     finally:
+        if gc.get_freeze_count() == 0:  # what is frozen later might be garbage
+            gc.freeze()
+        gc.enable()
         if usual:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
