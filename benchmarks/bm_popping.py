@@ -40,7 +40,7 @@ from blitzgs.runs.lod import MOST_KEPT, level_fork
 from blitzgs.runs.run_files import TrainedModel
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.charts import line_chart
-from blitzgs.view.gate import LodGate, SceneGate, centres_of
+from blitzgs.view.gate import LodGate, ModelGate, centres_of
 from blitzgs.view.views import CameraLike, ViewSet, render_options
 from blitzgs.viewer.film import new_film
 
@@ -95,7 +95,7 @@ def popping_of(
     if frames < 2:
         raise ValueError(f"a flight has at least 2 frames, got {frames}")
     viewmats, K, size = _flight(model, cameras, frames, width, camera)
-    gates: dict[str, SceneGate | None] = {"full": None}
+    gates: dict[str, ModelGate | None] = {"full": None}
     gates |= {mode: _gate(model, mode == "smooth", ranks) for mode in MODES[1:]}
     flights = {mode: _Flight(model, K, size, gate) for mode, gate in gates.items()}
     width, height = 3 * size[0] // 2 * 2, size[1] // 2 * 2  # the codec needs even edges
@@ -118,12 +118,10 @@ def popping_of(
 class _Flight:
     """Renders one frame after the other in one way, and records the changes."""
 
-    def __init__(
-        self, model: TrainedModel, K: Tensor, size: tuple[int, int], scene: SceneGate | None
-    ) -> None:
-        self._model, self._K, self._size, self._scene = model, K, size, scene
-        lod = None if scene is None else scene.gate
-        self._options = render_options(model.config, model.space, model.progress.sh_degree, lod)
+    def __init__(self, model: TrainedModel, K: Tensor, size: tuple[int, int], lod: ModelGate | None) -> None:
+        self._model, self._K, self._size, self._lod = model, K, size, lod
+        gate = None if lod is None else lod.gate
+        self._options = render_options(model.config, model.space, model.progress.sh_degree, gate)
         self._before: tuple[Tensor, Tensor] | None = None
         self._changes: list[float] = []
         self._kept: list[float] = []
@@ -138,7 +136,7 @@ class _Flight:
         if self._before is not None:
             last_pose, last_image = self._before
             self._changes.append(float((image - last_image).abs().mean()) * 255)
-            if self._scene is not None:
+            if self._lod is not None:
                 popped = (image - self._with_levels_of(last_pose, viewmats)).abs().mean(2).flatten() * 255
                 self.popping.append(float(popped.mean()))
                 if self.popping[-1] == max(self.popping):
@@ -149,19 +147,19 @@ class _Flight:
     def figures(self) -> dict[str, float]:
         """Return the figures of this way to render, as `popping` returns them."""
         found = {"mean_change": _mean(self._changes), "largest_change": max(self._changes)}
-        if self._scene is None:
+        if self._lod is None:
             return found
         pixel = float(self._worst.topk(max(1, len(self._worst) // 1000)).values[-1])
         popped = {"mean": _mean(self.popping), "largest": max(self.popping), "pixel": pixel}
         return found | popped | {"kept": _mean(self._kept)}
 
     def _active(self, viewmats: Tensor) -> ActiveRows | None:
-        return None if self._scene is None else self._scene.active(self._model.table, viewmats)
+        return None if self._lod is None else self._lod.active(self._model.table, viewmats)
 
     def _with_levels_of(self, other: Tensor, viewmats: Tensor) -> Tensor:
         """Return the image from a pose, with the Gaussians and weights of the pose `other`."""
-        assert self._scene is not None
-        table, gate = self._model.table, self._scene.gate
+        assert self._lod is not None
+        table, gate = self._model.table, self._lod.gate
         if gate.smooth:
             weights = gate.weights(table["means"], table["level"], centres_of(other)[0])
             opacities = (table["opacities"].double().sigmoid() * weights).logit().float()
@@ -179,13 +177,13 @@ def _mean(values: list[float]) -> float:
     return sum(values) / len(values)
 
 
-def _gate(model: TrainedModel, smooth: bool, ranks: Ranks) -> SceneGate:
+def _gate(model: TrainedModel, smooth: bool, ranks: Ranks) -> ModelGate:
     """Return the gate that the run has or would have at its end."""
     progress, config = model.progress, model.config
     count = progress.level_count
     finest = count - 1 if progress.finest_level is None else progress.finest_level
     gate = LodGate(progress.reference_distance, level_fork(config), count, finest, smooth)
-    return SceneGate(gate, math.inf if smooth else MOST_KEPT, model.table, ranks)
+    return ModelGate(gate, math.inf if smooth else MOST_KEPT, model.table, ranks)
 
 
 def _flight(

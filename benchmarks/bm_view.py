@@ -26,7 +26,8 @@ from blitzgs.config.fields import Config
 from blitzgs.distributed.group import Ranks, extend_memory_in_place
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.table.blocks import morton_order
-from blitzgs.view.draw import Drawer, Subject, intrinsics, table_of_parameters
+from blitzgs.table.table import GaussianTable
+from blitzgs.view.draw import Drawer, Subject, intrinsics
 from blitzgs.view.look import Look
 from blitzgs.view.views import Space, render_options
 from blitzgs.viewer.studio import Opened, Studio, box_of, open_model
@@ -44,7 +45,7 @@ def synthetic(count: int, device: str) -> Opened:
     order = morton_order(columns["means"])
     for name in list(columns):
         columns[name] = columns[name][order]
-    table = table_of_parameters(columns)
+    table = GaussianTable.of_parameters(columns)
     space = Space((0.0, 0.0, 0.0), unit, 1.0)
     options = render_options(Config(), space, 3)
     exhibit = Exhibit(

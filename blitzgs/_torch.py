@@ -44,11 +44,6 @@ def refusing_derivatives(
     return tuple(refuse(*tensors, *inputs)[: len(tensors)])
 
 
-def base_of(view: Tensor) -> Tensor | None:
-    """Return the tensor of which autograd knows `view` to be a view; None: of none."""
-    return view._base
-
-
 def raw_indices(table: Tensor) -> Tensor:
     """Return the indices of a sparse tensor whether it is coalesced or not."""
     return table._indices()

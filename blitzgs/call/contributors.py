@@ -12,9 +12,9 @@ from torch import Tensor
 from blitzgs.call.arguments import check_options, check_tensors, gaussians_of
 from blitzgs.call.bad_values import check_intrinsics, warn_of_gradient, warn_of_non_finite
 from blitzgs.call.extras import checked_pixels
-from blitzgs.call.groups import CUDA_TILE_SIZE
+from blitzgs.call.layout import CUDA_TILE_SIZE
 from blitzgs.ops.importance import UNITS, PixelSplats, pixel_splats, splat_contributions
-from blitzgs.ops.intersect import TileGrid
+from blitzgs.ops.intersect import TileGrid, tile_counts
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
 
@@ -249,7 +249,7 @@ def _splats_of_pixels(
     for name, integers in (("tile_offsets", tile_offsets), ("flatten_ids", flatten_ids)):
         if not isinstance(integers, Tensor) or integers.is_floating_point():
             raise TypeError(f"{name} must be a tensor of integers, as meta has it")
-    shape, tiles = tuple(means2d.shape[:-1]), (-(-height // tile_size), -(-width // tile_size))
+    shape, tiles = tuple(means2d.shape[:-1]), tile_counts(width, height, tile_size)[::-1]
     for name, tensor, wanted in (
         ("means2d", means2d, (*shape, 2)),
         ("conics", conics, (*shape, 3)),

@@ -18,8 +18,9 @@ from blitzgs._torch import hooks_on_saved_tensors
 from blitzgs.call.arguments import Gaussians, Scene
 from blitzgs.call.channels import ImageOptions, channels_of
 from blitzgs.call.covariances import Decomposed, shaped_by
+from blitzgs.call.layout import CUDA_TILE_SIZE, Lists
 from blitzgs.frame.render import run_attempts
-from blitzgs.frame.transport.protocol import Exchange, LocalExchange, LocalTransport
+from blitzgs.frame.transport.protocol import LocalExchange, LocalTransport
 from blitzgs.ops.project import TableRows, differentiable_splats, project_splats
 from blitzgs.ops.projection_types import (
     MAX_VIEWS,
@@ -27,12 +28,10 @@ from blitzgs.ops.projection_types import (
     ProjectedSplats,
     ProjectionInputs,
     ProjectionOptions,
+    Sizes,
     first_rows,
 )
 from blitzgs.ops.unscented import Lenses, project_unscented
-
-# The tile size of the CUDA kernels. If the caller asks for another one, only meta's lists have it.
-CUDA_TILE_SIZE = 16
 
 
 class Group(NamedTuple):
@@ -184,16 +183,14 @@ class Rendered(NamedTuple):
 
     Attributes:
         splats: the splats.
-        isect_splats: the tiles' lists.
-        tile_offsets: where they begin.
+        lists: the tiles' lists.
         composited: what `rasterize_fwd` returned, and alphas.
         rows: the visible rows, if the SH are in tables of which only these are read.
         has_blank_view: whether some view sees no Gaussian.
     """
 
     splats: ProjectedSplats
-    isect_splats: Tensor
-    tile_offsets: Tensor
+    lists: Lists
     composited: Sequence[Tensor]
     rows: TableRows | None
     has_blank_view: bool
@@ -239,8 +236,8 @@ def render_queued(
     needed = [t for t in read if t is not None and t.requires_grad] if torch.is_grad_enabled() else []
     backward_follows = len(needed) > 0 and not image.absgrad
 
-    def composite(exchange: Exchange) -> tuple[LocalExchange, list[Tensor]]:
-        assert isinstance(exchange, LocalExchange)
+    def attempt(capacity: Sizes | None) -> tuple[LocalExchange, tuple[LocalExchange, list[Tensor]]]:
+        exchange = transport.project_and_send(inputs, None, capacity)
         _, n_splats, n_isects = exchange.arrived
         projected, has_spare = exchange.projected, n_splats is not None
         splats = projected.splats
@@ -249,14 +246,15 @@ def render_queued(
         channels = None
         if not sh:
             channels = splats.colors if only_colors else channels_of(splats, gaussians, image, not exact)
-        return exchange, torch.ops.blitzgs.render(
+        outputs = torch.ops.blitzgs.render(
             splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids,
             splats.visible_ids, splats.splat_offsets, splats.radii, splats.tiles_touched,
             channels, image.render_mode != "RGB", rows_of, sh, *inputs.cameras, *options,
             image.backgrounds, n_isects, backward_follows, projected.totals if has_spare else None,
         )  # fmt: skip
+        return exchange, (exchange, outputs)
 
-    result, (exchange, outputs) = run_attempts(transport, inputs, None, composite)
+    result, (exchange, outputs) = run_attempts(transport, attempt)
     assert exchange.totals is not None
     splats, (visible, count, isects, *rest) = result.projected, exchange.totals
     isect_splats, tile_offsets, *images = outputs[: _LISTS + _IMAGES]
@@ -271,7 +269,8 @@ def render_queued(
         splats = splats._replace(colors=colors)
         rows = TableRows(inputs._replace(gaussians=found), numbers, indices, sh)
     has_blank_view = 0 in rest[VIEW_TOTALS - 3 :]
-    return Rendered(splats, isect_splats, tile_offsets, images, rows, has_blank_view)
+    lists = Lists(isect_splats, tile_offsets, options.width, options.height, options.tile_size)
+    return Rendered(splats, lists, images, rows, has_blank_view)
 
 
 @lru_cache(maxsize=16)

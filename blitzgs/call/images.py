@@ -23,13 +23,13 @@ from blitzgs.call.groups import (
     project_groups,
     render_queued,
 )
-from blitzgs.call.layout import Layout, Lists, lists_of, lists_of_pixels
+from blitzgs.call.layout import Layout, Lists, lists_of
 from blitzgs.call.meta import make_meta
 from blitzgs.call.ranks import CallRanks, send_splats
 from blitzgs.ops.importance import pixel_splats
 from blitzgs.ops.project import differentiable_splats
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
-from blitzgs.ops.rasterize import MetaGeometry, rasterize
+from blitzgs.ops.rasterize import rasterize
 
 _CHANNELS_AT_A_TIME = 64
 
@@ -56,11 +56,7 @@ def render(
     compiling = torch.compiler.is_compiling()
     nan_marks: list[Tensor] = []
     if groups is None:
-        shown = gaussians
-        valued = gaussians.colors is not None and gaussians.sh_degree is None
-        if valued or gaussians.signals is not None:
-            nan_marks = [_nan_or_zero(scene, valued, gaussians.signals) for scene in gaussians.scenes]
-            shown = _without_non_finite(gaussians, nan_marks)
+        shown, nan_marks = _without_non_finite(gaussians)
         groups = groups_of(shown, projection)
     with_others = gaussians.signals is not None or image.normals
     only_colors = gaussians.sh_degree is not None and not with_others and image.render_mode == "RGB"
@@ -75,35 +71,25 @@ def render(
     # As in gsplat, Gaussians without a splat have their own opacity.
     over_all = not (image.packed or projection.antialiased or image.sparse_grad)
     arranged = layout.rendered_columns(gaussians.opacities if over_all else None)
-    rendered, meta_geometry = splats, None
-    if layout.places is not None:
-        if compiling or job is not None:
-            columns = layout.gather(*arranged.values())
-            rendered = splats._replace(**dict(zip(arranged, columns, strict=True)))
-        else:
-            meta_geometry = MetaGeometry(
-                layout.places.arrange, [arranged[name] for name in ("means2d", "conics", "opacities")]
-            )
-            if image.render_mode != "RGB" or image.median:
-                rendered = splats._replace(depths=layout.gather(arranged["depths"])[0])
+    rendered, meta_geometry = layout.splats_to_composite(
+        arranged, gathered=compiling or job is not None, depths=image.render_mode != "RGB" or image.median
+    )
     channels = rendered.colors if only_colors else channels_of(rendered, gaussians, image)
     lead = gaussians.lead
     if job is not None:
         (rendered, channels), lead = send_splats(rendered, channels, job), (job.views,)
-    # The projection counts the tiles of the splats that it returns. Ranks exchange splats, and the conics of
-    # covariances differ from the projection's by rounding, so their tiles have to be counted again.
+    images = math.prod(lead)
     if queued is not None:
-        size = (projection.width, projection.height, projection.tile_size)
-        lists = composited_lists = Lists(queued.isect_splats, queued.tile_offsets, *size)
-    elif image.pixels is None:
+        lists = composited_lists = queued.lists
+    else:
+        # The projection counts the tiles of the splats that it returns. Ranks exchange splats, and the conics
+        # of covariances differ from the projection's by rounding: their tiles have to be counted again.
         uncounted = compiling or job is not None or groups[0].covariances is not None
         count = -1 if uncounted else int(splats.counts[2])
-        lists, composited_lists = lists_of(rendered, math.prod(lead), projection, count)
-    else:
-        lists, composited_lists = lists_of_pixels(rendered, math.prod(lead), projection, image.pixels)
+        lists, composited_lists = lists_of(rendered, images, projection, count, image.pixels)
     renders, alphas = rasterize(
         rendered.means2d, rendered.conics, rendered.opacities, channels,
-        composited_lists.splats, composited_lists.offsets, n_cameras=math.prod(lead), width=projection.width,
+        composited_lists.splats, composited_lists.offsets, n_cameras=images, width=projection.width,
         height=projection.height, tile_size=composited_lists.tile_size, backgrounds=image.backgrounds,
         store_absgrad=layout.absgrad_store(arranged["means2d"]) if image.absgrad else None,
         composited=None if queued is None else queued.composited, meta_geometry=meta_geometry,
@@ -111,29 +97,50 @@ def render(
     if not compiling:
         # A view with a bad camera sees no Gaussian. Reading `cameras` does not wait: the host has waited for
         # the projection, which was queued after their copy.
-        suspects_cameras = not cameras.are_finite() if cameras is not None else False
+        suspects_cameras = cameras is not None and not cameras.are_finite()
         if queued is not None and queued.has_blank_view:
             check_intrinsics(gaussians.named["Ks"])
             suspects_cameras = True
         watch_for_non_finite(gaussians, layout, function, nan_marks, suspects_cameras)
+    median = _median_depths(rendered, composited_lists, images, image.pixels) if image.median else None
+    renders, alphas, others = _images_of_caller(renders, alphas, median, gaussians, image, lead)
+    arrived = None if job is None else rendered
+    return renders, alphas, make_meta(gaussians, layout, {**arranged, **others}, lists, lead, arrived)
+
+
+def _images_of_caller(
+    renders: Tensor,
+    alphas: Tensor,
+    median: Tensor | None,
+    gaussians: Gaussians,
+    image: ImageOptions,
+    lead: tuple[int, ...],
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """Return images and alphas as the caller asked for them, and the further images of `meta` by key.
+
+    Args:
+        renders: all channels, [I, H, W, channels].
+        alphas: [I, H, W].
+        median: median depths, [I, H, W, 1] or of M pixels [M, 1]; None: not asked for.
+        lead: batch dimensions, and the number of views that are rendered here.
+    """
     alphas = alphas.unsqueeze(-1)
+    shape = (*lead, *renders.shape[1:3])
     if image.pixels is not None:
         renders, alphas = (t.flatten(0, 2).index_select(0, image.pixels.numbers) for t in (renders, alphas))
     others: dict[str, Tensor] = {}
-    if with_others:
+    if gaussians.signals is not None or image.normals:
         renders, others = split_channels(renders, gaussians, image)
-    if image.median:
-        others["render_median"] = _median_depths(rendered, composited_lists, math.prod(lead), image.pixels)
+    if median is not None:
+        others["render_median"] = median
     if image.render_mode.endswith("ED"):
         # Autograd saves the divisor. It is a copy, so that the caller may change alphas in place.
         covered = alphas.clone().clamp_(min=1e-10)
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / covered], dim=-1)
     if len(lead) > 1 and image.pixels is None:
-        shape = (*lead, projection.height, projection.width)
         renders, alphas = renders.view(*shape, renders.shape[-1]), alphas.view(*shape, 1)
         others = {key: values.view(*shape, values.shape[-1]) for key, values in others.items()}
-    arrived = None if job is None else rendered
-    return renders, alphas, make_meta(gaussians, layout, {**arranged, **others}, lists, lead, arrived)
+    return renders, alphas, others
 
 
 def _median_depths(splats: ProjectedSplats, lists: Lists, images: int, pixels: Pixels | None) -> Tensor:
@@ -176,10 +183,17 @@ def _nan_or_zero(scene: Scene, valued: bool, signals: Signals | None) -> Tensor:
     return totals[0] if len(totals) == 1 else totals[0] + totals[1]
 
 
-def _without_non_finite(gaussians: Gaussians, nan_marks: Sequence[Tensor]) -> Gaussians:
-    """Set the opacity of Gaussians to 0 whose `nan_marks` are NaN: NaN reaches no pixel."""
+def _without_non_finite(gaussians: Gaussians) -> tuple[Gaussians, list[Tensor]]:
+    """Set the opacity of Gaussians to 0 whose colours or signals are not finite: NaN reaches no pixel.
+
+    SH are left to the projection. Also returns `_nan_or_zero` of each scene, or an empty list.
+    """
+    valued = gaussians.colors is not None and gaussians.sh_degree is None
+    if not valued and gaussians.signals is None:
+        return gaussians, []
+    nan_marks = [_nan_or_zero(scene, valued, gaussians.signals) for scene in gaussians.scenes]
     scenes = [
         scene._replace(opacities=scene.opacities.masked_fill(value.isnan(), 0))
         for scene, value in zip(gaussians.scenes, nan_marks, strict=True)
     ]
-    return replace(gaussians, scenes=tuple(scenes))
+    return replace(gaussians, scenes=tuple(scenes)), nan_marks

@@ -18,10 +18,13 @@ from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.call.extras import Pixels
-from blitzgs.call.groups import CUDA_TILE_SIZE
 from blitzgs.ops.derivatives import linear_map
-from blitzgs.ops.intersect import TileGrid
+from blitzgs.ops.intersect import TileGrid, tile_counts
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
+from blitzgs.ops.rasterize import MetaGeometry
+
+# The tile size of the CUDA kernels. If the caller asks for another one, only meta's lists have it.
+CUDA_TILE_SIZE = 16
 
 
 class Places(NamedTuple):
@@ -163,6 +166,31 @@ class Layout:
         means2d, conics, depths, opacities = self.arrange(*columns, under=under)
         return {"means2d": means2d, "conics": conics, "opacities": opacities, "depths": depths}
 
+    def splats_to_composite(
+        self, arranged: dict[str, Tensor], gathered: bool, depths: bool
+    ) -> tuple[ProjectedSplats, MetaGeometry | None]:
+        """Return the splats to composite, so that their gradients reach `rendered_columns`.
+
+        Args:
+            arranged: the `rendered_columns`.
+            gathered: gather the splats from them, as under `torch.compile` and where splats are sent on.
+                Otherwise the splats are as they are, and compositing arranges their gradients.
+            depths: whether an image depends on the depths.
+
+        Returns:
+            The splats; and the geometry that gets the gradients in their place, None: their own.
+        """
+        if self.places is None:
+            return self.splats, None
+        if gathered:
+            columns = self.gather(*arranged.values())
+            return self.splats._replace(**dict(zip(arranged, columns, strict=True))), None
+        splats = self.splats
+        if depths:
+            splats = splats._replace(depths=self.gather(arranged["depths"])[0])
+        geometry = [arranged[name] for name in ("means2d", "conics", "opacities")]
+        return splats, MetaGeometry(self.places.arrange, geometry)
+
     def absgrad_store(self, means2d: Tensor) -> Callable[[Tensor], None]:
         """Set `means2d.absgrad` to 0; return a function that fills it with the splats' gradients, [P, 2]."""
         absgrad = torch.zeros_like(means2d)
@@ -196,12 +224,12 @@ class Lists:
     @property
     def tiles_x(self) -> int:
         """Number of tiles in a row."""
-        return -(-self.width // self.tile_size)
+        return tile_counts(self.width, self.height, self.tile_size)[0]
 
     @property
     def tiles_y(self) -> int:
         """Number of tiles in a column."""
-        return -(-self.height // self.tile_size)
+        return tile_counts(self.width, self.height, self.tile_size)[1]
 
     def listed(self) -> Tensor:
         """Return `splats` without the undefined entries, which exist if splats are hidden."""
@@ -213,7 +241,7 @@ class Lists:
 
 
 def lists_of(
-    splats: ProjectedSplats, images: int, projection: ProjectionOptions, count: int
+    splats: ProjectedSplats, images: int, projection: ProjectionOptions, count: int, pixels: Pixels | None
 ) -> tuple[Lists, Lists]:
     """Return the tile lists for meta, and those to composite.
 
@@ -221,45 +249,32 @@ def lists_of(
         images: number of images I.
         projection: the size of the images, and the caller's tile size.
         count: number of entries of the lists for meta; -1: unknown.
+        pixels: the pixels that are rendered: the lists of tiles without any are empty, and those of the
+            others are as in the whole image, so that these pixels have the same bits. None: all.
     """
-    width, height, tile_size = projection.width, projection.height, projection.tile_size
 
-    def listed_by(size: int, n_isects: int) -> Lists:
-        isect_splats, offsets = torch.ops.blitzgs.intersect(
-            splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, None,
-            *TileGrid(images, width, height, size), n_isects, None, True,
-        )  # fmt: skip
-        return Lists(isect_splats, offsets, width, height, size)
+    def listed_by(edge: int, n_isects: int) -> Lists:
+        grid = TileGrid(images, projection.width, projection.height, edge)
+        return _lists(splats, grid, n_isects) if pixels is None else _lists_of_pixels(splats, grid, pixels)
 
-    lists = listed_by(tile_size, count)
-    if not splats.means2d.is_cuda or tile_size == CUDA_TILE_SIZE:
+    lists = listed_by(projection.tile_size, count)
+    if not splats.means2d.is_cuda or projection.tile_size == CUDA_TILE_SIZE:
         return lists, lists
     return lists, listed_by(CUDA_TILE_SIZE, -1)
 
 
-def lists_of_pixels(
-    splats: ProjectedSplats, images: int, projection: ProjectionOptions, pixels: Pixels
-) -> tuple[Lists, Lists]:
-    """Return the tile lists for meta, and those to composite; they are empty but in tiles that have a pixel.
-
-    These tiles have the same lists as in the whole image, so their pixels have the same bits.
-
-    Args:
-        images: number of images I.
-        projection: the size of the images, and the caller's tile size.
-    """
-    lists = _lists_by(projection.tile_size, splats, images, projection, pixels)
-    if not splats.means2d.is_cuda or projection.tile_size == CUDA_TILE_SIZE:
-        return lists, lists
-    return lists, _lists_by(CUDA_TILE_SIZE, splats, images, projection, pixels)
+def _lists(splats: ProjectedSplats, grid: TileGrid, n_isects: int) -> Lists:
+    isect_splats, offsets = torch.ops.blitzgs.intersect(
+        splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, None,
+        *grid, n_isects, None, True,
+    )  # fmt: skip
+    return Lists(isect_splats, offsets, grid.width, grid.height, grid.tile_size)
 
 
-def _lists_by(
-    edge: int, splats: ProjectedSplats, images: int, projection: ProjectionOptions, pixels: Pixels
-) -> Lists:
-    grid = TileGrid(images, projection.width, projection.height, edge)
-    rows, columns = -(-grid.height // edge), -(-grid.width // edge)
-    wanted = torch.zeros(images, rows, columns, dtype=torch.bool, device=splats.means2d.device)
+def _lists_of_pixels(splats: ProjectedSplats, grid: TileGrid, pixels: Pixels) -> Lists:
+    edge = grid.tile_size
+    columns, rows = tile_counts(grid.width, grid.height, edge)
+    wanted = torch.zeros(grid.n_cameras, rows, columns, dtype=torch.bool, device=splats.means2d.device)
     wanted[pixels.images, pixels.rows // edge, pixels.columns // edge] = True
     near = _splats_near(splats, wanted, edge)
     own = [t.detach().index_select(0, near) for t in (splats.means2d, splats.conics, splats.opacities)]

@@ -173,7 +173,7 @@ class Sight:
 def measured_extent(centres: Float64, points: Float64) -> float:
     """Return a scene's extent (`Capture.extent`) by its training cameras [V, 3] and points [M, 3]."""
     extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-    distance = float(np.median(np.linalg.norm(points - centres[0], axis=1)))
+    distance = float(np.median(np.linalg.norm(sampled(points, len(centres)) - centres[0], axis=1)))
     if extent > _LEAST_SPREAD * distance:
         return extent
     extent = distance

@@ -19,12 +19,12 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import input_files
 from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
-from blitzgs.runs.lod import lod_gate, scene_gate
+from blitzgs.runs.lod import lod_gate, model_gate
 from blitzgs.runs.world import gate_of, model_of_file
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.util.progress import image_progress
 from blitzgs.util.terminal import printable
-from blitzgs.view.gate import SceneGate
+from blitzgs.view.gate import ModelGate
 from blitzgs.view.views import Space, ViewSet, render_options
 
 HELP = """\
@@ -88,17 +88,17 @@ def run(args: argparse.Namespace) -> int:
                 found, config, Space.of(capture.offset, capture.extent), capture.near, ranks
             )
             gate, config = gate_of(found, model.space.unit), model.config
-            lod = None if gate is None else SceneGate(gate, math.inf, model.table, ranks)
+            lod = None if gate is None else ModelGate(gate, math.inf, model.table, ranks)
             folder = args.out or path.with_name(f"{path.name}.evaluation") / args.split
         else:
             check_capture(model.space, capture, run_folder)
             gate = lod_gate(config, model.progress)
-            lod = scene_gate(config, model.progress, model.table, ranks)
+            lod = model_gate(config, model.progress, model.table, ranks)
             folder = args.out or run_folder / run_files.EVALUATION / args.split
         indices = arguments.chosen_views(args.split, capture, path)
         with image_progress("Comparing", ranks.rank == 0) as report:
             result = evaluate(
-                model.scene(ranks.device),
+                model.gaussians_on(ranks.device),
                 ViewSet(list(capture.cameras), model.space, ranks.device),
                 capture.cameras,
                 images,

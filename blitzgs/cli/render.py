@@ -29,7 +29,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, RunCameras, input_files, load_cameras
 from blitzgs.runs.evaluation import render_view
-from blitzgs.runs.lod import lod_gate, scene_gate
+from blitzgs.runs.lod import lod_gate, model_gate
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.util.output import OutputFolder
@@ -166,7 +166,7 @@ def _renders(
     Every rank goes through all views; `destination` depends on the position, and other ranks get None.
     """
     views, subject = ViewSet(list(opened.cameras), opened.space, ranks.device), opened.subject
-    finder, owners = VisibleFinder(subject.scene, subject.lod), TileOwners(ranks)
+    finder, owners = VisibleFinder(subject.gaussians, subject.lod), TileOwners(ranks)
     for position, index in enumerate(opened.indices):
         yield index, render_view(finder, views, index, subject.options, owners, destination(position))
 
@@ -291,8 +291,8 @@ def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> 
         options = render_options(
             model.config, space, model.progress.sh_degree, lod_gate(model.config, model.progress)
         )
-        lod = scene_gate(model.config, model.progress, model.table, ranks)
-        subject = Subject(model.scene(ranks.device), options, space.unit, lod)
+        lod = model_gate(model.config, model.progress, model.table, ranks)
+        subject = Subject(model.gaussians_on(ranks.device), options, space.unit, lod)
     cameras: Sequence[CameraLike]
     if args.cameras is not None:
         cameras = read_cameras(args.cameras, np.array(space.offset))

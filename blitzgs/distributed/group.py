@@ -129,8 +129,9 @@ class Ranks:
         return ranks
 
     def _join(self, transport: Transport, tables_on_host: bool, lap: Callable[[str], None]) -> None:
+        # Torch reads these variables whenever it maps shared memory. Multicast would not be used.
+        os.environ.setdefault("TORCH_SYMM_MEM_DISABLE_MULTICAST", "1")
         if self.shares_gpu:
-            # Torch reads this variable whenever it maps shared memory.
             os.environ["TORCH_SYMM_MEM_ALLOW_OVERLAPPING_DEVICES"] = "1"
         nccl = self.device.type == "cuda" and not self.shares_gpu
         dist.init_process_group(

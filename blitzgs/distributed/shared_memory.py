@@ -25,7 +25,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import torch
 import torch.distributed as dist
 from torch import Tensor
-from torch.distributed import _symmetric_memory as symmetric
+from torch._C._distributed_c10d import _SymmetricMemory
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
@@ -111,7 +111,7 @@ class SharedMemory:
 
     def map_symmetric(self, name: str, mine: Tensor) -> list[Tensor]:
         """Map every rank's counterpart of a symmetric tensor; collective."""
-        handle = symmetric.rendezvous(mine, dist.distributed_c10d._get_default_group())
+        handle = _SymmetricMemory.rendezvous(mine, dist.distributed_c10d._get_default_group().group_name)
         self._handles[name] = handle
         mapped = [handle.get_buffer(rank, mine.shape, mine.dtype) for rank in range(self.world_size)]
         mapped[self.rank] = mine
@@ -159,7 +159,7 @@ class SharedMemory:
             torch.cuda.current_stream(self.device).synchronize()
             self._boards = []
             self._board_parts.clear()
-            mine = symmetric.empty(2 * max(words, LEAST_BOARD), dtype=torch.float32, device=self.device)
+            mine = symmetric_words(2 * max(words, LEAST_BOARD), torch.float32, self.device)
             torch.cuda.current_stream(self.device).synchronize()
             self._boards = self.map_symmetric("board", mine)
         key = words, self._side_barriers % 2
@@ -181,12 +181,20 @@ class SharedMemory:
         """
         if self.buffers and len(self.buffers[0]) >= words:
             return
-        mine = symmetric.empty(-(-words // 4096) * 4096, dtype=torch.int32, device=self.device)
+        mine = symmetric_words(-(-words // 4096) * 4096, torch.int32, self.device)
         # The new buffer is zeroed in stream order; this must end before a peer writes to it. Also, this
         # rank's queued work may still read the other ranks' old buffers, which are freed when all ranks have
         # reached the mapping.
         torch.cuda.current_stream(self.device).synchronize()
         self.buffers = self.map_symmetric("rows", mine)
+
+
+def symmetric_words(count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Allocate memory [count] that `SharedMemory.map_symmetric` can map on all ranks; not cleared.
+
+    `torch.distributed._symmetric_memory.empty` would load SymPy, for seconds, to find the stride.
+    """
+    return _SymmetricMemory.empty_strided_p2p((count,), (1,), dtype, device)
 
 
 def connect(job: Job, timeout_seconds: float) -> SharedMemory | str:
@@ -204,7 +212,7 @@ def connect(job: Job, timeout_seconds: float) -> SharedMemory | str:
     if obstacle is None:
         try:
             words = control_words(job.world_size)
-            control = symmetric.empty(words, dtype=torch.int64, device=job.device).zero_()
+            control = symmetric_words(words, torch.int64, job.device).zero_()
         except RuntimeError as error:
             obstacle = f"rank {job.rank}: {error}"
     obstacles = [text for text in job.all_gather_object(obstacle) if text is not None]

@@ -77,7 +77,7 @@ class WebSplats:
 
 @dataclass(frozen=True)
 class WebLevels:
-    """How views leave out Gaussians by their octree levels; see `blitzgs.view.gate.SceneGate`.
+    """How views leave out Gaussians by their octree levels; see `blitzgs.view.gate.ModelGate`.
 
     Attributes:
         reach: distance up to which views keep each level; None: any; negative: none.

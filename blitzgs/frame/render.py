@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -170,33 +170,14 @@ def render_frame(
         transport = LocalTransport() if assignment is None else open_transport(assignment.ranks)
     grid = tile_grid(views, options, assignment)
     backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
-    rows = active if active is None or isinstance(active, ActiveRows) else None
 
-    def inputs(capacity: Sizes | None) -> ProjectionInputs:
-        nonlocal rows
-        if callable(active):
-            rows = active(capacity)
-        return inputs_of(table, views, options, rows)
+    def attempt(capacity: Sizes | None) -> tuple[Exchange, Any]:
+        rows = active(capacity) if callable(active) else active
+        inputs = inputs_of(table, views, options, rows)
+        exchange = transport.project_and_send(inputs, assignment, capacity)
+        return exchange, (rows, *_composite(exchange, grid, backgrounds, backward_follows))
 
-    def composite(exchange: Exchange) -> tuple[list[Tensor], Sequence[Tensor], Tensor | None]:
-        """Return the tiles' lists, what `rasterize_fwd` returns, and zeros for the gradients of splats."""
-        splats, n_splats, _ = exchange.arrived
-        lists = tile_lists(exchange.arrived, grid)
-        stage_ended("sort")
-        geometry = (splats.means2d, splats.conics, splats.opacities)
-        arguments = (*geometry, splats.colors, backgrounds, *lists, *grid)
-        shared = exchange.gradient_table
-        if shared is not None and backward_follows:
-            images = torch.ops.blitzgs.rasterize_fwd_(*arguments, shared, n_splats)
-            zeros = shared
-        else:
-            *images, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, False, backward_follows, n_splats)
-            if shared is not None:
-                zeros = None  # the gradients must be in `shared`, which the backward pass then zeroes
-        stage_ended("raster")
-        return lists, images, zeros
-
-    result, (lists, images, zeros) = run_attempts(transport, inputs, assignment, composite)
+    result, (rows, lists, images, zeros) = run_attempts(transport, attempt)
     renders, transmittances, last_ids, tile_work, packed_splats, tile_order = images
     splats = result.splats
     return Frame(
@@ -219,6 +200,27 @@ def render_frame(
         ),
         gradients=GradientBuffer(zeros, None if result.way_back is None else result.way_back.cleared_table),
     )
+
+
+def _composite(
+    exchange: Exchange, grid: TileGrid, backgrounds: Tensor | None, backward_follows: bool
+) -> tuple[list[Tensor], Sequence[Tensor], Tensor | None]:
+    """Return the tiles' lists, what `rasterize_fwd` returns, and zeros for the gradients of splats."""
+    splats, n_splats, _ = exchange.arrived
+    lists = tile_lists(exchange.arrived, grid)
+    stage_ended("sort")
+    geometry = (splats.means2d, splats.conics, splats.opacities)
+    arguments = (*geometry, splats.colors, backgrounds, *lists, *grid)
+    shared = exchange.gradient_table
+    if shared is not None and backward_follows:
+        images = torch.ops.blitzgs.rasterize_fwd_(*arguments, shared, n_splats)
+        zeros = shared
+    else:
+        *images, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, False, backward_follows, n_splats)
+        if shared is not None:
+            zeros = None  # the gradients must be in `shared`, which the backward pass then zeroes
+    stage_ended("raster")
+    return lists, images, zeros
 
 
 def inputs_of(
@@ -293,26 +295,22 @@ def backward_splats(frame: Frame, v_renders: Tensor) -> SplatGradients:
 # mean that the inputs change or that the program is wrong.
 MAX_ATTEMPTS = 4
 
-Consumed = TypeVar("Consumed")
+Outputs = TypeVar("Outputs")
 
 
 def run_attempts(
-    transport: Transport,
-    inputs: ProjectionInputs | Callable[[Sizes | None], ProjectionInputs],
-    assignment: TileAssignment | None,
-    consume: Callable[[Exchange], Consumed],
-) -> tuple[ExchangeResult, Consumed]:
-    """Project, send the splats and consume them, without gradients, until all results had enough memory.
+    transport: Transport, attempt: Callable[[Sizes | None], tuple[Exchange, Outputs]]
+) -> tuple[ExchangeResult, Outputs]:
+    """Queue a frame's work, without gradients, until all results had enough memory.
 
     Args:
-        transport: sends the splats, and estimates the sizes.
-        inputs: of the projection; or a function that returns them, given the capacity (None: the sizes are
-            not known, and the work waits for them).
-        assignment: the tiles of each rank; None: one rank composites all.
-        consume: queues the work with the splats that have arrived.
+        transport: estimates the sizes.
+        attempt: given the capacity (None: the sizes are not known, and the work waits for them), projects
+            and sends the splats with `transport`, and queues the work with those that arrive. It returns the
+            exchange and the outputs of this work, and keeps neither: another attempt needs their memory.
 
     Returns:
-        The splats, cut to their numbers, and what `consume` returned for them.
+        The splats, cut to their numbers, and the outputs of the last attempt.
 
     Raises:
         RuntimeError: `MAX_ATTEMPTS` attempts did not suffice, each with the sizes that the last one
@@ -320,17 +318,15 @@ def run_attempts(
     """
     for _ in range(MAX_ATTEMPTS):
         capacity = None if transport.estimate is None else transport.estimate.sizes
-        given = inputs(capacity) if callable(inputs) else inputs
         # Skip autograd: for an op with a registered gradient formula, its Python takes 20 us of host time.
         with below_autograd():
-            exchange = transport.project_and_send(given, assignment, capacity)
-            consumed = consume(exchange)
+            exchange, outputs = attempt(capacity)
             needed, result = exchange.finish()
         if transport.estimate is not None:
             transport.estimate.learn(needed)
         if result is not None:
-            return result, consumed
-        del exchange, consumed  # before the next attempt takes as much memory again
+            return result, outputs
+        del exchange, outputs  # before the next attempt takes as much memory again
     raise RuntimeError(
         f"{MAX_ATTEMPTS} attempts have each needed more than the one before had asked for: the last had "
         f"{capacity} and needs {tuple(needed)}. The inputs must not change during a call"

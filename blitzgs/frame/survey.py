@@ -12,7 +12,7 @@ from blitzgs.frame.render import RenderOptions, inputs_of, run_attempts, tile_gr
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import Exchange, LocalTransport, Transport, open_transport
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.projection_types import ProjectedSplats, Views
+from blitzgs.ops.projection_types import ProjectedSplats, Sizes, Views
 from blitzgs.table.table import GaussianTable
 
 
@@ -61,13 +61,14 @@ def survey(
     inputs = inputs_of(table, views, options, active, colored=False)
     grid = tile_grid(views, options, assignment)
 
-    def measure(exchange: Exchange) -> tuple[Tensor, Tensor, Tensor]:
+    def attempt(capacity: Sizes | None) -> tuple[Exchange, tuple[Tensor, Tensor, Tensor]]:
+        exchange = transport.project_and_send(inputs, assignment, capacity)
         splats, n_splats, _ = exchange.arrived
         lists = tile_lists(exchange.arrived, grid)
         geometry = (splats.means2d, splats.conics, splats.opacities)
-        return torch.ops.blitzgs.contributions(*geometry, *lists, *grid, n_splats, squares)
+        return exchange, torch.ops.blitzgs.contributions(*geometry, *lists, *grid, n_splats, squares)
 
-    result, sums = run_attempts(transport, inputs, assignment, measure)
+    result, sums = run_attempts(transport, attempt)
     columns = [column[: len(result.splats.depths)] for column in (sums if squares else sums[:2])]
     if result.way_back is not None:
         returned = result.way_back.return_sums(torch.stack([column.long() for column in columns], 1))

@@ -48,7 +48,7 @@ class TileRanges:
     @cached_property
     def tiles_x(self) -> int:
         """Tiles in a row."""
-        return -(-self.width // self.tile_size)
+        return tile_counts(self.width, self.height, self.tile_size)[0]
 
     @cached_property
     def tiles_per_view(self) -> int:

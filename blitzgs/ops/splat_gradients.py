@@ -12,23 +12,17 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
-from blitzgs._torch import base_of
 
 # Where the parts of a splat gradient begin in its floats (csrc/common/kernel.h), and how many these
 # are.
 _MEAN2D, _CONIC, _OPACITY, _COLOR, _MEAN2D_ABS, SPLAT_GRADIENT = torch.ops.blitzgs.splat_gradient_layout()
 
-# Where the `gradient_columns` begin, their shapes behind the number of splats, and their strides.
-_COLUMNS: tuple[tuple[int, tuple[int, ...], tuple[int, ...]], ...] = (
-    (_MEAN2D, (2,), (SPLAT_GRADIENT, 1)),
-    (_CONIC, (3,), (SPLAT_GRADIENT, 1)),
-    (_OPACITY, (), (SPLAT_GRADIENT,)),
-    (_COLOR, (3,), (SPLAT_GRADIENT, 1)),
-)
+# The attribute by which a column carries the table that it is a part of, and its number among the columns.
+_TABLE = "_blitzgs_gradient_table"
 
 
 def gradient_columns(table: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """View a table of splat gradients as columns.
+    """View a table of splat gradients as columns, from which `gradient_table_of` takes the table.
 
     Args:
         table: [P, 12], as the op `rasterize_bwd` fills it.
@@ -36,32 +30,26 @@ def gradient_columns(table: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     Returns:
         Gradients of means2d [P, 2], conics [P, 3], opacities [P] and colors [P, 3].
     """
-    return (
+    columns = (
         table[:, _MEAN2D : _MEAN2D + 2],
         table[:, _CONIC : _CONIC + 3],
         table[:, _OPACITY],
         table[:, _COLOR : _COLOR + 3],
     )
+    for number, column in enumerate(columns):
+        setattr(column, _TABLE, (table, number))
+    return columns
 
 
 def gradient_table_of(columns: Sequence[Tensor | None]) -> Tensor | None:
     """Return the table of which `columns` are the `gradient_columns`; None if they are not of one table.
 
-    The table may be the first rows of a longer one, because memory is allocated for more splats than there
-    are.
+    Autograd hands these columns on as they are, unless something else has a part in a gradient (a second use
+    of the splats, a hook): it is then another tensor, which carries no table.
     """
-    if columns[0] is None:
-        return None
-    whole = base_of(columns[0])
-    if whole is None or whole.dim() != 2 or whole.shape[1] != SPLAT_GRADIENT or not whole.is_contiguous():
-        return None
-    first, count = whole.storage_offset(), columns[0].shape[0]
-    for column, (begin, width, stride) in zip(columns, _COLUMNS, strict=True):
-        if column is None or base_of(column) is not whole or column.storage_offset() != first + begin:
-            return None
-        if column.shape != (count, *width) or column.stride() != stride:
-            return None
-    return whole if whole.shape[0] == count else whole[:count]
+    table, _ = getattr(columns[0], _TABLE, (None, 0))
+    parts = (getattr(column, _TABLE, (None, 0)) for column in columns)
+    return table if all(of is table and i == n for i, (of, n) in enumerate(parts)) else None
 
 
 class SplatGradients(NamedTuple):

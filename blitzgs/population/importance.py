@@ -36,8 +36,8 @@ from blitzgs.ops.importance import ViewSums, view_sums_
 from blitzgs.ops.projection_types import Views
 from blitzgs.table.layouts import CULL
 from blitzgs.table.table import GaussianTable
-from blitzgs.view.gate import SceneGate
-from blitzgs.view.visible import Scene, VisibleFinder, VisibleScene, table_of
+from blitzgs.view.gate import ModelGate
+from blitzgs.view.visible import TableOrPool, VisibleFinder, VisibleRows, table_of
 
 # The constants of the formulas. PHI_EPS and VIEW_MASS are the paper's values; the paper calls the
 # epsilon of the score small and gives no value.
@@ -95,20 +95,20 @@ class Importance:
 
 
 def sweep(
-    scene: Scene,
+    gaussians: TableOrPool,
     batches: Iterable[ViewBatch],
     n_views: int,
     options: RenderOptions,
     ranks: Ranks,
     owners: TileOwners | None = None,
     rule: ScoreRule = "density",
-    lod: SceneGate | None = None,
+    lod: ModelGate | None = None,
     stops: Callable[[], bool] | None = None,
 ) -> Importance:
     """Score the Gaussians by their contributions to V views. Collective: every rank calls it.
 
     Args:
-        scene: this rank's Gaussians, without pending optimiser steps.
+        gaussians: this rank's Gaussians, without pending optimiser steps.
         batches: the views, each once, in the same batches on every rank.
         n_views: V, columns of the cull matrix.
         options: how the views are rendered.
@@ -122,11 +122,11 @@ def sweep(
     Raises:
         SweepStoppedError: `stops` said so; the table is as it was.
     """
-    table = table_of(scene)
+    table = table_of(gaussians)
     sums = _Sums(len(table), n_views, table.device, rule)
     owners = owners or TileOwners(ranks)
-    transport, finder = open_transport(ranks), VisibleFinder(scene, lod)
-    with _SideWork(table.device, ranks.world_size == 1 and scene is table) as side:
+    transport, finder = open_transport(ranks), VisibleFinder(gaussians, lod)
+    with _SideWork(table.device, ranks.world_size == 1 and gaussians is table) as side:
         for number, batch in enumerate(batches):
             if stops is not None and number > 0 and stops():
                 raise SweepStoppedError
@@ -211,7 +211,7 @@ class _Sums:
             _all_culled(n_views, device).repeat(count, 1),
         )
 
-    def add(self, found: Survey, columns: Sequence[int], surveyed: VisibleScene, ranks: Ranks) -> None:
+    def add(self, found: Survey, columns: Sequence[int], surveyed: VisibleRows, ranks: Ranks) -> None:
         """Add the splats of a batch of views."""
         splats, ids = found.splats, surveyed.table["id"]
         counts = integer_mass_prefix(

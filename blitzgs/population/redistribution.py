@@ -34,7 +34,7 @@ def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = MAX_
     if imbalance(sizes) <= max_imbalance:
         return False
     mine = global_positions(sizes, ranks.rank) % ranks.world_size
-    table.exchange(mine.to(table.device), ranks)
+    table.move_rows(mine.to(table.device), ranks)
     # Rows arrive by source rank; put them into the global order.
     positions = torch.cat([global_positions(sizes, source) for source in range(ranks.world_size)])
     arrived = positions[positions % ranks.world_size == ranks.rank]

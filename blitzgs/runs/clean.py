@@ -29,8 +29,7 @@ from blitzgs.runs.evaluation import image_metrics
 from blitzgs.runs.folder import Model
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.util.output import write_file
-from blitzgs.view.draw import table_of_parameters
-from blitzgs.view.gate import SceneGate
+from blitzgs.view.gate import ModelGate
 from blitzgs.view.views import CameraLike, Space, render_options, viewmat
 
 # Contributions are measured, and pictures drawn, at most so wide.
@@ -45,7 +44,7 @@ def contributions(
     space: Space,
     options: RenderOptions,
     ranks: Ranks,
-    lod: SceneGate | None,
+    lod: ModelGate | None,
     rule: ScoreRule = "weight",
 ) -> Importance:
     """Measure what each Gaussian contributes to views of these cameras, in small pictures."""
@@ -85,7 +84,7 @@ def cleaned(
 
     `photograph` returns the photograph of a camera; None: there are none.
     """
-    table = table_of_parameters({name: getattr(model, name) for name in (*PARAMETERS, "level")})
+    table = GaussianTable.of_parameters({name: getattr(model, name) for name in (*PARAMETERS, "level")})
     gate = None if model.lod is None else model.lod.gate
     options = render_options(model.config, model.space, model.sh_degree, gate)
     views = [cameras.cameras[index] for index in cameras.train]

@@ -31,9 +31,9 @@ from blitzgs.ops.photometric import ssim
 from blitzgs.util.errors import explain_memory
 from blitzgs.util.output import OutputFolder
 from blitzgs.util.progress import Report
-from blitzgs.view.gate import SceneGate
+from blitzgs.view.gate import ModelGate
 from blitzgs.view.views import CameraLike, ViewSet
-from blitzgs.view.visible import Scene, VisibleFinder
+from blitzgs.view.visible import TableOrPool, VisibleFinder
 
 Lpips = Callable[[Tensor, Tensor], Tensor]
 Stops = Callable[[], bool]
@@ -131,7 +131,7 @@ def render_view(
 
 
 def evaluate(
-    scene: Scene,
+    gaussians: TableOrPool,
     views: ViewSet,
     cameras: Sequence[CameraLike],
     images: ImageStore,
@@ -145,7 +145,7 @@ def evaluate(
     report: Report | None = None,
     inputs: Iterable[Path] = (),
     optional_files: bool = False,
-    lod: SceneGate | None = None,
+    lod: ModelGate | None = None,
     stops: Stops | None = None,
 ) -> dict[str, Any]:
     """Render views and compare them with their photographs; the ranks take turns at comparing.
@@ -177,7 +177,7 @@ def evaluate(
     lost: str | None = None
     previews = Previews(folder, set(chosen)) if folder is not None and pictures > 0 else None
     own = list(indices[ranks.rank :: ranks.world_size])
-    finder = VisibleFinder(scene, lod)
+    finder = VisibleFinder(gaussians, lod)
     for position, index in enumerate(indices):
         turn, destination = divmod(position, ranks.world_size)
         if destination == 0:

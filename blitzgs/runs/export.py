@@ -30,13 +30,12 @@ from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.checkpoint_files import DAMAGE, Shard, header_of, read_rows, verified
 from blitzgs.runs.folder import Model
 from blitzgs.runs.folder_checks import check_own
-from blitzgs.runs.lod import lod_gate, scene_gate
+from blitzgs.runs.lod import lod_gate, model_gate
 from blitzgs.runs.run_files import Progress
 from blitzgs.runs.world import trained_columns
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import Report
-from blitzgs.view.draw import table_of_parameters
 from blitzgs.view.gate import LodGate
 from blitzgs.view.views import CameraLike, Space
 
@@ -276,10 +275,10 @@ def largest_of_run(source: RunSource, most: int, device: torch.device) -> Model:
     x, y, z = source.space.offset
     found = replace(chosen, comments=[f"comment offset {x!r} {y!r} {z!r}"])
     columns = trained_columns(found, source.space, Ranks())
-    table = table_of_parameters({name: column.to(device) for name, column in columns.items()})
+    table = GaussianTable.of_parameters({name: column.to(device) for name, column in columns.items()})
     return Model(
         **{name: table[name] for name in (*PARAMETERS, "level")},
-        lod=scene_gate(source.config, source.progress, table, Ranks()),
+        lod=model_gate(source.config, source.progress, table, Ranks()),
         space=source.space,
         sh_degree=0,
         config=source.config,

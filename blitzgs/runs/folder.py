@@ -24,10 +24,10 @@ from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks, resolve_device
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import RunCamera, RunCameras, checked_camera, load_cameras
-from blitzgs.runs.lod import scene_gate
+from blitzgs.runs.lod import model_gate
 from blitzgs.runs.log import LOG, records
 from blitzgs.table.table import PARAMETERS
-from blitzgs.view.gate import SceneGate, centres_of
+from blitzgs.view.gate import ModelGate, centres_of
 from blitzgs.view.views import CameraLike, Space, render_options, viewmat
 
 
@@ -59,7 +59,7 @@ class Model:
     opacities: Tensor
     sh: Tensor
     level: Tensor
-    lod: SceneGate | None
+    lod: ModelGate | None
     space: Space
     sh_degree: int
     config: Config
@@ -235,7 +235,7 @@ class RunFolder:
         columns = {name: found.table[name].to(chosen) for name in (*PARAMETERS, "level")}
         return Model(
             **columns,
-            lod=scene_gate(found.config, found.progress, found.table, Ranks()),
+            lod=model_gate(found.config, found.progress, found.table, Ranks()),
             space=found.space,
             sh_degree=found.progress.sh_degree,
             config=found.config,

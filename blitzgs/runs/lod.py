@@ -9,7 +9,7 @@ from blitzgs.config.fields import FORK, Config
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.run_files import Progress
 from blitzgs.table.table import GaussianTable
-from blitzgs.view.gate import LodGate, SceneGate
+from blitzgs.view.gate import LodGate, ModelGate
 from blitzgs.view.levels import FOOTPRINT_STEPS
 
 # Views that would keep at least this share of all Gaussians are rendered with all of them.
@@ -43,7 +43,7 @@ def level_fork(config: Config) -> float:
     return FORK ** (1 / FOOTPRINT_STEPS) if config.view.footprint > 0 else FORK
 
 
-def scene_gate(config: Config, progress: Progress, table: GaussianTable, ranks: Ranks) -> SceneGate | None:
+def model_gate(config: Config, progress: Progress, table: GaussianTable, ranks: Ranks) -> ModelGate | None:
     """Return a model's LOD gate for any camera; None: it is not open. No step may be pending. Collective."""
     gate = lod_gate(config, progress)
     if gate is None:
@@ -51,5 +51,5 @@ def scene_gate(config: Config, progress: Progress, table: GaussianTable, ranks: 
     # With smooth levels every view has the gate: a change from a view with it to one without would be a
     # visible jump.
     if gate.smooth:
-        return SceneGate(gate, math.inf, table, ranks)
-    return SceneGate(gate, MOST_KEPT, table, ranks, _SLACK * progress.least_kept)
+        return ModelGate(gate, math.inf, table, ranks)
+    return ModelGate(gate, MOST_KEPT, table, ranks, _SLACK * progress.least_kept)

@@ -27,7 +27,7 @@ from blitzgs.table.host_table import HostTable, available_bytes
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.views import Space
-from blitzgs.view.visible import Scene
+from blitzgs.view.visible import TableOrPool
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
@@ -101,8 +101,8 @@ class TrainedModel:
     # Gain and bias of each training photograph, [T, 2, 3]; None if the run has none.
     exposures: torch.Tensor | None = None
 
-    def scene(self, device: torch.device) -> Scene:
-        """Return the scene that views are rendered from on a device.
+    def gaussians_on(self, device: torch.device) -> TableOrPool:
+        """Return the Gaussians that views are rendered from on a device.
 
         With a pool, the first call moves the table into memory that the pool can reach. PoolError: the pool
         has room for fewer than two blocks.

@@ -24,8 +24,8 @@ from blitzgs.formats.models import offset_of
 from blitzgs.ops.harmonics import spherical_harmonics
 from blitzgs.runs.folder import Model
 from blitzgs.runs.run_files import Progress, TrainedModel
+from blitzgs.table.table import GaussianTable
 from blitzgs.util.output import write_file
-from blitzgs.view.draw import table_of_parameters
 from blitzgs.view.gate import LodGate
 from blitzgs.view.views import Space
 
@@ -126,7 +126,7 @@ def gate_of(found: Gaussians, unit: float) -> LodGate | None:
 def model_of_file(found: Gaussians, config: Config, space: Space, near: float, ranks: Ranks) -> TrainedModel:
     """Return a model to be rendered in the views of a capture; `near` is in the capture's unit."""
     columns = trained_columns(found, space, ranks)
-    table = table_of_parameters({name: column.to(ranks.device) for name, column in columns.items()})
+    table = GaussianTable.of_parameters({name: column.to(ranks.device) for name, column in columns.items()})
     progress = Progress(step=0, sh_degree=found.degree, level_count=1, peak_gaussians=len(found), seconds=0.0)
     near /= space.unit * space.extent
     return TrainedModel(changed(config, "model", near=near), progress, space, table)

@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from blitzgs.capture.colmap import Float64
+from blitzgs.capture.colmap import Float64, read_model
+from blitzgs.capture.lens import Lens
 
 _PAIR_IDS = 2147483647  # the id of a pair of images a < b is this number times a, plus b
 
@@ -77,7 +78,10 @@ _POSES = re.compile(r"num_reg_frames=(\d+)")
 _MATCHERS = {"gps": "spatial", "sequence": "sequential", "exhaustive": "exhaustive"}
 # Photographs up to which every pair is matched, and poses are found one after the other.
 MOST_IN_ALL_PAIRS, _MOST_ONE_BY_ONE = 300, 500
-_MANY = 15
+# Photographs of a camera that determine a full lens.
+MANY = 15
+# A principal point farther from the middle, as a share of the width or height, was not determined.
+_OFF_CENTRE = 0.1
 # Bytes; with fewer, a failure may be that of the disk.
 _LEAST_SPACE = 50e6
 MISSING = (
@@ -179,10 +183,7 @@ def _commands(program: str, stage: str, job: Job) -> Iterator[list[str]]:
     base = ["--database_path", job.database]
     if stage == "features":
         gpu = _gpu_flags(program, "feature_extractor")
-        groups: dict[tuple[tuple[int, int], Path], list[str]] = defaultdict(list)
-        for name, size in zip(job.names, job.sizes, strict=True):
-            groups[size, Path(name).parent].append(name)
-        for names in groups.values():
+        for names in _groups(job):
             listed = Path(job.models) / "photographs.txt"
             listed.write_text("\n".join(names) + "\n", encoding="utf-8")
             reader = ["--ImageReader.camera_model", lens_model(job.camera_model, len(names))]
@@ -206,6 +207,32 @@ def _commands(program: str, stage: str, job: Job) -> Iterator[list[str]]:
         paths = ["--image_path", job.photos, "--output_path", job.models]
         least = ["--Mapper.min_model_size", str(least_model(len(job.names)))] if mapper == "mapper" else []
         yield [program, mapper, *base, *paths, *least]
+        if min(map(len, _groups(job))) >= MANY:  # as `pycolmap_stage._centre_lenses`
+            for folder in sorted(Path(job.models).glob("[0-9]*")):
+                (refined := folder.with_name("refined")).mkdir(exist_ok=True)
+                paths = ["--input_path", str(folder), "--output_path", str(refined)]
+                yield [program, "bundle_adjuster", *paths, "--BundleAdjustment.refine_principal_point", "1"]
+                adopt(refined, folder)
+
+
+def adopt(refined: Path, folder: Path) -> None:
+    """Move a refined model to its place, unless a principal point went far from the middle."""
+    shares = [
+        np.array(Lens(camera.model, camera.width, camera.height, tuple(camera.params)).intrinsics[2:])
+        / (camera.width, camera.height)
+        for camera in read_model(refined).cameras
+    ]
+    if (np.abs(np.stack(shares) - 0.5) <= _OFF_CENTRE).all():
+        shutil.copytree(refined, folder, dirs_exist_ok=True)
+    shutil.rmtree(refined)
+
+
+def _groups(job: Job) -> list[list[str]]:
+    """Return the photographs of each camera, without EXIF: those of one size and folder."""
+    groups: dict[tuple[tuple[int, int], Path], list[str]] = defaultdict(list)
+    for name, size in zip(job.names, job.sizes, strict=True):
+        groups[size, Path(name).parent].append(name)
+    return list(groups.values())
 
 
 def _help(program: str, command: str) -> str:
@@ -253,4 +280,4 @@ def lens_model(wanted: str, photographs: int) -> str:
     """Return the camera model for a camera that took so many photographs: many determine a full lens."""
     if wanted != "auto":
         return wanted
-    return "OPENCV" if photographs >= _MANY else "SIMPLE_RADIAL"
+    return "OPENCV" if photographs >= MANY else "SIMPLE_RADIAL"

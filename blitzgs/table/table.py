@@ -111,7 +111,7 @@ def as_stored(name: str, column: Tensor) -> Tensor:
 class GaussianTable:
     """One rank's Gaussians as named columns of equal length N.
 
-    The operations `append`, `keep`, `permute`, `replace` and `exchange` act on all columns, one column at a
+    The operations `append`, `keep`, `permute`, `replace` and `move_rows` act on all columns, one column at a
     time, so that peak memory exceeds the table by one column and not by a second table. `replace` touches
     only the rows that change; for that, columns that grow have memory for more rows than they hold.
 
@@ -169,6 +169,22 @@ class GaussianTable:
         }
         table.append(first | dict(rows))
         return table
+
+    @classmethod
+    def of_parameters(cls, columns: Mapping[str, Tensor]) -> GaussianTable:
+        """Build a table for rendering only: the columns of the optimiser are zeros that take no memory.
+
+        Args:
+            columns: `PARAMETERS`, and "level" and "id" if known.
+        """
+        sh = columns["sh"]
+        count, known = len(sh), dict(columns)
+        if "id" not in known:
+            known["id"] = torch.arange(count, device=sh.device)
+        for name, column in schema(round(sh.shape[1] ** 0.5) - 1).items():
+            if name not in known:
+                known[name] = sh.new_zeros((), dtype=column.dtype).expand(count, *column.shape)
+        return cls(known)
 
     def __len__(self) -> int:
         return int(self.columns["means"].shape[0])
@@ -358,7 +374,7 @@ class GaussianTable:
                 self._memory.setdefault(name, column)
                 self.columns[name] = column[: placement.total]
 
-    def exchange(self, destination_ranks: Tensor, ranks: Ranks) -> None:
+    def move_rows(self, destination_ranks: Tensor, ranks: Ranks) -> None:
         """Move every row to a rank. Collective: every rank calls it. Rows arrive ordered by source rank.
 
         Args:

@@ -28,7 +28,7 @@ _LEAST_SHARE = 0.2
 # In squares of the range of colours: pulls the gain to 1 in pictures of nearly one colour.
 _RIDGE = 1e-3
 # Photographs are measured at colours between these, of 255: others may have been cut off.
-_DARKEST, _BRIGHTEST = 3, 252
+_DARKEST, _BRIGHTEST = 5, 250
 # Colours are added up as integers, so that the sums are the same in any order, and at any number of ranks.
 _UNIT = 65535
 
@@ -129,8 +129,6 @@ class Exposures:
 LEAST_SPREAD = 0.04
 # Edge of the square whose mean colour is a point's, in pixels: keypoints are where colours change.
 _BLUR = 5
-# Colours between these, of 255, have not been cut off.
-_DARKEST, _BRIGHTEST = 5, 250
 # Points of a photograph that are compared; more would change nothing.
 _MAX_POINTS = 2000
 # Photographs that are decoded ahead.

@@ -58,7 +58,7 @@ class OffloadingStepper(Stepper):
     step runs.
     """
 
-    scene: Pool
+    gaussians: Pool
 
     def __init__(self, pool: Pool, upcoming: UpcomingCameras, *shared: Any) -> None:
         """Prepare to step with a pool; further arguments are those of `Stepper` after the table."""
@@ -66,7 +66,7 @@ class OffloadingStepper(Stepper):
         self._reported = pool.moved
         self._up_to_date_at: int | None = None
         super().__init__(pool.held, *shared)
-        self.scene = pool
+        self.gaussians = pool
 
     def reindex(self) -> None:
         """See `Stepper.reindex`."""

@@ -30,7 +30,7 @@ from blitzgs.util.charts import line_chart
 from blitzgs.util.output import write_file
 
 PICTURE = "trajectory.svg"
-_STAGES = ("initial", "before_pass_1", "after_pass_1", "peak", "before_pass_2", "after_pass_2", "final")
+_MILESTONES = ("initial", "before_pass_1", "after_pass_1", "peak", "before_pass_2", "after_pass_2", "final")
 
 
 def population_report(state: TrainingState, memory_samples: Sequence[int]) -> dict[str, Any]:
@@ -44,7 +44,7 @@ def population_report(state: TrainingState, memory_samples: Sequence[int]) -> di
     counts = progress.milestones | {"peak": progress.peak_gaussians, "final": state.population()}
     mean = round(fmean(memory_samples)) if memory_samples else None
     memory = state.ranks.all_gather_object((peak_memory_bytes(state.ranks.device), mean))
-    report: dict[str, Any] = {name: counts[name] for name in _STAGES if name in counts}
+    report: dict[str, Any] = {name: counts[name] for name in _MILESTONES if name in counts}
     report["peak_memory_bytes"] = [peak for peak, _ in memory]
     if all(mean is not None for _, mean in memory):
         report["mean_memory_bytes"] = [mean for _, mean in memory]
@@ -53,7 +53,7 @@ def population_report(state: TrainingState, memory_samples: Sequence[int]) -> di
 
 def describe(report: dict[str, Any]) -> str:
     """Return the report in one line of text."""
-    stages = [f"{name.replace('_', ' ')} {report[name]:,}" for name in _STAGES if name in report]
+    stages = [f"{name.replace('_', ' ')} {report[name]:,}" for name in _MILESTONES if name in report]
     return "population: " + ", ".join(stages)
 
 

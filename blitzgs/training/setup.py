@@ -44,7 +44,7 @@ from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.state import Curve, TrainingState
 from blitzgs.training.step import Stepper
 from blitzgs.training.view_level import keep_to_views
-from blitzgs.view.levels import Levels, measure_levels
+from blitzgs.view.levels import measure_levels
 from blitzgs.view.views import Space, ViewSet, trained_centres
 
 
@@ -83,11 +83,7 @@ def set_up(
     lap("checks")
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
     restored = run_files.restore(folder, ranks, home) if resume else None
-    config = _resolved(config, capture, restored)
-    if restored is not None:
-        config = _continued(config, restored, extend)
-    elif extend is not None:
-        raise FileNotFoundError(f"{folder} has no checkpoint: there is no finished run to extend")
+    config = _continued(_resolved(config, capture, restored), restored, extend, folder)
     schedule = Schedule(config.schedule)
     if restored is None:
         table, progress = first_gaussians(config, capture, space, ranks, home)
@@ -103,26 +99,17 @@ def set_up(
 
     run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
     if ranks.rank == 0:
-        save_config(config, folder / run_files.CONFIG)
-        if restored is None or not (folder / CAMERAS).exists():
-            save_cameras(folder, capture, run_id)
-            if restored is None and capture.about.source.frame is not None:
-                save_world_frame(folder, capture.about.source.frame)
+        _describe(folder, config, capture, run_id, is_new=restored is None)
     optimiser = TableAdam(config.optimiser, schedule, space.extent, ranks.device)
     owners = _tile_owners(ranks, progress, restored)
     views = ViewSet(list(capture.cameras), space, ranks.device)
-    sizes = [(capture.cameras[i].width, capture.cameras[i].height) for i in capture.train]
-    tour = None
-    if config.memory.resident_gb > 0 and config.memory.tour:
-        tour = tour_of([capture.cameras[i] for i in capture.train], capture.points)
-    sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed, schedule, tour)
+    sampler = _sampler(config, capture, schedule)
     if config.memory.resident_gb > 0:
         if restored is not None and restored.config.memory.resident_gb == 0:
             sort_rows(table)  # as events do for a table in host memory
         table = HostTable(table.release(), pinned=ranks.device.type == "cuda")
-    stepper = _stepper(
-        config, table, optimiser, owners, space.extent, UpcomingCameras(sampler, capture.train, views)
-    )
+    upcoming = UpcomingCameras(sampler, capture.train, views)
+    stepper = _stepper(config, table, optimiser, owners, space.extent, upcoming)
     if config.model.exposure:
         stepper.exposures = _exposures(capture, images, ranks, progress, restored)
     lineage = _start_lineage(config, capture, folder, table, progress, ranks)
@@ -166,6 +153,15 @@ def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
         )
 
 
+def _describe(folder: Path, config: Config, capture: Capture, run_id: str, is_new: bool) -> None:
+    """Write what the folder of a run tells of its configuration, its cameras and its world."""
+    save_config(config, folder / run_files.CONFIG)
+    if is_new or not (folder / CAMERAS).exists():
+        save_cameras(folder, capture, run_id)
+    if is_new and capture.about.source.frame is not None:
+        save_world_frame(folder, capture.about.source.frame)
+
+
 def _resolved(config: Config, capture: Capture, restored: run_files.Restored | None) -> Config:
     """Return `config` with the values that depend on the training views and on what the run has measured.
 
@@ -192,8 +188,14 @@ def _resolved(config: Config, capture: Capture, restored: run_files.Restored | N
     return run_files.with_pace_of(config, None if restored is None else restored.config)
 
 
-def _continued(config: Config, restored: run_files.Restored, extend: float | None) -> Config:
-    """Return the configuration to continue a run with: `config`, or one with a longer schedule."""
+def _continued(
+    config: Config, restored: run_files.Restored | None, extend: float | None, folder: Path
+) -> Config:
+    """Return the configuration to begin or continue a run with: `config`, or one with a longer schedule."""
+    if restored is None:
+        if extend is not None:
+            raise FileNotFoundError(f"{folder} has no checkpoint: there is no finished run to extend")
+        return config
     if extend is not None:
         # An interrupted extension may have left its schedule in the folder's configuration.
         config = replace(config, schedule=restored.config.schedule)
@@ -235,6 +237,16 @@ def _exposures(
     return exposures if restored is not None or exposures_differ(gains) else None
 
 
+def _sampler(config: Config, capture: Capture, schedule: Schedule) -> BatchSampler:
+    """Return the sampler of batches, with a tour of the views if the Gaussians are in a pool."""
+    cameras = [capture.cameras[i] for i in capture.train]
+    tour = None
+    if config.memory.resident_gb > 0 and config.memory.tour:
+        tour = tour_of(cameras, capture.points)
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    return BatchSampler(sizes, config.schedule.batch_size, config.seed, schedule, tour)
+
+
 def _stepper(
     config: Config,
     table: GaussianTable,
@@ -244,26 +256,15 @@ def _stepper(
     upcoming: UpcomingCameras,
 ) -> Stepper:
     """Return a stepper for a table on the device, or one with a pool for a table on the host."""
-    shared = (
-        optimiser,
-        owners,
-        config.loss,
-        extent,
-        _position_noise(config, extent),
-    )
+    noise, factor = None, config.optimiser.position_noise
+    if factor > 0:
+        noise = PositionNoise(factor, extent, config.population.min_opacity, config.seed)
+    shared = (optimiser, owners, config.loss, extent, noise)
     if not isinstance(table, HostTable):
         return Stepper(table, *shared)
     budget = int(config.memory.resident_gb * 1e9)
     pool = Pool(table, owners.ranks.device, budget, optimiser.pending_table)
     return OffloadingStepper(pool, upcoming, *shared)
-
-
-def _position_noise(config: Config, extent: float) -> PositionNoise | None:
-    """Return the noise of `optimiser.position_noise`; None if it is 0."""
-    factor = config.optimiser.position_noise
-    if factor == 0:
-        return None
-    return PositionNoise(factor, extent, config.population.min_opacity, config.seed)
 
 
 def _start_lineage(
@@ -292,37 +293,40 @@ def first_gaussians(
     config: Config, capture: Capture, space: Space, ranks: Ranks, home: torch.device
 ) -> tuple[GaussianTable, Progress]:
     """Make the first Gaussians; each rank keeps its share of them at `home`."""
-    lod, device = config.lod, ranks.device
+    device = ranks.device
     points = torch.from_numpy(capture.points).to(device) / space.unit
     # Cameras that are far from the others would stretch the octree over distances that no photograph covers.
     together = [i for i in capture.train if i not in capture.apart] or capture.train
     centres = trained_centres([capture.cameras[i] for i in together], space).to(device)
     levels = measure_levels(points, centres, FORK)
-    colors, most = torch.from_numpy(capture.colors).to(device), config.population.max_gaussians
     if config.model.start:
-        return _of_file(config, space, levels, ranks, home)
-    first = octree_gaussians(
-        points, colors, centres, levels, lod.visible_threshold, most=most, seed=config.seed
-    )
-    # A row of the table has some 750 bytes, so each rank makes only its own rows, on its device.
-    share = slice(ranks.rank, None, ranks.world_size)
-    table = first.table(config.model.sh_degree, INITIAL_OPACITY, home, share)
+        table, count, degree = _of_file(config, space, ranks, home)
+        found = count
+    else:
+        first = octree_gaussians(
+            points, torch.from_numpy(capture.colors).to(device), centres, levels,
+            config.lod.visible_threshold, most=config.population.max_gaussians, seed=config.seed,
+        )  # fmt: skip
+        # A row of the table has some 750 bytes, so each rank makes only its own rows, on its device.
+        share = slice(ranks.rank, None, ranks.world_size)
+        table = first.table(config.model.sh_degree, INITIAL_OPACITY, home, share)
+        count, degree, found = len(first), 0, first.found
     sort_rows(table)
     return table, Progress(
         step=0,
-        sh_degree=0,
+        sh_degree=degree,
         level_count=levels.count,
-        peak_gaussians=len(first),
+        peak_gaussians=count,
         seconds=0.0,
-        milestones={"initial": len(first)} | ({"found": first.found} if first.found > len(first) else {}),
+        milestones={"initial": count} | ({"found": found} if found > count else {}),
         reference_distance=levels.reference_distance,
     )
 
 
 def _of_file(
-    config: Config, space: Space, levels: Levels, ranks: Ranks, home: torch.device
-) -> tuple[GaussianTable, Progress]:
-    """Begin with the Gaussians of `model.start`."""
+    config: Config, space: Space, ranks: Ranks, home: torch.device
+) -> tuple[GaussianTable, int, int]:
+    """Return a table of this rank's Gaussians of `model.start`, their number on all ranks, and degree."""
     path, degree, most = Path(config.model.start), config.model.sh_degree, config.population.max_gaussians
     found = read_gaussians(path)
     count, known = len(found), min(found.degree, degree)
@@ -330,14 +334,4 @@ def _of_file(
         limit = f"population.max_gaussians is {most:,}" if count else "a training needs some"
         raise ValueError(f"{path} (model.start) holds {count:,} Gaussians: {limit}")
     columns = trained_columns(with_degree(found, degree), space, ranks)
-    table = GaussianTable.create({name: column.to(home) for name, column in columns.items()})
-    sort_rows(table)
-    return table, Progress(
-        step=0,
-        sh_degree=known,
-        level_count=levels.count,
-        peak_gaussians=count,
-        seconds=0.0,
-        milestones={"initial": count},
-        reference_distance=levels.reference_distance,
-    )
+    return GaussianTable.create({name: column.to(home) for name, column in columns.items()}), count, known

@@ -26,7 +26,6 @@ from blitzgs.runs.log import RunLog
 from blitzgs.runs.run_files import Progress
 from blitzgs.spawn.candidates import Veto
 from blitzgs.spawn.lineage import Lineage
-from blitzgs.table.blocks import sort_rows
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.sampler import BatchSampler
@@ -194,10 +193,6 @@ class TrainingState:
     def catch_up(self) -> None:
         """Apply all pending optimiser steps, so that all rows of the table can be read."""
         self.stepper.catch_up(self.progress.step)
-
-    def sort(self) -> None:
-        """Sort the table (`sort_rows`)."""
-        sort_rows(self.table)
 
     def population(self) -> int:
         """Count the Gaussians of all ranks; every rank calls this."""

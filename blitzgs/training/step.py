@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from blitzgs.table.table import GaussianTable
     from blitzgs.training.batches import Batch
     from blitzgs.training.exposure import Exposures
-    from blitzgs.view.visible import Scene
+    from blitzgs.view.visible import TableOrPool
 
 
 class Stepper:
@@ -33,7 +33,9 @@ class Stepper:
 
     # The rows to which a frame's ids refer: all of this rank's Gaussians, or those of a pool.
     table: GaussianTable
-    scene: Scene  # all of this rank's Gaussians, for rendering between steps; call `catch_up` before
+    gaussians: (
+        TableOrPool  # all of this rank's Gaussians, for rendering between steps; call `catch_up` before
+    )
     exposures: Exposures | None = None  # of the training photographs; None: all are taken as they are
 
     def __init__(
@@ -46,7 +48,7 @@ class Stepper:
         noise: PositionNoise | None = None,
     ) -> None:
         """Prepare to step; `extent` is the scene's in the unit of the means."""
-        self.table = self.scene = table
+        self.table = self.gaussians = table
         self._optimiser, self._owners = optimiser, owners
         self._loss, self._extent, self._noise = loss, extent, noise
         self._transport = open_transport(owners.ranks)

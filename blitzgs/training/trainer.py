@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import time
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,7 +31,7 @@ from blitzgs.runs.log import RunLog
 from blitzgs.spawn.gate import lineage_subject
 from blitzgs.table.pool import PoolError
 from blitzgs.training import view_level
-from blitzgs.training.agreement import MAX_STEPS, Agreement, StopRequest
+from blitzgs.training.agreement import MAX_STEPS, Agreement, Decision, StopRequest
 from blitzgs.training.batches import MAX_MASKED, BatchLoader
 from blitzgs.training.budget import Budget
 from blitzgs.training.events import evaluate, handle_all, save
@@ -111,65 +113,20 @@ class Trainer:
                 `memory.resident_gb`; with one rank, the steps before it are saved.
             CheckpointError: the model could not be saved, although the run waited for disk space.
         """
-        state, done, size = self.state, self.state.progress.step, self.state.schedule.batch_size
+        state = self.state
         folder = state.folder if state.ranks.rank == 0 else None
         board = state.config.log.tensorboard
-        state.log = RunLog(folder, state.schedule.iterations, done * size, board, state.run_id)
-        watching = self._watching
-        if watching is not None:
-            state.log.listener = watching.told
+        state.log = RunLog(folder, state.schedule.iterations, state.images_seen, board, state.run_id)
+        wants = never
+        if self._watching is not None:
+            state.log.listener, wants = self._watching.told, self._watching.wants
         state.start_clock()
         try:
             with StopRequest() as stop:
-                wants = never if watching is None else watching.wants
                 agreement = Agreement(state.ranks, stop, state.save_clock, wants)
                 state.stops = lambda: agreement.now(state.progress.step).signal is not None
-                self._announce()
-                if self._saves_first:  # so that --resume knows the longer schedule
-                    save.save_checkpoint(state)
-                budget, glances = Budget(state), Glances(state)
-                # What a stop kept from happening after the last step comes first.
-                if not handle_all(state, [Event(*entry) for entry in state.progress.events_left]):
-                    self._stop_by(agreement.now(done).signal)
+                if not self._take_steps(agreement):
                     return None
-                # The budget may change the number of steps.
-                while (step := state.progress.step + 1) <= state.schedule.steps:
-                    try:
-                        self.step(step)
-                    except PoolError as error:
-                        self._save_without_room(error, "a step", is_saved=step == done + 1)
-                    if step == done + 1:
-                        self._laps.lap("first step")
-                        state.log.event(step * size, "setup", self._laps.seconds, self._laps.text())
-                    events = state.schedule.events((step - 1) * size, step * size)
-                    if events:
-                        self._write_record()
-                        try:
-                            all_ran = handle_all(state, events)
-                        except PoolError as error:
-                            self._save_without_room(error, "an event")
-                        if not all_ran:
-                            self._stop_by(agreement.now(step).signal)
-                            return None
-                    budget.after(step)
-                    glances.after((step - 1) * size, step * size)
-                    if step == state.schedule.steps:
-                        break
-                    decision = agreement.after(step, self.loader.lost is not None)
-                    if decision.signal is not None:
-                        self._stop_by(decision.signal)
-                        return None
-                    if decision.lost:
-                        break
-                    if decision.save:
-                        with state.stage("checkpoint"):
-                            save.save_checkpoint(state)
-                    if decision.written:
-                        with state.stage("checkpoint"):
-                            save.finish_checkpoint(state)
-                    if decision.watched and watching is not None:
-                        self._write_record()
-                        watching.serve(state.stops)
                 self._write_record()
                 self._check_photographs()
                 return self.finish(agreement)
@@ -184,15 +141,70 @@ class Trainer:
             state.stops = never
             self.close()
 
-    def _save_without_room(self, error: PoolError, what: str, is_saved: bool = False) -> NoReturn:
-        """Save the model, unless it `is_saved`; raise the error that `what` does not fit into the pool."""
+    def _take_steps(self, agreement: Agreement) -> bool:
+        """Take the steps that are left, with their events; False: a signal has stopped the run, now saved."""
+        state, done, size = self.state, self.state.progress.step, self.state.schedule.batch_size
+        self._announce()
+        if self._saves_first:  # so that --resume knows the longer schedule
+            save.save_checkpoint(state)
+        budget, glances = Budget(state), Glances(state)
+        # What a stop kept from happening after the last step comes first.
+        if not handle_all(state, [Event(*entry) for entry in state.progress.events_left]):
+            self._stop_by(agreement.now(done).signal)
+            return False
+        # The budget may change the number of steps.
+        while (step := state.progress.step + 1) <= state.schedule.steps:
+            with self._saved_for_lack_of_room("a step", is_saved=step == done + 1):
+                self.step(step)
+            if step == done + 1:
+                self._laps.lap("first step")
+                state.log.event(step * size, "setup", self._laps.seconds, self._laps.text())
+            if events := state.schedule.events((step - 1) * size, step * size):
+                self._write_record()
+                with self._saved_for_lack_of_room("an event"):
+                    all_ran = handle_all(state, events)
+                if not all_ran:
+                    self._stop_by(agreement.now(step).signal)
+                    return False
+            budget.after(step)
+            glances.after((step - 1) * size, step * size)
+            if step == state.schedule.steps:
+                break
+            decision = agreement.after(step, self.loader.lost is not None)
+            if decision.signal is not None:
+                self._stop_by(decision.signal)
+                return False
+            if decision.lost:
+                break
+            self._carry_out(decision)
+        return True
+
+    def _carry_out(self, decision: Decision) -> None:
+        """Save, and serve the watcher, as the ranks have decided."""
         state = self.state
-        if is_saved or state.ranks.world_size > 1:
-            raise error  # with several ranks, the others are in the middle of the step or event
-        self._stop(f"saved after {state.images_seen:,} images, before {what} that lacks room")
-        raise PoolError(
-            f"{error}. The model so far is saved: continue with --resume and a larger memory.resident_gb"
-        ) from error
+        if decision.save:
+            with state.stage("checkpoint"):
+                save.save_checkpoint(state)
+        if decision.written:
+            with state.stage("checkpoint"):
+                save.finish_checkpoint(state)
+        if decision.watched and self._watching is not None:
+            self._write_record()
+            self._watching.serve(state.stops)
+
+    @contextlib.contextmanager
+    def _saved_for_lack_of_room(self, what: str, is_saved: bool = False) -> Iterator[None]:
+        """Save the model, unless it `is_saved`, if `what` does not fit into the pool (PoolError)."""
+        try:
+            yield
+        except PoolError as error:
+            state = self.state
+            if is_saved or state.ranks.world_size > 1:
+                raise  # with several ranks, the others are in the middle of the step or event
+            self._stop(f"saved after {state.images_seen:,} images, before {what} that lacks room")
+            raise PoolError(
+                f"{error}. The model so far is saved: continue with --resume and a larger memory.resident_gb"
+            ) from error
 
     def _check_photographs(self) -> None:
         """Raise an error on all ranks if one of them continued without a photograph (`BatchLoader.lost`)."""

@@ -10,7 +10,7 @@ import warnings
 from blitzgs.capture.capture import Capture, train_views_fingerprint
 from blitzgs.config.schedule import Event
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.lod import level_fork, lod_gate, scene_gate
+from blitzgs.runs.lod import level_fork, lod_gate, model_gate
 from blitzgs.runs.run_files import Progress
 from blitzgs.table.layouts import CULL
 from blitzgs.table.table import GaussianTable
@@ -64,10 +64,10 @@ def choose_views(state: TrainingState) -> None:
     state.catch_up()  # the prediction reads the means
     # Without the earlier choice, by which the gate may be closed.
     unchosen = dataclasses.replace(state.progress, gated_views="", least_kept=0.0)
-    scene = scene_gate(state.config, unchosen, state.table, state.ranks)
-    assert scene is not None  # the gate is open
-    kept = scene.kept(state.views.centres(state.capture.train))
-    gated = [scene.applies(share) for share in kept]
+    gate = model_gate(state.config, unchosen, state.table, state.ranks)
+    assert gate is not None  # the gate is open
+    kept = gate.kept(state.views.centres(state.capture.train))
+    gated = [gate.applies(share) for share in kept]
     flags = "".join("1" if has_gate else "0" for has_gate in gated)
     state.progress = dataclasses.replace(state.progress, gated_views=flags, least_kept=min(kept, default=0.0))
     mean = sum(share if has_gate else 1.0 for share, has_gate in zip(kept, gated, strict=True)) / len(kept)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs.lod import scene_gate
+from blitzgs.runs.lod import model_gate
 from blitzgs.table.pool import Pool
 from blitzgs.training.events import save
 from blitzgs.training.state import TrainingState
@@ -82,12 +82,12 @@ class Watching:
 
     def _drawn(self, look: Look) -> Picture | None:
         state = self._state
-        scene = state.stepper.scene
-        if isinstance(scene, Pool):
+        gaussians = state.stepper.gaussians
+        if isinstance(gaussians, Pool):
             # The pool is filled for the view, and written back with nothing pending.
             state.catch_up()
-        lod = scene_gate(state.config, state.progress, state.table, state.ranks)
-        subject = Subject(scene, state.render_options, state.space.unit, lod)
+        lod = model_gate(state.config, state.progress, state.table, state.ranks)
+        subject = Subject(gaussians, state.render_options, state.space.unit, lod)
         return Drawer(subject, TileOwners(state.ranks)).draw(look)
 
     def _asked(self, call: Callable[[Watcher], T], otherwise: T) -> T:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TypeVar, cast
@@ -23,10 +23,10 @@ from blitzgs.ops.host import to_host
 from blitzgs.ops.projection_types import Sizes, Views
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.table.pool import Pool
-from blitzgs.table.table import PARAMETERS, GaussianTable, schema
-from blitzgs.view.gate import SceneGate
+from blitzgs.table.table import PARAMETERS, GaussianTable
+from blitzgs.view.gate import ModelGate
 from blitzgs.view.look import Look, Mode, Picture
-from blitzgs.view.visible import Scene, VisibleFinder, VisibleScene
+from blitzgs.view.visible import TableOrPool, VisibleFinder, VisibleRows
 
 T = TypeVar("T")
 
@@ -52,34 +52,17 @@ class Subject:
     """The model that is drawn, as it is at one moment.
 
     Attributes:
-        scene: this rank's Gaussians. Pending optimiser steps are not applied, so that looking at a training
-            does not change it; the rows that wait for them are off by far less than a pixel.
+        gaussians: this rank's. Pending optimiser steps are not applied, so that looking at a training does
+            not change it; the rows that wait for them are off by far less than a pixel.
         options: how the model is rendered, at its present spherical-harmonics degree.
         unit: length of a trained unit in the capture's unit.
         lod: the LOD gate; None: there is none.
     """
 
-    scene: Scene
+    gaussians: TableOrPool
     options: RenderOptions
     unit: float
-    lod: SceneGate | None
-
-
-def table_of_parameters(columns: Mapping[str, Tensor]) -> GaussianTable:
-    """Return a table for rendering only: the columns of the optimiser take no memory.
-
-    Args:
-        columns: `PARAMETERS`, and "level" and "id" if known.
-    """
-    sh = columns["sh"]
-    count, degree = len(sh), round(sh.shape[1] ** 0.5) - 1
-    known = dict(columns)
-    if "id" not in known:
-        known["id"] = torch.arange(count, device=sh.device)
-    for name, column in schema(degree).items():
-        if name not in known:
-            known[name] = sh.new_zeros((), dtype=column.dtype).expand(count, *column.shape)
-    return GaussianTable(known)
+    lod: ModelGate | None
 
 
 class DrawingError(RuntimeError):
@@ -119,7 +102,7 @@ class Drawer:
         options = self._options(look)
         ranges = assignment = None
         if ranks.world_size > 1:
-            self._together(lambda: _reserve(subject.scene, look, device))
+            self._together(lambda: _reserve(subject.gaussians, look, device))
             ranges = self._owners.divide([None], look.width, look.height, options.tile_size)
             assignment = TileAssignment(ranks, ranges)
         depths = [options.near_plane, options.far_plane]
@@ -156,16 +139,16 @@ class Drawer:
             How many are seen, int64 [1]; what is composited by now, float32 [1, H, W, C], and the light that
             still comes through it, [1, H, W].
         """
-        scene, painted = self._subject.scene, look.mode == "level"
+        gaussians, painted = self._subject.gaussians, look.mode == "level"
         table: GaussianTable
         active: ActiveRows | Callable[[Sizes | None], ActiveRows]
-        if assignment is None and not isinstance(scene, Pool):
+        if assignment is None and not isinstance(gaussians, Pool):
 
             def active(capacity: Sizes | None) -> ActiveRows:
-                room = capacity.blocks if capacity is not None and scene.device.type == "cuda" else None
+                room = capacity.blocks if capacity is not None and gaussians.device.type == "cuda" else None
                 return self._together(lambda: self._found(look, views, options, room)).active
 
-            table = scene
+            table = gaussians
         else:
             # All ranks find their rows before any projects: an error of one rank is one of all.
             table, active, _ = self._together(lambda: self._found(look, views, options))
@@ -196,7 +179,7 @@ class Drawer:
 
     def _found(
         self, look: Look, views: Views, options: RenderOptions, room: int | None = None
-    ) -> VisibleScene:
+    ) -> VisibleRows:
         found = self._finder(look).find(views, options.limits, room)
         if look.crop is None:
             return found
@@ -214,7 +197,7 @@ class Drawer:
             fade=() if gate is None else gate.gate.fade(),
         )
 
-    def _gate(self, look: Look) -> SceneGate | None:
+    def _gate(self, look: Look) -> ModelGate | None:
         """Return the gate of a look, with the levels cut off or faded as it asks."""
         lod = self._subject.lod if look.lod else None
         if lod is None or look.smooth is None or look.smooth == lod.gate.smooth:
@@ -224,18 +207,18 @@ class Drawer:
     def _finder(self, look: Look) -> VisibleFinder:
         key = (look.lod, look.smooth)
         if key not in self._finders:
-            self._finders[key] = VisibleFinder(self._subject.scene, self._gate(look))
+            self._finders[key] = VisibleFinder(self._subject.gaussians, self._gate(look))
         return self._finders[key]
 
 
-def _reserve(scene: Scene, look: Look, device: torch.device) -> None:
+def _reserve(gaussians: TableOrPool, look: Look, device: torch.device) -> None:
     """Allocate the memory of a frame, which torch keeps for it: without, one rank would fail in its middle.
 
     Raises:
         RuntimeError: it cannot.
     """
     if device.type == "cuda":
-        rows = len(scene.held if isinstance(scene, Pool) else scene)
+        rows = len(gaussians.held if isinstance(gaussians, Pool) else gaussians)
         size = rows * _ROW_BYTES + look.width * look.height * _PIXEL_BYTES
         torch.empty(size, dtype=torch.uint8, device=device)
 
@@ -257,7 +240,7 @@ def _painted(table: GaussianTable) -> GaussianTable:
     levels = table["level"].int() % len(colours)
     sh = ((colours - 0.5) / _SH_0)[levels][:, None]
     columns = {name: table[name] for name in (*PARAMETERS[:4], "level", "id")}
-    return table_of_parameters(columns | {"sh": sh})
+    return GaussianTable.of_parameters(columns | {"sh": sh})
 
 
 def _channels(frame: Frame, mode: Mode) -> Tensor:

@@ -102,7 +102,7 @@ class ViewGate:
         return GateRules(table["level"], list(self.reach), self.lod_views, sectors, list(self.columns))
 
 
-class SceneGate:
+class ModelGate:
     """The LOD gate of a model, applied only to views for which it leaves out enough Gaussians to pay.
 
     A sample of the Gaussians of all ranks, drawn by their ids, predicts the share that each view would keep;
@@ -130,7 +130,7 @@ class SceneGate:
         self._means, self._reach = table["means"][chosen].to(device).double(), reach[level]
         self._size = int(ranks.all_reduce(torch.tensor(len(level), device=device)).item())
 
-    def with_smooth(self, smooth: bool) -> SceneGate:
+    def with_smooth(self, smooth: bool) -> ModelGate:
         """Return this gate with levels that fade, or that are cut off; a gate that fades is in every view."""
         other = copy.copy(self)
         other.gate = replace(self.gate, smooth=smooth)

@@ -14,16 +14,16 @@ from blitzgs.ops.projection_types import Views
 from blitzgs.table.blocks import BlockIndex, Cameras
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
-from blitzgs.view.gate import SceneGate
+from blitzgs.view.gate import ModelGate
 
 # The Gaussians that views are rendered from: a table on the device, or a table on the host with its pool.
-Scene = GaussianTable | Pool
+TableOrPool = GaussianTable | Pool
 
 # Depths are chosen among so many quantiles.
 _DEPTHS = 64
 
 
-class VisibleScene(NamedTuple):
+class VisibleRows(NamedTuple):
     """The Gaussians to render for a batch of views.
 
     Attributes:
@@ -37,26 +37,26 @@ class VisibleScene(NamedTuple):
     rows_of: Callable[[Tensor], Tensor]
 
 
-def table_of(scene: Scene) -> GaussianTable:
-    """Return the table of all of this rank's Gaussians in a scene."""
-    return scene.table if isinstance(scene, Pool) else scene
+def table_of(gaussians: TableOrPool) -> GaussianTable:
+    """Return the table of all of this rank's Gaussians."""
+    return gaussians.table if isinstance(gaussians, Pool) else gaussians
 
 
 class VisibleFinder:
-    """Finds the Gaussians to render for batches of views of a scene that stays as it is meanwhile.
+    """Finds the Gaussians to render for batches of views of a model that stays as it is meanwhile.
 
     Blocks of Gaussians that no view of a batch may see are not read.
     """
 
-    def __init__(self, scene: Scene, lod: SceneGate | None = None) -> None:
-        """Compute the bounds of the scene's blocks, unless its pool has them.
+    def __init__(self, gaussians: TableOrPool, lod: ModelGate | None = None) -> None:
+        """Compute the bounds of the blocks, unless a pool has them.
 
         Args:
-            scene: this rank's Gaussians, without pending optimiser steps.
+            gaussians: this rank's Gaussians, without pending optimiser steps.
             lod: leaves out rows whose octree level is too fine for their distance; None: no gate.
         """
-        self._scene, self._lod = scene, lod
-        self._index = None if isinstance(scene, Pool) else BlockIndex(scene)
+        self._gaussians, self._lod = gaussians, lod
+        self._index = None if isinstance(gaussians, Pool) else BlockIndex(gaussians)
 
     def depths(self, views: Views, planes: Sequence[float], blocks: int) -> list[float]:
         """Divide the depths of one view such that about a number of blocks lies between two of them.
@@ -68,7 +68,7 @@ class VisibleFinder:
 
         Returns:
             The near plane, depths in ascending order, the far plane. Only these planes if few blocks are in
-            the view, or if the scene is in a pool, which bounds the memory anyway.
+            the view, or if the Gaussians are in a pool, which bounds the memory anyway.
         """
         near, far = planes
         if self._index is None or len(self._index.bounds) <= blocks:
@@ -94,7 +94,7 @@ class VisibleFinder:
         views: Views,
         limits: tuple[float, float, float],
         room: int | None = None,
-    ) -> VisibleScene:
+    ) -> VisibleRows:
         """Find the Gaussians to render for a batch of views. Collective if there is a gate.
 
         Args:
@@ -106,14 +106,14 @@ class VisibleFinder:
         Raises:
             PoolError: the pool is too small for the views.
         """
-        scene, index = self._scene, self._index
-        if isinstance(scene, Pool):
+        gaussians, index = self._gaussians, self._index
+        if isinstance(gaussians, Pool):
             sizes = torch.tensor([[views.width, views.height]] * len(views), dtype=torch.int32)
             cameras = Cameras(views.viewmats, views.Ks, sizes.to(views.viewmats.device), limits)
-            index = scene.load_for_views(cameras)
-            table, rows_of = scene.held, scene.rows_of
+            index = gaussians.load_for_views(cameras)
+            table, rows_of = gaussians.held, gaussians.rows_of
         else:
-            table, rows_of = scene, _same_rows
+            table, rows_of = gaussians, _same_rows
         assert index is not None
         rules = None if self._lod is None else self._lod.rules(table["level"], views.viewmats)
         # Either way, the host does not wait for the number of blocks.
@@ -122,7 +122,7 @@ class VisibleFinder:
             active = active._replace(blocks=None)
         if rules is not None:
             gate_views_(active, table["means"], views.viewmats, rules)
-        return VisibleScene(table, active, rows_of)
+        return VisibleRows(table, active, rows_of)
 
 
 def _same_rows(rows: Tensor) -> Tensor:

@@ -27,8 +27,8 @@ from blitzgs.runs.folder import open_run
 from blitzgs.runs.world import gate_of, load_world_frame, trained_columns
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import PARAMETERS, GaussianTable
-from blitzgs.view.draw import Drawer, Subject, table_of_parameters
-from blitzgs.view.gate import SceneGate
+from blitzgs.view.draw import Drawer, Subject
+from blitzgs.view.gate import ModelGate
 from blitzgs.view.views import Space, render_options
 from blitzgs.viewer.page import Page
 from blitzgs.viewer.world import Exhibit
@@ -84,7 +84,7 @@ def open_model(
         model = largest_of_run(source, most, ranks.device)
         count, degree = len(source), source.degree
     columns = {name: getattr(model, name) for name in (*PARAMETERS, "level")}
-    table = table_of_parameters(columns)
+    table = GaussianTable.of_parameters(columns)
     options = render_options(
         model.config, model.space, model.sh_degree, model.lod.gate if model.lod else None
     )
@@ -132,11 +132,13 @@ def _open_file(path: Path, ranks: Ranks, paths: Path, most: int | None) -> Opene
     space = Space.of(middle + np.array(offset_of(found.comments)), max(extent, 1e-6))
     columns = trained_columns(found, space, Ranks())
     order = morton_order(columns["means"])
-    table = table_of_parameters({name: column[order].to(ranks.device) for name, column in columns.items()})
+    table = GaussianTable.of_parameters(
+        {name: column[order].to(ranks.device) for name, column in columns.items()}
+    )
     config = Config(model=ModelConfig(antialiased=is_antialiased(found), near=1e-3))
     gate = gate_of(found, space.unit)
     options = render_options(config, space, found.degree, gate)
-    lod = None if gate is None else SceneGate(gate, math.inf if gate.smooth else 0.95, table, ranks)
+    lod = None if gate is None else ModelGate(gate, math.inf if gate.smooth else 0.95, table, ranks)
     exhibit = Exhibit(
         title=path.name,
         space=space,

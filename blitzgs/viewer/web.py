@@ -27,7 +27,7 @@ from blitzgs.runs.clean import contributions as measured
 from blitzgs.runs.export import open_source
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import PARAMETERS, GaussianTable
-from blitzgs.view.gate import SceneGate
+from blitzgs.view.gate import ModelGate
 from blitzgs.view.views import CameraLike, Space, render_options
 from blitzgs.viewer.studio import Opened, box_of
 from blitzgs.viewer.world import SCALE, World
@@ -167,7 +167,7 @@ def web_scene(world: World, options: RenderOptions, unit: float, lod: WebLevels 
     )
 
 
-def _levels(lod: SceneGate) -> WebLevels:
+def _levels(lod: ModelGate) -> WebLevels:
     fade = lod.gate.fade()
     return WebLevels(
         reach=[None if math.isinf(reach) else reach for reach in lod.gate.reach()],

@@ -254,7 +254,7 @@ def test_boards_alternate_between_two_halves_and_grow(alone, monkeypatch):
     _, memory, queued = alone
     monkeypatch.setattr(torch.cuda, "current_stream", lambda _: SimpleNamespace(synchronize=lambda: None))
     monkeypatch.setattr(
-        shared_memory.symmetric, "empty", lambda words, dtype, device: torch.arange(words, dtype=dtype)
+        shared_memory, "symmetric_words", lambda words, dtype, device: torch.arange(words, dtype=dtype)
     )
     half = shared_memory.LEAST_BOARD
     for words, begin in ((5, 0), (5, half), (half, 0), (7, half), (half + 1, 0), (5, half + 1), (5, 0)):

@@ -227,7 +227,7 @@ class NeedsMemory:
     def __init__(self, needed, sizes=None):
         self.estimate, self._needed, self.given = CapacityEstimate(sizes), needed, []
 
-    def project_and_send(self, inputs, assignment, sizes):
+    def exchange(self, sizes):
         self.given.append(sizes)
         needed = self._needed(len(self.given))
         fits = sizes is not None and sizes.holds(needed)
@@ -248,19 +248,16 @@ def test_an_estimate_follows_the_largest_recent_sizes():
 
 
 def test_the_next_attempt_gets_the_sizes_the_last_one_needed():
-    transport, asked, consumed = NeedsMemory(lambda _: Sizes(10, 100, 1000), Sizes(10, 99, 2000)), [], []
-    found = run_attempts(
-        transport, asked.append, None, lambda exchange: consumed.append(exchange) or len(consumed)
-    )
-    assert found == ("result", 2)
-    assert asked == transport.given and len(asked) == 2
+    transport = NeedsMemory(lambda _: Sizes(10, 100, 1000), Sizes(10, 99, 2000))
+    found = run_attempts(transport, lambda sizes: (transport.exchange(sizes), len(transport.given)))
+    assert found == ("result", 2) and len(transport.given) == 2
     assert transport.given[0] == (10, 99, 2000, 1) and transport.given[1].holds((10, 100, 1000))
 
 
 def test_attempts_are_bounded_when_the_needed_size_grows():
     transport = NeedsMemory(lambda count: Sizes(1, 10**count, 1))
     with pytest.raises(RuntimeError, match=f"{MAX_ATTEMPTS} attempts .* needs \\(1, 10000, 1, 0\\)"):
-        run_attempts(transport, lambda sizes: None, None, lambda exchange: None)
+        run_attempts(transport, lambda sizes: (transport.exchange(sizes), None))
     assert len(transport.given) == MAX_ATTEMPTS
 
 
@@ -270,7 +267,7 @@ def test_an_attempt_that_fails_leaves_the_estimate():
 
     transport = NeedsMemory(lambda _: Sizes(9, 9, 9), Sizes(1, 2, 3))
     with pytest.raises(MemoryError):
-        run_attempts(transport, fail, None, lambda exchange: None)
+        run_attempts(transport, fail)
     assert transport.estimate.sizes == (1, 2, 3, 1)
 
 

@@ -265,12 +265,13 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
     transport = PeerTransport(alone)
 
     def finished():
-        def check(exchange):
+        def attempt(sizes):
+            exchange = transport.project_and_send(inputs, assignment, sizes)
             arrived, table = exchange.arrived, exchange.gradient_table
             assert arrived.n_isects > 0 and len(arrived.splats.ids) >= len(table)
-            return exchange
+            return exchange, exchange
 
-        result, exchange = run_attempts(transport, lambda _: inputs, assignment, check)
+        result, exchange = run_attempts(transport, attempt)
         return result, exchange.finish()[0]
 
     result, needed = finished()

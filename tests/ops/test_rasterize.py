@@ -342,9 +342,19 @@ def test_a_table_of_gradients_is_found_again_behind_autograd(capacity):
         def backward(ctx, v_sum):
             return gradient_columns(GradientBuffer(buffer).take(torch.zeros(5, 2)))
 
-    Composited.apply(*Projected.apply(torch.ones(5, 3, requires_grad=True))).backward()
-    assert found[0].data_ptr() == buffer.data_ptr()
-    assert torch.equal(found[0], buffer[:5])
+    def composite(used=None, hook=None):
+        columns = Projected.apply(torch.ones(5, 3, requires_grad=True))
+        if hook is not None:
+            columns[1].register_hook(hook)
+        image = Composited.apply(*columns)
+        (image if used is None else image + columns[used].sum()).backward()
+        return found.pop()
+
+    table = composite()
+    assert table.data_ptr() == buffer.data_ptr()
+    assert torch.equal(table, buffer[:5])
+    assert all(composite(used) is None for used in range(4))  # a second use of the splats
+    assert composite(hook=lambda v_conics: 2 * v_conics) is None
 
 
 def test_columns_of_no_table_are_not_one():

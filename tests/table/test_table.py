@@ -155,11 +155,11 @@ class LoopbackRanks:
         return torch.cat((rows[: sent[0]], self.incoming[name]))
 
 
-def test_exchange_moves_every_column():
+def test_rows_move_with_every_column():
     table, incoming = filled_table(20), filled_table(6, seed=3)
     ids = table["id"].clone()
     destination = ids % 2
-    table.exchange(destination, LoopbackRanks(incoming))
+    table.move_rows(destination, LoopbackRanks(incoming))
     assert torch.equal(table["id"], torch.cat((ids[ids % 2 == 0], incoming["id"])))
     assert_rows_whole(table)
 

@@ -8,7 +8,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import render_view
-from blitzgs.runs.lod import scene_gate
+from blitzgs.runs.lod import model_gate
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.pool import Pool, PoolError
 from blitzgs.table.table import GaussianTable
@@ -187,18 +187,18 @@ def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypat
                        "schedule.t1=12", "schedule.t2=0", "view.cull=true")  # fmt: skip
     model, ranks = run_files.open_model(tmp_path, Ranks()), Ranks()
     table = model.table
-    lod = scene_gate(model.config, model.progress, table, ranks)
+    lod = model_gate(model.config, model.progress, table, ranks)
     options, owners = trainer.state.render_options, TileOwners(ranks)
     resident, views = VisibleFinder(table, lod), trainer.state.views
     expected = [render_view(resident, views, i, options, owners) for i in (0, 5)]
     whole = GaussianTable({name: table[name].clone() for name in table})
-    scene = model.scene(ranks.device)
-    finder = VisibleFinder(scene, lod)
-    assert isinstance(scene, Pool) and len(scene.held) < 0.42 * len(whole)
+    pool = model.gaussians_on(ranks.device)
+    finder = VisibleFinder(pool, lod)
+    assert isinstance(pool, Pool) and len(pool.held) < 0.42 * len(whole)
     for i, image in zip((0, 5), expected, strict=True):
         assert torch.equal(render_view(finder, views, i, options, owners), image)
         assert image.std() > 0.01
-    scene.write_back()
+    pool.write_back()
     for name in whole:
         assert torch.equal(model.table[name], whole[name]), name
 
@@ -209,10 +209,11 @@ def test_rows_are_sorted_for_a_pool_or_for_another_number_of_ranks(tmp_path):
     run_ranks(_train, 2, tmp_path / "two", ("schedule.iterations=20",))
     restored = run_files.restore(tmp_path / "two", Ranks())
     assert restored.progress.sorted_spread == 0
-    scene = run_files.open_model(tmp_path / "one", Ranks(), resident_gb=0.1).scene(torch.device("cpu"))
+    model = run_files.open_model(tmp_path / "one", Ranks(), resident_gb=0.1)
+    pool = model.gaussians_on(torch.device("cpu"))
     config = tiny_config(*SETTINGS, "schedule.iterations=20", RESIDENT)
     resumed = Trainer(config, *street(), tmp_path / "one", Ranks(), resume=True)
-    for table in (restored.table, scene.table, resumed.state.table):
+    for table in (restored.table, pool.table, resumed.state.table):
         assert torch.equal(morton_order(table["means"]), torch.arange(len(table)))
 
 

@@ -18,7 +18,7 @@ from blitzgs.frame.render import render_frame
 from blitzgs.population.importance import is_culled
 from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import image_metrics
-from blitzgs.runs.lod import lod_gate, scene_gate
+from blitzgs.runs.lod import lod_gate, model_gate
 from blitzgs.table.layouts import CULL
 from blitzgs.table.table import GaussianTable
 from blitzgs.training import view_level
@@ -119,8 +119,8 @@ def test_what_the_run_says_and_saves(whole_run):
     saved = run_files.open_model(folder, Ranks())
     # What comes after the checkpoint takes time, too.
     assert saved.progress == dataclasses.replace(progress, stages=saved.progress.stages)
-    gate = scene_gate(saved.config, saved.progress, saved.table, Ranks())
-    assert gate.gate == scene_gate(trainer.state.config, progress, trainer.state.table, Ranks()).gate
+    gate = model_gate(saved.config, saved.progress, saved.table, Ranks())
+    assert gate.gate == model_gate(trainer.state.config, progress, trainer.state.table, Ranks()).gate
 
 
 def test_evaluation_has_the_gate_and_no_mask(tmp_path, monkeypatch):
@@ -132,7 +132,7 @@ def test_evaluation_has_the_gate_and_no_mask(tmp_path, monkeypatch):
     found = evaluate.measure(state, [3], None)
     view, camera = state.views.pick([3]), state.capture.cameras[3]
     distances = torch.cdist(state.table["means"].double(), centres_of(view.viewmats))[:, 0]
-    gate = scene_gate(state.config, state.progress, state.table, Ranks()).gate
+    gate = model_gate(state.config, state.progress, state.table, Ranks()).gate
     reach = torch.tensor(gate.reach(), dtype=torch.float64)[state.table["level"].long()]
     assert (distances <= reach).double().mean() < 0.95
     small = GaussianTable({name: state.table[name] for name in state.table})
@@ -162,7 +162,7 @@ def test_levels_that_follow_footprints_leave_out_what_is_small_in_the_view(tmp_p
     def watched(state):
         before = state.table["level"].clone()
         follow(state)
-        gate, table = scene_gate_of(state), state.table
+        gate, table = model_gate_of(state), state.table
         distances = torch.cdist(table["means"].double(), state.views.centres(state.capture.train))
         _, middle, largest = table["scales"].double().exp().sort(1).values.unbind(1)
         size = table["opacities"].double().sigmoid() * (middle * largest).sqrt()
@@ -172,7 +172,7 @@ def test_levels_that_follow_footprints_leave_out_what_is_small_in_the_view(tmp_p
         assert footprints[left_out].max() < 0.5 and left_out[footprints < 0.5 / 2**0.25].all()
         followed.append((state.images_seen, not torch.equal(table["level"], before)))
 
-    def scene_gate_of(state):
+    def model_gate_of(state):
         return lod_gate(state.config, dataclasses.replace(state.progress, finest_level=31, gated_views=""))
 
     monkeypatch.setattr(view_level, "follow_footprints", watched)
@@ -231,11 +231,11 @@ def test_a_gate_that_no_training_view_has_is_not_applied_elsewhere(tmp_path, mon
 
 def test_a_view_from_farther_away_than_training_views_has_no_gate(whole_run):
     folder, trainer, _, _ = whole_run
-    scene, state = blitzgs.open_run(folder).model().lod, trainer.state
-    kept = scene.kept(state.views.centres(state.capture.train))
-    assert [scene.applies(share) for share in kept] == [flag == "1" for flag in state.progress.gated_views]
-    (far,) = scene.kept(torch.tensor([[0.0, 0.0, 1e3 * state.progress.reference_distance]]).double())
-    assert far < scene.least_kept < min(kept) and not scene.applies(far)
+    gate, state = blitzgs.open_run(folder).model().lod, trainer.state
+    kept = gate.kept(state.views.centres(state.capture.train))
+    assert [gate.applies(share) for share in kept] == [flag == "1" for flag in state.progress.gated_views]
+    (far,) = gate.kept(torch.tensor([[0.0, 0.0, 1e3 * state.progress.reference_distance]]).double())
+    assert far < gate.least_kept < min(kept) and not gate.applies(far)
 
 
 def test_the_export_carries_the_levels(whole_run, tmp_path):
@@ -304,9 +304,9 @@ def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path, monkeypat
     state = trainer.state
     assert_same_table(resumed.state.table, state.table)
     assert set(state.progress.gated_views) == {"1"}  # for any share that the views keep
-    scene = scene_gate(state.config, state.progress, state.table, Ranks())
+    gate = model_gate(state.config, state.progress, state.table, Ranks())
     view, camera = state.views.pick([3]), state.capture.cameras[3]
-    weights = scene.gate.weights(state.table["means"], state.table["level"], centres_of(view.viewmats)[0])
+    weights = gate.gate.weights(state.table["means"], state.table["level"], centres_of(view.viewmats)[0])
     assert ((weights > 0) & (weights < 1)).sum() > 10
     faded = GaussianTable({name: state.table[name].clone() for name in state.table})
     faded["opacities"] = (faded["opacities"].double().sigmoid() * weights).logit().float()

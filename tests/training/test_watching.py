@@ -159,7 +159,7 @@ def test_intrinsics_are_centred():
 def test_a_model_in_host_memory_is_shown(tmp_path):
     settings = ("schedule.iterations=20", "memory.resident_gb=0.001")
     trainer, watcher, summary = watched_run(tmp_path, *settings)
-    assert trainer.state.stepper.scene is not trainer.state.table
+    assert trainer.state.stepper.gaussians is not trainer.state.table
     assert len(watcher.pictures) == 19
     assert watcher.failures == []
     assert watcher.pictures[-1].values.std() > 10

@@ -16,8 +16,8 @@ from blitzgs.ops.projection_types import Views
 from blitzgs.population.initialisation import _seen_by_more
 from blitzgs.runs.folder import open_run
 from blitzgs.table.table import PARAMETERS, GaussianTable
-from blitzgs.view.draw import LAYER_ROWS, Drawer, Subject, intrinsics, table_of_parameters
-from blitzgs.view.gate import LodGate, SceneGate
+from blitzgs.view.draw import LAYER_ROWS, Drawer, Subject, intrinsics
+from blitzgs.view.gate import LodGate, ModelGate
 from blitzgs.view.levels import BLOCK_POINTS, PointBlocks, measure_levels
 from blitzgs.view.look import MODES, Look
 from blitzgs.view.views import render_options, viewmat
@@ -31,7 +31,7 @@ def subject_of(model, part=slice(None)):
     columns = {name: getattr(model, name)[part] for name in (*PARAMETERS, "level")}
     columns["id"] = torch.arange(len(model), device=model.means.device)[part]
     options = render_options(model.config, model.space, model.sh_degree)
-    return Subject(table_of_parameters(columns), options, model.space.unit, model.lod)
+    return Subject(GaussianTable.of_parameters(columns), options, model.space.unit, model.lod)
 
 
 def look_of(model, camera, **choices):
@@ -107,7 +107,7 @@ def test_layers_of_depth_are_one_picture(scene, trained, device, monkeypatch):
 
 def test_depths_divide_what_a_view_sees(scene):
     model, camera = scene
-    finder = VisibleFinder(subject_of(model).scene)
+    finder = VisibleFinder(subject_of(model).gaussians)
     views = Views(
         *(torch.from_numpy(m).float()[None] for m in (viewmat(camera, model.space), camera.K)),
         camera.width,
@@ -239,7 +239,7 @@ def test_rows_outside_the_views_are_left_out_and_the_image_stays_the_same(device
 def test_the_gate_leaves_out_the_rows_that_it_leaves_out_of_the_whole_table(device):
     table, views = make_table(device=device), Views(*make_views(device=device), WIDTH, HEIGHT)
     table["level"] = (torch.arange(len(table), device=device) % 6).to(torch.uint8)
-    lod = SceneGate(LodGate(20.0, 2.0, 6, 4), 1.0, table, Ranks(device=torch.device(device)))
+    lod = ModelGate(LodGate(20.0, 2.0, 6, 4), 1.0, table, Ranks(device=torch.device(device)))
     gated = lod.active(table, views.viewmats)
     found = VisibleFinder(table, lod).find(views, LIMITS).active
     image, expected = (render_frame(table, views, OPTIONS, rows).renders for rows in (found, gated))

@@ -22,7 +22,7 @@ from blitzgs.table.layouts import CULL, sectors_in
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batches import Batch
 from blitzgs.training.step import Stepper
-from blitzgs.view.gate import SAMPLE, LodGate, SceneGate, ViewGate, centres_of
+from blitzgs.view.gate import SAMPLE, LodGate, ModelGate, ViewGate, centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.helpers import DEVICES
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
@@ -102,12 +102,12 @@ def test_every_set_is_that_of_the_definition(device, lod_views, columns):
 def test_a_level_beyond_the_finest_is_kept_nowhere_and_level_0_everywhere(device):
     table = make_scene(device=device)
     viewmats, _ = make_views(device=device)
-    scene = SceneGate(LodGate(1e6, 2.0, 6, 2), 1.0, table, Ranks(device=torch.device(device)))
-    near = scene.active(table, viewmats)
+    gate = ModelGate(LodGate(1e6, 2.0, 6, 2), 1.0, table, Ranks(device=torch.device(device)))
+    near = gate.active(table, viewmats)
     finite = table["means"].isfinite().all(1)
     assert torch.equal((near.views == 15)[finite], (table["level"] <= 2)[finite])
-    scene = SceneGate(LodGate(1e-6, 2.0, 6, 5), 1.0, table, Ranks(device=torch.device(device)))
-    far = scene.active(table, viewmats)
+    gate = ModelGate(LodGate(1e-6, 2.0, 6, 5), 1.0, table, Ranks(device=torch.device(device)))
+    far = gate.active(table, viewmats)
     assert torch.equal((far.views == 15)[finite], (table["level"] == 0)[finite])
 
 
@@ -284,9 +284,9 @@ def test_the_share_a_view_keeps_is_predicted_from_a_sample():
     viewmats, _ = make_views()
     for n, tolerance in ((3000, 1e-12), (4 * SAMPLE, 0.015)):
         table = make_scene(n)
-        scene = SceneGate(GATE, 0.8, table, Ranks())
+        gate = ModelGate(GATE, 0.8, table, Ranks())
         kept, _ = kept_by_definition(table, viewmats)
-        found = torch.tensor(scene.kept(centres_of(viewmats)), dtype=torch.float64)
+        found = torch.tensor(gate.kept(centres_of(viewmats)), dtype=torch.float64)
         expected = (kept & table["means"].isfinite().all(1)[:, None]).double().mean(0)
         torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
 
@@ -294,12 +294,12 @@ def test_the_share_a_view_keeps_is_predicted_from_a_sample():
 def test_a_view_that_keeps_almost_all_has_no_gate():
     table = make_scene()
     viewmats, _ = make_views()
-    kept = SceneGate(GATE, 0.8, table, Ranks()).kept(centres_of(viewmats))
+    kept = ModelGate(GATE, 0.8, table, Ranks()).kept(centres_of(viewmats))
     border = sum(sorted(kept)[1:3]) / 2  # between the views
-    active = SceneGate(GATE, border, table, Ranks()).active(table, viewmats)
+    active = ModelGate(GATE, border, table, Ranks()).active(table, viewmats)
     for view, share in enumerate(kept):
         assert bits(active.views, 4)[:, view].all() == (share >= border)
-    assert SceneGate(GATE, 0.0, table, Ranks()).active(table, viewmats) is None
+    assert ModelGate(GATE, 0.0, table, Ranks()).active(table, viewmats) is None
 
 
 def _gated_image(ranks):
@@ -309,16 +309,16 @@ def _gated_image(ranks):
     table = GaussianTable({name: table[name].to(ranks.device) for name in table})
     viewmats, Ks = make_views(device=ranks.device)
     views, owners = Views(viewmats, Ks, WIDTH, HEIGHT), TileOwners(ranks)
-    scene = SceneGate(GATE, 0.8, table, ranks)
-    shares = scene.kept(centres_of(viewmats))
+    gate = ModelGate(GATE, 0.8, table, ranks)
+    shares = gate.kept(centres_of(viewmats))
     images = []
     masked = BlockIndex(table).active(table, Views(viewmats, Ks, WIDTH, HEIGHT), (NEAR, FAR, 0.3))
     rules = ViewGate(GATE.reach(), 0b1101, COLUMNS).rules(table)
     gate_views_(masked, table["means"], viewmats, rules)
     smooth = replace(GATE, smooth=True)
-    faded = SceneGate(smooth, math.inf, table, ranks).active(table, viewmats)
+    faded = ModelGate(smooth, math.inf, table, ranks).active(table, viewmats)
     fading = replace(OPTIONS, fade=smooth.fade())
-    for active, options in ((scene.active(table, viewmats), OPTIONS), (masked, OPTIONS), (faded, fading)):
+    for active, options in ((gate.active(table, viewmats), OPTIONS), (masked, OPTIONS), (faded, fading)):
         if ranks.world_size == 1:
             images.append(render_frame(table, views, options, active).renders.cpu())
             continue
@@ -345,9 +345,9 @@ def test_a_sweep_scores_what_the_gate_lets_views_show(device):
     table["scales"].clamp_(max=0.0)
     viewmats, Ks = make_views(device=device)
     views, ranks = Views(viewmats, Ks, WIDTH, HEIGHT), Ranks(device=torch.device(device))
-    shares = SceneGate(GATE, 1.0, table, ranks).kept(centres_of(viewmats))
-    scene = SceneGate(GATE, max(shares), table, ranks)  # one view has no gate
-    found = sweep(table, [ViewBatch(range(4), views)], 4, OPTIONS, ranks, lod=scene)
+    shares = ModelGate(GATE, 1.0, table, ranks).kept(centres_of(viewmats))
+    gate = ModelGate(GATE, max(shares), table, ranks)  # one view has no gate
+    found = sweep(table, [ViewBatch(range(4), views)], 4, OPTIONS, ranks, lod=gate)
     gated = [view for view in range(4) if shares[view] < max(shares)]
     assert len(gated) == 3
     kept, _ = kept_by_definition(table, viewmats, GATE, gated)

@@ -13,7 +13,7 @@ from blitzgs.frame.render import render_frame
 from blitzgs.ops.project import differentiable_splats, gaussian_tensors, project
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Views
 from blitzgs.reference.render import render as reference_render
-from blitzgs.view.gate import LodGate, SceneGate, centres_of
+from blitzgs.view.gate import LodGate, ModelGate, centres_of
 from blitzgs.view.levels import FOOTPRINT_LEVELS, Levels, footprint_levels, footprint_sizes, measure_levels
 from tests.helpers import DEVICES
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_views
@@ -165,13 +165,13 @@ def test_the_gate_before_the_projection_changes_nothing(device):
     table = faint_scene(6000, device)
     viewmats, Ks = make_views(device=device)
     views = Views(viewmats, Ks, WIDTH, HEIGHT)
-    active = SceneGate(SMOOTH, math.inf, table, Ranks(device=torch.device(device))).active(table, viewmats)
+    active = ModelGate(SMOOTH, math.inf, table, Ranks(device=torch.device(device))).active(table, viewmats)
     assert (active.views != 15).double().mean() > 0.2
     faded = render_frame(table, views, FADED, active)
     everything = render_frame(table, views, FADED)
     assert torch.equal(faded.renders, everything.renders)
     assert torch.equal(faded.projected.gaussian_ids, everything.projected.gaussian_ids)
-    cut = SceneGate(GATE, math.inf, table, Ranks(device=torch.device(device))).active(table, viewmats)
+    cut = ModelGate(GATE, math.inf, table, Ranks(device=torch.device(device))).active(table, viewmats)
     assert not torch.equal(faded.renders, render_frame(table, views, OPTIONS, cut).renders)
 
 
@@ -188,13 +188,13 @@ def test_images_change_little_where_the_gate_makes_them_jump(device):
     K = torch.tensor([[120.0, 0, 80], [0, 120.0, 60], [0, 0, 1]], device=device)[None]
     largest = {}
     for smooth in (False, True):
-        scene = SceneGate(replace(gate, smooth=smooth), math.inf, table, ranks)
+        faded = ModelGate(replace(gate, smooth=smooth), math.inf, table, ranks)
         images = []
         for step in range(80):
             viewmat = torch.eye(4, device=device)[None]
             viewmat[:, 2, 3] = gate.reach()[2] * 2 ** (0.5 - step / 80)
-            options = replace(OPTIONS, fade=scene.gate.fade())
-            frame = render_frame(table, Views(viewmat, K, 160, 120), options, scene.active(table, viewmat))
+            options = replace(OPTIONS, fade=faded.gate.fade())
+            frame = render_frame(table, Views(viewmat, K, 160, 120), options, faded.active(table, viewmat))
             images.append(frame.renders)
         stack = torch.cat(images)
         largest[smooth] = (stack[1:] - stack[:-1]).abs().max().item()

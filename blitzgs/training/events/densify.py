@@ -16,7 +16,7 @@ from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit
 from blitzgs.population.redistribution import MAX_IMBALANCE, redistribute
 from blitzgs.population.relocation import relocate
 from blitzgs.runs.guard import ModelLostError, check_table
-from blitzgs.table.blocks import spread
+from blitzgs.table.blocks import sort_rows, spread
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.table import PARAMETERS
 from blitzgs.training.state import TrainingState
@@ -37,7 +37,7 @@ def run_density_event(state: TrainingState, event: Event) -> None:
     # Views copy whole blocks of a table in host memory.
     is_sorted = moved or isinstance(state.table, HostTable)
     if is_sorted:
-        state.sort()
+        sort_rows(state.table)
     state.stepper.reindex()
     counts, spread_now = _over_all_ranks(state, dataclasses.asdict(report) | {"gaussians": len(state.table)})
     if counts["gaussians"] == 0:
@@ -78,7 +78,7 @@ def _keep_sorted(state: TrainingState, event: Event, spread_now: int, is_sorted:
         is_compact = spread_now <= MOST_SPREAD * state.progress.sorted_spread
         if is_compact and not state.schedule.is_last_density_event(event.time):
             return False
-        state.sort()
+        sort_rows(state.table)
         state.stepper.reindex()
         _, spread_now = _over_all_ranks(state, {})
     state.progress = dataclasses.replace(state.progress, sorted_spread=spread_now)

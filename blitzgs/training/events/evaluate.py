@@ -15,7 +15,7 @@ from blitzgs.config.schedule import Event
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, evenly_ordered, worst_views
-from blitzgs.runs.lod import scene_gate
+from blitzgs.runs.lod import model_gate
 from blitzgs.training.state import TrainingState
 from blitzgs.util.output import write_file
 
@@ -80,7 +80,7 @@ def measure(
     state.catch_up()
     with state.log.work("views measured") as report:
         return evaluate(
-            state.stepper.scene,
+            state.stepper.gaussians,
             state.views,
             state.capture.cameras,
             state.images,
@@ -92,7 +92,7 @@ def measure(
             lpips=lpips,
             report=report,
             optional_files=True,
-            lod=scene_gate(state.config, state.progress, state.table, state.ranks),
+            lod=model_gate(state.config, state.progress, state.table, state.ranks),
             stops=state.stops,
         )
 

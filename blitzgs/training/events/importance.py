@@ -15,8 +15,9 @@ from blitzgs.config.schedule import Event
 from blitzgs.population.importance import Importance, ViewBatch, sample_by_score, sweep, top_by_score
 from blitzgs.population.redistribution import redistribute
 from blitzgs.runs.guard import ModelLostError, check_table
-from blitzgs.runs.lod import scene_gate
+from blitzgs.runs.lod import model_gate
 from blitzgs.spawn.lineage import Cause
+from blitzgs.table.blocks import sort_rows
 from blitzgs.table.table import opacity_logit
 from blitzgs.training import view_level
 from blitzgs.training.state import TrainingState
@@ -39,14 +40,14 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
     views = len(state.capture.train)
     with state.log.work("views surveyed") as report:
         found = sweep(
-            state.stepper.scene,
+            state.stepper.gaussians,
             _reported(view_batches(state), report, views),
             views,
             state.render_options,
             state.ranks,
             state.owners,
             cast(ScoreRule, state.config.population.score),
-            scene_gate(state.config, state.progress, state.table, state.ranks),
+            model_gate(state.config, state.progress, state.table, state.ranks),
             state.stops,
         )
     found.store(state.table, state.config.view.cull)
@@ -60,7 +61,7 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
     if after == 0:
         raise ModelLostError(_nothing_kept(state, event, before))
     redistribute(state.table, state.ranks, max_imbalance=0)
-    state.sort()
+    sort_rows(state.table)
     state.stepper.reindex()
     progress = state.progress
     milestones = progress.milestones | {f"before_{event.kind}": before, f"after_{event.kind}": after}
