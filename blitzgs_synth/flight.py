@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blitzgs_synth.arrays import Doubles, Floats, dot, transformed
-from blitzgs_synth.plan import CityOptions
+from blitzgs_synth.plan import CityOptions, Doubles, Floats, dot, transformed
 
 FIELD_OF_VIEW = math.radians(62)  # horizontal
 TILT = math.radians(45)  # of the oblique views, from straight down

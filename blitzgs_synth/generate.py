@@ -29,10 +29,9 @@ from blitzgs.capture.colmap import (
 )
 from blitzgs.util.output import PARTIAL, write_file
 from blitzgs.util.progress import image_progress
-from blitzgs_synth.arrays import Doubles, Ints
 from blitzgs_synth.flight import View, plan_flight
 from blitzgs_synth.photographs import CORNERS, Progress, each, take_photographs
-from blitzgs_synth.plan import PRESETS, CityOptions, Plan
+from blitzgs_synth.plan import PRESETS, CityOptions, Doubles, Ints, Plan
 from blitzgs_synth.render import City
 from blitzgs_synth.tracks import Cloud, track
 

@@ -7,9 +7,21 @@ from typing import Final
 
 import numpy as np
 
-from blitzgs_synth.arrays import Bools, Doubles, Floats, Ints
 from blitzgs_synth.materials import Noise, cell_random, inside, mix, resolved, rgb, stripes
-from blitzgs_synth.plan import HOUSES, PARK, PLAZA, RETAIL, SIDEWALK, TOWERS, Plan, Streets
+from blitzgs_synth.plan import (
+    HOUSES,
+    PARK,
+    PLAZA,
+    RETAIL,
+    SIDEWALK,
+    TOWERS,
+    Bools,
+    Doubles,
+    Floats,
+    Ints,
+    Plan,
+    Streets,
+)
 
 _SWAY: Final = 0.12  # standard deviation of the movement of crops, metres
 _WHITE: Final = (0.74, 0.74, 0.70)

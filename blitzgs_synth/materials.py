@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from blitzgs_synth.arrays import Bools, Floats
 from blitzgs_synth.buildings import BANDED, BRICK, FLOOR
+from blitzgs_synth.plan import Bools, Floats
 
 _LATTICE = 64  # random values along one period of the noise
 _TEXELS = 8  # texels from one random value to the next

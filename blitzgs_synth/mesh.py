@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blitzgs_synth.arrays import Doubles, Floats, Ints
-from blitzgs_synth.plan import Plan
+from blitzgs_synth.plan import Doubles, Floats, Ints, Plan
 
 Point = tuple[float, float, float]
 Color = tuple[float, float, float]

@@ -17,9 +17,8 @@ import numpy as np
 
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import follow_parent
-from blitzgs_synth.arrays import Bytes
 from blitzgs_synth.flight import View
-from blitzgs_synth.plan import CityOptions
+from blitzgs_synth.plan import Bytes, CityOptions
 from blitzgs_synth.render import City
 from blitzgs_synth.tracks import Corners, find_corners
 

@@ -11,12 +11,11 @@ import cv2
 import numpy as np
 
 from blitzgs_synth import materials, mesh
-from blitzgs_synth.arrays import Bools, Bytes, Doubles, Floats, Ints, dot
 from blitzgs_synth.city import build_city
 from blitzgs_synth.flight import View
 from blitzgs_synth.ground import ground_color
 from blitzgs_synth.materials import Noise, Points, rgb
-from blitzgs_synth.plan import Plan
+from blitzgs_synth.plan import Bools, Bytes, Doubles, Floats, Ints, Plan, dot
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from typing import Final
 import cv2
 import numpy as np
 
-from blitzgs_synth.arrays import Bools, Bytes, Doubles, Ints, transformed
 from blitzgs_synth.flight import View
 from blitzgs_synth.mesh import LEAVES
+from blitzgs_synth.plan import Bools, Bytes, Doubles, Ints, transformed
 from blitzgs_synth.render import City
 
 PIXEL_NOISE: Final = 0.35  # standard deviation of an observation, pixels

@@ -35,7 +35,7 @@ set_source_files_properties(
   csrc/common/build_cuda.cu
   PROPERTIES COMPILE_DEFINITIONS "BLITZGS_CUDA_BUILD=\"${CMAKE_CUDA_COMPILER_VERSION} ${architectures}\""
 )
-add_library(blitzgs_cuda SHARED csrc/common/schema_digest.cpp ${op_sources} ${cuda_kernels})
+add_library(blitzgs_cuda SHARED ${schema_digest_source} ${op_sources} ${cuda_kernels})
 target_compile_definitions(blitzgs_cuda PRIVATE BLITZGS_BACKEND_CUDA USE_CUDA)
 if(BLITZGS_SM80_BRANCHES)
   target_compile_definitions(blitzgs_cuda PRIVATE BLITZGS_SM80_BRANCHES=1)

@@ -39,7 +39,7 @@ _LEAST_WHITE = 1 / 4
 
 
 class ImageFile(NamedTuple):
-    """The bytes of an image file, and what its header says (csrc/io/image_header.h)."""
+    """The bytes of an image file, and what its header says (csrc/io/image_file.h)."""
 
     name: str
     data: bytes | UInt8

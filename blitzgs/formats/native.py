@@ -203,14 +203,14 @@ def read_image_file(path: Path) -> tuple[Array, dict[str, Any]]:
 
 
 def read_image_header(data: bytes | Array, name: Path) -> dict[str, Any]:
-    """Return what the header of an image says: the fields of `ImageHeader` in csrc/io/image_header.h."""
+    """Return what the header of an image says: the fields of `ImageHeader` in csrc/io/image_file.h."""
     (header,) = _call("read_image_header", data, name)
     found: dict[str, Any] = json.loads(header.tobytes())
     return found
 
 
 def tiff_as_stored(data: bytes | Array, name: Path) -> bytes | Array:
-    """Return a TIFF that OpenCV decodes as it is stored (csrc/io/image_header.h)."""
+    """Return a TIFF that OpenCV decodes as it is stored (csrc/io/image_file.h)."""
     (changed,) = _call("tiff_as_stored", data, name)
     return changed if len(changed) else data
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "io/image_header.h"
+#include "io/image_file.h"
 
 #include <algorithm>
 #include <string_view>

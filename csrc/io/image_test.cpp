@@ -5,7 +5,6 @@
 
 #include "common/catch.h"
 #include "io/image_file.h"
-#include "io/image_header.h"
 
 using namespace blitzgs::io;
 using namespace std::string_view_literals;

@@ -23,7 +23,6 @@
 
 #include "io/colmap.h"
 #include "io/image_file.h"
-#include "io/image_header.h"
 #include "io/ply.h"
 
 // The interface. Only these types and functions cross the border of the library, so that it contains the C++

@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <cstring>
 
-#include "io/image_header.h"
+#include "io/image_file.h"
 
 namespace blitzgs::io {
 

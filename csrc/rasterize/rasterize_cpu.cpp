@@ -4,7 +4,6 @@
 #include <vector>
 
 #include "common/parallel.h"
-#include "rasterize/pixel_splats.h"
 #include "rasterize/rasterize.h"
 #include "rasterize/tile_jobs.h"
 

@@ -3,8 +3,6 @@
 
 #include <tuple>
 
-#include "rasterize/pixel_splats.h"
-
 namespace blitzgs {
 namespace {
 

@@ -261,7 +261,7 @@ void contribute_tile(const TileJob<typename Lanes::Scalar>& tile, const Contribu
   composite_list<Lanes>(tile, state, sink);
 }
 
-// Writes the splats of the pixels (pixel_splats.h).
+// Writes the splats of the pixels (rasterize.h).
 template <class Lanes, class T>
 struct PixelSink {
   const TileJob<T>& tile;

@@ -6,7 +6,6 @@
 #include <cstdint>
 
 #include "importance/importance.h"
-#include "rasterize/pixel_splats.h"
 #include "rasterize/rasterize.h"
 
 namespace blitzgs::cpu {

@@ -209,14 +209,6 @@ def test_masks_are_found_turned_and_shrunk_so_that_mixed_pixels_are_excluded(tmp
         load_capture(tmp_path, masks="other")
 
 
-def test_labels_of_dark_colours_are_not_black(tmp_path):
-    write_capture(tmp_path, NAMES[:1], width=64, height=48)
-    mask = np.zeros((48, 64, 3), dtype=np.uint8)
-    mask[:, 17:, 2] = 4  # blue, which has little weight in grey
-    write_image(tmp_path / "masks" / "v00.png", mask)
-    np.testing.assert_array_equal(ImageStore(load_capture(tmp_path)).mask(0).numpy(), mask[..., 2] // 4)
-
-
 def test_a_mask_of_another_shape_is_refused(tmp_path):
     write_capture(tmp_path, NAMES[:1], width=64, height=48)
     (tmp_path / "masks").mkdir()

@@ -10,7 +10,7 @@ import pytest
 
 from blitzgs.capture import colmap
 from blitzgs.capture.capture import MissingImagesError, load_capture
-from blitzgs.capture.names import files_below, match_names, unified
+from blitzgs.capture.names import files_below, match_names
 from blitzgs.formats import native
 from tests.capture.helpers import (
     as_text,
@@ -355,7 +355,3 @@ def test_folders_that_the_caller_names_may_be_anywhere(tmp_path, recwarn):
     (root / "images").rename(tmp_path / "photographs")
     assert len(load_capture(root, images="../photographs", inside_only=True).cameras) == 4
     assert not [str(warning.message) for warning in recwarn.list]
-
-
-def test_unified_names():
-    assert unified(".\\a\\b.jpg") == unified("a/./b.jpg") == "a/b.jpg"

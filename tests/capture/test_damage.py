@@ -96,18 +96,6 @@ def test_a_mask_in_separate_bands_of_16_bits_is_refused():
         decode_mask(described(data, "m.tif"))
 
 
-@pytest.mark.parametrize("kept", [0.2, 0.5, 0.8])
-def test_scans_of_a_progressive_jpeg_that_became_zeros_are_damage(tmp_path, kept):
-    pixels = np.random.default_rng(0).integers(0, 256, (200, 300, 3)).astype(np.uint8)
-    data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
-    length = int(kept * len(data))
-    (tmp_path / "a.jpg").write_bytes(data[:length] + bytes(len(data) - length - 2) + data[-2:])
-    with pytest.raises(ValueError, match="a.jpg: at byte .*damaged JPEG"):
-        read_whole(tmp_path / "a.jpg")
-    (tmp_path / "a.jpg").write_bytes(data[:-2] + bytes(100) + data[-2:])
-    read_whole(tmp_path / "a.jpg")
-
-
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".webp", ".jpg", ".jp2", ".bmp"])
 def test_damaged_files_leave_the_terminal_to_our_message(tmp_path, suffix, capfd):
     """Decoders write lines of their own before they fail."""

@@ -201,16 +201,6 @@ def test_a_small_jpeg_of_many_blocks_allocates_little(tmp_path, in_fresh_process
     assert in_fresh_process(check_huge, tmp_path / "huge.jpg") == "whole"
 
 
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "model.ply"])
-def test_every_truncation_of_a_binary_file_is_refused(samples, tmp_path, name):
-    path = tmp_path / name
-    data = samples[name]
-    for length in range(0, len(data), max(1, len(data) // 300)):
-        path.write_bytes(data[:length])
-        with pytest.raises(ValueError, match=f"{name}: "):
-            READERS[name](str(path))
-
-
 @pytest.mark.parametrize("kind", ["BASELINE", "OPTIMIZE", "PROGRESSIVE", "RST_INTERVAL"])
 def test_a_lost_sector_of_a_jpeg_is_noticed(tmp_path, kind):
     """512 bytes of zeros, as a disk leaves them, wherever they lie in the image data."""

@@ -209,15 +209,6 @@ def test_a_photograph_is_not_taken_for_its_own_mask(tmp_path):
     assert found == [tmp_path / "capture" / "masks" / "a.png"]
 
 
-def test_labels_of_16_bits_are_not_black(tmp_path):
-    write_capture(tmp_path, ["v00.jpg"], width=64, height=48)
-    mask = np.zeros((48, 64), dtype=np.uint16)
-    mask[:, 17:] = 1
-    (tmp_path / "masks").mkdir()
-    cv2.imwrite(str(tmp_path / "masks" / "v00.png"), mask)
-    np.testing.assert_array_equal(ImageStore(load_capture(tmp_path)).mask(0).numpy(), mask)
-
-
 BACKGROUNDS = [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.2371, 0.5513, 0.9127)]
 SIZE = 16
 

@@ -32,7 +32,7 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.optim.table_adam import BETA1, BETA2, EPS
 
 FOLDER = Path(__file__).parents[2] / "configs"
-CONFIGS, AERIAL = sorted(FOLDER.glob("*.yaml")), FOLDER / "aerial.yaml"
+AERIAL = FOLDER / "aerial.yaml"
 
 
 def test_file_then_overrides(tmp_path):
@@ -84,6 +84,11 @@ def test_saved_configuration_reads_back_to_the_same(tmp_path):
         ("--seed=[", "seed: cannot read the value"),
         ("--schedule.scale=" + "9" * 400, "schedule.scale: 9+ is too large"),
         ("--log=&all {every: *all}", "log: sections are nested more than 20 deep"),
+        ("--schedule.scale=1e-9", r"schedule.scale: must be in \[0.0001, 10,000\], got 1e-09"),
+        ("--schedule.iterations=999999999", "times schedule.scale must be at most 10,000,000 images"),
+        ("--view.lod=fade", "view.lod: must be true, false or smooth, got fade"),
+        ("--lod.visible_threshold=1", r"lod.visible_threshold: must be in \[0, 1\), got 1.0"),
+        ("--data.exif=maybe", "data.exif: must be one of auto, apply, ignore, got maybe"),
     ],
 )
 def test_errors_name_the_field(override, message):
@@ -111,11 +116,6 @@ def test_unreadable_files(tmp_path):
     (tmp_path / "loop.yaml").write_text("base: loop.yaml")
     with pytest.raises(ConfigError, match="leads back"):
         load_config(tmp_path / "loop.yaml")
-
-
-@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
-def test_shipped_configurations_load(path):
-    assert load_config(path).schedule.iterations > 0
 
 
 NUMBERS = [(name, value) for name, value in flat_fields(Config()) if isinstance(value, (int, float, tuple))]
@@ -175,24 +175,6 @@ def test_senseless_numbers_are_refused_by_name(name, default, value):
     text = f"[{value}, 0, 0]" if isinstance(default, tuple) else value
     with pytest.raises(ConfigError, match=rf"{name}.*: must be .*got"):
         load_config(None, [f"--{name}={text}"])
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("schedule.scale=1e-9", r"schedule.scale: must be in \[0.0001, 10,000\], got 1e-09"),
-        ("schedule.iterations=999999999", "times schedule.scale must be at most 10,000,000 images"),
-        ("view.lod=fade", "view.lod: must be true, false or smooth, got fade"),
-        ("lod.visible_threshold=1", r"lod.visible_threshold: must be in \[0, 1\), got 1.0"),
-        ("population.min_opacity=2", r"population.min_opacity: must be in \[0, 1\), got 2.0"),
-        ("model.near=2e6", "model.near: must be in"),
-        ("data.exif=maybe", "data.exif: must be one of auto, apply, ignore, got maybe"),
-        ("ranks.timeout_seconds=-1", r"ranks.timeout_seconds: must be in \[1, 1,000,000\], got -1.0"),
-    ],
-)
-def test_values_out_of_range_are_refused(override, message):
-    with pytest.raises(ConfigError, match=message):
-        load_config(None, [f"--{override}"])
 
 
 def test_a_position_rate_of_zero_keeps_the_means_in_place():

@@ -4,7 +4,6 @@
 import dataclasses
 import json
 import math
-import os
 import random
 import shutil
 import subprocess
@@ -369,30 +368,6 @@ def test_antialiased_models_are_marked_and_can_be_baked(tmp_path, capsys):
         errors["baked"] += (baked.render(camera) - wanted).square().mean().item()
     gain = 10 * math.log10(errors["marked"] / errors["baked"])
     assert gain > 3, errors
-
-
-@pytest.mark.parametrize("kind", ["link", "device"])
-def test_export_replaces_regular_files_only(trained, tmp_path, capsys, kind):
-    path = tmp_path / "model.ply"
-    if kind == "link":
-        (tmp_path / "target").write_text("precious")
-        path.symlink_to(tmp_path / "target")
-    else:
-        os.mkfifo(path)
-    before = path.lstat()
-    assert main(["export", str(trained[1]), "--ply", str(path)]) == 1
-    assert "which is not overwritten" in capsys.readouterr().err
-    after = path.lstat()
-    assert (after.st_ino, after.st_mode) == (before.st_ino, before.st_mode)
-    assert kind == "device" or (tmp_path / "target").read_text() == "precious"
-
-
-def test_export_replaces_no_file_of_another_format(trained, tmp_path, capsys):
-    path = tmp_path / "notes.txt"
-    path.write_text("precious")
-    assert main(["export", str(trained[1]), "--ply", str(path)]) == 1
-    assert "notes.txt exists and is not a PLY file: choose another name" in capsys.readouterr().err
-    assert path.read_text() == "precious"
 
 
 def test_export_refuses_a_name_that_promises_another_format(trained, tmp_path, capsys):

@@ -16,12 +16,16 @@ from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.names import IMAGE_SUFFIXES, ImageFinder, files_below, unified
 from blitzgs.capture.points import SUFFIXES, SourcePoints, file_points
-from blitzgs.capture.projects.bundler import is_bundler, read_bundler
 from blitzgs.capture.projects.metashape import is_metashape, read_metashape
 from blitzgs.capture.projects.opensfm import NAME, read_opensfm
 from blitzgs.capture.projects.pix4d import SUFFIX, read_opf, read_pix4d
 from blitzgs.capture.projects.project import Project
-from blitzgs.capture.projects.realitycapture import is_realitycapture, read_realitycapture
+from blitzgs.capture.projects.realitycapture import (
+    is_bundler,
+    is_realitycapture,
+    read_bundler,
+    read_realitycapture,
+)
 from blitzgs.capture.world import WorldFrame, converted, frame_beside
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras that RealityCapture or RealityScan exports as CSV ("Internal/External camera parameters").
+"""Cameras and points that RealityCapture or RealityScan exports, as CSV and as Bundler's reconstruction.
 
-Conventions (the program's export template and its help on camera models):
+CSV ("Internal/External camera parameters"; the program's export template and its help on camera models):
 
 - f is a 35 mm equivalent: f / 36 times the longer side in pixels. px and py are the principal point minus
   half of the image, as shares of the longer side.
@@ -10,6 +10,14 @@ Conventions (the program's export template and its help on camera models):
 - Brown's model with k1 to k4. t1 belongs to r^2 + 2 x^2, as OpenCV's p2: the program's own OpenCV template
   writes t2 before t1.
 - x, y and alt are coordinates of the export's reference system, which the file does not name.
+
+Bundler's bundle.out, version 0.3, which Metashape and others export too (N. Snavely, Bundler v0.4 User's
+Manual):
+
+- R and t map world to camera with x right, y up, z backwards.
+- The principal point is the centre of the image; f is in pixels, and y points up in the image.
+- (1 + k1 r^2 + k2 r^4) scales a point before f.
+- The photographs' names, in the order of the cameras, are in list.txt or the file's own name with .list.txt.
 """
 
 from __future__ import annotations
@@ -22,7 +30,16 @@ import numpy as np
 
 from blitzgs.capture.cameras import Float64
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.projects.project import Project, ProjectView, made_lens, number, pose_of, read_text
+from blitzgs.capture.points import SourcePoints
+from blitzgs.capture.projects.project import (
+    Project,
+    ProjectView,
+    check_size,
+    made_lens,
+    number,
+    pose_of,
+    read_text,
+)
 
 _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 # Newer versions write these names.
@@ -86,3 +103,87 @@ def _lens(values: dict[str, float], where: str, width: int, height: int) -> Lens
     cy = height / 2 + values.get("py", 0) * side
     k1, k2, k3, k4, t1, t2 = (values.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "t1", "t2"))
     return made_lens(where, "BROWN", width, height, f, f, cx, cy, k1, k2, k3, k4, t2, t1, 0)
+
+
+_SIGN = b"# Bundle file v0.3"
+
+
+def is_bundler(path: Path) -> bool:
+    """Tell whether a file begins as a reconstruction of Bundler does."""
+    with open(path, "rb") as file:
+        return file.read(len(_SIGN)) == _SIGN
+
+
+def read_bundler(path: Path) -> Project:
+    """Read cameras and points."""
+    check_size(path)
+    with open(path, "rb") as file:
+        file.readline()
+        counts = file.readline().split()
+        body = file.read()
+    try:
+        cameras, points = (int(word) for word in counts)
+        if not (0 <= cameras <= len(body) and 0 <= points <= len(body)):
+            raise ValueError
+    except ValueError as error:
+        raise ValueError(f"{path}: line 2: expected the numbers of cameras and points") from error
+    lines = body.splitlines()
+    if len(lines) < 5 * cameras + 3 * points:
+        raise ValueError(
+            f"{path}: {len(lines) + 2} lines are too few for {cameras} cameras and {points} points: the file "
+            "is cut off; export it again"
+        )
+    try:
+        rows = np.array(b" ".join(lines[: 5 * cameras]).split(), dtype=np.float64).reshape(cameras, 15)
+    except ValueError as error:
+        raise ValueError(f"{path}: the cameras are not 15 numbers each ({error}); export it again") from error
+    names = _names(path, cameras)
+    views = []
+    for index, row in enumerate(rows):
+        if row[0] == 0:  # not registered
+            continue
+        where = f"{path}: camera {index} ({names[index]})"
+        rotation = row[3:12].reshape(3, 3)
+        centre = -rotation.T @ row[12:15]
+        lens = functools.partial(_bundle_lens, row[:3], where)
+        views.append(ProjectView(names[index], lens, pose_of(rotation.T * [1, -1, -1], centre, where)))
+    return Project(views, _points(path, lines[5 * cameras :], points), lost=cameras - len(views))
+
+
+def _bundle_lens(values: Float64, where: str, width: int, height: int) -> Lens:
+    f, k1, k2 = values
+    return made_lens(where, "RADIAL", width, height, f, width / 2, height / 2, k1, k2)
+
+
+def _names(path: Path, count: int) -> list[str]:
+    beside = [path.with_suffix(".list.txt"), path.with_suffix(".txt"), path.with_name("list.txt")]
+    beside += sorted(path.parent.glob("*list*.txt"))
+    found = next((file for file in beside if file.is_file()), None)
+    if found is None:
+        raise ValueError(f"{path} has no list of its photographs: put list.txt, one name a line, beside it")
+    # A line may have a focal length after the name.
+    names = [line.strip() for line in read_text(found).splitlines() if line.strip()]
+    names = [
+        name if len(words := name.rsplit(maxsplit=2)) < 3 or words[1] != "0" else words[0] for name in names
+    ]
+    if len(names) != count:
+        raise ValueError(f"{found} has {len(names)} names for the {count} cameras of {path}: they must agree")
+    return names
+
+
+def _points(path: Path, lines: list[bytes], count: int) -> SourcePoints:
+    try:
+        positions = np.array(b" ".join(lines[: 3 * count : 3]).split(), dtype=np.float64).reshape(count, 3)
+        colors = np.array(b" ".join(lines[1 : 3 * count : 3]).split(), dtype=np.float64).reshape(count, 3)
+        tracks = np.array([int(line.split(None, 1)[0]) for line in lines[2 : 3 * count : 3]], dtype=np.int64)
+    except (ValueError, IndexError) as error:
+        raise ValueError(
+            f"{path}: a point has not three lines of numbers ({error}); export it again"
+        ) from error
+    return SourcePoints(
+        positions,
+        np.clip(colors, 0, 255).astype(np.uint8),
+        tracks,
+        path=path,
+        colors_from="the points' own colours",
+    )

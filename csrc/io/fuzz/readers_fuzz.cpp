@@ -12,7 +12,6 @@
 
 #include "io/colmap.h"
 #include "io/image_file.h"
-#include "io/image_header.h"
 #include "io/ply.h"
 
 namespace io = blitzgs::io;
