@@ -168,23 +168,26 @@ def test_interrupted_work_goes_on_and_is_placed_by_gps(tmp_path, monkeypatch):
     assert not (tmp_path / "images").is_symlink()
 
 
-@pytest.mark.parametrize(("count", "away", "found"), [(20, 30, 30), (10, 30, 0), (20, 80, 0)])
+@pytest.mark.parametrize(("count", "away", "found"), [(20, 40, 40), (10, 40, 0), (20, 1, 0)])
 def test_many_photographs_determine_the_principal_point(tmp_path, count, away, found):
-    """A few do not, and one that is far from the middle is not believed."""
+    """A few do not, and it stays in the middle if the error is hardly less elsewhere."""
     made = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=count, num_points3D=300)
     made.camera_width, made.camera_height = 640, 480
     made.camera_model_id, made.camera_params = pycolmap.CameraModelId.PINHOLE, [600, 600, 320 + away, 240]
     with pycolmap.Database.open(tmp_path / "database.db") as database:
         model = pycolmap.synthesize_dataset(made, database)
+        pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.3), model, database)
     model.cameras[1].params = [600, 600, 320, 240]
     pycolmap.bundle_adjustment(model)  # as the mappers leave it
+    model.update_point_3d_errors()
     (tmp_path / "0").mkdir()
     model.write(tmp_path / "0")
     _centre_lenses(str(tmp_path / "database.db"), tmp_path / "0", pycolmap.IncrementalPipelineOptions())
     params = pycolmap.Reconstruction(tmp_path / "0").cameras[1].params
-    assert params[2] == pytest.approx(320 + found, abs=0.1)
     if found:
-        assert params == pytest.approx([600, 600, 320 + away, 240], abs=0.1)
+        assert params == pytest.approx([600, 600, 320 + found, 240], abs=1)
+    else:
+        assert params[2:].tolist() == [320, 240]
     assert [path.name for path in tmp_path.glob("*") if path.is_dir()] == ["0"]
 
 
