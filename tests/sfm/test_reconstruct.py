@@ -26,6 +26,7 @@ from blitzgs.sfm.photographs import Photographs, judge_positions
 from blitzgs.sfm.pycolmap_stage import _centre_lenses, features
 from blitzgs.sfm.reconstruct import Settings
 from blitzgs.sfm.report import examine
+from tests.capture.helpers import Posed, opensfm, pix4d, realitycapture
 from tests.sfm.scene import FOCAL, aligned, with_gps, write_photographs
 from tests.training.tiny import OVERRIDES, as_flags
 
@@ -315,6 +316,17 @@ def test_photographs_alone_are_recognised(tmp_path, capsys):
     with pytest.raises(FileNotFoundError, match=f"has its cameras: --data={tmp_path / 'data'} "):
         command.with_poses(config_of(tmp_path / "data/images"), tmp_path / "x")
     assert command.with_poses(config_of(tmp_path / "data"), tmp_path / "x") == config_of(tmp_path / "data")
+
+
+@pytest.mark.filterwarnings("ignore:.*no points", "ignore:.*of the project", "ignore:.*the largest is used")
+def test_projects_of_other_programs_have_poses(tmp_path):
+    posed = Posed(origin=np.array([500_000.0, 5_200_000.0, 400.0]))
+    pix4d(posed, posed.write_images(tmp_path / "a") / "1_initial" / "params", posed.origin)
+    opensfm(Posed(), posed.write_images(tmp_path / "b") / "reconstruction.json", (47.5, 8.25, 432.0))
+    realitycapture(posed, posed.write_images(tmp_path / "c") / "registration.csv")
+    for name in "abc":
+        assert command.understood_alone(config_of(tmp_path / name)) is None
+        assert len(load_capture(tmp_path / name).cameras) == 6
 
 
 def test_other_ranks_wait_for_rank_0(tmp_path, monkeypatch):
