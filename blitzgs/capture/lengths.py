@@ -200,7 +200,8 @@ def random_points(
         np.einsum("nij,nj->i", across, centres) + 1e-6 * centres.mean(axis=0),
     )
     half = 0.35 * float(np.linalg.norm(centres - target, axis=1).mean())
-    if half <= _LEAST_SPREAD * (1 + float(np.abs(offset).max())):
+    # Files state coordinates of a map, with offsets of millions of metres, to a millimetre.
+    if half <= _LEAST_SPREAD * (1 + 1e-3 * float(np.abs(offset).max())):
         raise ValueError(
             "the capture has no points and all its cameras are in one place, so the position of the "
             "scene is unknown: add points to the capture"

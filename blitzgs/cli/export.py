@@ -52,8 +52,8 @@ Write a model in a format of other programs, or as one HTML file to send:
   blitzgs export RUN|CHECKPOINT|FILE --html SCENE.html    the model and a viewer, opened from the disk
   blitzgs export FILE.splat --spz MODEL.spz               a model of another program
 
-The guide's page on formats compares them. All but --ply, --glb and --html need packages:
-pip install "blitzgs[formats]".
+The guide's page on formats compares them. --compressed-ply and --spz need packages: pip install
+"blitzgs[formats]".
 
 Georeferenced models are written around their own origin, because the files' numbers cannot hold large
 coordinates. The offset is in FILE.offset.json and, where there is one, in the header.

@@ -101,7 +101,7 @@ def open_gaussians(path: Path, checked: bool = True) -> GaussianSource:
 def read_gaussians(path: Path | str) -> Gaussians:
     """Read a model that any program wrote: PLY (INRIA's layout or compressed), SPZ, SOG or .splat.
 
-    Formats but INRIA's PLY need the packages of `pip install "blitzgs[formats]"`.
+    SPZ needs the packages of `pip install "blitzgs[formats]"`.
 
     Raises:
         ValueError: the file is damaged, no model, or holds values that cannot be shown; names the file.

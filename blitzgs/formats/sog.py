@@ -23,6 +23,7 @@ from torch import Tensor
 
 from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource, check_memory, is_antialiased
 from blitzgs.formats.packed import quats_without_largest, unit_blocks
+from blitzgs.formats.selection import opacity_length
 from blitzgs.util.output import new_file
 
 Bytes = npt.NDArray[np.uint8]
@@ -34,6 +35,8 @@ _META_BYTES = 1 << 20
 _PALETTE, _SHARED, _EXACT = 65536, 16, 4096
 # Rounds of clustering, on so many rows for each entry.
 _ROUNDS, _SAMPLE = 8, 4
+# The largest and least weight of a row of the palette's sample, from the median: logarithms.
+_LOG_WEIGHT = 7.0
 # Bytes of a Gaussian in each picture.
 _CHANNELS = {"means_l": 3, "means_u": 3, "scales": 3, "quats": 4, "sh0": 4, "shN_labels": 2}
 # Values of a table of distances.
@@ -49,7 +52,7 @@ def write_sog(path: Path, source: GaussianSource) -> None:
     """
     count, survey = len(source), _survey(source)
     scales_book, colors_book = _codebook(survey.scales), _codebook(survey.colors)
-    palette = _palette(survey.rest, count) if source.degree > 0 else None
+    palette = _palette(survey.rest, survey.shown, count) if source.degree > 0 else None
     codes = {name: np.empty((count, channels), dtype=np.uint8) for name, channels in _CHANNELS.items()}
     first = 0
     for block in unit_blocks(source):
@@ -99,24 +102,28 @@ class _Survey(NamedTuple):
     scales: Tensor
     colors: Tensor
     rest: Tensor
+    shown: Tensor
 
 
 def _survey(source: GaussianSource) -> _Survey:
     ends: list[list[Tensor]] = [[], [], []]
-    samples: list[list[Tensor]] = [[], [], []]
+    samples: list[list[Tensor]] = [[], [], [], []]
     step = max(1, len(source) // (_SAMPLE * _PALETTE))
     for block in unit_blocks(source):
         columns = (_logs(block), block.scales, block.sh[:, 0])
         for found, column in zip(ends, columns, strict=True):
             found.append(torch.stack([column.amin(dim=0), column.amax(dim=0)]))
-        for found, column in zip(samples, (*columns[1:], block.sh[:, 1:].flatten(1)), strict=True):
-            found.append(column[::step].clone())
+        some = block.rows(slice(None, None, step))
+        shown = opacity_length(some.opacities, some.scales)
+        sampled = (some.scales, some.sh[:, 0], some.sh[:, 1:].flatten(1), shown)
+        for found, column in zip(samples, sampled, strict=True):
+            found.append(column.clone())
     rows = (torch.cat(found) for found in ends)
     reach, *others = (torch.stack([found.amin(dim=0), found.amax(dim=0)]) for found in rows)
-    scales, colors, rest = (torch.cat(found) for found in samples)
+    scales, colors, rest, shown = (torch.cat(found) for found in samples)
     # The ends are in the samples, because codebooks span them.
     scales, colors = (torch.cat(pair) for pair in zip((scales, colors), others, strict=True))
-    return _Survey(reach[0], reach[1], scales, colors, rest)
+    return _Survey(reach[0], reach[1], scales, colors, rest, shown)
 
 
 def _logs(block: Gaussians) -> Tensor:
@@ -174,34 +181,39 @@ class _Palette(NamedTuple):
         return found
 
 
-def _palette(sample: Tensor, count: int) -> _Palette:
-    """Return a palette for `count` rows of which there is a sample [S, D].
+def _palette(sample: Tensor, shown: Tensor, count: int) -> _Palette:
+    """Return a palette for `count` rows of which there is a sample [S, D]; `shown` weighs its rows.
 
     With cells, a row is compared with 2 sqrt(P) others instead of P, which is a hundredth.
     """
     size = min(_PALETTE, max(_EXACT, -(-count // (64 * _SHARED)) * 64), len(sample))
-    order = torch.randperm(len(sample), generator=torch.Generator().manual_seed(0))
-    some = sample[order[: _SAMPLE * size]]
-    centres = _clustered(some, math.isqrt(size))
+    weights = (shown - shown.median()).clamp(-_LOG_WEIGHT, _LOG_WEIGHT).exp()
+    # Random, without repetition, in proportion to the weights (Efraimidis and Spirakis 2006).
+    draws = torch.rand(len(sample), generator=torch.Generator().manual_seed(0)).log() / weights
+    order = draws.argsort(descending=True, stable=True)[: _SAMPLE * size]
+    some, weights = sample[order], weights[order]
+    centres = _clustered(some, weights, math.isqrt(size))
     cells, order = _nearest(some, centres).sort(stable=True)
     # Each cell has entries in proportion to its rows; one without any is left out.
     chosen = torch.linspace(0, len(some) - 1, size, dtype=torch.float64).round().long()
     used, shares = cells[chosen].unique_consecutive(return_counts=True)
-    parts = some[order].split(torch.bincount(cells).tolist())
+    counts = torch.bincount(cells).tolist()
+    parts, weights_of = some[order].split(counts), weights[order].split(counts)
     entries = [
-        _clustered(parts[cell], share) for cell, share in zip(used.tolist(), shares.tolist(), strict=True)
+        _clustered(parts[cell], weights_of[cell], share)
+        for cell, share in zip(used.tolist(), shares.tolist(), strict=True)
     ]
     return _Palette(centres[used], entries)
 
 
-def _clustered(rows: Tensor, size: int) -> Tensor:
-    """Return so many centres of rows in random order, by Lloyd's method from the first of them."""
-    centres = rows[:size]
+def _clustered(rows: Tensor, weights: Tensor, size: int) -> Tensor:
+    """Return so many weighted centres of rows in random order, by Lloyd's method from the first of them."""
+    centres, weighted = rows[:size], rows * weights[:, None]
     for _ in range(_ROUNDS):
         nearest = _nearest(rows, centres)
-        counts = torch.bincount(nearest, minlength=size)[:, None]
-        sums = torch.zeros_like(centres).index_add_(0, nearest, rows)
-        centres = torch.where(counts > 0, sums / counts.clamp_min(1), centres)
+        totals = torch.zeros(size).index_add_(0, nearest, weights)[:, None]
+        sums = torch.zeros_like(centres).index_add_(0, nearest, weighted)
+        centres = torch.where(totals > 0, sums / totals, centres)
     return centres
 
 

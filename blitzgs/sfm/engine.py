@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.colmap import Float64, read_model
-from blitzgs.capture.lens import Lens
 
 _PAIR_IDS = 2147483647  # the id of a pair of images a < b is this number times a, plus b
 
@@ -80,8 +79,6 @@ _MATCHERS = {"gps": "spatial", "sequence": "sequential", "exhaustive": "exhausti
 MOST_IN_ALL_PAIRS, _MOST_ONE_BY_ONE = 300, 500
 # Photographs of a camera that determine a full lens.
 MANY = 15
-# A principal point farther from the middle, as a share of the width or height, was not determined.
-_OFF_CENTRE = 0.1
 # Bytes; with fewer, a failure may be that of the disk.
 _LEAST_SPACE = 50e6
 MISSING = (
@@ -216,13 +213,12 @@ def _commands(program: str, stage: str, job: Job) -> Iterator[list[str]]:
 
 
 def adopt(refined: Path, folder: Path) -> None:
-    """Move a refined model to its place, unless a principal point went far from the middle."""
-    shares = [
-        np.array(Lens(camera.model, camera.width, camera.height, tuple(camera.params)).intrinsics[2:])
-        / (camera.width, camera.height)
-        for camera in read_model(refined).cameras
-    ]
-    if (np.abs(np.stack(shares) - 0.5) <= _OFF_CENTRE).all():
+    """Move a refined model to its place if its error is less by a tenth.
+
+    Else the lens is centred, or the photographs do not determine it: its axis then goes anywhere, and the
+    focal length with it.
+    """
+    if read_model(refined).points.errors.mean() < 0.9 * read_model(folder).points.errors.mean():
         shutil.copytree(refined, folder, dirs_exist_ok=True)
     shutil.rmtree(refined)
 

@@ -17,6 +17,7 @@ from blitzgs.capture.colmap import Float64, find_incomplete_model, find_models
 from blitzgs.capture.image_files import decode_mask, read_header, read_whole
 from blitzgs.capture.masks import find_masks
 from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, to_convert
+from blitzgs.capture.projects.find import find_project
 from blitzgs.capture.transforms import find_transforms
 from blitzgs.sfm.engine import MOST_IN_ALL_PAIRS
 from blitzgs.util.output import write_file
@@ -42,13 +43,17 @@ def find_photographs(folder: Path) -> list[str]:
 
 
 def has_photographs_alone(root: Path, images: str) -> bool:
-    """Tell whether a folder has photographs and nothing that says where they were taken from."""
+    """Tell whether a folder has photographs and nothing that says where they were taken from.
+
+    ValueError: it has several projects of other programs.
+    """
     if not root.is_dir() or find_models(root) or find_incomplete_model(root) or find_transforms(root):
         return False
     posed = any(find_models(root / part) for part in ("train", "val")) or any(
         any(root.rglob(f"cameras{end}")) for end in (".bin", ".txt")
     )
-    return not posed and bool(find_photographs(photograph_folder(root, images)))
+    alone = not posed and find_project(root) is None
+    return alone and bool(find_photographs(photograph_folder(root, images)))
 
 
 @dataclass(frozen=True)

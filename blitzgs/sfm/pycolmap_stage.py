@@ -150,7 +150,7 @@ def _all_at_once(job: dict[str, Any], gpu: bool) -> dict[int, Any]:
 
 
 def _centre_lenses(database: str, folder: Path, options: Any) -> None:
-    """Find the principal points as well, and all else once more; a model for which that fails stays.
+    """Find the principal points as well, and all else once more.
 
     The mappers leave them in the middle of the image, as a few photographs do not tell them from a turn of
     the camera. Many do, and a lens whose axis is 35 pixels off costs half of the exactness of the poses.

@@ -67,9 +67,9 @@ class Reconstruction:
                 rest = len(reasons) - _NAMED
                 lines.append(f"{'':15}and {rest} others, all in {self.capture / 'sfm/report.json'}")
         if found < _MOST * count:
-            all_pairs = "exhaustive" in self.decisions["pairs"]
-            remedy = "" if all_pairs else "; --pairs exhaustive may find more, slowly"
-            lines.append(f"warning: {count - found} of {count} photographs have no pose{remedy}")
+            pairs = "" if "exhaustive" in self.decisions["pairs"] else " or --pairs exhaustive (slow)"
+            remedy = f"another --camera-model{pairs} may find more"
+            lines.append(f"warning: {count - found} of {count} photographs have no pose; {remedy}")
         if not self.error < _LARGE:
             lines.append(f"warning: {self.error:.1f} pixels are much: check lens, sharpness and masks")
         return lines

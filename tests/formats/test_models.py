@@ -246,6 +246,15 @@ def test_flat_gaussians_are_written_and_infinite_ones_are_not(tmp_path, name):
             written(tmp_path, name, bad)
 
 
+def test_the_palette_of_sog_is_nearest_to_what_shows_most(tmp_path):
+    model = some_gaussians(12_000, 1)
+    model.scales[:2_000] += 3
+    model.opacities[:2_000] += 5
+    found = read_gaussians(written(tmp_path, "sog", model))
+    away = (found.sh - model.sh)[:, 1:].square().mean(dim=(1, 2)).sqrt()
+    assert away[:2_000].mean() < 0.3 * away[2_000:].mean()
+
+
 @pytest.mark.parametrize(("name", "kind"), [("spz", "spz"), ("sog", "sog"), ("splat", "splat")])
 def test_files_of_the_other_package_are_read(tmp_path, model, name, kind):
     path = tmp_path / f"a{FORMATS[name].suffix}"
