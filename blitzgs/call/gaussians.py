@@ -79,12 +79,15 @@ def relocate(
 
     Raises:
         ValueError: a shape does not fit.
+        TypeError: `min_opacity` is a table.
     """
     if opacities.dim() != 1 or scales.shape != (len(opacities), 3) or ratios.shape != opacities.shape:
         raise ValueError(
             f"opacities and ratios must be [N] and scales [N, 3], got {list(opacities.shape)}, "
             f"{list(ratios.shape)} and {list(scales.shape)}"
         )
+    if isinstance(min_opacity, Tensor) and min_opacity.dim() > 0:  # gsplat's fourth argument
+        raise TypeError(f"min_opacity must be a number, got {list(min_opacity.shape)}; leave out binoms")
     copies = ratios.long().clamp(1, MAX_COPIES)
     before = opacities.double()
     shared = (-torch.expm1(torch.log1p(-before) / copies)).clamp(min=min_opacity)

@@ -24,7 +24,7 @@ def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor
         masks: bool [...]: where False, the result is 0; None: all True.
 
     Returns:
-        [..., D].
+        [..., D], of the wider dtype of the two.
 
     Raises:
         ValueError: the degree is not 0 to 4, or a shape does not fit.
@@ -36,7 +36,8 @@ def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor
         raise ValueError(f"dirs must be [..., 3], got {list(dirs.shape)}")
     if coeffs.dim() < 2 or coeffs.shape[-2] < count:
         raise ValueError(f"coeffs must be [..., K, D] with K >= {count}, got {list(coeffs.shape)}")
-    values = (_basis(dirs, degree).unsqueeze(-2) @ coeffs[..., :count, :]).squeeze(-2)
+    dtype = torch.promote_types(dirs.dtype, coeffs.dtype)
+    values = (_basis(dirs, degree).unsqueeze(-2).to(dtype) @ coeffs[..., :count, :].to(dtype)).squeeze(-2)
     return values if masks is None else torch.where(masks.unsqueeze(-1), values, torch.zeros_like(values))
 
 

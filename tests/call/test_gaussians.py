@@ -70,6 +70,8 @@ def test_relocation_is_the_paper_s_double_sum(backend, min_opacity):
         assert math.isclose(own[i].item(), new, rel_tol=bound)
         assert relative_error(sizes[i], scales[i] * (o / math.fsum(terms))) < bound
     assert own.dtype == dtype and ratios.max() == 99
+    with pytest.raises(TypeError, match=r"number, got \[51, 51\]; leave out binoms"):
+        blitzgs.relocate(torch.rand(51), torch.rand(51, 3), torch.ones(51), torch.zeros(51, 51))
     with pytest.raises(ValueError, match=r"opacities and ratios must be \[N\]"):
         blitzgs.relocate(opacities[:, None], scales, ratios)
 
@@ -239,7 +241,7 @@ def test_gradients():
     coeffs = torch.randn(4, 25, 2, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda d, c: blitzgs.spherical_harmonics(4, d, c), (dirs, coeffs))
     at_zero = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
-    blitzgs.spherical_harmonics(4, at_zero, coeffs[:1]).sum().backward()
+    blitzgs.spherical_harmonics(4, at_zero, coeffs[:1].float()).sum().backward()  # the dtypes may differ
     assert at_zero.grad.isfinite().all()
 
 
