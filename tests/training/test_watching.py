@@ -261,6 +261,7 @@ def test_the_share_of_the_time_is_small(tmp_path, monkeypatch, cost):
         return {"psnr": 20.0}
 
     monkeypatch.setattr(glances, "measure", measure)
+    monkeypatch.setattr(state.stepper, "catch_up", lambda step: None)
     state.capture.test = list(range(30))
     state.schedule.iterations, watched = 1000, Glances(state)
     for step in range(1000):
