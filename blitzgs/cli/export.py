@@ -76,10 +76,11 @@ contribute least are left out; the page and the output of this command say how m
 
 A city that no browser holds at once is written as a folder that viewers load piece by piece:
 
-  blitzgs export RUN|CHECKPOINT|FILE.ply --tiles CITY       # 3D Tiles 1.1; then blitzgs view CITY
-  blitzgs export RUN|CHECKPOINT|FILE.ply --streamed-sog CITY  # for SuperSplat
+  blitzgs export RUN|CHECKPOINT|FILE --tiles CITY            # 3D Tiles 1.1; then blitzgs view CITY
+  blitzgs export RUN|CHECKPOINT|FILE --streamed-sog CITY     # for SuperSplat
 
-Memory does not grow with the model; the disk needs twice the size of the model. See docs/guide/formats.md.
+Memory does not grow with a run or a PLY file; the disk needs twice the size of the model. See
+docs/guide/formats.md.
 """
 _TILES = "--tiles and --streamed-sog"
 _COUNT = arguments.number(int, lambda value: value >= 1, "a whole number from 1 on")

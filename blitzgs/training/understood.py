@@ -85,7 +85,9 @@ def _look(capture: Capture, images: ImageStore) -> Pictures:
         try:
             image, mask = images.get(index).numpy(), images.mask(index)
         except (OSError, ValueError) as error:
-            pictures.unread.append(str(error))
+            # What the check of all files has found is raised for every photograph.
+            if str(error) not in pictures.unread:
+                pictures.unread.append(str(error))
             continue
         step = max(1, min(image.shape[:2]) // 256)
         pixels = image[::step, ::step]

@@ -15,8 +15,7 @@ from torch import Tensor
 from blitzgs.capture.world import GEO, GEOCENTRIC, WorldFrame, converted, pyproj_module, read_world_frame
 from blitzgs.config.fields import Config, ModelConfig
 from blitzgs.formats.gaussians import GaussianSource, is_antialiased
-from blitzgs.formats.models import offset_of
-from blitzgs.formats.ply import PlySource
+from blitzgs.formats.models import offset_of, open_gaussians
 from blitzgs.formats.selection import opacity_length
 from blitzgs.formats.tiles import upright
 from blitzgs.formats.web_page import WebLevels, WebScene, WebSplats, estimated_bytes, frame_bytes, web_page
@@ -211,18 +210,18 @@ class City:
 
 
 def open_city(path: Path, checked: bool = True) -> City:
-    """Open a run, a checkpoint in it or a PLY file, without reading its Gaussians into memory.
+    """Open a run, a checkpoint in it or a file, without reading a run's or a PLY's Gaussians into memory.
 
-    `checked` is as for `blitzgs.formats.models.open_gaussians`.
+    Files and `checked` are as for `blitzgs.formats.models.open_gaussians`.
 
     Raises:
         FileNotFoundError: there is no such file, or no run or checkpoint in the folder.
-        ValueError: the file is damaged, or holds no Gaussians.
+        ValueError: the file is damaged or no model, or holds no Gaussians.
     """
     cameras: Sequence[CameraLike] = ()
     run, frame = None, None
     if path.is_file():
-        source: GaussianSource = PlySource(path, checked)
+        source: GaussianSource = open_gaussians(path, checked)
         offset = np.array(offset_of(source.comments))
     else:
         folder, checkpoint = run_files.run_and_checkpoint(path)

@@ -25,6 +25,8 @@ from blitzgs.training import inputs
 from blitzgs.training.budget import _grown, estimate
 from blitzgs.training.understood import (
     HopelessCaptureError,
+    _exposure,
+    _look,
     check_worlds,
     large_images_hint,
     undistortion_note,
@@ -105,6 +107,19 @@ def test_masks_and_their_share(data, capsys):
         cv2.imwrite(str(data / "masks" / f"{i:02}.png"), half)
     _, lines, _, _ = check(data, capsys)
     assert lines["masks"] == "4 of 8 photographs have one; mean share excluded 50.0% of 3 looked at"
+
+
+def test_a_damaged_photograph_is_counted_once():
+    """The check of all files has found one, and reading any photograph raises its error from then on."""
+
+    def get(index):
+        if index > 3:
+            raise ValueError("07.png: truncated")
+        return torch.full((2, 2, 3), 90, dtype=torch.uint8)
+
+    images = SimpleNamespace(prefetch=list, get=get, mask=lambda index: None)
+    said = _exposure(_look(SimpleNamespace(train=list(range(8))), images))
+    assert said == "means of 4 photographs 90 to 90 of 255 (0.0 stops); 1 cannot be read: 07.png: truncated"
 
 
 @pytest.mark.parametrize(("value", "what"), [(0, "black"), (255, "saturated")])

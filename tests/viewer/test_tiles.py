@@ -12,6 +12,7 @@ from blitzgs.capture.world import WorldFrame, enu_frame
 from blitzgs.cli import main
 from blitzgs.cli.view import tiles_server
 from blitzgs.distributed.group import Ranks
+from blitzgs.formats.packed import write_splat
 from blitzgs.formats.ply import save_ply
 from blitzgs.formats.tiles import write_tiles
 from blitzgs.frame.ownership import TileOwners
@@ -161,6 +162,11 @@ def test_a_file_is_written_as_tiles_and_flags_choose(tmp_path, capsys):
     inside = (means[:, 0] <= 20) & (means[:, 1] <= 99) & (means[:, 2] <= 99)
     _, positions = contents(tmp_path / "t")
     assert len(positions) == inside.sum() and positions[:, 0].max() <= 20
+    write_splat(tmp_path / "m.splat", city(800))
+    flags = ["--tiles", str(tmp_path / "s"), "--processes", "1"]
+    assert main(["export", str(tmp_path / "m.splat"), *flags]) == 0
+    _, positions = contents(tmp_path / "s")
+    np.testing.assert_allclose(np.sort(positions, axis=0), np.sort(means, axis=0), rtol=1e-6)
     capsys.readouterr()
     for flags, reason in (
         (["--tiles", str(tmp_path / "t")], "is not an empty folder"),

@@ -123,6 +123,8 @@ class Glances:
         state, total = self._state, self._state.schedule.iterations
         if not self._order or end >= total or POINTS * begin // total == POINTS * end // total:
             return
+        # Pending steps are applied at every point, as this rounds: the clock must not decide on bits.
+        state.catch_up()
         # Rank 0 decides, because the clocks of the ranks differ.
         count = state.ranks.broadcast_object(self._affordable() if state.ranks.rank == 0 else 0)
         if count > 0:
