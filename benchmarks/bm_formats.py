@@ -32,7 +32,7 @@ from blitzgs.runs.export import export, source_of
 from blitzgs.runs.folder import open_run
 from blitzgs.runs.world import trained_columns
 from blitzgs.table.table import PARAMETERS
-from tests.formats.helpers import read_glb
+from tests.helpers import read_glb
 
 
 def read(path: Path) -> Gaussians:

@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from blitzgs import rasterization
 from blitzgs.viewer.world import looking
-from tests.formats.helpers import read_glb
+from tests.helpers import read_glb
 
 # The flight begins and ends at these multiples of the distance of the page's first view.
 FARTHEST, NEAREST = 4.0, 0.05

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from blitzgs.formats import packed
 from blitzgs.formats.gaussians import MIP, Gaussians
 from blitzgs.formats.models import FORMATS, check_replaces, read_gaussians, with_degree
-from tests.formats.helpers import some_gaussians
+from tests.helpers import some_gaussians
 
 gaussforge = pytest.importorskip("gaussforge")
 gsply = pytest.importorskip("gsply")

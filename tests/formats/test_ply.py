@@ -13,7 +13,7 @@ import torch
 from blitzgs.formats import gaussians as blocks
 from blitzgs.formats.ply import PlySource, read_ply, read_points, save_ply, write_ply
 from blitzgs.formats.selection import Selected, Selection, read_polygon
-from tests.formats.helpers import some_gaussians
+from tests.helpers import some_gaussians
 
 
 def gaussians(n: int, degree: int, seed: int = 0) -> dict[str, torch.Tensor]:
@@ -231,7 +231,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
 
 def test_blocks_of_a_file_are_its_rows(tmp_path, monkeypatch):
     from blitzgs.formats import ply
-    from tests.formats.helpers import some_gaussians
+    from tests.helpers import some_gaussians
 
     model = some_gaussians(250, 2, levels=True)
     save_ply(tmp_path / "m.ply", model)

@@ -18,7 +18,7 @@ from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.tiles import new_folder, upright, write_tiles
 from blitzgs.formats.web_page import WebScene
 from blitzgs.util.progress import ending_by_exception
-from tests.formats.helpers import read_glb
+from tests.helpers import read_glb
 
 LOD = "comment lod reference_distance 40.0 fork 2.0 levels 4 finest 3"
 SCENE = WebScene(0.01, 1e4, 0.3, False, (0, 0, 0), (0, 0, 1), (20, -30, 30), (20, 20, 0), 0.9)

@@ -26,8 +26,8 @@ from blitzgs.formats.web_page import (
     packed,
     web_page,
 )
-from tests.formats.helpers import read_glb, some_gaussians
 from tests.formats.test_tiles import city
+from tests.helpers import read_glb, some_gaussians
 
 SCENE = WebScene(0.01, 100.0, 0.3, False, (0.1, 0.2, 0.3), (0, 0, 1), (0, -3, 1), (0, 0, 0), 0.8)
 

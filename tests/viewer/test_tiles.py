@@ -22,8 +22,8 @@ from blitzgs.view.look import Look
 from blitzgs.viewer.studio import open_model
 from blitzgs.viewer.web import open_city, to_globe
 from tests.browser import Browser, needs_chromium, wait_for
-from tests.formats.helpers import read_glb
 from tests.formats.test_tiles import SCENE, city, nodes
+from tests.helpers import read_glb
 from tests.viewer.test_parts import camera_at
 
 WIDTH, HEIGHT = 320, 240
