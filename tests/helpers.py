@@ -218,7 +218,7 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
 def read_glb(path):
-    """Return the JSON and the attributes of the only primitive by name, by the glTF 2.0 specification alone."""
+    """Return the JSON and the attributes of the only primitive by name, by the glTF specification alone."""
     data = path.read_bytes()
     magic, version, length = struct.unpack_from("<4sII", data)
     assert (magic, version, length) == (b"glTF", 2, len(data))
