@@ -76,7 +76,8 @@ class Photographs:
         names = find_photographs(folder) if folder.is_dir() else []
         if not names:
             others = to_convert(files_below(folder) if folder.is_dir() else [folder.name])
-            raise FileNotFoundError(f"{folder} has no photographs ({', '.join(IMAGE_SUFFIXES)}){others}")
+            what = "has no photographs" if folder.is_dir() else "is no folder of photographs"
+            raise FileNotFoundError(f"{folder} {what} ({', '.join(IMAGE_SUFFIXES)}){others}")
         root = folder if (folder / "masks").is_dir() else folder.parent
         masks = find_masks(root, None, names, [None] * len(names))
         problems = damaged([(folder / name, mask) for name, mask in zip(names, masks, strict=True)])

@@ -191,7 +191,7 @@ def read_film(
     if not file.is_file():
         raise FileNotFoundError(f"--path {source}: there is no such file; {', '.join(TOURS)} need none")
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8", errors="replace")
         path = from_json(text)
         frames = [] if fps or seconds else frames_from_json(text)
     except ValueError as error:

@@ -269,7 +269,8 @@ def test_what_cannot_work_is_said(tmp_path, monkeypatch, capsys):
         assert main(["sfm", str(tmp_path / photos), str(tmp_path / capture)]) == 1
         return capsys.readouterr().err
 
-    assert "has no photographs" in message("nothing", "capture")
+    assert "is no folder of photographs" in message("nothing", "capture")
+    assert "is no folder of photographs" in message(next((tmp_path / "photos").iterdir()), "capture")
     assert "is in the folder of the photographs" in message("photos", "photos/capture")
     (tmp_path / "other/sparse").mkdir(parents=True)
     assert "has a model that blitzgs sfm did not make" in message("photos", "other")

@@ -362,6 +362,7 @@ KEY = {"matrix": opengl(np.eye(4)), "fov": 50, "aspect": 1.5}
     ("content", "reason"),
     [
         ("{", "no JSON: .* line 1 column"),
+        (b"\xa9", "no JSON: .* line 1 column"),
         ("[]", "its content is no object"),
         ("{}", "neither keyframes nor camera_path"),
         ({"keyframes": [KEY, KEY | {"matrix": [1, 2]}]}, r"keyframes\[1\]: matrix must be 16 finite numbers"),
@@ -377,7 +378,8 @@ KEY = {"matrix": opengl(np.eye(4)), "fov": 50, "aspect": 1.5}
 )
 def test_damaged_paths_name_file_and_place(tmp_path, content, reason):
     file = tmp_path / "p.json"
-    file.write_text(content if isinstance(content, str) else json.dumps(content))
+    text = content if isinstance(content, str | bytes) else json.dumps(content)
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ValueError, match=reason) as raised:
         read_film(str(file), None, None, None, None)
     assert str(file) in str(raised.value)
