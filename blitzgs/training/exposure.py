@@ -28,7 +28,7 @@ _LEAST_SHARE = 0.2
 # In squares of the range of colours: pulls the gain to 1 in pictures of nearly one colour.
 _RIDGE = 1e-3
 # Photographs are measured at colours between these, of 255: others may have been cut off.
-_DARKEST, _BRIGHTEST = 5, 250
+_DARKEST, _BRIGHTEST = 3, 252
 # Colours are added up as integers, so that the sums are the same in any order, and at any number of ranks.
 _UNIT = 65535
 
@@ -129,6 +129,8 @@ class Exposures:
 LEAST_SPREAD = 0.04
 # Edge of the square whose mean colour is a point's, in pixels: keypoints are where colours change.
 _BLUR = 5
+# Points are compared at colours between these, of 255: in their square, single pixels may have been cut off.
+_DARKEST_MEAN, _BRIGHTEST_MEAN = 5, 250
 # Points of a photograph that are compared; more would change nothing.
 _MAX_POINTS = 2000
 # Photographs that are decoded ahead.
@@ -199,7 +201,7 @@ def _colors(
     inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     x, y, seen = x[inside].astype(np.int64), y[inside].astype(np.int64), seen[inside]
     colors = cv2.blur(images.get(index).numpy(), (_BLUR, _BLUR))[y, x].astype(np.float64)
-    good = ((colors > _DARKEST) & (colors < _BRIGHTEST)).all(1)
+    good = ((colors > _DARKEST_MEAN) & (colors < _BRIGHTEST_MEAN)).all(1)
     mask = images.mask(index)
     if mask is not None:
         good &= mask.numpy()[y, x] != 0
