@@ -38,7 +38,8 @@ class Exposures:
 
     The model has the mean exposure: over the training views the gains have the mean 1 and the biases the mean
     0. A photograph is measured by least squares against the render of its view, over the pixels that count.
-    While the gains differ by less than `LEAST_SPREAD`, renders are compared with the photographs as they are.
+    While the gains differ by less than `blitzgs.runs.cameras.LEAST_SPREAD`, renders are compared with the
+    photographs as they are.
     """
 
     def __init__(self, train: Sequence[int], ranks: Ranks) -> None:
@@ -126,7 +127,7 @@ class Exposures:
 
 # Photographs whose gains differ by less than this, as a standard deviation of their logarithms, have the same
 # exposure: so much is what shading and blur do to photographs of equal exposure.
-LEAST_SPREAD = 0.04
+_LEAST_TRACK_SPREAD = 0.04
 # Edge of the square whose mean colour is a point's, in pixels: keypoints are where colours change.
 _BLUR = 5
 # Points are compared at colours between these, of 255: in their square, single pixels may have been cut off.
@@ -164,7 +165,7 @@ def track_gains(capture: Capture, images: ImageStore, ranks: Ranks) -> Tensor | 
 
 def exposures_differ(gains: Tensor) -> bool:
     """Tell whether photographs with these gains, [T, 3], have different exposures."""
-    return float(gains.log().std(0, correction=0).mean()) >= LEAST_SPREAD
+    return float(gains.log().std(0, correction=0).mean()) >= _LEAST_TRACK_SPREAD
 
 
 def _observed_points(capture: Capture) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]] | None:

@@ -118,8 +118,11 @@ def test_unreadable_files(tmp_path):
         load_config(tmp_path / "loop.yaml")
 
 
-NUMBERS = [(name, value) for name, value in flat_fields(Config()) if isinstance(value, (int, float, tuple))]
-NUMBERS = [(name, value) for name, value in NUMBERS if not isinstance(value, bool)]
+NUMBERS = [
+    (name, value)
+    for name, value in flat_fields(Config())
+    if isinstance(value, (int, float, tuple)) and not isinstance(value, bool)
+]
 
 
 def test_relocation_has_no_candidates_for_a_gate():

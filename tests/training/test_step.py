@@ -220,6 +220,16 @@ def test_masked_pixels_do_not_count():
     assert torch.allclose(found[:, 0], GAINS[:, None].double().expand(-1, 3), atol=0.03)
 
 
+@pytest.mark.parametrize(("dark", "bright", "gain"), [(4, 251, 247 / 200), (3, 252, 1.0)])
+def test_only_colours_that_are_cut_off_do_not_count(dark, bright, gain):
+    renders = torch.full((5, 64, 48, 3), 20 / 255)
+    renders[:, :, 24:] = 220 / 255
+    targets = torch.where(renders > 0.5, bright, dark).to(torch.uint8)
+    exposures = Exposures(TRAIN, Ranks())
+    exposures.measure(4, renders, SimpleNamespace(indices=TRAIN, targets=targets, masks=None, ranges=None))
+    assert torch.allclose(exposures.measured[:, 0], torch.tensor(gain).double(), atol=0.01)
+
+
 def test_photographs_that_agree_are_taken_as_they_are():
     gains, biases = measured(1 + 0.5 * LEAST_SPREAD * (GAINS - 1) / GAINS.std(), 0 * BIASES).of(TRAIN)
     assert torch.equal(gains, torch.ones_like(gains)) and torch.equal(biases, torch.zeros_like(biases))
