@@ -84,9 +84,7 @@ def drawn_alone(opened: Opened, size: tuple[int, int], seconds: float) -> dict[s
     }
 
 
-def served(
-    opened: Opened, size: tuple[int, int], seconds: float, full: bool, moves: bool = True
-) -> dict[str, float]:
+def served(opened: Opened, size: tuple[int, int], seconds: float, full: bool) -> dict[str, float]:
     """Serve the page to a client in a process of its own."""
     import viser
 
@@ -95,7 +93,7 @@ def served(
         middle, radius, height = orbit(opened)
         options = {
             "url": studio.page.url, "version": viser.__version__, "warm_up": WARM_UP, "seconds": seconds,
-            "middle": middle, "radius": radius, "height": height, "size": list(size), "moves": moves,
+            "middle": middle, "radius": radius, "height": height, "size": list(size),
         }  # fmt: skip
         program = Path(__file__).with_name("view_client.py")
         client = subprocess.Popen(

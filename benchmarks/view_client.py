@@ -76,7 +76,7 @@ def main() -> None:
         end = begin + options["warm_up"] + options["seconds"]
         sent, arrived = begin, []
         while (now := time.monotonic()) < end:
-            if now >= sent and (options["moves"] or sent == begin):
+            if now >= sent:
                 sent = max(sent + 1 / CAMERAS_A_SECOND, now)
                 angle = 0.3 * (now - begin)
                 socket.send(
@@ -85,9 +85,7 @@ def main() -> None:
                     )
                 )
             try:
-                message = socket.recv(
-                    timeout=max(0.0, min(end, sent if options["moves"] else end) - time.monotonic())
-                )
+                message = socket.recv(timeout=max(0.0, min(end, sent) - time.monotonic()))
             except TimeoutError:
                 continue
             except websockets.exceptions.ConnectionClosed:

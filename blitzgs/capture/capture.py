@@ -132,7 +132,7 @@ def load_capture(
         downscale: reduce both sides of the camera model's size by this factor. A folder such as images_4 is
             used for 4 if it contains every image at the right size; otherwise images are downscaled by
             averaging areas when they are decoded.
-        split: see `splits.split_views`: n, "val", a list file, or "auto" (the split of the files, or every
+        split: see `usable.split_views`: n, "val", a list file, or "auto" (the split of the files, or every
             8th view).
         masks: folder of masks (NAME.png or STEM.png; black = excluded). None uses `masks/` when it exists;
             True requires it; False uses none.

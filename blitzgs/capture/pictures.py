@@ -67,17 +67,15 @@ def encode_image(image: Tensor, suffix: str) -> bytes:
     return bytes(data)
 
 
-def error_map(
-    render: Tensor, target: Tensor, mask: Tensor | None = None, full: float = _FULL_ERROR
-) -> Tensor:
-    """Return the mean absolute error over channels as colours from dark blue (0) to red (`full` or more).
+def error_map(render: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return the mean absolute error over channels as colours from dark blue (0) to red (0.25 or more).
 
     Images are float (the target also uint8), [H, W, 3]; pixels with 0 in the mask, uint8 [H, W], become grey.
     Returns uint8 RGB [H, W, 3] on the CPU.
     """
     truth = target.cpu().float() / 255 if target.dtype == torch.uint8 else target.cpu().float()
     error = (render.detach().cpu().float().clamp(0, 1) - truth).abs().mean(dim=-1)
-    levels = to_uint8(error / full)
+    levels = to_uint8(error / _FULL_ERROR)
     colors = np.ascontiguousarray(cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1])
     if mask is not None:
         colors[mask.cpu().numpy() == 0] = 128

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decoded images in memory that the processes of one host share, so that one of them decodes each image.
 
-Every image has a fixed place. A process that has decoded an image copies it there and then sets its flag.
+Every image has a fixed place. A process decodes an image there, or copies it there, and then sets its flag.
 Two processes that decode the same image at the same time write the same bytes, so no process ever waits for
 another one. The memory has no name in the file system: it is freed when the last process that uses it has
 ended, however that happens.

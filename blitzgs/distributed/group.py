@@ -321,8 +321,8 @@ def _list(ranks: Sequence[int]) -> str:
     return ", ".join(map(str, ranks))
 
 
-def _shorten(text: str, limit: int = 200) -> str:
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+def _shorten(text: str) -> str:
+    return text if len(text) <= 200 else text[:197] + "..."
 
 
 def resolve_device(

@@ -241,10 +241,10 @@ def _over_all_ranks(
     return result
 
 
-def worst_views(views: Mapping[str, Mapping[str, float]], count: int = 3) -> list[tuple[str, float]]:
-    """Return names and PSNR of views of the lower half by PSNR, the worst first."""
+def worst_views(views: Mapping[str, Mapping[str, float]]) -> list[tuple[str, float]]:
+    """Return names and PSNR of at most three views, of the lower half by PSNR, the worst first."""
     ordered = sorted((view["psnr"], name) for name, view in views.items())
-    return [(name, psnr) for psnr, name in ordered[: min(count, len(ordered) // 2)]]
+    return [(name, psnr) for psnr, name in ordered[: min(3, len(ordered) // 2)]]
 
 
 def evenly_ordered(indices: Sequence[int]) -> list[int]:

@@ -212,7 +212,7 @@ class RunFolder:
         return {file.parent.name: self._json(file) for file in files}
 
     def cameras(self) -> RunCameras:
-        """Return the cameras that the run was trained and measured with; see `run_cameras.load_cameras`."""
+        """Return the cameras that the run was trained and measured with, as `load_cameras` does."""
         return load_cameras(self.path)
 
     def model(self, device: torch.device | str = "cpu", checkpoint: str | None = None) -> Model:

@@ -14,7 +14,7 @@
     return new Uint8Array(await new Response(stream).arrayBuffer());
   }
 
-  // Returns positions, levels and the texels of all Gaussians; `write_scene` of blitzgs/formats has the layout.
+  // Returns positions, levels and the texels of all Gaussians; `packed` in web_page.py has the layout.
   function decode(bytes) {
     const n = scene.count, blocks = Math.ceil(n / BLOCK), view = new DataView(bytes.buffer);
     let at = 0;
