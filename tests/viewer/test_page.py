@@ -134,7 +134,9 @@ def test_a_click_on_a_frustum_stands_there(studio, browser):
     world = studio.page.world
     start = world.start()
     middle = world.middle
-    visitor.go(start.__class__(middle + 2 * (start.position - middle), start.rotation, start.fov), 5.0)
+    wanted = start.__class__(middle + 2 * (start.position - middle), start.rotation, start.fov)
+    visitor.go(wanted, 5.0)
+    wait_for(lambda: visitor._stance.is_near(wanted, 0.02, 0.01), 60, "the browser's own camera is there")
     settled(studio)
     camera, stance = visitor.client.camera, visitor.stance
     focal = 0.5 * camera.image_height / math.tan(camera.fov / 2)
