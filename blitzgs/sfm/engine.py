@@ -109,9 +109,14 @@ class StageError(ValueError):
     """COLMAP could not do a stage."""
 
 
+def has_pycolmap() -> bool:
+    """Tell whether pycolmap is installed."""
+    return importlib.util.find_spec("pycolmap") is not None
+
+
 def backend() -> str:
     """Return "pycolmap", or the path of the program `colmap` (ImportError: neither is installed)."""
-    if importlib.util.find_spec("pycolmap") is not None:
+    if has_pycolmap():
         return "pycolmap"
     if (program := shutil.which("colmap")) is None:
         raise ImportError(MISSING)
@@ -126,13 +131,17 @@ def run_stage(stage: str, job: Job, log: Path, lock: int, report: Report) -> Non
     program = backend()
     Path(job.models).mkdir(parents=True, exist_ok=True)
     if program == "pycolmap":
-        file = log.with_name("job.json")  # thousands of names are too long for an argument
-        file.write_text(json.dumps({"stage": stage, **asdict(job)}))
-        commands = iter([[sys.executable, "-m", "blitzgs.sfm.pycolmap_stage", str(file)]])
-    else:
-        commands = _commands(program, stage, job)
-    for command in commands:
+        run_pycolmap(stage, asdict(job), log, lock, lambda line: _progress(line, len(job.names), report))
+        return
+    for command in _commands(program, stage, job):
         _run(command, log, lock, lambda line: _progress(line, len(job.names), report))
+
+
+def run_pycolmap(stage: str, job: dict[str, Any], log: Path, lock: int, heard: Callable[[str], None]) -> None:
+    """Do a stage of `blitzgs.sfm.pycolmap_stage`, as `run_stage`; `heard` gets each line that COLMAP says."""
+    file = log.with_name("job.json")  # thousands of names are too long for an argument
+    file.write_text(json.dumps({"stage": stage, **job}))
+    _run([sys.executable, "-m", "blitzgs.sfm.pycolmap_stage", str(file)], log, lock, heard)
 
 
 def _run(command: list[str], log: Path, lock: int, heard: Callable[[str], None]) -> None:

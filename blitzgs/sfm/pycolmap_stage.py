@@ -23,6 +23,8 @@ from blitzgs.sfm.engine import MANY, adopt, least_model, lens_model
 # The standard deviations of a position by GPS in metres, across and up; the second of an altitude that says
 # nothing. Drones state altitudes by barometer, which drift between flights.
 _ACROSS, _UP, _UNKNOWN = 3.0, 15.0, 1e4
+# A model is refined in rounds; after each, observations that miss by so many times the median are left out.
+_ROUNDS, _ITERATIONS, _WRONG = 3, 40, 6.0
 
 
 def features(job: dict[str, Any]) -> None:
@@ -186,6 +188,40 @@ def _place(model: Any, names: list[str], positions: Float64) -> None:
         model.transform(moved)
 
 
+def refine(job: dict[str, Any]) -> None:
+    """Find lenses, poses and points of a model once more, from the pixels at which its points were seen."""
+    model = pycolmap.Reconstruction(job["model"])
+    posed = [image for image in model.images.values() if image.has_pose]
+    before = np.stack([image.projection_center() for image in posed])
+    wanted = pycolmap.BundleAdjustmentConfig()
+    for image in posed:
+        wanted.add_image(image.image_id)
+    wanted.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    counts = Counter(image.camera_id for image in posed)
+    for number, camera in model.cameras.items():
+        if counts[number] < MANY:
+            wanted.set_constant_cam_intrinsics(number)
+        elif camera.model.name in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+            radial = [*camera.params[list(camera.extra_params_idxs())], 0.0, 0.0][:2]
+            lengths = camera.params[list(camera.focal_length_idxs())]
+            centre = camera.params[list(camera.principal_point_idxs())]
+            camera.model = pycolmap.CameraModelId.OPENCV
+            camera.params = [lengths[0], lengths[-1], *centre, *radial, 0.0, 0.0]
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = job["miss"]
+    options.ceres.use_gpu = pycolmap.has_cuda
+    options.ceres.solver_options.max_num_iterations = _ITERATIONS
+    for number in range(_ROUNDS):
+        pycolmap.create_default_bundle_adjuster(options, wanted, model).solve()
+        pycolmap.ObservationManager(model).filter_all_points3D(_WRONG * job["miss"], 0.0)
+        print(f"[{number + 1}/{_ROUNDS}]", flush=True)
+    moved = pycolmap.estimate_sim3d(np.stack([image.projection_center() for image in posed]), before)
+    if moved is not None:
+        model.transform(moved)
+    model.write(job["refined"])
+
+
 if __name__ == "__main__":
     work = json.loads(Path(sys.argv[1]).read_text())
-    {"features": features, "pairs": pairs, "cameras": cameras}[work["stage"]](work)
+    {"features": features, "pairs": pairs, "cameras": cameras, "refine": refine}[work["stage"]](work)

@@ -74,7 +74,7 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
             f"{capture} has a model that blitzgs sfm did not make: choose another folder for the capture"
         )
     work.mkdir(parents=True, exist_ok=True)
-    with _locked(work / "lock") as lock:
+    with locked(work / "lock") as lock:
         state = _state(work, photographs, settings)
         masks = photographs.write_masks(work / "masks")
         paths = [str((work / name).absolute()) for name in ("database.db", "models", "georeference.json")]
@@ -148,7 +148,7 @@ def _state(work: Path, photographs: Photographs, settings: Settings) -> dict[str
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[int]:
+def locked(path: Path) -> Iterator[int]:
     """Hold a lock, which COLMAP's processes inherit: one that outlives this process keeps others out."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:

@@ -86,7 +86,7 @@ def examine(
         SourceView(name, photographs.folder / name, None, lenses[camera], pose)
         for name, camera, pose in zip(names, model.images.camera_ids.tolist(), poses, strict=True)
     ]
-    errors, points = _errors(model, views)
+    errors, points = _errors(model)
     doubtful = {
         s.name: f"lies at {s.distance:.6g} from the middle, the others within {s.others:.6g}"
         for s in find_apart(views, model.points.positions)[1]
@@ -124,20 +124,31 @@ def examine(
     return found
 
 
-def _errors(model: ColmapModel, views: Sequence[SourceView]) -> tuple[dict[str, float], dict[str, int]]:
-    """Return the mean distance in pixels of each view's observations from their points, and their number."""
+def misses(model: ColmapModel) -> Float64:
+    """Return the distance in pixels of each observation from its point's image [O]; NaN: it has no point."""
+    lenses = {c.id: Lens(c.model, c.width, c.height, tuple(c.params.tolist())) for c in model.cameras}
     order = np.argsort(model.points.ids)
     ids, positions = model.points.ids[order], model.points.positions[order]
+    offsets, found = model.images.point2d_offsets.tolist(), np.full(len(model.images.points2d), np.nan)
+    rows = zip(offsets, offsets[1:], model.images.camera_ids.tolist(), strict=False)
+    for (begin, end, camera), pose in zip(rows, world_to_camera(model.images), strict=True):
+        at = begin + np.flatnonzero(model.images.point3d_ids[begin:end] >= 0)
+        world = positions[np.searchsorted(ids, model.images.point3d_ids[at])]
+        x, y, depth = pose[:3, :3] @ world.T + pose[:3, 3:]
+        u, v = lenses[camera].project(x / depth, y / depth)
+        found[at] = np.hypot(u - model.images.points2d[at, 0], v - model.images.points2d[at, 1])
+    return found
+
+
+def _errors(model: ColmapModel) -> tuple[dict[str, float], dict[str, int]]:
+    """Return the mean of each photograph's misses, in pixels, and their number."""
     errors, counts = {}, {}
-    for index, view in enumerate(views):
-        begin, end = model.images.point2d_offsets[index : index + 2].tolist()
-        seen = model.images.point3d_ids[begin:end]
-        pixels = model.images.points2d[begin:end][seen >= 0]
-        world = positions[np.searchsorted(ids, seen[seen >= 0])]
-        x, y, depth = view.world_to_camera[:3, :3] @ world.T + view.world_to_camera[:3, 3:]
-        u, v = view.lens.project(x / depth, y / depth)
-        counts[view.name] = len(pixels)
-        errors[view.name] = float(np.hypot(u - pixels[:, 0], v - pixels[:, 1]).mean()) if len(pixels) else 0.0
+    for name, missed in zip(
+        model.images.names, np.split(misses(model), model.images.point2d_offsets[1:-1].tolist()), strict=True
+    ):
+        seen = missed[~np.isnan(missed)]
+        counts[name] = len(seen)
+        errors[name] = float(seen.mean()) if len(seen) else 0.0
     return errors, counts
 
 

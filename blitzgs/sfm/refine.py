@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds lenses and poses of a capture once more, from the pixels at which its photographs saw its points."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from blitzgs.capture.cameras import camera_centres
+from blitzgs.capture.colmap import (
+    FILES,
+    ColmapCamera,
+    ColmapModel,
+    Float64,
+    find_models,
+    read_model,
+    world_to_camera,
+)
+from blitzgs.sfm.engine import has_pycolmap, run_pycolmap
+from blitzgs.sfm.reconstruct import WORK, locked
+from blitzgs.sfm.report import misses
+from blitzgs.util.progress import image_progress
+
+# A refined model replaces the old one if the median miss falls to this share of what it was.
+_BETTER = 0.9
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What was found; misses are distances in pixels of observations from the images of their points."""
+
+    before: float  # median miss
+    after: float  # of the same observations
+    observations: int
+    left_out: int  # observations that miss by too much
+    lenses: list[tuple[str, str]]  # each camera before and after
+    moved: float  # median shift of a photograph, in units of the capture
+    adopted: bool  # whether the capture got the refined model; else it has the one before
+
+    def lines(self) -> list[str]:
+        """Return the summary for the user."""
+        rest = f"; {self.left_out:,} others miss by too much" if self.left_out else ""
+        lines = [
+            f"{'median miss:':15}{self.before:.3f} -> {self.after:.3f} pixels "
+            f"({self.observations:,} observations{rest})"
+        ]
+        if not self.adopted:
+            return [*lines, f"{'result:':15}lenses and poses are as good as can be found: they stay"]
+        lines += [f"{'lens:':15}{old}\n{'':15}-> {new}" for old, new in self.lenses if old != new]
+        return [*lines, f"{'photographs:':15}moved by {self.moved:.3g} units (median)"]
+
+
+def refine(root: Path, capture: Path) -> Refined:
+    """Write a capture with the lenses, poses and points of the COLMAP model of another one, refined.
+
+    All else of it is linked. A camera of 15 photographs or more gets its principal point and a lens of the
+    model OPENCV, if it has no distortion or a radial one; others keep their lens. World coordinates stay.
+    FileNotFoundError: `root` has no model. FileExistsError: `capture` is not empty. ValueError: the model has
+    no observations. ImportError: pycolmap is not installed.
+    """
+    if not has_pycolmap():
+        raise ImportError("poses are refined by COLMAP's pycolmap: pip install 'blitzgs[sfm]'")
+    if not (models := find_models(root)):
+        raise FileNotFoundError(
+            f"{root} has no COLMAP model (sparse/0 with cameras, images and points3D), whose poses could be "
+            "refined; blitzgs sfm finds poses of photographs"
+        )
+    folder, capture = models[0][0], capture.absolute()
+    if capture.resolve().is_relative_to(root.resolve()):
+        raise ValueError(f"{capture} is in the capture itself: choose a folder outside {root}")
+    model = read_model(folder, points2d=True)
+    missed = misses(model)
+    if not (~np.isnan(missed)).any():
+        raise ValueError(
+            f"{folder} does not say at which pixels photographs saw its points, which tell lens and poses: "
+            "blitzgs sfm finds poses of the photographs anew"
+        )
+    if capture.is_dir() and any(path.name != WORK for path in capture.iterdir()):
+        raise FileExistsError(f"{capture} is not empty: choose another folder for the refined capture")
+    work = capture / WORK
+    work.mkdir(parents=True, exist_ok=True)
+    with locked(work / "lock") as lock, image_progress("poses", unit="rounds") as report:
+        (found := work / "models").mkdir(exist_ok=True)
+        job = {"model": str(folder.absolute()), "refined": str(found), "miss": float(np.nanmedian(missed))}
+
+        def heard(line: str) -> None:
+            if line.startswith("[") and "/" in line:
+                report(*map(int, line[1 : line.index("]")].split("/")))
+
+        run_pycolmap("refine", job, work / "colmap.log", lock, heard)
+    refined = _compare(model, read_model(found, points2d=True))
+    source = found if refined.adopted else folder
+    (sparse := capture / "sparse" / "0").mkdir(parents=True)
+    for name in FILES:
+        file = next(path for path in (source / f"{name}.bin", source / f"{name}.txt") if path.is_file())
+        shutil.copyfile(file, sparse / file.name)
+    shutil.rmtree(found)
+    _link_others(root.resolve(), folder.resolve(), capture)
+    (work / "refined.json").write_text(json.dumps(asdict(refined), indent=1))
+    return refined
+
+
+def _compare(old: ColmapModel, new: ColmapModel) -> Refined:
+    was, now = _by_name(old), _by_name(new)
+    both = {name: ~np.isnan(was[name][0]) & ~np.isnan(now[name][0]) for name in was}
+    before, after = (
+        float(np.median(np.concatenate([side[name][0][both[name]] for name in was]))) for side in (was, now)
+    )
+    kept = sum(int(rows.sum()) for rows in both.values())
+    lenses = {camera.id: _lens(camera) for camera in new.cameras}
+    return Refined(
+        before=before,
+        after=after,
+        observations=kept,
+        left_out=int(sum((~np.isnan(missed)).sum() for missed, _ in was.values())) - kept,
+        lenses=[(_lens(camera), lenses[camera.id]) for camera in old.cameras],
+        moved=float(np.median([np.linalg.norm(was[name][1] - now[name][1]) for name in was])),
+        adopted=after < _BETTER * before,
+    )
+
+
+def _by_name(model: ColmapModel) -> dict[str, tuple[Float64, Float64]]:
+    """Return the misses and the place of each photograph."""
+    parts = np.split(misses(model), model.images.point2d_offsets[1:-1].tolist())
+    centres = camera_centres(world_to_camera(model.images))
+    return dict(zip(model.images.names, zip(parts, centres, strict=True), strict=True))
+
+
+def _lens(camera: ColmapCamera) -> str:
+    return f"{camera.model} {', '.join(f'{value:.5g}' for value in camera.params.tolist())}"
+
+
+def _link_others(root: Path, model: Path, capture: Path) -> None:
+    """Link what a capture has beside its model."""
+    inside = model.relative_to(root).parts
+    for path in root.iterdir():
+        own = path.name in (*inside[:1], WORK) or (not inside and path.stem in (*FILES, "rigs", "frames"))
+        if not own:
+            (capture / path.name).symlink_to(path, target_is_directory=path.is_dir())

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A capture with a lens that is nearly right gets the right one, and poses that fit it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from blitzgs.capture.colmap import read_model
+from blitzgs.capture.lens import Lens
+from blitzgs.cli import main
+from blitzgs.sfm.refine import refine
+from blitzgs.sfm.report import misses
+
+pycolmap = pytest.importorskip("pycolmap")
+LENS = [600.0, 603.0, 340.0, 230.0, 0.02, -0.01, 0.001, 0.002]
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Return a function that writes a capture with a wrong lens, and returns the true centres by name."""
+
+    def make(count, lens=LENS, taken="PINHOLE", noise=0.1):
+        pycolmap.set_random_seed(0)
+        made = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=count, num_points3D=400)
+        made.camera_width, made.camera_height = 640, 480
+        made.camera_model_id, made.camera_params = pycolmap.CameraModelId.OPENCV, lens
+        model = pycolmap.synthesize_dataset(made)
+        pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=noise), model)
+        truth = {image.name: image.projection_center() for image in model.images.values()}
+        if taken == "PINHOLE":
+            model.cameras[1].model = pycolmap.CameraModelId.PINHOLE
+            model.cameras[1].params = [600, 600, 320, 240]
+            pycolmap.bundle_adjustment(model)
+        folder = tmp_path / "capture" / "sparse" / "0"
+        folder.mkdir(parents=True)
+        model.write(folder)
+        (tmp_path / "capture" / "images").mkdir()
+        (tmp_path / "capture" / "geo.json").write_text("{}")
+        return tmp_path / "capture", truth
+
+    return make
+
+
+def test_misses_are_those_of_pycolmap(scene):
+    capture, _ = scene(4)
+    model = pycolmap.Reconstruction(capture / "sparse/0")
+    read = read_model(capture / "sparse/0", points2d=True)
+    expected = []
+    for name in read.images.names:
+        image = model.find_image_with_name(name)
+        for seen in image.points2D:
+            known = seen.has_point3D()
+            pixel = image.project_point(model.points3D[seen.point3D_id].xyz) if known else [np.nan] * 2
+            expected.append(np.linalg.norm(pixel - seen.xy))
+    assert misses(read) == pytest.approx(expected, abs=1e-9, nan_ok=True)
+
+
+def test_lens_and_poses_are_found(scene, tmp_path, capsys):
+    capture, truth = scene(20)
+    assert main(["refine", str(capture), str(tmp_path / "new")]) == 0
+    told = capsys.readouterr().out
+    assert "-> OPENCV " in told and f"blitzgs train --data {tmp_path / 'new'}" in told
+    (camera,) = read_model(tmp_path / "new/sparse/0").cameras
+    assert camera.params[:4] == pytest.approx(LENS[:4], abs=1)
+    known, found = (Lens("OPENCV", 640, 480, tuple(values)) for values in (LENS, camera.params.tolist()))
+    within = np.linspace(-0.25, 0.25, 9), np.linspace(-0.2, 0.2, 9)
+    assert np.abs(np.subtract(known.project(*within), found.project(*within))).max() < 1
+    model = pycolmap.Reconstruction(tmp_path / "new/sparse/0")
+    # The true places but for the world, which stays that of the capture: its own places are wrong ones.
+    now = {image.name: image.projection_center() for image in model.images.values()}
+    moved = pycolmap.estimate_sim3d(np.stack([now[name] for name in truth]), np.stack(list(truth.values())))
+    away = {name: np.linalg.norm(moved * now[name] - place) for name, place in truth.items()}
+    size = np.ptp(np.stack(list(truth.values())), axis=0).max()
+    assert max(away.values()) < 2e-3 * size
+    figures = json.loads((tmp_path / "new/sfm/refined.json").read_text())
+    assert figures["adopted"] and figures["after"] == pytest.approx(0.1 * 1.177, rel=0.1)  # Rayleigh's median
+    assert figures["before"] > 1.2 * figures["after"]
+    # The mean place and spread of the photographs are those of the capture.
+    old = pycolmap.Reconstruction(capture / "sparse/0")
+    before = np.stack([old.find_image_with_name(name).projection_center() for name in now])
+    after = np.stack(list(now.values()))
+    assert after.mean(axis=0) == pytest.approx(before.mean(axis=0), abs=1e-3 * size)
+    assert after.std(axis=0) == pytest.approx(before.std(axis=0), rel=0.02)
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [
+        "geo.json",
+        "images",
+        "sfm",
+        "sparse",
+    ]
+    assert (tmp_path / "new/images").resolve() == (capture / "images").resolve()
+
+
+def test_a_lens_that_fits_stays(scene, tmp_path):
+    capture, _ = scene(20, taken="OPENCV")
+    found = refine(capture, tmp_path / "new")
+    for name in ("cameras", "images", "points3D"):
+        files = [folder / "sparse/0" / f"{name}.bin" for folder in (capture, tmp_path / "new")]
+        assert files[0].read_bytes() == files[1].read_bytes()
+    assert not found.adopted
+    assert "stay" in found.lines()[1]
+
+
+def test_a_few_photographs_do_not_determine_a_lens(scene, tmp_path):
+    capture, _ = scene(8)
+    old, new = refine(capture, tmp_path / "new").lenses[0]
+    assert old == new and old.startswith("PINHOLE")
+
+
+def test_wrong_observations_are_left_out(scene, tmp_path):
+    capture, _ = scene(20)
+    folder = capture / "sparse/0"
+    model = pycolmap.Reconstruction(folder)
+    for image in model.images.values():
+        image.points2D[3].xy = image.points2D[3].xy + [25, 0]
+    model.write(folder)
+    found = refine(capture, tmp_path / "new")
+    assert found.adopted and found.left_out == pytest.approx(20, abs=3)
+    (camera,) = read_model(tmp_path / "new/sparse/0").cameras
+    assert camera.params[2:4] == pytest.approx(LENS[2:4], abs=3)
+
+
+def test_what_cannot_be_refined_is_refused(scene, tmp_path, monkeypatch):
+    capture, _ = scene(4)
+    with pytest.raises(ValueError, match="is in the capture itself: choose a folder outside"):
+        refine(capture, capture / "new")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").write_text("")
+    with pytest.raises(FileExistsError, match="full is not empty: choose another folder"):
+        refine(capture, tmp_path / "full")
+    (tmp_path / "none").mkdir()
+    with pytest.raises(FileNotFoundError, match="none has no COLMAP model"):
+        refine(tmp_path / "none", tmp_path / "new")
+    model = pycolmap.Reconstruction(capture / "sparse/0")
+    for number in list(model.points3D):
+        model.delete_point3D(number)
+    model.write(capture / "sparse/0")
+    with pytest.raises(ValueError, match="does not say at which pixels photographs saw its points"):
+        refine(capture, tmp_path / "new")
+    monkeypatch.setattr("blitzgs.sfm.refine.has_pycolmap", lambda: False)
+    with pytest.raises(ImportError, match=r"pip install 'blitzgs\[sfm\]'"):
+        refine(capture, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
