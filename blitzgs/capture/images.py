@@ -317,8 +317,10 @@ class ImageStore:
         """Undistort and downscale."""
         if not camera.rectification.is_identity:
             columns, rows, _ = self._maps_of(camera.rectification)
-            border = cv2.BORDER_REPLICATE
-            pixels = _uint8(cv2.remap(pixels, columns, rows, cv2.INTER_LINEAR, borderMode=border))
+            # Linear interpolation blurs by up to a pixel, and is two times as fast.
+            is_halved = 2 * camera.width <= camera.rectification.lens.width
+            how = cv2.INTER_LINEAR if is_halved else cv2.INTER_CUBIC
+            pixels = _uint8(cv2.remap(pixels, columns, rows, how, borderMode=cv2.BORDER_REPLICATE))
         return _shrunk(pixels, camera)
 
     def _make_mask(self, index: int) -> UInt8:
