@@ -17,7 +17,7 @@ from blitzgs.formats.gaussians import Gaussians, is_antialiased
 from blitzgs.formats.models import read_gaussians
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
-from blitzgs.runs.cameras import input_files
+from blitzgs.runs.cameras import input_files, warn_of_changes
 from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
 from blitzgs.runs.lod import lod_gate, model_gate
 from blitzgs.runs.world import gate_of, model_of_file
@@ -92,6 +92,8 @@ def run(args: argparse.Namespace) -> int:
             folder = args.out or path.with_name(f"{path.name}.evaluation") / args.split
         else:
             check_capture(model.space, capture, run_folder)
+            if ranks.rank == 0:
+                warn_of_changes(run_folder, capture)
             gate = lod_gate(config, model.progress)
             lod = model_gate(config, model.progress, model.table, ranks)
             folder = args.out or run_folder / run_files.EVALUATION / args.split
