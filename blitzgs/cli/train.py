@@ -153,10 +153,10 @@ class _Help(argparse.Action):
     ) -> None:
         """Print the help; exit with status 2 if there is no such field."""
         if option_string == "--help-fields":
-            print(describe_page() if values == "markdown" else printable(describe_all()))
+            print(describe_page() if values == "markdown" else printable(describe_all(), lines=True))
         elif isinstance(values, str):
             try:
-                print(printable(describe(values)))
+                print(printable(describe(values), lines=True))
             except ConfigError as error:
                 parser.error(str(error))
         else:
@@ -264,7 +264,7 @@ def _config(args: argparse.Namespace) -> Config:
         )
     minutes = [] if args.minutes is None else [f"schedule.minutes={args.minutes}"]
     begun = args.resume and own is not None and any((args.out / run_files.CHECKPOINTS).glob("checkpoint_*"))
-    if args.minutes and begun and own.exists() and load_config(own).schedule.minutes == 0:
+    if args.minutes and begun and own is not None and own.exists() and load_config(own).schedule.minutes == 0:
         raise ConfigError(
             f"--minutes: the run in {args.out} began without it, so its length is decided: leave out "
             "--minutes to continue it; once it is finished, --extend 1.5 trains half as long again"

@@ -129,7 +129,7 @@ def test_torchrun_entry(trained, tmp_path):
         ),
         (["train", "--out", "x", "--extend=100.5"], 2, "a factor above 1, got 100.5"),
         (["train", "--help", "downscal"], 2, "no such field of the configuration; did you mean downscale"),
-        (["eval", "a\x1b[31m\x07b"], 1, "a\\x1b[31m\\x07b is not a run"),
+        (["eval", "a\x1b[31m\x07b\nc"], 1, "a\\x1b[31m\\x07b\\nc is not a run"),
         (["eval", "a", "--\x1b[2J"], 2, "unrecognized arguments: --\\x1b[2J"),
         (["train", "--data", "d"], 2, "required: --out"),
         (["train"], 2, "required: --data, --out"),

@@ -235,7 +235,7 @@ def test_a_file_gets_no_bar(capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
-        ("plain, ünïcode 🏙\n\tand more", "plain, ünïcode 🏙\n\tand more"),
+        ("plain, ünïcode 🏙\tand more\n", "plain, ünïcode 🏙\tand more\\n"),
         ("a\x1b[31mred", "a\\x1b[31mred"),
         ("\x07\x00\x7f\r", "\\x07\\x00\\x7f\\r"),
         ("\x9b2J", "\\x9b2J"),
@@ -244,3 +244,4 @@ def test_a_file_gets_no_bar(capsys, monkeypatch):
 )
 def test_control_characters_are_escaped(text, shown):
     assert printable(text) == shown
+    assert printable(text, lines=True) == shown.replace("\\n", "\n")
