@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
+from blitzgs.call.arguments import refuse_func_transforms
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_loss, pixel_counts, ssim
@@ -132,7 +133,9 @@ def position_noise(
     for name, value in (("quats", quats), ("scales", scales), ("opacities", opacities)):
         check_tensor(name, value)
     if opacities.numel() != len(quats):
-        raise ValueError(f"opacities must be [N] or [N, 1] with N = {len(quats)}, got {list(opacities.shape)}")
+        raise ValueError(
+            f"opacities must be [N] or [N, 1] with N = {len(quats)}, got {list(opacities.shape)}"
+        )
     rows = torch.arange(len(quats), device=quats.device)
     noise = quats.new_zeros(len(quats), 3)
     position_noise_(
@@ -200,9 +203,10 @@ def l1_ssim(
         TypeError: an argument is not a tensor, or has a dtype that is not listed above.
         ValueError: shapes or devices do not fit, the weight is outside [0, 1], the padding unknown or the
             image too small for it, or the targets require a gradient.
-        RuntimeError: float64 images are on a GPU.
+        RuntimeError: float64 images are on a GPU, or the call is inside a transform of `torch.func`.
         NotImplementedError: the images have forward-mode derivatives.
     """
+    refuse_func_transforms()
     _check_types(renders, targets, masks)
     if renders.dim() < 3 or renders.shape[-1] != 3 or targets.shape != renders.shape:
         raise ValueError(
