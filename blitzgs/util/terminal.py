@@ -24,6 +24,14 @@ def printable(text: str, lines: bool = False) -> str:
     return _CONTROLS.sub(lambda match: "\n" if lines and match[0] == "\n" else ascii(match[0])[1:-1], text)
 
 
+def amount(size: float) -> str:
+    """Return a number of bytes as text, in a unit that leaves three digits or so."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= 0.9995 * factor:
+            return f"{size / factor:,.{max(0, 3 - len(str(int(size / factor))))}f} {unit}"
+    return f"{size:.0f} bytes"
+
+
 class Output(io.FileIO):
     """One of the process's output streams, which keeps the program running when it cannot be written.
 
