@@ -22,6 +22,7 @@ from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
 from blitzgs.runs.lod import lod_gate, model_gate
 from blitzgs.runs.world import gate_of, model_of_file
 from blitzgs.training.inputs import check_capture, open_capture
+from blitzgs.training.understood import largest_size
 from blitzgs.util.progress import image_progress
 from blitzgs.util.terminal import printable
 from blitzgs.view.gate import ModelGate
@@ -45,6 +46,12 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     parser = arguments.add_command(commands, "eval", run, summary, HELP)
     arguments.add_model(parser)
     arguments.add_capture(parser)
+    parser.add_argument(
+        "--downscale",
+        type=arguments.number(int, lambda value: value >= 1, "a whole number from 1 on"),
+        metavar="N",
+        help="with FILE: reduce both sides of the photographs by this factor, as data.downscale",
+    )
     arguments.add_device(parser, shares_gpus=True)
     arguments.add_pool(parser)
     arguments.add_split(parser, "measure")
@@ -75,8 +82,10 @@ def run(args: argparse.Namespace) -> int:
         path: Path = args.model
         if path.is_file():
             found = read_gaussians(path)
-            config = _config_of(found, args.data)
+            config = _config_of(found, args.data, args.downscale)
         else:
+            if args.downscale is not None:
+                raise ValueError("--downscale is for a file: a run is measured at the size it was trained at")
             run_folder, checkpoint = run_files.run_and_checkpoint(path)
             model = run_files.open_model(run_folder, ranks, args.data, args.resident_gb, checkpoint)
             config = model.config
@@ -119,12 +128,16 @@ def run(args: argparse.Namespace) -> int:
             # Standard output has nothing but the JSON.
             for view, psnr in worst_views(result["views"]):
                 print(printable(f"among the worst views: {view} {psnr:.2f} dB"), file=sys.stderr)
-            print(f"{folder}: metrics.json and pictures", file=sys.stderr)
+            what = f"metrics.json and pictures of {len(indices)} views, {largest_size(capture)} pixels"
+            print(f"{folder}: {what}", file=sys.stderr)
     return 0
 
 
-def _config_of(found: Gaussians, data: Path | None) -> Config:
+def _config_of(found: Gaussians, data: Path | None, downscale: int | None) -> Config:
     """Return the configuration that shows a file in the views of a capture."""
     if data is None:
         raise ValueError("a file is compared with a capture: add --data CAPTURE")
-    return Config(data=DataConfig(path=str(data)), model=ModelConfig(antialiased=is_antialiased(found)))
+    return Config(
+        data=DataConfig(path=str(data), downscale=downscale or 1),
+        model=ModelConfig(antialiased=is_antialiased(found)),
+    )

@@ -166,8 +166,8 @@ def warn_of_changes(folder: Path, capture: Capture) -> None:
         more = ", ..." if len(changed) > _NAMED else ""
         warnings.warn(
             f"{len(changed)} of {len(now)} photographs or their masks have changed since the run in {folder} "
-            f"began: {', '.join(changed[:_NAMED])}{more}; the model was trained on the earlier ones: put "
-            "them back, or start another run",
+            f"began: {', '.join(changed[:_NAMED])}{more}; unless these replace damaged ones, put "
+            "the earlier ones back or start another run",
             stacklevel=2,
         )
 
