@@ -197,6 +197,15 @@ def check_options(
         raise ValueError(f"camera_model must be 'pinhole' or 'fisheye', got {camera_model!r}")
 
 
+def refuse_func_transforms() -> None:
+    """Raise a RuntimeError inside a transform of `torch.func`."""
+    if func_transforms_are_active():
+        raise RuntimeError(
+            "blitzgs does not support the transforms of torch.func (grad, vjp, jvp, jacrev, vmap, ...): use "
+            "torch.autograd or backward(), and batch dimensions of the arguments in place of vmap"
+        )
+
+
 def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]) -> None:
     """Check that arguments are tensors on one device, all float32 or all float64.
 
@@ -210,11 +219,7 @@ def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]
         ValueError: an argument has another dtype, or is on another device, whose memory the kernels could not
             read.
     """
-    if func_transforms_are_active():
-        raise RuntimeError(
-            "blitzgs does not support the transforms of torch.func (grad, vjp, jvp, jacrev, vmap, ...): use "
-            "torch.autograd or backward(), and batch dimensions of the arguments in place of vmap"
-        )
+    refuse_func_transforms()
     device, dtype, first = None, None, ""
     for name, value in (*required.items(), *optional.items()):
         if value is None and name in optional:
@@ -362,8 +367,10 @@ def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree:
         wanted = "SH coefficients [..., N, K, D], [..., C, N, K, D] or [N, K, D] when sh_degree is given"
         shape = tuple(colors.shape[:-2])
     if shape not in ((*batch, N), (*batch, C, N)) or colors.dim() < 2:
+        hint = "; SH coefficients need sh_degree" if sh_degree is None and shape[:-1] == (*batch, N) else ""
         raise ValueError(
-            f"colors must be {wanted}, here with {[*batch]} before N = {N}, C = {C}, got {list(colors.shape)}"
+            f"colors must be {wanted}, here with {[*batch]} before N = {N}, C = {C}, got "
+            f"{list(colors.shape)}{hint}"
         )
     if sh_degree is not None and (sh_degree + 1) ** 2 > colors.shape[-2]:
         raise ValueError(

@@ -10,10 +10,12 @@ import torch
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
+from blitzgs.call.arguments import refuse_func_transforms
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_loss, pixel_counts, ssim
 from blitzgs.ops.population import MAX_COPIES, overlap, position_noise_
+from blitzgs.util.errors import check_tensor
 
 _TRIANGLE = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
 
@@ -125,8 +127,15 @@ def position_noise(
         [N, 3] in the unit of the means, dtype of `quats`.
 
     Raises:
-        RuntimeError: wrong shapes or dtypes.
+        TypeError: an argument is not a tensor.
+        RuntimeError, ValueError: wrong shapes or dtypes.
     """
+    for name, value in (("quats", quats), ("scales", scales), ("opacities", opacities)):
+        check_tensor(name, value)
+    if opacities.numel() != len(quats):
+        raise ValueError(
+            f"opacities must be [N] or [N, 1] with N = {len(quats)}, got {list(opacities.shape)}"
+        )
     rows = torch.arange(len(quats), device=quats.device)
     noise = quats.new_zeros(len(quats), 3)
     position_noise_(
@@ -151,8 +160,10 @@ def knn(points: Tensor, k: int) -> Tensor:
         other finite points exist.
 
     Raises:
+        TypeError: `points` is not a tensor.
         RuntimeError: wrong shape or dtype, or k outside its range.
     """
+    check_tensor("points", points)
     return knn_distances(points, k)
 
 
@@ -192,9 +203,10 @@ def l1_ssim(
         TypeError: an argument is not a tensor, or has a dtype that is not listed above.
         ValueError: shapes or devices do not fit, the weight is outside [0, 1], the padding unknown or the
             image too small for it, or the targets require a gradient.
-        RuntimeError: float64 images are on a GPU.
+        RuntimeError: float64 images are on a GPU, or the call is inside a transform of `torch.func`.
         NotImplementedError: the images have forward-mode derivatives.
     """
+    refuse_func_transforms()
     _check_types(renders, targets, masks)
     if renders.dim() < 3 or renders.shape[-1] != 3 or targets.shape != renders.shape:
         raise ValueError(

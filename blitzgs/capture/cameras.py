@@ -22,6 +22,10 @@ from blitzgs.capture.lens import Array, Lens
 MAX_TANGENT = float(np.tan(np.radians(70.0)))
 _GRID = 384
 _MIN_SIDE = 16
+_UNSEEN = (
+    "the lens does not see along its own axis, or the image is folded or more than 70 degrees off the axis; "
+    "are the parameters right? {}"
+)
 
 
 @dataclass(frozen=True)
@@ -62,16 +66,16 @@ class Rectification:
             columns[begin:end], rows[begin:end] = x - 0.5, y - 0.5
         if not self.has_invalid:
             return columns, rows, _inside(self.lens, columns + 0.5, rows + 0.5)
-        _, _, cx, cy = self.lens.intrinsics
-        axis = int(np.clip(cy - self.y0, 0, self.height - 1)), int(np.clip(cx - self.x0, 0, self.width - 1))
-        return columns, rows, _seen(self.lens, columns + 0.5, rows + 0.5, axis)
+        u, v = (a.astype(np.float32) for a in self._directions(every, np.arange(self.height)))
+        return columns, rows, _seen(self.lens, u, v, columns + 0.5, rows + 0.5)
 
     def source(self, columns: npt.ArrayLike, rows: npt.ArrayLike) -> tuple[Array, Array]:
         """Return where the centres of the new image's pixels lie in the old image, (x, y)."""
+        return self.lens.project(*np.broadcast_arrays(*self._directions(columns, rows)))
+
+    def _directions(self, columns: npt.ArrayLike, rows: npt.ArrayLike) -> tuple[Array, Array]:
         fx, fy, cx, cy = self.lens.intrinsics
-        u = (np.asarray(columns) + 0.5 + self.x0 - cx) / fx
-        v = (np.asarray(rows) + 0.5 + self.y0 - cy) / fy
-        return self.lens.project(*np.broadcast_arrays(u, v))
+        return (np.asarray(columns) + 0.5 + self.x0 - cx) / fx, (np.asarray(rows) + 0.5 + self.y0 - cy) / fy
 
 
 def rectify(lens: Lens, policy: str = "crop") -> Rectification:
@@ -101,11 +105,13 @@ def _seen_grid(lens: Lens) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
     while True:
         box = np.clip(box, -MAX_TANGENT, MAX_TANGENT)
         u, v = np.linspace(box[0], box[1], _GRID), np.linspace(box[2], box[3], _GRID)
-        axis = int(np.abs(v).argmin()), int(np.abs(u).argmin())
-        seen = _seen(lens, *lens.project(*np.broadcast_arrays(u[None, :], v[:, None])), axis)
+        seen = _seen(lens, u, v, *lens.project(*np.broadcast_arrays(u[None, :], v[:, None])))
         open_sides = np.array([seen[:, 0].any(), seen[:, -1].any(), seen[0].any(), seen[-1].any()])
+        open_sides |= not seen.any()  # of a part of a picture that is far from the axis
         open_sides &= np.abs(box) < MAX_TANGENT
         if not open_sides.any():
+            if not seen.any():
+                raise ValueError(_UNSEEN.format(lens))
             return u, v, seen
         box = np.where(open_sides, box + np.array([-0.08, 0.08, -0.08, 0.08]) * _spans(box), box)
 
@@ -120,23 +126,36 @@ def _inside(lens: Lens, x: npt.NDArray[Any], y: npt.NDArray[Any]) -> npt.NDArray
 
 
 def _seen(
-    lens: Lens, x: npt.NDArray[Any], y: npt.NDArray[Any], axis: tuple[int, int]
+    lens: Lens, u: npt.NDArray[Any], v: npt.NDArray[Any], x: npt.NDArray[Any], y: npt.NDArray[Any]
 ) -> npt.NDArray[np.bool_]:
     """Return which directions of a grid fall inside the image, without those that are folded back into it.
 
-    x, y are their pixels, [rows, columns] of the grid; `axis` is the row and column of the optical axis.
-    Beyond a fold the image would be mirrored, so only directions that are connected to the axis without
-    crossing a fold count as seen.
+    u, v are the directions of the grid's columns and rows, x, y their pixels, [rows, columns]. Beyond a fold
+    the image would be mirrored, so only directions that are connected to the axis without crossing a fold
+    count as seen. The axis itself may lie outside the image, as in a part of a picture.
     """
     seen = _inside(lens, x, y)
     with np.errstate(invalid="ignore"):
         dx_dv, dx_du = np.gradient(x)
         dy_dv, dy_du = np.gradient(y)
         seen &= dx_du * dy_dv > dx_dv * dy_du
-    if not seen[axis]:
-        raise ValueError(f"the lens does not see along its own axis; are the parameters right? {lens}")
+    if not seen.any():
+        return seen
+    distances = np.where(seen, u[None, :] ** 2 + v[:, None] ** 2, np.inf)
+    row, column = np.unravel_index(distances.argmin(), seen.shape)
+    if _is_folded(lens, float(u[column]), float(v[row])):
+        raise ValueError(_UNSEEN.format(lens))
     _, labels = cv2.connectedComponents(seen.astype(np.uint8), connectivity=4)
-    return np.asarray(labels == labels[axis])
+    return np.asarray(labels == labels[row, column])
+
+
+def _is_folded(lens: Lens, u: float, v: float) -> bool:
+    """Tell whether the lens mirrors the image or sees nothing somewhere between its axis and a direction."""
+    share, step = np.linspace(0, 1, _GRID), 1e-5
+    right, left = (lens.project(share * u + d, share * v) for d in (step, -step))
+    below, above = (lens.project(share * u, share * v + d) for d in (step, -step))
+    turned = (right[0] - left[0]) * (below[1] - above[1]) - (right[1] - left[1]) * (below[0] - above[0])
+    return not bool((turned > 0).all())  # NaN too
 
 
 def _bounds(seen: npt.NDArray[np.bool_]) -> tuple[int, int, int, int]:

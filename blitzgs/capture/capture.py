@@ -35,7 +35,7 @@ from blitzgs.capture.image_files import ImageHeader, read_header
 from blitzgs.capture.layouts import Source, read_layout
 from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_extent
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.masks import check_masks, find_masks
+from blitzgs.capture.masks import check_mask_sizes, check_masks, find_masks
 from blitzgs.capture.names import MissingImagesError as MissingImagesError
 from blitzgs.capture.names import check_inside, existing, to_convert
 from blitzgs.capture.points import SourcePoints
@@ -207,6 +207,7 @@ def load_capture(
         _camera(view, header, offset, downscale, undistort, exif, plans)
         for view, header in zip(views, headers, strict=True)
     ]
+    check_mask_sizes(cameras)
     has_points = len(points.positions) > 0
     if not has_points:
         points = points_at_random(root, [c for i, c in enumerate(cameras) if i not in apart_left], offset)

@@ -61,7 +61,10 @@ def read_control_points(path: Path) -> tuple[list[ControlPoint], str]:
         if len(row) < len(columns):
             raise ValueError(f"{where}: {len(row)} values in {len(columns)} columns")
         cells = dict(zip(columns, (cell.strip() for cell in row), strict=False))
-        _add(points, cells["name"], cells["image"], [cells[key] for key in ("e", "n", "h", "x", "y")], where)
+        numbers = [cells[key] for key in ("e", "n", "h", "x", "y")]
+        if separator == ";":  # where a comma is the decimal mark
+            numbers = [number.replace(",", ".") for number in numbers]
+        _add(points, cells["name"], cells["image"], numbers, where)
     return list(points.values()), ""
 
 

@@ -29,7 +29,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.capture.cameras import Camera, Rectification, same_shape
+from blitzgs.capture.cameras import Camera, Rectification
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.check_files import FileCheck, mask_error
 from blitzgs.capture.image_files import (
@@ -43,9 +43,11 @@ from blitzgs.capture.image_files import (
     reduced,
     reduced_mask,
 )
+from blitzgs.capture.masks import misfit
 from blitzgs.capture.shared_images import BoundedCache as BoundedCache
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.formats import native
+from blitzgs.util.terminal import amount
 
 DEFAULT_BUDGET = 4 << 30
 _MAPS_KEPT = 4
@@ -68,11 +70,11 @@ class ImageMemory:
     decoded: int  # number of decodings of images and masks
 
     def __str__(self) -> str:
-        """Return the figures as text, in gigabytes."""
+        """Return the figures as text."""
         return (
-            f"photographs held in host memory: {self.compressed_bytes / 1e9:.2f} GB compressed (limit "
-            f"{self.compressed_budget / 1e9:.2f}), {self.decoded_bytes / 1e9:.2f} GB decoded (limit "
-            f"{self.decoded_budget / 1e9:.2f}); {self.decoded:,} decodings"
+            f"photographs held in host memory: {amount(self.compressed_bytes)} compressed (limit "
+            f"{amount(self.compressed_budget)}), {amount(self.decoded_bytes)} decoded (limit "
+            f"{amount(self.decoded_budget)}); {self.decoded:,} decodings"
         )
 
 
@@ -347,11 +349,8 @@ class ImageStore:
         if (mask.shape[1], mask.shape[0]) == stored:
             mask = apply_orientation(mask, camera.orientation)
         height, width = mask.shape
-        if not same_shape((width, height), (lens.width, lens.height)):
-            raise ValueError(
-                f"{path} is {width} x {height}, which does not fit the image of {lens.width} x {lens.height} "
-                f"that it masks, {camera.image_path}"
-            )
+        if (problem := misfit(camera, width, height)) is not None:  # the file has changed
+            raise ValueError(problem)
         if (width, height) != (lens.width, lens.height):  # the mask has another resolution
             mask = _uint8(cv2.resize(mask, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST))
         return mask

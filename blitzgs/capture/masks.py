@@ -10,7 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from pathlib import Path, PurePosixPath
 
-from blitzgs.capture.image_files import decode_mask, read_whole
+from blitzgs.capture.cameras import Camera, same_shape
+from blitzgs.capture.image_files import decode_mask, read_header, read_whole
 from blitzgs.capture.names import files_below, unified, what_is_at
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp", ".avif", ".jp2")
@@ -22,6 +23,7 @@ _FORMS_OF_ANY_SUFFIX = ("{name}", "{stem}", "{stem}_mask")
 _FORMS_OF_A_PLACE = len(_FORMS) + 1 + len(_FORMS_OF_ANY_SUFFIX) * len(_SUFFIXES[1:])
 # Masks are decoded when the capture is loaded to see what they exclude.
 _SAMPLED = 8
+_THREADS = 16
 
 
 def find_masks(
@@ -129,6 +131,36 @@ def _places(name: str) -> Iterator[str]:
             yield "/".join((*parts[begin:-1], own))
         for form, suffix in product(_FORMS_OF_ANY_SUFFIX, _SUFFIXES[1:]):
             yield "/".join((*parts[begin:-1], form.format(name=path.name, stem=path.stem) + suffix))
+
+
+def misfit(camera: Camera, width: int, height: int) -> str | None:
+    """Return why a mask file of this stored size does not fit the photograph of its camera; None: it does."""
+    lens = camera.rectification.lens
+    stored = (lens.width, lens.height) if camera.orientation < 5 else (lens.height, lens.width)
+    if (width, height) == stored or same_shape((width, height), (lens.width, lens.height)):
+        return None
+    return (
+        f"the mask {camera.mask_path} is {width} x {height}, which does not fit the photograph of "
+        f"{lens.width} x {lens.height} that it masks, {camera.image_path}: make it from that photograph, "
+        "or use --data.masks=false"
+    )
+
+
+def check_mask_sizes(cameras: Sequence[Camera]) -> None:
+    """Refuse masks whose sizes do not fit (ValueError); damaged ones are left to who needs them."""
+
+    def problem(camera: Camera) -> str | None:
+        try:
+            header = read_header(camera.mask_path) if camera.mask_path is not None else None
+        except (OSError, ValueError):
+            return None
+        return None if header is None else misfit(camera, header.width, header.height)
+
+    with ThreadPoolExecutor(_THREADS) as pool:  # the files may be on a slow network disk
+        found = [text for text in pool.map(problem, cameras) if text is not None]
+    if found:
+        more = f" ({len(found)} masks do not fit)" if len(found) > 1 else ""
+        raise ValueError(found[0] + more)
 
 
 def check_masks(masks: Sequence[Path | None]) -> None:

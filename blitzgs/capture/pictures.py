@@ -60,10 +60,10 @@ def encode_image(image: Tensor, suffix: str) -> bytes:
         raise ValueError(f"an image must be [H, W, 3], got {list(image.shape)}")
     try:
         written, data = cv2.imencode(suffix, np.ascontiguousarray(to_uint8(image)[..., ::-1]))
-    except cv2.error as error:
-        raise ValueError(f"cannot write a picture as '{suffix}': {error}") from error
+    except cv2.error:  # its message has paths of its sources
+        written = False
     if not written:
-        raise ValueError(f"cannot write a picture as '{suffix}'")
+        raise ValueError(f"cannot write a picture as '{suffix}': use .png, .jpg or .webp")
     return bytes(data)
 
 

@@ -95,7 +95,7 @@ def _run(given: list[str]) -> int:
     chosen = next((text for text in given if not text.startswith("-")), "")
     name = f"blitzgs {chosen}" if chosen in COMMANDS else "blitzgs"
     # Our warnings are about the user's data, so they are shown without the line of code that raised them.
-    warnings.formatwarning = lambda message, *_, **__: printable(f"{name}: warning: {message}\n")
+    warnings.formatwarning = lambda message, *_, **__: printable(f"{name}: warning: {message}") + "\n"
     try:
         with _importing(name):
             parser, commands = parser_of([chosen])
@@ -111,7 +111,9 @@ def _run(given: list[str]) -> int:
     except Exception as error:
         if not isinstance(error, _user_errors()):
             raise
-        _print_error(f"{name}: {printable(_message(error))}")
+        # Those of Python's imports and of YAML have lines.
+        lines = isinstance(error, ImportError) or type(error).__name__ == "ConfigError"
+        _print_error(f"{name}: {printable(_message(error), lines)}")
         return 1
 
 

@@ -17,11 +17,12 @@ from blitzgs.formats.gaussians import Gaussians, is_antialiased
 from blitzgs.formats.models import read_gaussians
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
-from blitzgs.runs.cameras import input_files
+from blitzgs.runs.cameras import input_files, warn_of_changes
 from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
 from blitzgs.runs.lod import lod_gate, model_gate
 from blitzgs.runs.world import gate_of, model_of_file
 from blitzgs.training.inputs import check_capture, open_capture
+from blitzgs.training.understood import largest_size
 from blitzgs.util.progress import image_progress
 from blitzgs.util.terminal import printable
 from blitzgs.view.gate import ModelGate
@@ -45,6 +46,12 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     parser = arguments.add_command(commands, "eval", run, summary, HELP)
     arguments.add_model(parser)
     arguments.add_capture(parser)
+    parser.add_argument(
+        "--downscale",
+        type=arguments.number(int, lambda value: value >= 1, "a whole number from 1 on"),
+        metavar="N",
+        help="with FILE: reduce both sides of the photographs by this factor, as data.downscale",
+    )
     arguments.add_device(parser, shares_gpus=True)
     arguments.add_pool(parser)
     arguments.add_split(parser, "measure")
@@ -75,8 +82,10 @@ def run(args: argparse.Namespace) -> int:
         path: Path = args.model
         if path.is_file():
             found = read_gaussians(path)
-            config = _config_of(found, args.data)
+            config = _config_of(found, args.data, args.downscale)
         else:
+            if args.downscale is not None:
+                raise ValueError("--downscale is for a file: a run is measured at the size it was trained at")
             run_folder, checkpoint = run_files.run_and_checkpoint(path)
             model = run_files.open_model(run_folder, ranks, args.data, args.resident_gb, checkpoint)
             config = model.config
@@ -92,6 +101,8 @@ def run(args: argparse.Namespace) -> int:
             folder = args.out or path.with_name(f"{path.name}.evaluation") / args.split
         else:
             check_capture(model.space, capture, run_folder)
+            if ranks.rank == 0:
+                warn_of_changes(run_folder, capture)
             gate = lod_gate(config, model.progress)
             lod = model_gate(config, model.progress, model.table, ranks)
             folder = args.out or run_folder / run_files.EVALUATION / args.split
@@ -117,12 +128,16 @@ def run(args: argparse.Namespace) -> int:
             # Standard output has nothing but the JSON.
             for view, psnr in worst_views(result["views"]):
                 print(printable(f"among the worst views: {view} {psnr:.2f} dB"), file=sys.stderr)
-            print(f"{folder}: metrics.json and pictures", file=sys.stderr)
+            what = f"metrics.json and pictures of {len(indices)} views, {largest_size(capture)} pixels"
+            print(f"{folder}: {what}", file=sys.stderr)
     return 0
 
 
-def _config_of(found: Gaussians, data: Path | None) -> Config:
+def _config_of(found: Gaussians, data: Path | None, downscale: int | None) -> Config:
     """Return the configuration that shows a file in the views of a capture."""
     if data is None:
         raise ValueError("a file is compared with a capture: add --data CAPTURE")
-    return Config(data=DataConfig(path=str(data)), model=ModelConfig(antialiased=is_antialiased(found)))
+    return Config(
+        data=DataConfig(path=str(data), downscale=downscale or 1),
+        model=ModelConfig(antialiased=is_antialiased(found)),
+    )

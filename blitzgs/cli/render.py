@@ -55,8 +55,8 @@ Render views of a model to pictures, or a camera path to a film:
   blitzgs render RUN --path orbit --out FILM.mp4          # also flight and spline
   blitzgs render RUN --path orbit --depth --out PICTURES  # each frame as a picture, with its depth
 
-MODEL is the folder of a run, a checkpoint in it, or a PLY file. Films need the package av:
-pip install "blitzgs[film]".
+MODEL is the folder of a run, a checkpoint in it, or a file of Gaussians of any
+program (PLY, compressed PLY, SPZ, SOG, .splat). Films need the package av: pip install "blitzgs[film]".
 """
 
 
@@ -310,9 +310,9 @@ def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> 
 
 def _open_ply(args: argparse.Namespace, ranks: Ranks) -> Opened:
     if ranks.world_size > 1:
-        raise ValueError(f"{args.model}: one process renders a PLY file: run render without torchrun")
+        raise ValueError(f"{args.model}: one process renders a file: run render without torchrun")
     if args.data is not None:
-        raise ValueError("--data needs the folder of a run: for a PLY file, use --path or --cameras")
+        raise ValueError("--data needs the folder of a run: for a file, use --path or --cameras")
     return open_model(args.model, ranks)
 
 

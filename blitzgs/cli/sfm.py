@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         photograph_folder(args.photos), args.capture, Settings(args.pairs, args.mapper, args.camera_model)
     )
     name = shlex.quote(str(args.capture))
-    print(printable(f"next:\n  blitzgs train --data {name} --out RUN"))
+    print(f"next:\n  {printable(f'blitzgs train --data {name} --out RUN')}")
     return 0
 
 

@@ -153,10 +153,10 @@ class _Help(argparse.Action):
     ) -> None:
         """Print the help; exit with status 2 if there is no such field."""
         if option_string == "--help-fields":
-            print(describe_page() if values == "markdown" else printable(describe_all()))
+            print(describe_page() if values == "markdown" else printable(describe_all(), lines=True))
         elif isinstance(values, str):
             try:
-                print(printable(describe(values)))
+                print(printable(describe(values), lines=True))
             except ConfigError as error:
                 parser.error(str(error))
         else:
@@ -166,6 +166,8 @@ class _Help(argparse.Action):
 
 def run(args: argparse.Namespace) -> int:
     """Train; returns the exit status."""
+    if args.extend is not None and args.minutes is not None:
+        args.parser.error("--extend and --minutes exclude each other: --extend says how many images")
     args.resume = args.resume or args.extend is not None
     if args.out is None and not args.show_config and not args.check:
         needed = "--out" if args.data or args.config else "--data, --out"
@@ -261,6 +263,12 @@ def _config(args: argparse.Namespace) -> Config:
             f"{source} would be overwritten by the new run's resolved configuration: choose another --out"
         )
     minutes = [] if args.minutes is None else [f"schedule.minutes={args.minutes}"]
+    begun = args.resume and own is not None and any((args.out / run_files.CHECKPOINTS).glob("checkpoint_*"))
+    if args.minutes and begun and own is not None and own.exists() and load_config(own).schedule.minutes == 0:
+        raise ConfigError(
+            f"--minutes: the run in {args.out} began without it, so its length is decided: leave out "
+            "--minutes to continue it; once it is finished, --extend 1.5 trains half as long again"
+        )
     config = load_config(source, [*args.overrides, *minutes])
     if args.data is not None:
         # Set the path directly: YAML does not allow all characters that a path may have.
@@ -281,6 +289,8 @@ _FIGURES: dict[str, tuple[str, int, float]] = {
     "gaussians": ("Gaussians", 0, 1),
     "peak_gaussians": ("Gaussians at most", 0, 1),
     "peak_memory_bytes": ("peak memory, GB", 2, 1e9),
+    "budget_seconds": ("time limit, minutes", 1, 60),
+    "scale": ("scale of the schedule", 2, 1),
     "largest_fall": ("largest fall of the training PSNR, dB", 2, 1),
 }
 

@@ -27,6 +27,7 @@ from blitzgs.distributed.group import Ranks, extend_memory_in_place, resolve_dev
 from blitzgs.formats.tiles import PAGE, TILESET
 from blitzgs.runs import run_files
 from blitzgs.training.inputs import open_capture
+from blitzgs.util.terminal import printable
 
 HELP = """\
 Look at a model in the browser. MODEL is the folder of a run, a checkpoint in it, a file of Gaussians of any
@@ -107,7 +108,7 @@ def photographs(folder: Path, data: Path | None) -> Callable[[int], npt.NDArray[
             config = changed(config, "data", path=str(data))
         _, images = open_capture(config, Ranks(), "--data DIR")
     except (OSError, ValueError) as error:
-        print(f"no photographs to compare with: {error}")
+        print(printable(f"no photographs to compare with: {error}"))
         return None
     return lambda index: np.asarray(images.get(index).numpy())
 

@@ -25,6 +25,8 @@ from datetime import timedelta
 import torch
 from torch.distributed import PrefixStore, TCPStore  # type: ignore[attr-defined]
 
+from blitzgs.util.terminal import printable
+
 EXIT_STUCK = 75  # EX_TEMPFAIL: a restart may help
 # How long a rank continues to wait after another rank has reported a failure.
 GRACE_SECONDS = 4.0
@@ -287,12 +289,12 @@ class Watchdog:
         if time.monotonic() - self._announced > 60:
             self._announced = time.monotonic()
             text = f"rank {self.rank}: has waited {waited:.0f} s in {self.name}: {late}"
-            print(text, file=sys.stderr, flush=True)
+            print(printable(text), file=sys.stderr, flush=True)
 
     def _abort(self, reason: str) -> None:
         blame = self._first_failure() or self._late_ranks() or "no rank is known to be late"
         message = f"rank {self.rank}: {reason}: {blame}. Ending the job."
-        print(message, file=sys.stderr, flush=True)
+        print(printable(message), file=sys.stderr, flush=True)
         self.report_failure(message)
         # The main thread is inside a collective that cannot be interrupted.
         os._exit(EXIT_STUCK)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.util.errors import check_tensor
+from blitzgs.util.terminal import amount
 
 # Writers take so many Gaussians at a time: 62 MB at SH degree 3.
 BLOCK = 1 << 18
@@ -141,8 +142,8 @@ def check_memory(holds: str, count: int, degree: int, copies: int = 2) -> None:
     free = psutil.virtual_memory().available
     if needed > free:
         raise ValueError(
-            f"{holds} {count:,} Gaussians: reading them takes {needed / 1e9:,.1f} GB of memory or more, and "
-            f"{free / 1e9:,.1f} GB are free"
+            f"{holds} {count:,} Gaussians: reading them takes {amount(needed)} of memory or more, and "
+            f"{amount(free)} are free"
         )
 
 

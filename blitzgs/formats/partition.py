@@ -22,6 +22,7 @@ import numpy.typing as npt
 import torch
 
 from blitzgs.formats.gaussians import Gaussians, GaussianSource
+from blitzgs.util.terminal import amount
 
 # Cells of the grid along an axis, as a power of two. A cell's key has the digits of an octree, 3 bits each.
 BITS = 8
@@ -84,8 +85,8 @@ class Partition:
         if free < 2 * needed:
             raise OSError(
                 errno.ENOSPC,
-                f"{2 * needed / 1e9:.1f} GB are needed for the files and a temporary copy, and "
-                f"{free / 1e9:.1f} GB are free",
+                f"{amount(2 * needed)} are needed for the files and a temporary copy, and "
+                f"{amount(free)} are free",
                 str(folder),
             )
         with open(self._places, "wb") as file:

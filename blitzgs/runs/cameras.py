@@ -4,7 +4,11 @@
 from __future__ import annotations
 
 import json
+import os
+import warnings
+import zlib
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +24,8 @@ from blitzgs.view.views import CameraLike
 
 CAMERAS = "cameras.json"
 _VERSION = 1
+# Bytes that are read at the beginning, middle and end of a photograph to recognise it; names in a warning.
+_PIECE, _NAMED, _THREADS = 4096, 4, 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +130,7 @@ def _matrix(argument: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 def save_cameras(folder: Path, capture: Capture, run_id: str = "") -> None:
     """Write the cameras of a capture into the folder of a run; `run_id` tells its checkpoints from others."""
+    stamps = _stamps(capture)
     views = [
         {
             "name": camera.name,
@@ -131,6 +138,7 @@ def save_cameras(folder: Path, capture: Capture, run_id: str = "") -> None:
             "height": camera.height,
             "K": np.asarray(camera.K).tolist(),
             "world_to_camera": np.asarray(camera.world_to_camera).tolist(),
+            "stamp": stamps[camera.name],
         }
         for camera in capture.cameras
     ]
@@ -143,6 +151,50 @@ def save_cameras(folder: Path, capture: Capture, run_id: str = "") -> None:
         "cameras": views,
     }
     write_file(folder / CAMERAS, json.dumps(content))
+
+
+def warn_of_changes(folder: Path, capture: Capture) -> None:
+    """Warn if photographs or masks of a capture are others than those that the run in `folder` began with."""
+    try:
+        views = json.loads((folder / CAMERAS).read_text(encoding="utf-8"))["cameras"]
+        before = {view["name"]: view.get("stamp", "") for view in views}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return  # an older run, or a damaged file, which is named where it is needed
+    now = _stamps(capture)
+    changed = [name for name, stamp in before.items() if stamp and now.get(name, "") not in ("", stamp)]
+    if changed:
+        more = ", ..." if len(changed) > _NAMED else ""
+        warnings.warn(
+            f"{len(changed)} of {len(now)} photographs or their masks have changed since the run in {folder} "
+            f"began: {', '.join(changed[:_NAMED])}{more}; unless these replace damaged ones, put "
+            "the earlier ones back or start another run",
+            stacklevel=2,
+        )
+
+
+def _stamps(capture: Capture) -> dict[str, str]:
+    """Return by name what tells the photograph and mask of a camera from others; empty: they are not there.
+
+    Size and a checksum of three pieces are the same for a copy, unlike its time, and quick to read.
+    """
+
+    def stamp(paths: Sequence[Path]) -> str:
+        found = 0
+        try:
+            for path in paths:
+                with path.open("rb") as file:
+                    size = file.seek(0, os.SEEK_END)
+                    found = zlib.crc32(str(size).encode(), found)
+                    for begin in (0, size // 2, max(0, size - _PIECE)):
+                        file.seek(begin)
+                        found = zlib.crc32(file.read(_PIECE), found)
+        except OSError:
+            return ""
+        return f"{found:08x}"
+
+    files = [[p for p in (c.image_path, c.mask_path) if p is not None] for c in capture.cameras]
+    with ThreadPoolExecutor(_THREADS) as pool:  # the files may be on a slow network disk
+        return dict(zip((c.name for c in capture.cameras), pool.map(stamp, files), strict=True))
 
 
 def load_cameras(folder: Path) -> RunCameras:

@@ -21,6 +21,7 @@ from blitzgs.runs.cameras import CAMERAS
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.log import LOG
 from blitzgs.table.table import GaussianTable
+from blitzgs.util.terminal import amount
 
 LOCK = ".lock"
 # A rank that torchrun restarts may begin before the process that it replaces has ended.
@@ -142,7 +143,7 @@ def check_room(folder: Path, table: GaussianTable, ranks: Ranks, most_gaussians:
     free = ranks.broadcast_object(shutil.disk_usage(folder).free if ranks.rank == 0 else 0)
     if free < rows * row:
         raise FolderError(
-            f"{folder}: a checkpoint takes {_gigabytes(rows * row)} and {_gigabytes(free)} are free: free "
+            f"{folder}: a checkpoint takes {amount(rows * row)} and {amount(free)} are free: free "
             "some space or choose another --out"
         )
     # A new checkpoint is complete before an old one is deleted.
@@ -150,14 +151,9 @@ def check_room(folder: Path, table: GaussianTable, ranks: Ranks, most_gaussians:
     wanted = 2 * most * row
     if free < wanted and ranks.rank == 0:
         warnings.warn(
-            f"{folder}: {_gigabytes(free)} are free; two checkpoints of {most:,} Gaussians take "
-            f"{_gigabytes(wanted)}",
+            f"{folder}: {amount(free)} are free; two checkpoints of {most:,} Gaussians take {amount(wanted)}",
             stacklevel=2,
         )
-
-
-def _gigabytes(size: float) -> str:
-    return f"{size / 1e9:.2f} GB"
 
 
 # The last records of a log are within this number of bytes.

@@ -10,6 +10,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
@@ -134,7 +135,16 @@ def run_stage(stage: str, job: Job, log: Path, lock: int, report: Report) -> Non
         run_pycolmap(stage, asdict(job), log, lock, lambda line: _progress(line, len(job.names), report))
         return
     for command in _commands(program, stage, job):
-        _run(command, log, lock, lambda line: _progress(line, len(job.names), report))
+        try:
+            _run(command, log, lock, lambda line: _progress(line, len(job.names), report))
+        except StageError as error:
+            if "bundle_adjuster" not in command:
+                raise
+            shutil.rmtree(command[command.index("--output_path") + 1])  # `adopt` keeps the model before
+            warnings.warn(
+                f"the principal point stays in the middle of the photographs, as refining it failed: {error}",
+                stacklevel=2,
+            )
 
 
 def run_pycolmap(stage: str, job: dict[str, Any], log: Path, lock: int, heard: Callable[[str], None]) -> None:
@@ -222,11 +232,13 @@ def _commands(program: str, stage: str, job: Job) -> Iterator[list[str]]:
 
 
 def adopt(refined: Path, folder: Path) -> None:
-    """Move a refined model to its place if its error is less by a tenth.
+    """Move a refined model, if there is one, to its place if its error is less by a tenth.
 
     Else the lens is centred, or the photographs do not determine it: its axis then goes anywhere, and the
     focal length with it.
     """
+    if not refined.exists():
+        return
     if read_model(refined).points.errors.mean() < 0.9 * read_model(folder).points.errors.mean():
         shutil.copytree(refined, folder, dirs_exist_ok=True)
     shutil.rmtree(refined)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from blitzgs.ops.rows import take_rows
 from blitzgs.table.table import GROWTH, GaussianTable
+from blitzgs.util.terminal import amount
 
 MEMORY_INFO = Path("/proc/meminfo")
 
@@ -82,8 +83,8 @@ def _allocate(like: Tensor, rows: int, pinned: bool) -> Tensor:
     available = available_bytes()
     if available is not None and size > available:
         raise HostMemoryError(
-            f"a column of {len(like):,} Gaussians needs {size / 1e9:.2f} GB in the memory of the host, which "
-            f"has {available / 1e9:.2f} GB left: use more memory or hosts, or cap population.max_gaussians"
+            f"a column of {len(like):,} Gaussians needs {amount(size)} in the memory of the host, which "
+            f"has {amount(available)} left: use more memory or hosts, or cap population.max_gaussians"
         )
     pages = mmap.mmap(-1, max(1, size), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     for advice in ("MADV_HUGEPAGE", "MADV_DONTFORK"):  # fewer pages to pin; a fork must not copy them
@@ -96,7 +97,7 @@ def _allocate(like: Tensor, rows: int, pinned: bool) -> Tensor:
         error = int(torch.cuda.cudart().cudaHostRegister(address, size, 0))
         if error:
             raise HostMemoryError(
-                f"{size / 1e9:.2f} GB of the host's memory cannot be pinned (CUDA error {error}): use a host "
+                f"{amount(size)} of the host's memory cannot be pinned (CUDA error {error}): use a host "
                 "with more memory, or cap population.max_gaussians"
             )
         weakref.finalize(view, _unpin, address, pages)

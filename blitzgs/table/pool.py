@@ -24,6 +24,7 @@ from blitzgs.table.blocks import UNSEEN, BlockIndex, BlockVisibility, Cameras, c
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.layouts import CULL, LAYOUTS, sectors_in
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
+from blitzgs.util.terminal import amount
 
 # Columns that steps change and that are therefore written back to the host.
 _WRITTEN = (
@@ -139,7 +140,7 @@ class Pool:
         if slots < min(1, self._blocks):
             raise PoolError(
                 f"{_SETTING}: {self._budget / 1e9:g} GB are less than two blocks of 256 Gaussians, "
-                f"which take {2 * self._bytes_in / 1e9:.4f} GB"
+                f"which take {amount(2 * self._bytes_in)}"
             )
         rows = slots * BLOCK_ROWS + self._rest
         allocated_rows = (slots + has_rest) * BLOCK_ROWS
@@ -337,8 +338,8 @@ class Pool:
         slots = len(self._block_in)
         raise PoolError(
             f"views that are rendered together see {needed:,} blocks of 256 Gaussians, "
-            f"{needed * self._bytes_in / 1e9:.3f} GB, and the pool has room for {slots:,}, "
-            f"{slots * self._bytes_in / 1e9:.3f} GB: raise {_SETTING}, or train with a lower "
+            f"{amount(needed * self._bytes_in)}, and the pool has room for {slots:,}, "
+            f"{amount(slots * self._bytes_in)}: raise {_SETTING}, or train with a lower "
             "schedule.batch_size"
         )
 

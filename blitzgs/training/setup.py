@@ -22,7 +22,7 @@ from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY, octree_gaussians
 from blitzgs.population.relocation import PositionNoise
 from blitzgs.runs import run_files
-from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_cameras
+from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_cameras, warn_of_changes
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
 from blitzgs.runs.log import LOG, RunLog
 from blitzgs.runs.run_files import Progress
@@ -90,6 +90,8 @@ def set_up(
     else:
         table, progress = restored.table, restored.progress
         check_capture(restored.space, capture, folder)
+        if ranks.rank == 0:
+            warn_of_changes(folder, capture)
     lap("gaussians")
     # The views and the spawn gate are compared with those of the checkpoint.
     progress = keep_to_views(table, progress, capture, ranks)
@@ -130,7 +132,7 @@ def set_up(
         stepper=stepper,
         owners=owners,
         run_id=run_id,
-        origin=_origin(restored, resume, folder, schedule.iterations),
+        origin=_origin(restored, resume, folder, schedule),
         save_clock=SaveClock(config.log.checkpoint_seconds),
         veto=veto,
         lineage=lineage,
@@ -280,12 +282,15 @@ def _start_lineage(
     return lineage
 
 
-def _origin(restored: run_files.Restored | None, resume: bool, folder: Path, iterations: int) -> str:
+def _origin(restored: run_files.Restored | None, resume: bool, folder: Path, schedule: Schedule) -> str:
     """Describe where the run begins, for the log."""
     if restored is not None:
-        longer = Schedule(restored.config.schedule).iterations != iterations
-        extended_to = f", extended to {iterations:,} images" if longer else ""
-        return f"resumed from {restored.source} after {restored.progress.step:,} steps{extended_to}"
+        more = ""
+        if Schedule(restored.config.schedule).iterations != schedule.iterations:
+            more = f", extended to {schedule.iterations:,} images"
+        elif restored.progress.step >= schedule.steps:
+            more = ", its end (--extend trains it longer)"
+        return f"resumed from {restored.source} after {restored.progress.step:,} steps{more}"
     return f"nothing to resume in {folder}: starting anew" if resume else "new run"
 
 

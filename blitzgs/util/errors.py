@@ -10,6 +10,8 @@ import psutil
 import torch
 from torch import Tensor
 
+from blitzgs.util.terminal import amount
+
 
 def check_tensor(name: str, value: object) -> None:
     """Raise a TypeError unless a value is a tensor."""
@@ -53,7 +55,7 @@ def explain_memory(
     count = "1 view" if views == 1 else f"{views:,} views"
     raise NotEnoughMemoryError(
         f"not enough memory to render {count} of {width:,} x {height:,} pixels with {gaussians:,} "
-        f"Gaussians: the pixels alone take {needed / 1e9:,.2f} GB, and {_free(device) / 1e9:,.2f} GB are "
+        f"Gaussians: the pixels alone take {amount(needed)}, and {amount(_free(device))} are "
         f"free on {device}. Render smaller views, or fewer at once"
     ) from error
 

@@ -20,6 +20,8 @@ from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
 
+from blitzgs.util.terminal import amount
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -247,9 +249,7 @@ def check_space(folder: Path, columns: Mapping[str, Tensor]) -> None:
     needed = sum(column.numel() * column.element_size() for column in columns.values())
     free = shutil.disk_usage(folder).free
     if free < needed:
-        raise OSError(
-            errno.ENOSPC, f"{needed / 1e6:,.1f} MB are needed and {free / 1e6:,.1f} MB are free", str(folder)
-        )
+        raise OSError(errno.ENOSPC, f"{amount(needed)} are needed and {amount(free)} are free", str(folder))
 
 
 def explain(error: OSError) -> str:

@@ -12,13 +12,24 @@ import sys
 from collections.abc import Iterator
 from typing import Any, TextIO
 
-# Control characters except line feed and tab, and the marks that change the direction of text.
-_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+# Control characters except tab, and the marks that change the direction of text.
+_CONTROLS = re.compile("[\x00-\x08\x0a-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
 
-def printable(text: str) -> str:
-    """Return text for a terminal: control characters, as in names of files, are written as escapes."""
-    return _CONTROLS.sub(lambda match: ascii(match[0])[1:-1], text)
+def printable(text: str, lines: bool = False) -> str:
+    """Return text for a terminal: control characters, as in names of files, are written as escapes.
+
+    `lines`: line feeds stay; for text without names that somebody else chose.
+    """
+    return _CONTROLS.sub(lambda match: "\n" if lines and match[0] == "\n" else ascii(match[0])[1:-1], text)
+
+
+def amount(size: float) -> str:
+    """Return a number of bytes as text, in a unit that leaves three digits or so."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= 0.9995 * factor:
+            return f"{size / factor:,.{max(0, 3 - len(str(int(size / factor))))}f} {unit}"
+    return f"{size:.0f} bytes"
 
 
 class Output(io.FileIO):

@@ -7,13 +7,13 @@
 #include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
-#include <torch/headeronly/util/Exception.h>
 #include <algorithm>
 #include <cstdint>
 #include <initializer_list>
 #include <limits>
 #include <optional>
 #include <sstream>
+#include <stdexcept>
 #include <string>
 #include <vector>
 
@@ -47,8 +47,21 @@ inline std::string shape_of(const Tensor& tensor) {
   return text.str();
 }
 
-// Throws "blitzgs::<op>: <message>" unless a condition holds.
-#define BLITZGS_CHECK(condition, op, ...) STD_TORCH_CHECK(condition, "blitzgs::", op, ": ", __VA_ARGS__)
+template <typename... Parts>
+[[noreturn]] void fail(const Parts&... parts) {
+  std::ostringstream text;
+  text << "blitzgs::";
+  (text << ... << parts);
+  throw std::runtime_error(text.str());
+}
+
+// Throws "blitzgs::<op>: <message>" unless a condition holds. Unlike STD_TORCH_CHECK, without the path of the
+// source file, which says nothing to a user.
+#define BLITZGS_CHECK(condition, op, ...)     \
+  do {                                        \
+    if (!(condition)) [[unlikely]]            \
+      ::blitzgs::fail(op, ": ", __VA_ARGS__); \
+  } while (false)
 
 // shape: one entry per dimension, -1 for any size. The message is built only if the check fails, because a
 // step checks some two hundred tensors while the GPU waits for its next kernel.

@@ -81,6 +81,9 @@ def test_transforms_of_torch_func_are_refused(transform):
     means = scene.means[None] if transform is torch.vmap else scene.means
     with pytest.raises(RuntimeError, match=r"blitzgs does not support the transforms of torch\.func"):
         transform(loss)(means)
+    images = torch.rand(1, 1, 12, 12, 3)
+    with pytest.raises(RuntimeError, match=r"blitzgs does not support the transforms of torch\.func"):
+        transform(lambda renders: blitzgs.l1_ssim(renders, images[0]))(images)
 
 
 def test_a_gradient_with_a_graph_may_be_used_as_a_value():

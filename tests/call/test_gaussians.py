@@ -106,6 +106,13 @@ def test_neighbours(backend):
     assert relative_error(blitzgs.knn(points, 3), expected) < 1e-6
 
 
+def test_wrong_points_and_opacities_are_named():
+    with pytest.raises(TypeError, match="points must be a torch.Tensor, got list"):
+        blitzgs.knn([[1.0, 2.0, 3.0]], 1)
+    with pytest.raises(ValueError, match=r"opacities must be \[N\] or \[N, 1\] with N = 5, got \[4\]"):
+        blitzgs.position_noise(torch.ones(5, 4), torch.ones(5, 3), torch.ones(4), 1.0, seed=0, step=0)
+
+
 @pytest.mark.parametrize(
     "scales",
     [(3, 2, 1), (1, 1e-5, 2e-5), (1, 2, 1e-7), (1, 1, 1), (1, 1, 0.5), (1, 0.5, 0.5), (1, 0, 0), (0, 0, 0)],

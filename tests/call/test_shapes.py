@@ -292,7 +292,7 @@ def test_an_argument_that_gsplat_has_not_is_refused(value):
         ({"render_mode": "N"}, "render_mode must be one of"),
         ({"rasterize_mode": "fast"}, "rasterize_mode must be"),
         ({"tile_size": 65}, "tile_size must be 1 to 64 px, got 65"),
-        ({"sh_degree": None}, "colors must be"),
+        ({"sh_degree": None}, "colors must be .*; SH coefficients need sh_degree"),
         ({"colors": torch.zeros(4, 9, 3)}, "sh_degree 3 needs 16 SH coefficients, got 9"),
         (
             {"sh_degree": None, "colors": torch.zeros(3, 4)},

@@ -214,12 +214,15 @@ def test_a_mask_of_another_shape_is_refused(tmp_path):
     (tmp_path / "masks").mkdir()
     for size, fits in (((24, 32), True), ((383, 512), True), ((48, 48), False)):
         cv2.imwrite(str(tmp_path / "masks" / "v00.png"), np.full(size, 255, dtype=np.uint8))
-        store = ImageStore(load_capture(tmp_path))
         if fits:
-            assert store.mask(0).all()
+            capture = load_capture(tmp_path)
+            assert ImageStore(capture).mask(0).all()
             continue
-        with pytest.raises(ValueError, match=r"masks/v00.png is 48 x 48, which does not fit .* 64 x 48"):
-            store.mask(0)
+        message = r"masks/v00.png is 48 x 48, which does not fit .* 64 x 48 .*: make it from"
+        with pytest.raises(ValueError, match=message):
+            load_capture(tmp_path)
+        with pytest.raises(ValueError, match=message):  # the file has changed
+            ImageStore(capture).mask(0)
 
 
 def test_distorted_captures_become_pinhole_ones(tmp_path):

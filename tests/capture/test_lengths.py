@@ -324,6 +324,27 @@ def test_cropping_leaves_only_pixels_that_were_seen_and_most_of_them(model):
     assert crop.width * crop.height > 0.6 * seen
 
 
+@pytest.mark.parametrize("policy", ["crop", "mask"])
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "EUCM"])
+def test_a_part_of_a_picture_beside_the_axis_is_undistorted_as_the_whole(model, policy):
+    lens, left, top = make_lens(model), 400, 290
+    *_, cx, cy = lens.intrinsics
+    shifted, at = list(lens.params), lens.params.index(cx)
+    shifted[at : at + 2] = cx - left, cy - top
+    whole, part = rectify(lens, "mask"), rectify(Lens(model, 180, 140, tuple(shifted)), policy)
+    assert part.K[0, 2] < 0 and part.K[1, 2] < 0  # the axis is outside
+    image = np.add.outer(np.sin(np.arange(480) / 9), np.cos(np.arange(640) / 7)).astype(np.float32)
+    expected = cv2.remap(image, *whole.maps()[:2], cv2.INTER_LINEAR)
+    columns, rows, seen = part.maps()
+    found = cv2.remap(image[top:430, left:580], columns, rows, cv2.INTER_LINEAR)
+    x, y = np.round(whole.K[:2, 2] - part.K[:2, 2]).astype(int)
+    expected = expected[y : y + part.height, x : x + part.width]
+    found, seen = (a[: expected.shape[0], : expected.shape[1]] for a in (found, seen))
+    assert seen.sum() > 0.7 * 180 * 140 and (seen.all() or policy == "mask")
+    inner = cv2.erode(np.pad(seen[2:-2, 2:-2].astype(np.uint8), 2), np.ones((5, 5))) > 0
+    np.testing.assert_allclose(found[inner], expected[inner], atol=1e-2)
+
+
 def test_strong_distortion_that_folds_back_is_cut_off():
     lens = Lens("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.35))
     u = np.linspace(0, 3, 300)

@@ -223,6 +223,8 @@ def test_both_files_of_points_are_read(setting, tmp_path):
     assert crs == "" and [p.name for p in found] == ["P0", "P1", "P2"]
     np.testing.assert_array_equal([p.world for p in found], [p.world for p in points[:3]])
     assert found[1].marks == points[1].marks
+    (tmp_path / "comma.csv").write_text(text.replace(".", ",").replace(",JPG", ".JPG"))
+    assert [p.marks for p in read_control_points(tmp_path / "comma.csv")[0]] == [p.marks for p in found]
     text = "WGS84 UTM 32N\n" + "".join(
         f"{e} {n} {h} {x} {y} {image} {name}\n" for name, e, n, h, image, x, y in rows
     )

@@ -60,6 +60,8 @@ def test_a_file_is_measured_as_its_run(trained, whole, tmp_path, capsys):
     file = json.loads(capsys.readouterr().out)
     # The file's positions are rounded to float32 away from the origin.
     assert file["psnr"] == pytest.approx(run["psnr"], abs=0.02)
+    assert main(["eval", str(whole), *flags, "--downscale=2"]) == 0
+    assert "pictures of 1 views, 24 x 16 pixels" in capsys.readouterr().err
     assert main(["eval", str(whole)]) == 1
     assert "add --data CAPTURE" in capsys.readouterr().err
 

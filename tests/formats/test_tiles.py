@@ -277,7 +277,7 @@ def test_a_full_disk_or_bad_values_leave_nothing(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("shutil.disk_usage", lambda path: type("Usage", (), {"free": 1000}))
         with pytest.raises(
-            OSError, match=r"GB are needed for the files and a temporary copy, and 0.0 GB are"
+            OSError, match=r"kB are needed for the files and a temporary copy, and 1.00 kB are"
         ):
             write_tiles(tmp_path / "a", city(1000), np.eye(4), SCENE, "a")
     bad = city(1000)

@@ -220,7 +220,7 @@ def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path, monkeypatc
         check_writable(tmp_path / "file" / "run", Ranks())
     usage = type("Usage", (), {"free": 1000})
     monkeypatch.setattr("shutil.disk_usage", lambda path: usage)
-    with pytest.raises(FolderError, match=r"a checkpoint takes .* GB and 0.00 GB are free"):
+    with pytest.raises(FolderError, match=r"a checkpoint takes .* kB and 1.00 kB are free"):
         Trainer(tiny_config(), *tiny_scene(), tmp_path / "run", Ranks())
     monkeypatch.undo()
     table = Trainer(tiny_config(), *tiny_scene(), tmp_path / "run", Ranks()).state.table

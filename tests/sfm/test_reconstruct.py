@@ -28,7 +28,7 @@ from blitzgs.sfm.reconstruct import Settings
 from blitzgs.sfm.report import examine
 from tests.capture.helpers import Posed, opensfm, pix4d, realitycapture
 from tests.sfm.scene import FOCAL, aligned, with_gps, write_photographs
-from tests.training.tiny import OVERRIDES, as_flags
+from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -398,6 +398,29 @@ else:
     options = pycolmap.IncrementalPipelineOptions(min_model_size=int(flags["--Mapper.min_model_size"]))
     pycolmap.incremental_mapping(database, flags["--image_path"], flags["--output_path"], options)
 """
+
+
+def test_a_model_that_cannot_be_refined_is_kept(tmp_path, monkeypatch):
+    write_tiny_capture(tmp_path / "tiny")
+    program = tmp_path / "colmap"
+    found = f"cp -r {tmp_path}/tiny/sparse/0 {tmp_path}/models/0"
+    program.write_text(
+        f'#!/bin/sh\ncase $1 in mapper) {found} ;; help) ;; *) echo "no CUDA"; exit 3 ;; esac\n'
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr(engine, "backend", lambda: str(program))
+    monkeypatch.setattr(engine, "MANY", 8)
+    names = [f"{i}.png" for i in range(8)]
+    job = engine.Job(
+        "d", "p", "", str(tmp_path / "models"), "", names, [(48, 32)] * 8, "auto", "exhaustive", "incremental"
+    )
+    with (tmp_path / "lock").open("w") as lock:
+        stage = (job, tmp_path / "colmap.log", lock.fileno(), lambda done, total: None)
+        with pytest.warns(UserWarning, match="principal point stays .* status 3: no CUDA"):
+            engine.run_stage("cameras", *stage)
+        assert [path.name for path in (tmp_path / "models").iterdir()] == ["0"]
+        with pytest.raises(engine.StageError, match="status 3: no CUDA"):
+            engine.run_stage("pairs", *stage)
 
 
 @pytest.mark.slow

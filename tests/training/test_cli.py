@@ -7,6 +7,7 @@ import shutil
 import struct
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import cv2
@@ -118,6 +119,7 @@ def test_torchrun_entry(trained, tmp_path):
         (["eval", "x", "--dev=cpu"], 2, "--dev=cpu; did you mean --device?"),
         (["eval", "x", "--pictures", "1", "--pictures=2"], 2, "--pictures is given twice"),
         (["train", "--out", "x", "--out=y"], 2, "--out is given twice"),
+        (["train", "--out", "x", "--extend=2", "--minutes=3"], 2, "--extend and --minutes exclude"),
         (["train", "--out", "x", "--seed=1", "--seed=2"], 2, "--seed is given twice"),
         (["train", "--out", "x", "--log.every", "1", "--log.every=1"], 2, "--log.every is given twice"),
         (
@@ -127,7 +129,7 @@ def test_torchrun_entry(trained, tmp_path):
         ),
         (["train", "--out", "x", "--extend=100.5"], 2, "a factor above 1, got 100.5"),
         (["train", "--help", "downscal"], 2, "no such field of the configuration; did you mean downscale"),
-        (["eval", "a\x1b[31m\x07b"], 1, "a\\x1b[31m\\x07b is not a run"),
+        (["eval", "a\x1b[31m\x07b\nc"], 1, "a\\x1b[31m\\x07b\\nc is not a run"),
         (["eval", "a", "--\x1b[2J"], 2, "unrecognized arguments: --\\x1b[2J"),
         (["train", "--data", "d"], 2, "required: --out"),
         (["train"], 2, "required: --data, --out"),
@@ -182,6 +184,21 @@ def test_another_capture_is_refused(trained, tmp_path, capsys):
         assert "is not the capture of the run" in message and not (tmp_path / "no").exists()
 
 
+def test_photographs_that_were_changed_meanwhile_are_named(trained, tmp_path):
+    data, out = tmp_path / "data", tmp_path / "run"
+    shutil.copytree(trained[0], data)
+    shutil.copytree(trained[1], out)
+    resume = ["train", "--resume", "--out", str(out), "--data", str(data)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert main(resume) == 0  # copies are the same photographs
+    brighter = cv2.imread(str(data / "images" / "03.png")) // 2 + 120
+    assert cv2.imwrite(str(data / "images" / "03.png"), brighter)
+    for command in (resume, ["eval", str(out), "--data", str(data)]):
+        with pytest.warns(UserWarning, match="1 of 8 photographs .* have changed .* began: 03.png; "):
+            assert main(command) == 0
+
+
 def test_mistakes_with_files_name_them(trained, tmp_path, capsys):
     file = tmp_path / "binary"
     file.write_bytes(b"\xff\xfe")
@@ -192,6 +209,8 @@ def test_mistakes_with_files_name_them(trained, tmp_path, capsys):
             capsys, "render", trained[1], "--out", out
         )
     assert f"{file} is a file where a folder is needed" in fails(capsys, "synth", file / "inside")
+    limited = fails(capsys, "train", "--resume", "--out", trained[1], "--minutes=3")
+    assert "--minutes: the run in" in limited and "leave out --minutes" in limited and "--extend" in limited
     small = fails(capsys, "train", *data, "--data.downscale=100")
     assert "downscale 100 leaves 1 x 1 pixels" in small
 

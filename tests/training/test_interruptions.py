@@ -474,7 +474,8 @@ def test_a_resume_repeats_no_record_and_says_where_it_begins(tmp_path, monkeypat
     assert origins == [
         "new run",
         "resumed from checkpoint_000000 (the newest) after 51 steps",
-        f"resumed from {checkpoints(tmp_path)[-2]} (the newest) after 100 steps",
+        f"resumed from {checkpoints(tmp_path)[-2]} (the newest) after 100 steps, its end (--extend trains it "
+        "longer)",
     ]
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["run"] == found[0]["run"]

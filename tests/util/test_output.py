@@ -16,7 +16,7 @@ from blitzgs.util import progress
 from blitzgs.util.charts import line_chart
 from blitzgs.util.output import OutputFolder, new_file, write_file
 from blitzgs.util.progress import Laps, image_progress
-from blitzgs.util.terminal import printable
+from blitzgs.util.terminal import amount, printable
 
 PARTS = st.sampled_from(
     ["..", ".", "a", "A", "a.png", "a.jpg", "a.png.jpg", "b", "ä🏙", "x" * 300, "\udcff.png", ""]
@@ -235,7 +235,7 @@ def test_a_file_gets_no_bar(capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
-        ("plain, ünïcode 🏙\n\tand more", "plain, ünïcode 🏙\n\tand more"),
+        ("plain, ünïcode 🏙\tand more\n", "plain, ünïcode 🏙\tand more\\n"),
         ("a\x1b[31mred", "a\\x1b[31mred"),
         ("\x07\x00\x7f\r", "\\x07\\x00\\x7f\\r"),
         ("\x9b2J", "\\x9b2J"),
@@ -244,3 +244,11 @@ def test_a_file_gets_no_bar(capsys, monkeypatch):
 )
 def test_control_characters_are_escaped(text, shown):
     assert printable(text) == shown
+    assert printable(text, lines=True) == shown.replace("\\n", "\n")
+
+
+def test_amounts_have_a_unit_that_fits():
+    sizes = (0, 999, 1234, 999_600, 12.34e6, 8e9, 1.2345e12)
+    assert [amount(size) for size in sizes] == [
+        "0 bytes", "999 bytes", "1.23 kB", "1.00 MB", "12.3 MB", "8.00 GB", "1,234 GB"
+    ]  # fmt: skip
