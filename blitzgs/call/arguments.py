@@ -51,60 +51,38 @@ RAW_DEFAULTS: dict[str, Any] = {
 
 
 class Scene(NamedTuple):
-    """N Gaussians and C views of them.
+    """N Gaussians and C views of them."""
 
-    Attributes:
-        means: [N, 3].
-        quats: [N, 4].
-        scales: [N, 3].
-        opacities: [N].
-        colors: SH [N, K, 3] or [C, N, K, 3], values [N, D] or [C, N, D]; None: depth alone.
-        viewmats: [C, 4, 4].
-        Ks: [C, 3, 3].
-        extra_signals: values [N, E] or [C, N, E], or SH [N, K, E], see `Signals`; None: none.
-        covariances: covariances given instead of quats and scales; quats and scales then are their
-            decomposition.
-        lenses: lenses and shutters of the views; None: pinhole cameras.
-    """
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    colors: Tensor | None
-    viewmats: Tensor
-    Ks: Tensor
+    means: Tensor  # [N, 3]
+    quats: Tensor  # [N, 4]
+    scales: Tensor  # [N, 3]
+    opacities: Tensor  # [N]
+    colors: Tensor | None  # SH [N, K, 3] or [C, N, K, 3], values [N, D] or [C, N, D]; None: depth alone
+    viewmats: Tensor  # [C, 4, 4]
+    Ks: Tensor  # [C, 3, 3]
+    # Values [N, E] or [C, N, E], or SH [N, K, E], see `Signals`; None: none.
     extra_signals: Tensor | None = None
+    # Covariances given instead of quats and scales; quats and scales then are their decomposition.
     covariances: Decomposed | None = None
-    lenses: Lenses | None = None
+    lenses: Lenses | None = None  # lenses and shutters of the views; None: pinhole cameras
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """The checked arguments of a call: S scenes of N Gaussians and C views each, I = S C images.
+    """The checked arguments of a call: S scenes of N Gaussians and C views each, I = S C images."""
 
-    Attributes:
-        scenes: the scenes, S >= 1. Without batch dimensions it has the caller's own tensors, so that a leaf
-            stays a leaf.
-        colors: colours of all scenes, as given by the caller.
-        opacities: opacities of all scenes, as given by the caller.
-        sh_degree: degree of the SH that are evaluated; None: colours are values, or not rendered.
-        per_view: whether every view has its own colours.
-        lead: the batch dimensions, and C.
-        raw: whether scales and opacities are before their activation.
-        named: the arguments of the call that have to be finite, a tensor for each scene.
-        signals: the extra signals; None: none.
-    """
-
+    # The scenes, S >= 1. Without batch dimensions it has the caller's own tensors, so that a leaf stays a
+    # leaf.
     scenes: tuple[Scene, ...]
-    colors: Tensor | None
-    opacities: Tensor
-    sh_degree: int | None
-    per_view: bool
-    lead: tuple[int, ...]
-    raw: bool
+    colors: Tensor | None  # colours of all scenes, as given by the caller
+    opacities: Tensor  # opacities of all scenes, as given by the caller
+    sh_degree: int | None  # degree of the SH that are evaluated; None: colours are values, or not rendered
+    per_view: bool  # whether every view has its own colours
+    lead: tuple[int, ...]  # the batch dimensions, and C
+    raw: bool  # whether scales and opacities are before their activation
+    # The arguments of the call that have to be finite, a tensor for each scene.
     named: Mapping[str, tuple[Tensor, ...]]
-    signals: Signals | None = None
+    signals: Signals | None = None  # the extra signals; None: none
 
     @property
     def views(self) -> int:

@@ -16,27 +16,16 @@ from blitzgs.ops.projection_types import ProjectedSplats
 
 
 class ImageOptions(NamedTuple):
-    """The options of compositing and of `meta`; see `blitzgs.rasterization`.
+    """The options of compositing and of `meta`; see `blitzgs.rasterization`."""
 
-    Attributes:
-        render_mode: which channels are rendered.
-        backgrounds: [I, channels] or None.
-        packed: whether `meta` has only the visible splats, or else an entry for every Gaussian and view.
-        sparse_grad: whether gradients are sparse.
-        absgrad: whether the backward pass also returns absolute gradients.
-        normals: whether normals are rendered.
-        median: whether the median depth is.
-        pixels: the pixels that are rendered; None: all.
-    """
-
-    render_mode: str
-    backgrounds: Tensor | None
-    packed: bool
-    sparse_grad: bool
-    absgrad: bool
-    normals: bool = False
-    median: bool = False
-    pixels: Pixels | None = None
+    render_mode: str  # which channels are rendered
+    backgrounds: Tensor | None  # [I, channels] or None
+    packed: bool  # whether `meta` has only the visible splats, or else an entry for every Gaussian and view
+    sparse_grad: bool  # whether gradients are sparse
+    absgrad: bool  # whether the backward pass also returns absolute gradients
+    normals: bool = False  # whether normals are rendered
+    median: bool = False  # whether the median depth is
+    pixels: Pixels | None = None  # the pixels that are rendered; None: all
 
 
 def background_rows(

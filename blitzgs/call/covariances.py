@@ -18,17 +18,11 @@ from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs
 
 @dataclass(frozen=True)
 class Decomposed:
-    """Covariances and their rotations and scales.
+    """Covariances and their rotations and scales."""
 
-    Attributes:
-        upper: [N, 6]: xx, xy, xz, yy, yz, zz; they get gradients.
-        quats: [N, 4], without gradients.
-        scales: [N, 3], without gradients; NaN if the covariance is not finite.
-    """
-
-    upper: Tensor
-    quats: Tensor
-    scales: Tensor
+    upper: Tensor  # [N, 6]: xx, xy, xz, yy, yz, zz; they get gradients
+    quats: Tensor  # [N, 4], without gradients
+    scales: Tensor  # [N, 3], without gradients; NaN if the covariance is not finite
 
 
 def decompose(covars: Tensor) -> Decomposed:

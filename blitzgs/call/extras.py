@@ -13,17 +13,11 @@ _MAX_DEGREE = 3
 
 
 class Signals(NamedTuple):
-    """The extra signals of a call.
+    """The extra signals of a call."""
 
-    Attributes:
-        values: of all scenes: [..., N, E], per view [..., C, N, E], or SH coefficients [..., N, K, E].
-        sh_degree: degree of the SH that are evaluated; None: the values are composited.
-        per_view: whether every view has its own values.
-    """
-
-    values: Tensor
-    sh_degree: int | None
-    per_view: bool
+    values: Tensor  # of all scenes: [..., N, E], per view [..., C, N, E], or SH coefficients [..., N, K, E]
+    sh_degree: int | None  # degree of the SH that are evaluated; None: the values are composited
+    per_view: bool  # whether every view has its own values
 
     @property
     def channels(self) -> int:
@@ -63,19 +57,12 @@ def checked_signals(values: Tensor, sh_degree: int | None, batch: tuple[int, ...
 
 
 class Pixels(NamedTuple):
-    """The pixels of a call.
+    """The pixels of a call."""
 
-    Attributes:
-        numbers: int64 [M], (image H + row) W + column.
-        images: int64 [M], the image of each.
-        rows: int64 [M].
-        columns: int64 [M].
-    """
-
-    numbers: Tensor
-    images: Tensor
-    rows: Tensor
-    columns: Tensor
+    numbers: Tensor  # int64 [M], (image H + row) W + column
+    images: Tensor  # int64 [M], the image of each
+    rows: Tensor  # int64 [M]
+    columns: Tensor  # int64 [M]
 
 
 def checked_pixels(pixels: Tensor, image_ids: Tensor | None, images: int, width: int, height: int) -> Pixels:

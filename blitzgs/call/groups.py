@@ -35,34 +35,22 @@ from blitzgs.ops.unscented import Lenses, project_unscented
 
 
 class Group(NamedTuple):
-    """Views of one scene that are projected together.
-
-    Attributes:
-        inputs: of the projection.
-        first_image: number of its first view among the images of the call.
-        covariances: the covariances that the caller gave instead of quats and scales; None: none.
-        rows: the rows that `inputs` were gathered from, as long as these; None: `inputs` are the tables.
-        lenses: lenses and shutters of the views; None: pinhole cameras.
-    """
+    """Views of one scene that are projected together."""
 
     inputs: ProjectionInputs
-    first_image: int
+    first_image: int  # number of its first view among the images of the call
+    # The covariances that the caller gave instead of quats and scales; None: none.
     covariances: Decomposed | None
+    # The rows that `inputs` were gathered from, as long as these; None: `inputs` are the tables.
     rows: Gathered | None = None
-    lenses: Lenses | None = None
+    lenses: Lenses | None = None  # lenses and shutters of the views; None: pinhole cameras
 
 
 class Gathered(NamedTuple):
-    """Rows of tables that some view sees.
+    """Rows of tables that some view sees."""
 
-    Attributes:
-        ids: int32 [A], the rows.
-        tables: means, quats, scales and opacities.
-        sh: the SH.
-    """
-
-    ids: Tensor
-    tables: ProjectionInputs
+    ids: Tensor  # int32 [A], the rows
+    tables: ProjectionInputs  # means, quats, scales and opacities
     sh: ShTables
 
 
@@ -179,33 +167,21 @@ _LISTS, _IMAGES = 2, 8
 
 
 class Rendered(NamedTuple):
-    """The outputs of the ops; see each op for its fields.
-
-    Attributes:
-        splats: the splats.
-        lists: the tiles' lists.
-        composited: what `rasterize_fwd` returned, and alphas.
-        rows: the visible rows, if the SH are in tables of which only these are read.
-        has_blank_view: whether some view sees no Gaussian.
-    """
+    """The outputs of the ops; see each op for its fields."""
 
     splats: ProjectedSplats
     lists: Lists
-    composited: Sequence[Tensor]
-    rows: TableRows | None
-    has_blank_view: bool
+    composited: Sequence[Tensor]  # what `rasterize_fwd` returned, and alphas
+    rows: TableRows | None  # the visible rows, if the SH are in tables of which only these are read
+    has_blank_view: bool  # whether some view sees no Gaussian
 
 
 class ShTables(NamedTuple):
-    """SH of which only the rows of visible Gaussians are read.
+    """SH of which only the rows of visible Gaussians are read."""
 
-    Attributes:
-        parts: the SH of all Gaussians in parts, [N, L, 3] each; empty: no SH are rendered.
-        before: called before rows are read, with the rows, int32 [A], and the number of those that are
-            valid, int32 [1] on the device, or None if all are.
-    """
-
-    parts: Sequence[Tensor]
+    parts: Sequence[Tensor]  # the SH of all Gaussians in parts, [N, L, 3] each; empty: no SH are rendered
+    # Called before rows are read, with the rows, int32 [A], and the number of those that are valid, int32 [1]
+    # on the device, or None if all are.
     before: Callable[[Tensor, Tensor | None], object]
 
 

@@ -28,17 +28,13 @@ CUDA_TILE_SIZE = 16
 
 
 class Places(NamedTuple):
-    """Where P splats are in an arrangement.
+    """Where P splats are in an arrangement."""
 
-    Attributes:
-        indices: (order,), int64 [P]: entry i is splat order[i], and each splat has one entry; or (images,
-            gaussians), int32 [P] each: a splat is the entry [image, Gaussian] of an arrangement of all
-            Gaussians in all images, and no two splats have the same entry.
-        shape: dimensions of the arrangement, [P] or [..., C, N], where the images are counted through
-            [..., C].
-    """
-
+    # (order,), int64 [P]: entry i is splat order[i], and each splat has one entry; or (images, gaussians),
+    # int32 [P] each: a splat is the entry [image, Gaussian] of an arrangement of all Gaussians in all images,
+    # and no two splats have the same entry.
     indices: tuple[Tensor, ...]
+    # Dimensions of the arrangement, [P] or [..., C, N], where the images are counted through [..., C].
     shape: tuple[int, ...]
 
     def flat(self) -> Tensor:
@@ -204,21 +200,13 @@ class Layout:
 
 @dataclass
 class Lists:
-    """The splats that each tile of all images composites.
+    """The splats that each tile of all images composites."""
 
-    Attributes:
-        splats: int32, splat indices; entries past the last offset are undefined.
-        offsets: int64 [I T + 1], where each tile's list begins.
-        width: image width in px.
-        height: image height in px.
-        tile_size: edge of a tile in px.
-    """
-
-    splats: Tensor
-    offsets: Tensor
-    width: int
-    height: int
-    tile_size: int
+    splats: Tensor  # int32, splat indices; entries past the last offset are undefined
+    offsets: Tensor  # int64 [I T + 1], where each tile's list begins
+    width: int  # image width in px
+    height: int  # image height in px
+    tile_size: int  # edge of a tile in px
     _listed: Tensor | None = None
 
     @property

@@ -24,17 +24,11 @@ from blitzgs.ops.projection_types import ProjectedSplats
 
 
 class CallRanks(NamedTuple):
-    """The ranks of a call.
-
-    Attributes:
-        rank: rank of this process.
-        size: number of ranks M.
-        views: number of views C of each rank.
-    """
+    """The ranks of a call."""
 
     rank: int
-    size: int
-    views: int
+    size: int  # number of ranks M
+    views: int  # number of views C of each rank
 
 
 def gather_views(

@@ -37,30 +37,20 @@ class MismatchError(RuntimeError):
 
 @dataclass
 class Ranks:
-    """One process's view of the job. With `world_size` 1 no process group exists and every call is local.
+    """One process's view of the job. With `world_size` 1 no process group exists and every call is local."""
 
-    Attributes:
-        rank: index of this process, 0 <= rank < world_size.
-        world_size: number of processes M.
-        local_world_size: number of processes on this host.
-        device: where this rank computes.
-        timeout_seconds: the job ends if a rank does not arrive at a collective within this time.
-        shares_gpu: several ranks of this host compute on one GPU.
-        watchdog: ends the job if a rank waits for another for too long; collectives and other waits for ranks
-            run in its `Watchdog.waiting`, and long work on the host in its `Watchdog.working`.
-        memory: memory that the ranks share; None: splats are sent by collectives.
-        transport: describes for the log how splats are sent.
-    """
-
-    rank: int = 0
-    world_size: int = 1
-    local_world_size: int = 1
-    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    rank: int = 0  # index of this process, 0 <= rank < world_size
+    world_size: int = 1  # number of processes M
+    local_world_size: int = 1  # number of processes on this host
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))  # where this rank computes
+    # The job ends if a rank does not arrive at a collective within this time.
     timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS
-    shares_gpu: bool = False
+    shares_gpu: bool = False  # several ranks of this host compute on one GPU
+    # Ends the job if a rank waits for another for too long; collectives and other waits for ranks run in its
+    # `Watchdog.waiting`, and long work on the host in its `Watchdog.working`.
     watchdog: Watchdog | NoWatchdog = field(default_factory=NoWatchdog)
-    memory: SharedMemory | None = None
-    transport: str = "none: one rank"
+    memory: SharedMemory | None = None  # memory that the ranks share; None: splats are sent by collectives
+    transport: str = "none: one rank"  # describes for the log how splats are sent
 
     @classmethod
     def from_environment(

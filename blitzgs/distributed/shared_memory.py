@@ -54,18 +54,13 @@ class Job(Protocol):
 
 
 class Shared(NamedTuple):
-    """The numbers that all ranks wrote for a barrier.
+    """The numbers that all ranks wrote for a barrier."""
 
-    Attributes:
-        everyone: int64 [M, n], the numbers of each rank; valid until the next barrier with numbers.
-        sums: int64 [n], sums over the ranks; valid until this rank queues the second barrier with numbers
-            after this.
-        host: `everyone` on the CPU, valid after the work queued on the current stream has ended, and as long
-            as `sums`.
-    """
-
-    everyone: Tensor
+    everyone: Tensor  # int64 [M, n], the numbers of each rank; valid until the next barrier with numbers
+    # int64 [n], sums over the ranks; valid until this rank queues the second barrier with numbers after this.
     sums: Tensor
+    # `everyone` on the CPU, valid after the work queued on the current stream has ended, and as long as
+    # `sums`.
     host: Tensor
 
 

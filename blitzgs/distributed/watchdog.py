@@ -61,19 +61,12 @@ def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
 
 @dataclass(frozen=True)
 class _Report:
-    """The latest report of a rank.
+    """The latest report of a rank."""
 
-    Attributes:
-        calls: number of collectives entered.
-        name: name of the last one.
-        stamp: when it was published, seconds since 1970 by the rank's own clock.
-        busy: the work on its host, or an empty string.
-    """
-
-    calls: int
-    name: str
-    stamp: float
-    busy: str
+    calls: int  # number of collectives entered
+    name: str  # name of the last one
+    stamp: float  # when it was published, seconds since 1970 by the rank's own clock
+    busy: str  # the work on its host, or an empty string
 
 
 class NoWatchdog:

@@ -21,25 +21,16 @@ _HEADER = 1 << 16
 
 @dataclass(frozen=True)
 class Format:
-    """A format that models are written in.
+    """A format that models are written in."""
 
-    Attributes:
-        title: what it is.
-        suffix: end of its files' names.
-        write: writes a file block by block; it appears under its name only when it is complete.
-        starts: how its files begin, of which one is true; empty: nothing tells.
-        states: what its viewers find in the file besides the Gaussians.
-        harmonics: whether it holds SH coefficients beyond the DC.
-        quantised: whether positions are finer near the origin than float32 makes them.
-    """
-
-    title: str
-    suffix: str
+    title: str  # what it is
+    suffix: str  # end of its files' names
+    # Writes a file block by block; it appears under its name only when it is complete.
     write: Callable[[Path, GaussianSource], None]
-    starts: tuple[bytes, ...] = ()
-    states: tuple[str, ...] = ()
-    harmonics: bool = True
-    quantised: bool = True
+    starts: tuple[bytes, ...] = ()  # how its files begin, of which one is true; empty: nothing tells
+    states: tuple[str, ...] = ()  # what its viewers find in the file besides the Gaussians
+    harmonics: bool = True  # whether it holds SH coefficients beyond the DC
+    quantised: bool = True  # whether positions are finer near the origin than float32 makes them
 
     def unstated(self, source: GaussianSource) -> list[str]:
         """Return what a viewer of the file will not know of a model, each a sentence without a full stop."""

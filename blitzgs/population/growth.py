@@ -17,15 +17,11 @@ MEMORY_SHARE = 0.9
 
 @dataclass(frozen=True)
 class GrowthLimit:
-    """The largest population that a density event may make.
+    """The largest population that a density event may make."""
 
-    Attributes:
-        count: Gaussians, over all ranks.
-        reason: the limit that applies, for the log: "memory", or the configuration field
-            "population.max_gaussians", "population.pixels_per_gaussian" or "population.gaussians_per_point".
-    """
-
-    count: int
+    count: int  # Gaussians, over all ranks
+    # The limit that applies, for the log: "memory", or the configuration field "population.max_gaussians",
+    # "population.pixels_per_gaussian" or "population.gaussians_per_point".
     reason: str
 
 

@@ -26,21 +26,13 @@ INITIAL_OPACITY = 0.1
 
 @dataclass(frozen=True)
 class FirstGaussians:
-    """What distinguishes the first Gaussians of a model from each other.
+    """What distinguishes the first Gaussians of a model from each other."""
 
-    Attributes:
-        means: float32 [C, 3].
-        log_scales: float32 [C], the same on all axes.
-        colors: float32 [C, 3], their SH coefficients of degree 0.
-        levels: uint8 [C], octree levels.
-        found: number of Gaussians before they were thinned to a limit.
-    """
-
-    means: Tensor
-    log_scales: Tensor
-    colors: Tensor
-    levels: Tensor
-    found: int
+    means: Tensor  # float32 [C, 3]
+    log_scales: Tensor  # float32 [C], the same on all axes
+    colors: Tensor  # float32 [C, 3], their SH coefficients of degree 0
+    levels: Tensor  # uint8 [C], octree levels
+    found: int  # number of Gaussians before they were thinned to a limit
 
     def __len__(self) -> int:
         return len(self.means)

@@ -187,21 +187,13 @@ class Saving:
 
 @dataclass
 class Loaded:
-    """A checkpoint in memory.
+    """A checkpoint in memory."""
 
-    Attributes:
-        columns: columns of this rank's shard.
-        state: the state that was saved with them.
-        shared: tensors that are the same on all ranks; empty if none were stored.
-        name: name of the checkpoint.
-        refused: for each newer checkpoint, why it was not used.
-    """
-
-    columns: dict[str, Tensor]
-    state: dict[str, Any]
-    shared: dict[str, Tensor]
-    name: str
-    refused: list[str]
+    columns: dict[str, Tensor]  # columns of this rank's shard
+    state: dict[str, Any]  # the state that was saved with them
+    shared: dict[str, Tensor]  # tensors that are the same on all ranks; empty if none were stored
+    name: str  # name of the checkpoint
+    refused: list[str]  # for each newer checkpoint, why it was not used
 
 
 def load_latest(

@@ -170,20 +170,14 @@ UNSEEN = MAX_VIEWS  # above the numbers of all batches
 
 
 class Cameras(NamedTuple):
-    """Views of any sizes, on the device, and the limits they share.
+    """Views of any sizes, on the device, and the limits they share."""
 
-    Attributes:
-        viewmats: float32 [V, 4, 4], world to camera.
-        Ks: float32 [V, 3, 3], pixels.
-        sizes: int32 [V, 2], width and height, pixels.
-        limits: near plane, far plane and eps2d, as `blitzgs.ops.blocks.cull_blocks` has them.
-        columns: the views' columns in the cull matrix, int64 [V]; None: the views have no mask.
-    """
-
-    viewmats: Tensor
-    Ks: Tensor
-    sizes: Tensor
+    viewmats: Tensor  # float32 [V, 4, 4], world to camera
+    Ks: Tensor  # float32 [V, 3, 3], pixels
+    sizes: Tensor  # int32 [V, 2], width and height, pixels
+    # Near plane, far plane and eps2d, as `blitzgs.ops.blocks.cull_blocks` has them.
     limits: tuple[float, float, float]
+    # The views' columns in the cull matrix, int64 [V]; None: the views have no mask.
     columns: Tensor | None = None
 
 

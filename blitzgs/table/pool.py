@@ -38,21 +38,13 @@ class PoolError(RuntimeError):
 
 
 class Moved(NamedTuple):
-    """Counts of what moved between host and device.
+    """Counts of what moved between host and device."""
 
-    Attributes:
-        steps: training steps.
-        needed: blocks that the views of these steps see.
-        loaded: blocks that were copied to the device because views see them.
-        bytes_in: bytes copied to the device, for any reason.
-        bytes_out: bytes written back to the host.
-    """
-
-    steps: int = 0
-    needed: int = 0
-    loaded: int = 0
-    bytes_in: int = 0
-    bytes_out: int = 0
+    steps: int = 0  # training steps
+    needed: int = 0  # blocks that the views of these steps see
+    loaded: int = 0  # blocks that were copied to the device because views see them
+    bytes_in: int = 0  # bytes copied to the device, for any reason
+    bytes_out: int = 0  # bytes written back to the host
 
     def since(self, earlier: Moved) -> Moved:
         """Return the difference from an earlier count."""

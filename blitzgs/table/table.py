@@ -50,19 +50,12 @@ class Column:
 
 
 class Placement(NamedTuple):
-    """Which row of a table each new Gaussian gets, and which others move.
+    """Which row of a table each new Gaussian gets, and which others move."""
 
-    Attributes:
-        total: number of rows afterwards.
-        new: int64 [M], the row of each new Gaussian.
-        moved_from: int64 [K], rows that move because the table becomes shorter.
-        moved_to: int64 [K], where they move.
-    """
-
-    total: int
-    new: Tensor
-    moved_from: Tensor
-    moved_to: Tensor
+    total: int  # number of rows afterwards
+    new: Tensor  # int64 [M], the row of each new Gaussian
+    moved_from: Tensor  # int64 [K], rows that move because the table becomes shorter
+    moved_to: Tensor  # int64 [K], where they move
 
 
 def schema(sh_degree: int) -> dict[str, Column]:

@@ -49,20 +49,14 @@ LEVEL_COLOURS = (
 
 @dataclass(frozen=True)
 class Subject:
-    """The model that is drawn, as it is at one moment.
+    """The model that is drawn, as it is at one moment."""
 
-    Attributes:
-        gaussians: this rank's. Pending optimiser steps are not applied, so that looking at a training does
-            not change it; the rows that wait for them are off by far less than a pixel.
-        options: how the model is rendered, at its present spherical-harmonics degree.
-        unit: length of a trained unit in the capture's unit.
-        lod: the LOD gate; None: there is none.
-    """
-
+    # This rank's. Pending optimiser steps are not applied, so that looking at a training does not change it;
+    # the rows that wait for them are off by far less than a pixel.
     gaussians: TableOrPool
-    options: RenderOptions
-    unit: float
-    lod: ModelGate | None
+    options: RenderOptions  # how the model is rendered, at its present spherical-harmonics degree
+    unit: float  # length of a trained unit in the capture's unit
+    lod: ModelGate | None  # the LOD gate; None: there is none
 
 
 class DrawingError(RuntimeError):

@@ -32,20 +32,13 @@ _MAX_DISTANCES = 1 << 24
 
 @dataclass(frozen=True)
 class LodGate:
-    """The LOD gate: the distance up to which views keep the Gaussians of each octree level.
+    """The LOD gate: the distance up to which views keep the Gaussians of each octree level."""
 
-    Attributes:
-        reference_distance: d_0, in the unit of the means.
-        fork: f, ratio of neighbouring levels.
-        count: number of levels K.
-        finest: the finest level that views keep, L_max in 0..K - 1.
-        smooth: opacities fade out over half a level, centred at these distances, instead of being cut off.
-    """
-
-    reference_distance: float
-    fork: float
-    count: int
-    finest: int
+    reference_distance: float  # d_0, in the unit of the means
+    fork: float  # f, ratio of neighbouring levels
+    count: int  # number of levels K
+    finest: int  # the finest level that views keep, L_max in 0..K - 1
+    # Opacities fade out over half a level, centred at these distances, instead of being cut off.
     smooth: bool = False
 
     def reach(self) -> list[float]:
@@ -83,17 +76,11 @@ class LodGate:
 
 @dataclass(frozen=True)
 class ViewGate:
-    """LOD gate and cull mask of the views of one batch (`blitzgs.frame.render.ViewFilter`).
+    """LOD gate and cull mask of the views of one batch (`blitzgs.frame.render.ViewFilter`)."""
 
-    Attributes:
-        reach: `LodGate.reach`.
-        lod_views: bit v is set when view v has an LOD gate.
-        columns: the views' columns in the cull matrix; empty: no view has a mask.
-    """
-
-    reach: Sequence[float]
-    lod_views: int
-    columns: Sequence[int] = ()
+    reach: Sequence[float]  # `LodGate.reach`
+    lod_views: int  # bit v is set when view v has an LOD gate
+    columns: Sequence[int] = ()  # the views' columns in the cull matrix; empty: no view has a mask
 
     def rules(self, table: GaussianTable) -> GateRules:
         """See `blitzgs.frame.render.ViewFilter.rules`."""

@@ -24,17 +24,11 @@ _DEPTHS = 64
 
 
 class VisibleRows(NamedTuple):
-    """The Gaussians to render for a batch of views.
+    """The Gaussians to render for a batch of views."""
 
-    Attributes:
-        table: a table on the device of the views.
-        active: rows of `table` to render, and the views of each.
-        rows_of: maps rows of `table` to rows of the model, both int32.
-    """
-
-    table: GaussianTable
-    active: ActiveRows
-    rows_of: Callable[[Tensor], Tensor]
+    table: GaussianTable  # a table on the device of the views
+    active: ActiveRows  # rows of `table` to render, and the views of each
+    rows_of: Callable[[Tensor], Tensor]  # maps rows of `table` to rows of the model, both int32
 
 
 def table_of(gaussians: TableOrPool) -> GaussianTable:

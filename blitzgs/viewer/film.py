@@ -114,25 +114,15 @@ SIZE, FPS = (1920, 1080), 30.0
 
 @dataclass(frozen=True)
 class Film:
-    """What is known of a film before the model is open.
+    """What is known of a film before the model is open."""
 
-    Attributes:
-        path: its path; None: it is made from the scene.
-        frames: viewpoints as the path's file has them; empty: computed from the keyframes.
-        kind: how the path is made from the scene.
-        width: pixels.
-        height: pixels.
-        fps: frames a second.
-        seconds: duration; None: the path's own.
-    """
-
-    path: CameraPath | None
-    frames: list[Keyframe]
-    kind: str
-    width: int
-    height: int
-    fps: float
-    seconds: float | None
+    path: CameraPath | None  # its path; None: it is made from the scene
+    frames: list[Keyframe]  # viewpoints as the path's file has them; empty: computed from the keyframes
+    kind: str  # how the path is made from the scene
+    width: int  # pixels
+    height: int  # pixels
+    fps: float  # frames a second
+    seconds: float | None  # duration; None: the path's own
 
     def cameras(self, space: Space, cameras: Sequence[CameraLike], box: Array) -> list[RunCamera]:
         """Return the cameras of all frames, in the re-centred world.

@@ -32,23 +32,14 @@ class Keyframe:
 
 @dataclass
 class CameraPath:
-    """Keyframes, and how they are played.
+    """Keyframes, and how they are played."""
 
-    Attributes:
-        keyframes: at least one.
-        width: pixels of a rendered frame.
-        height: pixels.
-        fps: frames a second.
-        seconds: duration of the film.
-        is_cycle: whether the last keyframe leads to the first.
-    """
-
-    keyframes: list[Keyframe] = field(default_factory=list)
-    width: int = 1920
-    height: int = 1080
-    fps: float = 24.0
-    seconds: float = 4.0
-    is_cycle: bool = False
+    keyframes: list[Keyframe] = field(default_factory=list)  # at least one
+    width: int = 1920  # pixels of a rendered frame
+    height: int = 1080  # pixels
+    fps: float = 24.0  # frames a second
+    seconds: float = 4.0  # duration of the film
+    is_cycle: bool = False  # whether the last keyframe leads to the first
 
     def frames(self) -> list[Keyframe]:
         """Return the viewpoints of all frames: positions on a Catmull-Rom spline, rotations interpolated."""

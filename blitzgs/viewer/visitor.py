@@ -33,27 +33,17 @@ EYE_HEIGHT = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Ask:
-    """A picture that a visitor waits for.
+    """A picture that a visitor waits for."""
 
-    Attributes:
-        look: what to draw.
-        version: number of the visitor's viewpoint and choices.
-        scale: side relative to full quality.
-        settings: the choices.
-        camera: index of the photograph's camera to compare with; None: no comparison.
-        columns: of the grid of images side by side.
-        exposure: gain and bias, float64 [2, 3], of the photograph whose exposure is shown, or None.
-        is_sounding: the look is down from the camera, to find the ground.
-    """
-
-    look: Look
-    version: int
-    scale: float
+    look: Look  # what to draw
+    version: int  # number of the visitor's viewpoint and choices
+    scale: float  # side relative to full quality
     settings: Settings
-    camera: int | None = None
-    columns: int = 1
+    camera: int | None = None  # index of the photograph's camera to compare with; None: no comparison
+    columns: int = 1  # of the grid of images side by side
+    # Gain and bias, float64 [2, 3], of the photograph whose exposure is shown, or None.
     exposure: npt.NDArray[np.float64] | None = None
-    is_sounding: bool = False
+    is_sounding: bool = False  # the look is down from the camera, to find the ground
 
 
 @dataclass(frozen=True, eq=False)

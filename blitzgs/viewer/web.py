@@ -39,19 +39,12 @@ _VIEWS = 32
 
 @dataclass(frozen=True)
 class WebFile:
-    """A page, and what it has of the model.
+    """A page, and what it has of the model."""
 
-    Attributes:
-        text: the HTML.
-        gaussians: number of Gaussians in it.
-        of: number of Gaussians of the model.
-        left_out: what is missing, in words; empty: nothing that can be seen.
-    """
-
-    text: str
-    gaussians: int
-    of: int
-    left_out: str
+    text: str  # the HTML
+    gaussians: int  # number of Gaussians in it
+    of: int  # number of Gaussians of the model
+    left_out: str  # what is missing, in words; empty: nothing that can be seen
 
 
 def web_file(opened: Opened, max_bytes: int) -> WebFile:
@@ -181,21 +174,13 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class City:
-    """A model that need not fit into memory, with what its tiles say besides its Gaussians.
+    """A model that need not fit into memory, with what its tiles say besides its Gaussians."""
 
-    Attributes:
-        source: the Gaussians, in the capture's unit around `offset`.
-        offset: origin of the source in the capture's coordinates, [3].
-        frame: where the capture lies in the world; None: nobody says.
-        scene: how the page shows the model, in the coordinates of the source.
-        title: name of the run or the file.
-    """
-
-    source: GaussianSource
-    offset: Array
-    frame: WorldFrame | None
-    scene: WebScene
-    title: str
+    source: GaussianSource  # the Gaussians, in the capture's unit around `offset`
+    offset: Array  # origin of the source in the capture's coordinates, [3]
+    frame: WorldFrame | None  # where the capture lies in the world; None: nobody says
+    scene: WebScene  # how the page shows the model, in the coordinates of the source
+    title: str  # name of the run or the file
 
     def transform(self) -> Array:
         """Return the map [4, 4] from the source's coordinates to EPSG:4978, or to an upright local frame.

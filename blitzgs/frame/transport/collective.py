@@ -105,17 +105,11 @@ class CollectiveExchange:
 
 
 class CollectiveWayBack(NamedTuple):
-    """Returns gradients by an all-to-all, and adds them up at the owner in the order of ranks.
-
-    Attributes:
-        ranks: the job.
-        traffic: numbers of splats sent between the ranks.
-        places: positions of this rank's own splats among those that it sent, from `scatter_splats`.
-    """
+    """Returns gradients by an all-to-all, and adds them up at the owner in the order of ranks."""
 
     ranks: Ranks
-    traffic: Traffic
-    places: Tensor
+    traffic: Traffic  # numbers of splats sent between the ranks
+    places: Tensor  # positions of this rank's own splats among those that it sent, from `scatter_splats`
 
     def check_still_valid(self) -> None:
         """Do nothing, because a frame does not overwrite the data of an earlier one."""

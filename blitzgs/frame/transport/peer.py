@@ -211,23 +211,14 @@ class PeerExchange:
 
 
 class PeerWayBack(NamedTuple):
-    """Lets owners read gradients in the memory of the ranks that added them up.
-
-    Attributes:
-        ranks: the job.
-        memory: the memory that the ranks share.
-        generation: number of the frame, `SharedMemory.generation`.
-        tables: table of splat gradients of each rank, float32 [length, 12], mapped here.
-        traffic: numbers of splats sent between the ranks.
-        places: positions of this rank's own splats among those that it sent, as from `scatter_splats`.
-    """
+    """Lets owners read gradients in the memory of the ranks that added them up."""
 
     ranks: Ranks
-    memory: SharedMemory
-    generation: int
-    tables: Sequence[Tensor]
-    traffic: Traffic
-    places: Tensor
+    memory: SharedMemory  # the memory that the ranks share
+    generation: int  # number of the frame, `SharedMemory.generation`
+    tables: Sequence[Tensor]  # table of splat gradients of each rank, float32 [length, 12], mapped here
+    traffic: Traffic  # numbers of splats sent between the ranks
+    places: Tensor  # positions of this rank's own splats among those that it sent, as from `scatter_splats`
 
     def check_still_valid(self) -> None:
         """See `WayBack.check_still_valid`."""
