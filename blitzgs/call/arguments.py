@@ -105,13 +105,8 @@ def check_further(
 ) -> None:
     """Check further keyword arguments: only gsplat's names with gsplat's default values are accepted.
 
-    Args:
-        function: name of the public function.
-        defaults: the names and the only values that the function takes.
-
-    Raises:
-        TypeError: gsplat has no such argument.
-        ValueError: the value is not gsplat's default.
+    `function`: name of the public function. `defaults`: the names and the only values that the function
+    takes. TypeError: gsplat has no such argument. ValueError: the value is not gsplat's default.
     """
     for name, value in further.items():
         if name not in defaults:
@@ -141,9 +136,8 @@ def check_options(
 ) -> None:
     """Check the arguments that are not tensors.
 
-    Raises:
-        TypeError: a size or the degree is not a whole number, or another option not a number.
-        ValueError: one is out of range or has an unknown value.
+    TypeError: a size or the degree is not a whole number, or another option not a number. ValueError: one is
+    out of range or has an unknown value.
     """
     whole = {"width": width, "height": height, "tile_size": tile_size}
     if sh_degree is not None:
@@ -178,15 +172,10 @@ def check_options(
 def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]) -> None:
     """Check that arguments are tensors on one device, all float32 or all float64.
 
-    Args:
-        optional: further arguments by name, which may be None.
-
-    Raises:
-        RuntimeError: the call is inside a transform of `torch.func`.
-        TypeError: an argument is not a tensor, but for example an array of another library, or has a dtype
-            that the kernels do not compute in.
-        ValueError: an argument has another dtype, or is on another device, whose memory the kernels could not
-            read.
+    `optional`: further arguments by name, which may be None. RuntimeError: the call is inside a transform of
+    `torch.func`. TypeError: an argument is not a tensor, but for example an array of another library, or has
+    a dtype that the kernels do not compute in. ValueError: an argument has another dtype, or is on another
+    device, whose memory the kernels could not read.
     """
     if func_transforms_are_active():
         raise RuntimeError(
@@ -294,12 +283,8 @@ def _scenes(whole: Scene, batch: tuple[int, ...]) -> tuple[Scene, ...]:
 def with_covariances(gaussians: Gaussians, covars: Tensor) -> Gaussians:
     """Return Gaussians whose quats and scales are those of covariances.
 
-    Args:
-        gaussians: with any quats and scales.
-        covars: as for `blitzgs.rasterization`.
-
-    Raises:
-        ValueError: the shape does not fit.
+    `gaussians`: with any quats and scales. `covars`: as for `blitzgs.rasterization`. ValueError: the shape
+    does not fit.
     """
     batch = gaussians.lead[:-1]
     wanted = (*batch, gaussians.count, 3, 3)

@@ -31,8 +31,7 @@ WRAPPED = {"raw_rasterization": 1}
 def warn_of_gradient(function: str) -> None:
     """Warn, once, that intrinsics which require a gradient get none, as in gsplat.
 
-    Args:
-        function: name of the public function.
+    `function`: name of the public function.
     """
     if not torch.compiler.is_compiling() and torch.is_grad_enabled():
         _warn_of_gradient(function)
@@ -52,11 +51,7 @@ def check_intrinsics(Ks: Sequence[Tensor]) -> None:  # noqa: N803
 
     The projection renders nothing with them, so that calls look only where a view shows nothing.
 
-    Args:
-        Ks: [C, 3, 3] of each scene.
-
-    Raises:
-        ValueError: a matrix has a skew, or another last row than 0, 0, 1.
+    `Ks`: [C, 3, 3] of each scene. ValueError: a matrix has a skew, or another last row than 0, 0, 1.
     """
     _check_rows(np.concatenate([to_host(matrices.detach()).numpy().reshape(-1, 9) for matrices in Ks]))
 
@@ -86,11 +81,7 @@ class CamerasOnHost:
         self._copy = HostCopy(torch.cat(matrices).double().view(torch.int64))
 
     def are_finite(self) -> bool:
-        """Tell whether all cameras are finite; waits for the copy.
-
-        Raises:
-            ValueError: see `check_intrinsics`.
-        """
+        """Tell whether all cameras are finite; waits for the copy (ValueError: see `check_intrinsics`)."""
         values = self._copy.read().view(torch.float64).numpy()
         _check_rows(values[: self._n_intrinsics].reshape(-1, 9))
         return bool(np.isfinite(values).all())

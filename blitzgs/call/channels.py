@@ -106,9 +106,8 @@ def _signals(splats: ProjectedSplats, gaussians: Gaussians, with_spare: bool) ->
     SH are evaluated as colours are, along the direction from the camera centre, but not clamped:
     sum of Y_k(direction) c_k, plus 0.5. Differentiable in the signals and, for SH, in means and viewmats.
 
-    Args:
-        gaussians: with signals.
-        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
+    `gaussians`: with signals. `with_spare`: whether the last splats may be spare capacity, whose ids are
+    undefined.
     """
     signals = gaussians.signals
     assert signals is not None

@@ -95,8 +95,7 @@ def shaped_by(splats: ProjectedSplats, inputs: ProjectionInputs, decomposed: Dec
 
     In double, because the determinant of a covariance loses the digits of a thin splat.
 
-    Args:
-        splats: of the decomposed covariances.
+    `splats`: of the decomposed covariances.
     """
     means, _, _, opacities, *_ = inputs.gaussians
     means, opacities, viewmats, Ks = (t.double() for t in (means, opacities, *inputs.cameras))

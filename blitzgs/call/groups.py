@@ -79,8 +79,7 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
 def gathered_groups(groups: Sequence[Group], sh: ShTables) -> list[Group]:
     """Return groups of the Gaussians alone that a view of any group sees.
 
-    Args:
-        groups: of one scene, without SH.
+    `groups`: of one scene, without SH.
     """
     ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
     sh.before(ids, None)
@@ -106,12 +105,8 @@ def _sh_of_views(gaussians: Gaussians, scene: Scene, parts: int) -> Sequence[Ten
 def project_groups(groups: Sequence[Group], sparse_grad: bool) -> ProjectedSplats:
     """Return the splats of all images, those of a group after those of the groups before.
 
-    Args:
-        sparse_grad: see `blitzgs.ops.project.project`.
-
-    Returns:
-        Splats whose camera_ids number all images of the call. Of several groups, visible_ids and
-        splat_offsets are those of the first.
+    `sparse_grad`: see `blitzgs.ops.project.project`. Returns splats whose camera_ids number all images of the
+    call. Of several groups, visible_ids and splat_offsets are those of the first.
     """
     parts = []
     for group in groups:

@@ -154,8 +154,7 @@ class Layout:
     def rendered_columns(self, under: Tensor | None) -> dict[str, Tensor]:
         """Arrange the columns that the image depends on.
 
-        Args:
-            under: opacities of the Gaussians, [..., N], where they have no splat; None: zero.
+        `under`: opacities of the Gaussians, [..., N], where they have no splat; None: zero.
         """
         splats = self.splats
         columns = (splats.means2d, splats.conics, splats.depths, splats.opacities)

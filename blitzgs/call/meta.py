@@ -37,9 +37,8 @@ class LazyDict(dict[str, Any]):
     def __init__(self, given: Mapping[str, Any], compute: Callable[[str], Any]) -> None:
         """Begin with some values.
 
-        Args:
-            given: the values by key; `LATER` where they are not known.
-            compute: returns the value of such a key.
+        `given`: the values by key; `LATER` where they are not known. `compute`: returns the value of such a
+        key.
         """
         super().__init__(given)
         self._compute = compute

@@ -89,13 +89,9 @@ def _require_same(given: tuple[Any, ...], device: torch.device) -> None:
 def send_splats(splats: ProjectedSplats, channels: Tensor, job: CallRanks) -> tuple[ProjectedSplats, Tensor]:
     """Send each splat to the rank that renders its view. Collective, as is its backward pass.
 
-    Args:
-        splats: of this rank's Gaussians in the views of all ranks.
-        channels: channels to composite, [P, D].
-
-    Returns:
-        The splats of this rank's views, ordered by (rank, Gaussian, view), and their channels. Only the
-        columns that tile lists and images need are valid.
+    `splats`: of this rank's Gaussians in the views of all ranks. `channels`: channels to composite, [P, D].
+    Returns the splats of this rank's views, ordered by (rank, Gaussian, view), and their channels. Only the
+    columns that tile lists and images need are valid.
     """
     images = splats.camera_ids.long()
     ranks = images // job.views

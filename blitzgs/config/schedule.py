@@ -201,12 +201,8 @@ class Schedule:
         rates fall exponentially from `densify_until` to `position_decay`, where `final` of them is left.
         Every rate is multiplied by sqrt(B).
 
-        Args:
-            config: the rates for B = 1.
-            extent: the scene's extent in its own unit.
-
-        Returns:
-            float32 [S + 1, 6]: row s holds the rates of step s = 1..S for `RATES`; row 0 is zero.
+        `config`: the rates for B = 1. `extent`: the scene's extent in its own unit. Returns float32
+        [S + 1, 6]: row s holds the rates of step s = 1..S for `RATES`; row 0 is zero.
         """
         begin = torch.arange(self.steps, dtype=torch.float64) * self.batch_size
         times = self.pace.times(begin)

@@ -188,11 +188,8 @@ class Ranks:
     def exchange_counts(self, counts: Tensor) -> Tensor:
         """Exchange the numbers of items that the ranks will send each other.
 
-        Args:
-            counts: int64 [M] or [M, C] on `device`; row m is what goes to rank m.
-
-        Returns:
-            A tensor of the same shape: row m is what comes from rank m.
+        `counts`: int64 [M] or [M, C] on `device`; row m is what goes to rank m. Returns a tensor of the same
+        shape: row m is what comes from rank m.
         """
         if self.world_size == 1:
             return counts.clone()
@@ -259,11 +256,8 @@ class Ranks:
     def compare_across_ranks(self, fields: Mapping[str, object]) -> None:
         """Check that every rank has the same values: configuration, code version, data fingerprint.
 
-        Args:
-            fields: name -> value; values are compared by their `repr`.
-
-        Raises:
-            MismatchError: on every rank, naming the first differing field, the ranks and their values.
+        `fields`: name -> value; values are compared by their `repr`. MismatchError: on every rank, naming the
+        first differing field, the ranks and their values.
         """
         mine = {name: repr(value) for name, value in fields.items()}
         everyone = self.all_gather_object((socket.gethostname(), mine))

@@ -178,8 +178,7 @@ def _mass_threshold(keys: Tensor, mantissas: Tensor, share: Fraction, ranks: Ran
 
     Masses are integers: a score is mantissa * 2^max(exponent, 1), in units of the smallest positive float.
 
-    Returns:
-        threshold (-1: select nothing), and how many rows equal to it are needed.
+    Returns the threshold (-1: select nothing), and how many rows equal to it are needed.
     """
     prefix, shift = 0, sum(_SCORE_DIGITS)
     missing: int | None = None
@@ -214,8 +213,7 @@ def _histogram(
 ) -> Tensor:
     """Count (or add up the weights of) the keys under a prefix, by their next digit.
 
-    Returns:
-        int64 [2^width], summed over the ranks.
+    Returns int64 [2^width], summed over the ranks.
     """
     heads = keys >> shift
     under = (heads >> width == prefix).nonzero().squeeze(1)

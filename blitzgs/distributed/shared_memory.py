@@ -126,8 +126,7 @@ class SharedMemory:
     def share(self, values: Tensor) -> Shared:
         """Queue a barrier that also gathers numbers from all ranks.
 
-        Args:
-            values: int64 [n], n <= MAX_VALUES, the same n on all ranks.
+        `values`: int64 [n], n <= MAX_VALUES, the same n on all ranks.
         """
         # Use the other half: a rank may have left the last barrier without having read its numbers yet.
         half = self._shared % 2
@@ -197,9 +196,7 @@ def connect(job: Job, timeout_seconds: float) -> SharedMemory | str:
 
     Collective.
 
-    Args:
-        job: the ranks, joined.
-        timeout_seconds: longest wait in a barrier.
+    `job`: the ranks, joined. `timeout_seconds`: longest wait in a barrier.
     """
     location = (socket.gethostname(), job.device.index if job.device.type == "cuda" else None)
     locations = job.all_gather_object(location)

@@ -131,12 +131,9 @@ class Watchdog:
 
         Enter it for collectives, and to wait for this rank's device, which may itself be waiting for other
         ranks. A rank that has entered fewer of these contexts than another is called late, so all ranks must
-        enter the same ones.
-
-        Raises:
-            RuntimeError: the work in the context failed; the message names the rank that caused it. If this
-                rank is out of memory, its own `torch.OutOfMemoryError` is raised instead, and its message is
-                for the other ranks.
+        enter the same ones. RuntimeError: the work in the context failed; the message names the rank that
+        caused it. If this rank is out of memory, its own `torch.OutOfMemoryError` is raised instead, and its
+        message is for the other ranks.
         """
         self.calls += 1
         self.name = name

@@ -105,9 +105,8 @@ class Gaussians:
     def check(self) -> None:
         """Check shapes and values.
 
-        Raises:
-            TypeError: a field is not a tensor.
-            ValueError: shapes disagree, or a viewer cannot show a value: NaN, infinite.
+        TypeError: a field is not a tensor. ValueError: shapes disagree, or a viewer cannot show a value: NaN,
+        infinite.
         """
         n, k = len(self.means), self.sh.shape[1] if isinstance(self.sh, Tensor) and self.sh.ndim == 3 else 0
         shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}

@@ -65,10 +65,8 @@ FORMATS = {
 def check_replaces(path: Path, kind: Format) -> None:
     """Check the name of a file to write, and that no file of another format is replaced.
 
-    Raises:
-        ValueError: the name has another suffix than files of the format.
-        FileExistsError: the file is not empty and no file of the format.
-        OSError: it is no regular file.
+    ValueError: the name has another suffix than files of the format. FileExistsError: the file is not empty
+    and no file of the format. OSError: it is no regular file.
     """
     check_replaceable(path, kind.starts, f" and is not a {kind.title} file")
     if path.suffix.lower() != kind.suffix:
@@ -78,10 +76,8 @@ def check_replaces(path: Path, kind: Format) -> None:
 def open_gaussians(path: Path, checked: bool = True) -> GaussianSource:
     """Open a model that any program wrote; one in INRIA's layout is read block by block, others at once.
 
-    Without `checked`, the blocks have values that cannot be shown, which a `Selected` leaves out.
-
-    Raises:
-        ValueError, ImportError: see `read_gaussians`.
+    Without `checked`, the blocks have values that cannot be shown, which a `Selected` leaves out. ValueError,
+    ImportError: see `read_gaussians`.
     """
     with open(path, "rb") as file:
         header = file.read(_HEADER).partition(b"end_header")[0]
@@ -92,11 +88,8 @@ def open_gaussians(path: Path, checked: bool = True) -> GaussianSource:
 def read_gaussians(path: Path | str) -> Gaussians:
     """Read a model that any program wrote: PLY (INRIA's layout or compressed), SPZ, SOG or .splat.
 
-    SPZ needs the packages of `pip install "blitzgs[formats]"`.
-
-    Raises:
-        ValueError: the file is damaged, no model, or holds values that cannot be shown; names the file.
-        ImportError: a package is missing; says which.
+    SPZ needs the packages of `pip install "blitzgs[formats]"`. ValueError: the file is damaged, no model, or
+    holds values that cannot be shown; names the file. ImportError: a package is missing; says which.
     """
     path = Path(path)
     with open(path, "rb") as file:

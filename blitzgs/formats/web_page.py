@@ -95,9 +95,8 @@ class WebScene:
 def check_replaces_page(path: Path) -> None:
     """Check that writing a page replaces no file of another program.
 
-    Raises:
-        FileExistsError: there is a file that is not empty and no page of ours.
-        OSError: `path` is no regular file.
+    FileExistsError: there is a file that is not empty and no page of ours. OSError: `path` is no regular
+    file.
     """
     mark = b'<meta name="generator" content="BlitzGS">'
     check_replaceable(path, (mark,), ", and blitzgs did not write it")

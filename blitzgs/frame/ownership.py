@@ -94,11 +94,10 @@ class TileOwners:
     def columns(self) -> dict[str, Tensor]:
         """Return what a resumed run needs to make the same divisions; the same on every rank.
 
-        Returns:
-            views int64 [V], tiles int64 [V] and costs float16 [sum of pieces]: the measured views, their
-            numbers of tiles and their costs; ages int64 [V]: 0 if divisions already use the costs, k if they
-            are from the k-th of the latest batches, whose costs are not used yet; steps int64 [S] and bounds
-            int64 [S, M + 1]: the stored divisions. Keys must be integers.
+        Returns views int64 [V], tiles int64 [V] and costs float16 [sum of pieces]: the measured views, their
+        numbers of tiles and their costs; ages int64 [V]: 0 if divisions already use the costs, k if they are
+        from the k-th of the latest batches, whose costs are not used yet; steps int64 [S] and bounds int64
+        [S, M + 1]: the stored divisions. Keys must be integers.
         """
         batches = [list(self._costs.values()), *(measured() for measured in self._delayed)]
         ages = [age for age, batch in enumerate(batches) for _ in batch]

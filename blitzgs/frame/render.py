@@ -233,11 +233,8 @@ def _backgrounds(colour: tuple[float, float, float], count: int, device: torch.d
 def backward_splats(frame: Frame, v_renders: Tensor) -> SplatGradients:
     """Compute the gradients of this rank's projected splats from the gradients of the images.
 
-    Args:
-        v_renders: gradient of the loss by the images, [B, H, W, 3]; only this rank's tiles are read.
-
-    Raises:
-        RuntimeError: the ranks share memory, and a later frame has overwritten this frame's splats.
+    `v_renders`: gradient of the loss by the images, [B, H, W, 3]; only this rank's tiles are read.
+    RuntimeError: the ranks share memory, and a later frame has overwritten this frame's splats.
     """
     views, options, way_back = frame.views, frame.options, frame.way_back
     tiles = (0, -1) if frame.assignment is None else frame.assignment.own_tiles

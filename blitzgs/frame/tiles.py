@@ -108,9 +108,8 @@ class TileAssignment:
 def collect_images(renders: Tensor, ranges: TileRanges, ranks: Ranks, destination: int) -> None:
     """Send all pixels of a rendering to one rank, which stores them in its `renders`, bit for bit.
 
-    Args:
-        renders: [B, H, W, C], contiguous; valid in this rank's tiles.
-        destination: the rank whose `renders` is complete afterwards.
+    `renders`: [B, H, W, C], contiguous; valid in this rank's tiles. `destination`: the rank whose `renders`
+    is complete afterwards.
     """
     if ranks.world_size == 1:
         return

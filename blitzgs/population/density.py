@@ -146,9 +146,7 @@ def cap_opacities(table: GaussianTable, opacity: float) -> None:
 
     This is the opacity reset of 3DGS (Kerbl et al. 2023, section 5.2).
 
-    Args:
-        table: changed in place.
-        opacity: the cap, in (0, 1).
+    `table`: changed in place. `opacity`: the cap, in (0, 1).
     """
     table["opacities"].clamp_(max=opacity_logit(opacity))
     table["exp_avg.opacities"].zero_()

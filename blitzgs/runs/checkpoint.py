@@ -146,13 +146,9 @@ class Saving:
     def finish(self) -> Path:
         """Wait until all ranks have written, and give the checkpoint its name. Collective.
 
-        Returns:
-            The folder of the new checkpoint, `directory/checkpoint_NNNNNN`; later numbers may have more
-            digits.
-
-        Raises:
-            CheckpointError: on every rank, if any rank could not write; earlier checkpoints are unchanged.
-            ValueError: a column has a dtype that the format lacks.
+        Returns the folder of the new checkpoint, `directory/checkpoint_NNNNNN`; later numbers may have more
+        digits. CheckpointError: on every rank, if any rank could not write; earlier checkpoints are
+        unchanged. ValueError: a column has a dtype that the format lacks.
         """
         ranks, path = self._ranks, self._directory / self._name
         with ranks.watchdog.working("writing a checkpoint"):

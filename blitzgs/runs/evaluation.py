@@ -89,8 +89,7 @@ def _psnr(pixels: Tensor, wanted: Tensor) -> float:
 def load_lpips(path: str | None) -> Lpips | None:
     """Load a perceptual metric: a TorchScript module (render, target) -> distance, [1, 3, H, W] in [-1, 1].
 
-    Raises:
-        ValueError: the file is missing or not a TorchScript module.
+    ValueError: the file is missing or not a TorchScript module.
     """
     if path is None:
         return None

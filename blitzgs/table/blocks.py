@@ -94,9 +94,8 @@ class BlockIndex:
     def __init__(self, table: GaussianTable, pending_table: Tensor | None = None) -> None:
         """Compute the bounds of every block of the table.
 
-        Args:
-            pending_table: `AdamSchedule.table` of the lazy optimiser, if rows may have pending steps; None:
-                they have none.
+        `pending_table`: `AdamSchedule.table` of the lazy optimiser, if rows may have pending steps; None:
+        they have none.
         """
         self._pending_table = pending_table
         count = -(-len(table) // BLOCK_ROWS)
@@ -150,9 +149,8 @@ def spread(bounds: Tensor, limit: float) -> Tensor:
     The number of boxes that a plane cuts is proportional to this, if the plane lies anywhere with the same
     probability (Crofton's formula). A step reads the rows of the blocks that the border of a view cuts.
 
-    Args:
-        bounds: float32 [blocks, 8], as `BlockIndex.bounds`.
-        limit: a larger width counts as this one: single far rows have no more weight.
+    `bounds`: float32 [blocks, 8], as `BlockIndex.bounds`. `limit`: a larger width counts as this one: single
+    far rows have no more weight.
     """
     widths = (bounds[:, 3:6].double() - bounds[:, :3]).clamp(min=0).sum(dim=1) / 2
     return widths.clamp(max=limit).sum()
@@ -239,8 +237,7 @@ class BlockVisibility:
 def culled_blocks(cull: Tensor) -> Tensor:
     """Return, as bits, the views that leave out all rows of each block, int32 [N, columns / 32].
 
-    Args:
-        cull: int32 [N, columns, 8], see `blitzgs.ops.blocks`; of whole blocks.
+    `cull`: int32 [N, columns, 8], see `blitzgs.ops.blocks`; of whole blocks.
     """
     bits = torch.arange(WORD_BITS, device=cull.device)
     length = max(1, _MAX_WORDS // max(1, cull[:1].numel()))

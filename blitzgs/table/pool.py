@@ -184,8 +184,7 @@ class Pool:
     def catch_up(self, function: Callable[[GaussianTable], None]) -> None:
         """Load every block of the table into the pool, one part after the other, and change its rows there.
 
-        Args:
-            function: changes the pool in place, and must tolerate that some rows are passed to it twice.
+        `function`: changes the pool in place, and must tolerate that some rows are passed to it twice.
         """
         self.write_back()
         self._open()
@@ -204,15 +203,9 @@ class Pool:
     def load_for_step(self, step: int, cameras: Cameras, batch_size: int) -> BlockIndex:
         """Load the blocks that the views of a step see into the pool.
 
-        Args:
-            cameras: views of this step and of the following steps, in order, at most 32.
-            batch_size: views per step.
-
-        Returns:
-            The index of the pool's blocks. The step updates its bounds; pass it to `store_bounds` afterwards.
-
-        Raises:
-            PoolError: the blocks do not fit into the pool.
+        `cameras`: views of this step and of the following steps, in order, at most 32. `batch_size`: views
+        per step. Returns the index of the pool's blocks. The step updates its bounds; pass it to
+        `store_bounds` afterwards. PoolError: the blocks do not fit into the pool.
         """
         self._open()
         self._begun = self._mark()
@@ -304,8 +297,7 @@ class Pool:
         loads at the lowest steady rate at which all blocks that are known to be needed come in time. They
         take slots whose block is not known to be needed.
 
-        Args:
-            loading: blocks that are already being loaded during this step.
+        `loading`: blocks that are already being loaded during this step.
         """
         due, batches = self._visibility.next_use, self._visibility.batches
         missing = ((self._slot_of < 0) & (due < UNSEEN)).nonzero()[0]

@@ -61,16 +61,12 @@ class Placement(NamedTuple):
 def schema(sh_degree: int) -> dict[str, Column]:
     """Return the columns of a table, in their order.
 
-    Args:
-        sh_degree: highest spherical-harmonics degree D; `sh` has K = (D + 1)^2 coefficients.
-
-    Returns:
-        means [3], quats [4], scales [3] (log), opacities [] (logit), sh [K, 3] as float32, their Adam moments
-        `exp_avg.*` and `exp_avg_sq.*`; last_step and moment_step int32 (the optimiser step up to which the
-        row's parameters, and its moments, are current); id int64 (persistent, unique over ranks), parent
-        int64 (-1: none), birth int32 (images seen when it was born), level uint8 (octree level); grad_sum
-        float32, grad_count int32, max_radii float32 (pixels): density statistics since the last density
-        event.
+    `sh_degree`: highest spherical-harmonics degree D; `sh` has K = (D + 1)^2 coefficients. Returns means [3],
+    quats [4], scales [3] (log), opacities [] (logit), sh [K, 3] as float32, their Adam moments `exp_avg.*`
+    and `exp_avg_sq.*`; last_step and moment_step int32 (the optimiser step up to which the row's parameters,
+    and its moments, are current); id int64 (persistent, unique over ranks), parent int64 (-1: none), birth
+    int32 (images seen when it was born), level uint8 (octree level); grad_sum float32, grad_count int32,
+    max_radii float32 (pixels): density statistics since the last density event.
     """
     f = torch.float32
     rows = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": ((sh_degree + 1) ** 2, 3)}
@@ -117,11 +113,8 @@ class GaussianTable:
     def __init__(self, columns: Mapping[str, Tensor]) -> None:
         """Take over the given columns.
 
-        Args:
-            columns: name -> tensor [N, ...]; at least those of `schema`, all on one device.
-
-        Raises:
-            ValueError: a column is missing, or its length, row shape, dtype or device does not fit.
+        `columns`: name -> tensor [N, ...]; at least those of `schema`, all on one device. ValueError: a
+        column is missing, or its length, row shape, dtype or device does not fit.
         """
         if "sh" not in columns:
             raise ValueError(f"GaussianTable: column 'sh' is missing; got {sorted(columns)}")
@@ -167,8 +160,7 @@ class GaussianTable:
     def of_parameters(cls, columns: Mapping[str, Tensor]) -> GaussianTable:
         """Build a table for rendering only: the columns of the optimiser are zeros that take no memory.
 
-        Args:
-            columns: `PARAMETERS`, and "level" and "id" if known.
+        `columns`: `PARAMETERS`, and "level" and "id" if known.
         """
         sh = columns["sh"]
         count, known = len(sh), dict(columns)
@@ -284,11 +276,8 @@ class GaussianTable:
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Add rows at the end.
 
-        Args:
-            rows: name -> tensor [M, ...] of every column; those of `ZERO_AT_BIRTH` may be absent.
-
-        Raises:
-            ValueError: a column is missing, an unknown one is given, or shapes or dtypes differ.
+        `rows`: name -> tensor [M, ...] of every column; those of `ZERO_AT_BIRTH` may be absent. ValueError: a
+        column is missing, an unknown one is given, or shapes or dtypes differ.
         """
         count = self._check_new(rows)
         for name in self._to_change():
@@ -370,8 +359,7 @@ class GaussianTable:
     def move_rows(self, destination_ranks: Tensor, ranks: Ranks) -> None:
         """Move every row to a rank. Collective: every rank calls it. Rows arrive ordered by source rank.
 
-        Args:
-            destination_ranks: int64 [N], the rank each row goes to.
+        `destination_ranks`: int64 [N], the rank each row goes to.
         """
         order = torch.argsort(destination_ranks, stable=True)
         counts = torch.bincount(destination_ranks, minlength=ranks.world_size)

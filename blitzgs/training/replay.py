@@ -124,9 +124,8 @@ def label_events(lineage: Path) -> tuple[Tensor, Tensor]:
 def branch_point(folder: Path, config: Config) -> Path:
     """Return the last checkpoint of a run before the gate's onset.
 
-    Raises:
-        FileNotFoundError: there is none.
-        ValueError: the run or its densification ends before the gate's onset, or a checkpoint is damaged.
+    FileNotFoundError: there is none. ValueError: the run or its densification ends before the gate's onset,
+    or a checkpoint is damaged.
     """
     schedule, found = Schedule(config.schedule), []
     if not schedule.has_spawn_gate(schedule.iterations - 1):

@@ -83,11 +83,8 @@ class Drawer:
     def draw(self, look: Look) -> Picture | None:
         """Render one look; every rank of the job calls this with the same look.
 
-        Returns:
-            The picture on rank 0; None elsewhere.
-
-        Raises:
-            DrawingError: a rank lacks the memory, or cannot find what the view sees.
+        Returns the picture on rank 0; None elsewhere. DrawingError: a rank lacks the memory, or cannot find
+        what the view sees.
         """
         begin, subject, ranks = time.perf_counter(), self._subject, self._owners.ranks
         device = ranks.device
@@ -129,9 +126,8 @@ class Drawer:
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """Composite the Gaussians between two depths behind what is in front of them.
 
-        Returns:
-            How many are seen, int64 [1]; what is composited by now, float32 [1, H, W, C], and the light that
-            still comes through it, [1, H, W].
+        Returns how many are seen, int64 [1]; what is composited by now, float32 [1, H, W, C], and the light
+        that still comes through it, [1, H, W].
         """
         gaussians, painted = self._subject.gaussians, look.mode == "level"
         table: GaussianTable
@@ -208,8 +204,7 @@ class Drawer:
 def _reserve(gaussians: TableOrPool, look: Look, device: torch.device) -> None:
     """Allocate the memory of a frame, which torch keeps for it: without, one rank would fail in its middle.
 
-    Raises:
-        RuntimeError: it cannot.
+    RuntimeError: it cannot.
     """
     if device.type == "cuda":
         rows = len(gaussians.held if isinstance(gaussians, Pool) else gaussians)

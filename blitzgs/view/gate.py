@@ -54,8 +54,7 @@ class LodGate:
         Let r be the reach of a Gaussian's level and d its distance from the camera. Its opacity is multiplied
         by clamp((1 - d^2 / r^2) f / (f - 1), 0, 1), which is 1 up to r / sqrt(f) and 0 from r on.
 
-        Returns:
-            f / (f - 1), then `reach`.
+        Returns f / (f - 1), then `reach`.
         """
         return (self.fork / (self.fork - 1), *self.reach()) if self.smooth else ()
 
@@ -128,8 +127,7 @@ class ModelGate:
     def kept(self, centres: Tensor) -> list[float]:
         """Predict the share of all Gaussians that each view keeps. Collective.
 
-        Args:
-            centres: positions of the cameras, float64 [V, 3].
+        `centres`: positions of the cameras, float64 [V, 3].
         """
         counts = torch.zeros(len(centres), dtype=torch.int64, device=self._means.device)
         length = max(1, _MAX_DISTANCES // max(1, len(self._means)))
@@ -147,9 +145,7 @@ class ModelGate:
     def active(self, table: GaussianTable, viewmats: Tensor) -> ActiveRows | None:
         """Return the rows that each of B views keeps; None if every view keeps every row. Collective.
 
-        Args:
-            table: this rank's Gaussians, caught up.
-            viewmats: float32 [B, 4, 4], B <= 32.
+        `table`: this rank's Gaussians, caught up. `viewmats`: float32 [B, 4, 4], B <= 32.
         """
         return self._gated(table["means"], table["level"], viewmats)
 

@@ -72,9 +72,7 @@ def footprint_sizes(scales: Tensor, opacities: Tensor) -> Tensor:
     nothing in front, pi times the square of the footprint is the sum of alpha^2, to which the squared error
     is proportional that leaving the Gaussian out makes.
 
-    Args:
-        scales: logarithms, [N, 3].
-        opacities: logits, [N].
+    `scales`: logarithms, [N, 3]. `opacities`: logits, [N].
     """
     broad = scales.double().sum(1) - scales.double().amin(1)
     return 0.5 * broad + torch.nn.functional.logsigmoid(opacities.double())

@@ -40,8 +40,7 @@ class Look:
     def __post_init__(self) -> None:
         """Check the values, which come from a browser.
 
-        Raises:
-            ValueError: a value is impossible; the message names it.
+        ValueError: a value is impossible; the message names it.
         """
         if self.mode not in MODES:
             raise ValueError(f"mode must be one of {', '.join(MODES)}, got {self.mode!r}")

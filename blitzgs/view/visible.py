@@ -45,9 +45,8 @@ class VisibleFinder:
     def __init__(self, gaussians: TableOrPool, lod: ModelGate | None = None) -> None:
         """Compute the bounds of the blocks, unless a pool has them.
 
-        Args:
-            gaussians: this rank's Gaussians, without pending optimiser steps.
-            lod: leaves out rows whose octree level is too fine for their distance; None: no gate.
+        `gaussians`: this rank's Gaussians, without pending optimiser steps. `lod`: leaves out rows whose
+        octree level is too fine for their distance; None: no gate.
         """
         self._gaussians, self._lod = gaussians, lod
         self._index = None if isinstance(gaussians, Pool) else BlockIndex(gaussians)

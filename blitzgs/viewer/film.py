@@ -199,11 +199,8 @@ def read_film(
 def _back(file: Path) -> Callable[[Keyframe], Keyframe]:
     """Return a function that takes a viewpoint from nerfstudio's world to that of its capture.
 
-    nerfstudio has x' = scale (R x + t), with [R | t] the "transform" of its file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is damaged.
+    nerfstudio has x' = scale (R x + t), with [R | t] the "transform" of its file. FileNotFoundError: there is
+    no such file. ValueError: it is damaged.
     """
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
@@ -232,8 +229,7 @@ _QUALITY = "17"
 def require_av() -> ModuleType:
     """Import the optional package that encodes films.
 
-    Raises:
-        ImportError: it is not installed; the message says how to install it.
+    ImportError: it is not installed; the message says how to install it.
     """
     try:
         import av
@@ -245,11 +241,8 @@ def require_av() -> ModuleType:
 def check_film(path: Path, width: int, height: int) -> None:
     """Check before rendering that a film can be written.
 
-    Raises:
-        ImportError: a package is missing.
-        FileExistsError: there is a file that is not empty and no film.
-        OSError: `path` is no regular file.
-        ValueError: a side is an odd number of pixels.
+    ImportError: a package is missing. FileExistsError: there is a file that is not empty and no film.
+    OSError: `path` is no regular file. ValueError: a side is an odd number of pixels.
     """
     require_av()
     check_replaceable(path)

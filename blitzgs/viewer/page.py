@@ -34,8 +34,7 @@ _FIGURES_SECONDS = 0.2
 def require_viser() -> None:
     """Check that the optional package of the viewer is installed.
 
-    Raises:
-        ImportError: it is not; the message says how to install it.
+    ImportError: it is not; the message says how to install it.
     """
     try:
         import viser  # noqa: F401

@@ -108,8 +108,7 @@ def to_json(path: CameraPath) -> str:
 def from_json(text: str) -> CameraPath:
     """Read a path; one without keyframes has its frames as keyframes.
 
-    Raises:
-        ValueError: it is no camera path; the message says where and why.
+    ValueError: it is no camera path; the message says where and why.
     """
     content = _content(text)
     keys = _viewpoints(content, "keyframes") or _viewpoints(content, "camera_path")
@@ -128,8 +127,7 @@ def from_json(text: str) -> CameraPath:
 def frames_from_json(text: str) -> list[Keyframe]:
     """Return the frames that a path has as its program computed them; empty if it has only keyframes.
 
-    Raises:
-        ValueError: as `from_json`.
+    ValueError: as `from_json`.
     """
     return _viewpoints(_content(text), "camera_path")
 

@@ -38,8 +38,7 @@ class Settings:
     ) -> Look:
         """Return what to draw for a pose; comparisons with a photograph are in RGB.
 
-        Raises:
-            ValueError: a choice is impossible.
+        ValueError: a choice is impossible.
         """
         return Look(
             viewmat,
@@ -89,9 +88,8 @@ class Pace:
     def next_scale(self, drawn: float | None, moving: bool) -> float | None:
         """Return the scale of the next picture; None: the one that is shown is good enough.
 
-        Args:
-            drawn: scale of the picture that shows the present viewpoint and choices; None: there is none.
-            moving: whether the camera moved just now.
+        `drawn`: scale of the picture that shows the present viewpoint and choices; None: there is none.
+        `moving`: whether the camera moved just now.
         """
         coarse = self.coarse()
         if drawn is None:

@@ -54,12 +54,8 @@ def web_file(opened: Opened, max_bytes: int) -> WebFile:
     of Gaussians. Then the Gaussians that contribute least to views of the capture are left out; without
     cameras, those of the least opacity times length.
 
-    Args:
-        opened: the model.
-        max_bytes: size of the file.
-
-    Raises:
-        ValueError: the model has no visible Gaussian, or none fits.
+    `opened`: the model. `max_bytes`: size of the file. ValueError: the model has no visible Gaussian, or none
+    fits.
     """
     table, exhibit, full_degree = opened.table, opened.exhibit, opened.exhibit.sh_degree
     degree, space = opened.subject.options.sh_degree, max_bytes - frame_bytes()
@@ -185,9 +181,7 @@ class City:
     def transform(self) -> Array:
         """Return the map [4, 4] from the source's coordinates to EPSG:4978, or to an upright local frame.
 
-        Raises:
-            ImportError: pyproj is missing.
-            ValueError: pyproj does not know the reference system.
+        ImportError: pyproj is missing. ValueError: pyproj does not know the reference system.
         """
         if self.frame is None or not self.frame.crs:
             return upright(self.scene.up)
@@ -197,11 +191,9 @@ class City:
 def open_city(path: Path, checked: bool = True) -> City:
     """Open a run, a checkpoint in it or a file, without reading a run's or a PLY's Gaussians into memory.
 
-    Files and `checked` are as for `blitzgs.formats.models.open_gaussians`.
-
-    Raises:
-        FileNotFoundError: there is no such file, or no run or checkpoint in the folder.
-        ValueError: the file is damaged or no model, or holds no Gaussians.
+    Files and `checked` are as for `blitzgs.formats.models.open_gaussians`. FileNotFoundError: there is no
+    such file, or no run or checkpoint in the folder. ValueError: the file is damaged or no model, or holds no
+    Gaussians.
     """
     cameras: Sequence[CameraLike] = ()
     run, frame = None, None
@@ -249,13 +241,8 @@ def to_globe(frame: WorldFrame, origin: Array) -> Array:
     scale of a map projection there; at a distance of 2 km, the earth's curvature departs from it by 0.3 m.
     Heights are taken as above the ellipsoid, unless the reference system says otherwise.
 
-    Args:
-        frame: of the capture; it has a reference system.
-        origin: [3], capture coordinates.
-
-    Raises:
-        ImportError: pyproj is missing.
-        ValueError: pyproj does not know the reference system, or the place is outside of it.
+    `frame`: of the capture; it has a reference system. `origin`: [3], capture coordinates. ImportError:
+    pyproj is missing. ValueError: pyproj does not know the reference system, or the place is outside of it.
     """
     # Central differences over this length, in the unit of the capture.
     step = 10.0

@@ -122,9 +122,8 @@ class Exchange(Protocol):
     def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """Wait for the numbers.
 
-        Returns:
-            The sizes that the frame needs, from which `Transport.estimate` learns; and the result, None if
-            the capacity was too small and the frame must be started again.
+        Returns the sizes that the frame needs, from which `Transport.estimate` learns; and the result, None
+        if the capacity was too small and the frame must be started again.
         """
 
 
@@ -134,8 +133,7 @@ class WayBack(Protocol):
     def check_still_valid(self) -> None:
         """Check that gradients of this frame can still be returned.
 
-        Raises:
-            RuntimeError: a later frame has overwritten this frame's splats.
+        RuntimeError: a later frame has overwritten this frame's splats.
         """
 
     def cleared_table(self) -> Tensor | None:
@@ -144,19 +142,15 @@ class WayBack(Protocol):
     def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
         """Return the gradients of this rank's own splats. Collective.
 
-        Args:
-            gradients: gradients of the splats that arrived, in `gradient_table` if there is one.
+        `gradients`: gradients of the splats that arrived, in `gradient_table` if there is one.
         """
 
     def return_sums(self, sums: Tensor) -> Tensor:
         """Return integer sums over the tiles of each rank to the splats' owners, and add them up. Collective.
 
-        Args:
-            sums: int64 [R, C], sums of the splats that arrived here.
-
-        Returns:
-            int64 [P, C], sums of this rank's own splats; zero for splats that touch no tile. Integers add up
-            exactly, so the result does not depend on the number of ranks.
+        `sums`: int64 [R, C], sums of the splats that arrived here. Returns int64 [P, C], sums of this rank's
+        own splats; zero for splats that touch no tile. Integers add up exactly, so the result does not depend
+        on the number of ranks.
         """
 
 

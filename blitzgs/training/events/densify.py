@@ -66,12 +66,8 @@ def _keep_sorted(state: TrainingState, event: Event, spread_now: int, is_sorted:
 
     After the last event the order stays for the rest of the run, so that sorting always pays.
 
-    Args:
-        spread_now: spread of the blocks of all ranks.
-        is_sorted: whether the event has sorted the table already.
-
-    Returns:
-        Whether this sorted the table.
+    `spread_now`: spread of the blocks of all ranks. `is_sorted`: whether the event has sorted the table
+    already. Returns whether this sorted the table.
     """
     sorts = not is_sorted
     if sorts:
