@@ -20,15 +20,12 @@ class _Side:
 
     Only one thread at a time may use it: a second thread could record `ready` again before the first one has
     made the stream wait for it.
-
-    Attributes:
-        stream: the second stream.
-        ready: event by which the second stream waits for the step's stream. It is recorded on the step's
-            stream before each use of the second one; a new record does not change waits that are queued.
     """
 
     def __init__(self, device: torch.device) -> None:
-        self.stream = torch.cuda.Stream(device)
+        self.stream = torch.cuda.Stream(device)  # the second stream
+        # Event by which the second stream waits for the step's stream. It is recorded on the step's stream
+        # before each use of the second one; a new record does not change waits that are queued.
         self.ready = torch.cuda.Event()
 
 

@@ -78,10 +78,6 @@ class SharedMemory:
         device: where this rank computes.
         control: this rank's control words, symmetric memory, `control_words` zeros.
         timeout_seconds: longest wait in a barrier.
-
-    Attributes:
-        buffers: int32 [words] of each rank, mapped here.
-        generation: how many times splats were written into the buffers; identifies the frame they belong to.
     """
 
     def __init__(
@@ -89,7 +85,8 @@ class SharedMemory:
     ) -> None:
         self.rank, self.world_size, self.device = rank, world_size, device
         self.timeout_seconds = timeout_seconds
-        self.buffers: list[Tensor] = []
+        self.buffers: list[Tensor] = []  # int32 [words] of each rank, mapped here
+        # How many times splats were written into the buffers; identifies the frame they belong to.
         self.generation = 0
         self._barriers = 0
         self._shared = 0  # number of barriers that gathered numbers

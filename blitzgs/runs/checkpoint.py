@@ -36,23 +36,15 @@ _UNFINISHED = ".unfinished_"
 
 
 class CheckpointError(RuntimeError):
-    """A checkpoint could not be written or read; the message names the checkpoint and the reason.
-
-    Attributes:
-        lacks_space: whether it could be written if there were more space on the disk.
-    """
+    """A checkpoint could not be written or read; the message names the checkpoint and the reason."""
 
     def __init__(self, message: str, lacks_space: bool = False) -> None:
         super().__init__(message)
-        self.lacks_space = lacks_space
+        self.lacks_space = lacks_space  # whether it could be written if there were more space on the disk
 
 
 class Saving:
-    """A checkpoint that a thread of each rank writes; there is none until `finish` has returned.
-
-    Attributes:
-        deleting: deletes older checkpoints on rank 0, after `finish`.
-    """
+    """A checkpoint that a thread of each rank writes; there is none until `finish` has returned."""
 
     def __init__(
         self,
@@ -101,7 +93,7 @@ class Saving:
         device = next(iter(columns.values())).device
         ready = torch.cuda.current_stream(device).record_event() if device.type == "cuda" else None
         pool = ThreadPoolExecutor(1, "blitzgs-checkpoint")
-        self.deleting: Thread | None = None
+        self.deleting: Thread | None = None  # deletes older checkpoints on rank 0, after `finish`
         self._written = pool.submit(self._write, columns, shared or {}, device, ready)
         pool.shutdown(wait=False)
 

@@ -85,10 +85,6 @@ class BlockIndex:
 
     Build a new index whenever rows were added, removed or reordered. Sort the table by `morton_order` first:
     the active set is right in any order, but in a random order blocks are large and no block is skipped.
-
-    Attributes:
-        bounds: the bounds of each block, float32 [blocks, 8]; see `update_block_bounds_` for their layout.
-        level_ranges: the coarsest and the finest level of each block, uint8 [blocks, 2].
     """
 
     def __init__(self, table: GaussianTable, pending_table: Tensor | None = None) -> None:
@@ -99,7 +95,9 @@ class BlockIndex:
         """
         self._pending_table = pending_table
         count = -(-len(table) // BLOCK_ROWS)
+        # The bounds of each block, float32 [blocks, 8]; see `update_block_bounds_` for their layout.
         self.bounds = torch.empty(count, 8, dtype=torch.float32, device=table.device)
+        # The coarsest and the finest level of each block, uint8 [blocks, 2].
         self.level_ranges = _level_ranges(table["level"], count)
         self.update(table, None)
 

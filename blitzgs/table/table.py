@@ -105,9 +105,6 @@ class GaussianTable:
     only the rows that change; for that, columns that grow have memory for more rows than they hold.
 
     A column of `LAYOUTS` is converted whenever it is set, read or moved.
-
-    Attributes:
-        columns: the columns by name, those of `LAYOUTS` in their stored form.
     """
 
     def __init__(self, columns: Mapping[str, Tensor]) -> None:
@@ -131,6 +128,7 @@ class GaussianTable:
                     f"GaussianTable: column '{name}' must be {column.dtype} {list(wanted)} on {sh.device}, "
                     f"got {tensor.dtype} {list(tensor.shape)} on {tensor.device}"
                 )
+        # The columns by name, those of `LAYOUTS` in their stored form.
         self.columns: dict[str, Tensor] = {name: as_stored(name, column) for name, column in columns.items()}
         # The memory of columns that have more of it than rows; they are its first rows.
         self._memory: dict[str, Tensor] = {}

@@ -164,20 +164,15 @@ def box_of(means: Tensor) -> npt.NDArray[np.float64]:
 
 
 class Studio:
-    """Draws for the visitors of a page until it is closed.
-
-    Attributes:
-        page: the page.
-        drawn: number of pictures so far.
-    """
+    """Draws for the visitors of a page until it is closed."""
 
     def __init__(self, opened: Opened, host: str = "127.0.0.1", port: int = 8080) -> None:
         """Start the page and the thread that draws; errors are those of `Page`."""
         self._drawer = Drawer(opened.subject, TileOwners(opened.ranks))
         count, size = len(opened.table), opened.bytes / 1e6
         memory = f"{count:,} in all &middot; {size:,.0f} MB"
-        self.page = Page(opened.exhibit, host, port, memory=lambda: memory)
-        self.drawn = 0
+        self.page = Page(opened.exhibit, host, port, memory=lambda: memory)  # the page
+        self.drawn = 0  # number of pictures so far
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._draw, daemon=True, name="viewer studio")
         self._thread.start()

@@ -89,26 +89,21 @@ def room_for(splats: int, words: int) -> int:
 
 
 class PeerBuffers:
-    """The parts of the buffers of all ranks.
-
-    Attributes:
-        buffers: int32 [words] of each rank, mapped here.
-        length: capacity of each buffer, in splats.
-        splats: columns in this rank's buffer, [length].
-        tables: table of splat gradients of each rank, float32 [length, 12].
-    """
+    """The parts of the buffers of all ranks."""
 
     def __init__(self, buffers: Sequence[Tensor], rank: int) -> None:
         """Divide buffers of equal length."""
-        self.buffers = list(buffers)
+        self.buffers = list(buffers)  # int32 [words] of each rank, mapped here
+        # Capacity of each buffer, in splats.
         self.length = len(buffers[0]) // WORDS_PER_SPLAT // _ALIGNMENT * _ALIGNMENT
         columns, begin = [], 0
         for dtype, words, shape in _COLUMNS:
             end = begin + self.length * words
             columns.append(buffers[rank][begin:end].view(dtype).view(self.length, *shape))
             begin = end
-        self.splats = Splats(*columns)
+        self.splats = Splats(*columns)  # columns in this rank's buffer, [length]
         end = begin + self.length * SPLAT_GRADIENT
+        # Table of splat gradients of each rank, float32 [length, 12].
         self.tables = [
             buffer[begin:end].view(torch.float32).view(self.length, SPLAT_GRADIENT) for buffer in buffers
         ]

@@ -182,13 +182,11 @@ class CapacityEstimate:
     If the host waited for the sizes, the device would be idle meanwhile. Instead, the host queues all the
     work with the estimate, and reads the true sizes while the device works. If the estimate was too small,
     the host queues the work again (`blitzgs.frame.render`).
-
-    Attributes:
-        sizes: the present estimate; None before the first frame has ended.
     """
 
     def __init__(self, sizes: Sizes | None = None) -> None:
         """Begin with an estimate, or with none; without one the first attempt waits for its sizes."""
+        # The present estimate; None before the first frame has ended.
         self.sizes = None if sizes is None else Sizes._make(max(1, size) for size in sizes)
         self._lock = threading.Lock()
 
