@@ -307,19 +307,16 @@ class ImageStore:
         packed = self.compressed.get(index)
         if packed is not None:
             return _uint8(native.decode_qoi(packed))
-        pixels = self._prepare(camera, self._decode(camera, self._read_whole(camera.image_path)))
-        if self._shared is None:
-            packed = native.encode_qoi(pixels)
-            self.compressed.put(index, packed, len(packed))
-        return pixels
-
-    def _prepare(self, camera: Camera, pixels: UInt8) -> UInt8:
-        """Undistort and downscale."""
+        pixels = self._decode(camera, self._read_whole(camera.image_path))
         if not camera.rectification.is_identity:
             columns, rows, _ = self._maps_of(camera.rectification)
             border = cv2.BORDER_REPLICATE
             pixels = _uint8(cv2.remap(pixels, columns, rows, cv2.INTER_LINEAR, borderMode=border))
-        return _shrunk(pixels, camera)
+        pixels = _shrunk(pixels, camera)
+        if self._shared is None:
+            packed = native.encode_qoi(pixels)
+            self.compressed.put(index, packed, len(packed))
+        return pixels
 
     def _make_mask(self, index: int) -> UInt8:
         camera = self.capture.cameras[index]

@@ -110,7 +110,11 @@ def _run(given: list[str]) -> int:
     except Exception as error:
         if not isinstance(error, _user_errors()):
             raise
-        _print_error(f"{name}: {printable(_message(error))}")
+        from rich.console import Console
+
+        text = f"{name}: {printable(_message(error))}"
+        console = Console(stderr=True, highlight=False, emoji=False)
+        console.print(text, style="red", markup=False, soft_wrap=True)
         return 1
 
 
@@ -179,13 +183,6 @@ def _user_errors() -> tuple[type[BaseException], ...]:
     """Return the errors that are reported as a message."""
     named = (path.rpartition(".") for path in _NAMED_ERRORS)
     return (*_USER_ERRORS, *(getattr(import_module(module), name) for module, _, name in named))
-
-
-def _print_error(text: str) -> None:
-    from rich.console import Console
-
-    console = Console(stderr=True, highlight=False, emoji=False)
-    console.print(text, style="red", markup=False, soft_wrap=True)
 
 
 def _message(error: BaseException) -> str:

@@ -13,7 +13,7 @@ from blitzgs.cli import arguments
 from blitzgs.config.fields import Config, DataConfig, ModelConfig
 from blitzgs.config.files import changed
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.gaussians import Gaussians, is_antialiased
+from blitzgs.formats.gaussians import is_antialiased
 from blitzgs.formats.models import read_gaussians
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
@@ -75,7 +75,11 @@ def run(args: argparse.Namespace) -> int:
         path: Path = args.model
         if path.is_file():
             found = read_gaussians(path)
-            config = _config_of(found, args.data)
+            if args.data is None:
+                raise ValueError("a file is compared with a capture: add --data CAPTURE")
+            config = Config(
+                data=DataConfig(path=str(args.data)), model=ModelConfig(antialiased=is_antialiased(found))
+            )
         else:
             run_folder, checkpoint = run_files.run_and_checkpoint(path)
             model = run_files.open_model(run_folder, ranks, args.data, args.resident_gb, checkpoint)
@@ -119,10 +123,3 @@ def run(args: argparse.Namespace) -> int:
                 print(printable(f"among the worst views: {view} {psnr:.2f} dB"), file=sys.stderr)
             print(f"{folder}: metrics.json and pictures", file=sys.stderr)
     return 0
-
-
-def _config_of(found: Gaussians, data: Path | None) -> Config:
-    """Return the configuration that shows a file in the views of a capture."""
-    if data is None:
-        raise ValueError("a file is compared with a capture: add --data CAPTURE")
-    return Config(data=DataConfig(path=str(data)), model=ModelConfig(antialiased=is_antialiased(found)))

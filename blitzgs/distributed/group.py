@@ -268,7 +268,7 @@ class Ranks:
                 holders.setdefault(values.get(name, "(missing)"), []).append(rank)
             if len(holders) > 1:
                 detail = "; ".join(
-                    f"rank{'s' if len(ranks) > 1 else ''} {_list(ranks)}"
+                    f"rank{'s' if len(ranks) > 1 else ''} {', '.join(map(str, ranks))}"
                     f" ({everyone[ranks[0]][0]}): {_shorten(value)}"
                     for value, ranks in holders.items()
                 )
@@ -299,10 +299,6 @@ def extend_memory_in_place() -> None:
     """
     if not any(name in os.environ for name in ALLOCATOR_VARIABLES):
         os.environ[ALLOCATOR_VARIABLES[0]] = "expandable_segments:True"
-
-
-def _list(ranks: Sequence[int]) -> str:
-    return ", ".join(map(str, ranks))
 
 
 def _shorten(text: str) -> str:

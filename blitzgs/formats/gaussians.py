@@ -114,7 +114,13 @@ class Gaussians:
         given = {name: getattr(self, name) for name in shapes if getattr(self, name) is not None}
         for name, tensor in given.items():
             check_tensor(name, tensor)
-            _check_values(name, tensor)
+            rows = _bad_rows(name, tensor)
+            if bool(rows.any()):
+                first = int(rows.nonzero()[0])
+                raise ValueError(
+                    f"{name} has NaN or infinite values in {int(rows.sum()):,} Gaussians, the first is "
+                    f"number {first}: leave these Gaussians out"
+                )
         if k not in (1, 4, 9, 16):
             raise ValueError(
                 f"sh has the shape {list(self.sh.shape)}, expected [N, K, 3] with K = 1, 4, 9 or 16"
@@ -173,17 +179,6 @@ def _bad_rows(name: str, tensor: Tensor) -> Tensor:
     if name == "scales":
         bad = ~(tensor < _LARGEST_SCALE)
     return bad.flatten(1).any(dim=1) if bad.dim() > 1 else bad
-
-
-def _check_values(name: str, tensor: Tensor) -> None:
-    """Refuse values that no viewer can show."""
-    rows = _bad_rows(name, tensor)
-    if bool(rows.any()):
-        first = int(rows.nonzero()[0])
-        raise ValueError(
-            f"{name} has NaN or infinite values in {int(rows.sum()):,} Gaussians, the first is number "
-            f"{first}: leave these Gaussians out"
-        )
 
 
 def unit_quats(quats: Tensor) -> Tensor:

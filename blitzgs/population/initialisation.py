@@ -99,7 +99,9 @@ def octree_gaussians(
     Raises:
         ValueError: no voxel is left.
     """
-    origin = _grid_origin(points, levels)
+    # The lower corner of the grids: below all points, unless outliers overflow the finest grid.
+    reach = levels.voxel_size_of(levels.count - 1) * 2 ** (CELL_BITS - 1)
+    origin = torch.maximum(points.amin(dim=0), points.median(dim=0).values - reach)
     parts = []
     for level in range(levels.count):
         means, mean_colors = _voxels(points, colors, origin, levels.voxel_size_of(level))
@@ -128,12 +130,6 @@ def _thinned(levels: Tensor, most: int, seed: int) -> Tensor:
     order = torch.argsort(draws, stable=True)
     order = order[torch.argsort(levels[order].long(), stable=True)]
     return order[:most].sort().values
-
-
-def _grid_origin(points: Tensor, levels: Levels) -> Tensor:
-    """Return the lower corner of the grids: below all points, unless outliers overflow the finest grid."""
-    reach = levels.voxel_size_of(levels.count - 1) * 2 ** (CELL_BITS - 1)
-    return torch.maximum(points.amin(dim=0), points.median(dim=0).values - reach)
 
 
 def _voxels(points: Tensor, colors: Tensor, origin: Tensor, size: float) -> tuple[Tensor, Tensor]:

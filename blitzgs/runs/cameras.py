@@ -29,7 +29,7 @@ class RunCamera:
     name: str  # name of the image
     width: int  # image width in pixels
     height: int  # image height in pixels
-    # intrinsics in pixels, float64 [3, 3]; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+    # Intrinsics in pixels, float64 [3, 3]; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
     K: npt.NDArray[np.float64]
     # Rigid pose, float64 [4, 4], in the re-centred world (capture position - the run's offset).
     world_to_camera: npt.NDArray[np.float64]

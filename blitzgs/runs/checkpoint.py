@@ -81,8 +81,9 @@ class Saving:
         name, problem = "", None
         if ranks.rank == 0:
             try:
-                name = _next_name(self._directory)
-                _delete_unfinished(self._directory)
+                names = names_of(self._directory)
+                name = f"checkpoint_{_number(names[-1]) + 1 if names else 0:06d}"
+                _delete(self._directory.glob(_UNFINISHED + "*"))  # of interrupted saves and deletions
             except OSError as error:
                 problem = f"no checkpoint was saved, because rank 0 could not read {directory}: {error}."
         self._name, problem = ranks.broadcast_object((name, problem))
@@ -312,11 +313,6 @@ def _delete_old(directory: Path, keep: int, reached: Callable[[str], None]) -> T
     return deleting
 
 
-def _delete_unfinished(directory: Path) -> None:
-    """Delete the files that interrupted saves and deletions have left."""
-    _delete(directory.glob(_UNFINISHED + "*"))
-
-
 def _delete(folders: Iterable[Path]) -> None:
     for folder in folders:
         shutil.rmtree(folder, ignore_errors=True)
@@ -332,11 +328,6 @@ def names_of(directory: Path) -> list[str]:
 
 def _number(name: str) -> int:
     return int(name.rpartition("_")[2])
-
-
-def _next_name(directory: Path) -> str:
-    names = names_of(directory)
-    return f"checkpoint_{_number(names[-1]) + 1 if names else 0:06d}"
 
 
 def _common_length(columns: Mapping[str, Tensor]) -> int:

@@ -98,7 +98,10 @@ class BlockIndex:
         # The bounds of each block, float32 [blocks, 8]; see `update_block_bounds_` for their layout.
         self.bounds = torch.empty(count, 8, dtype=torch.float32, device=table.device)
         # The coarsest and the finest level of each block, uint8 [blocks, 2].
-        self.level_ranges = _level_ranges(table["level"], count)
+        level = table["level"]
+        rest = level[-1:].expand(count * BLOCK_ROWS - len(level)) if count else level
+        of_block = torch.cat((level, rest)).view(-1, BLOCK_ROWS)
+        self.level_ranges = torch.stack((of_block.amin(dim=1), of_block.amax(dim=1)), dim=1)
         self.update(table, None)
 
     @classmethod
@@ -152,13 +155,6 @@ def spread(bounds: Tensor, limit: float) -> Tensor:
     """
     widths = (bounds[:, 3:6].double() - bounds[:, :3]).clamp(min=0).sum(dim=1) / 2
     return widths.clamp(max=limit).sum()
-
-
-def _level_ranges(level: Tensor, blocks: int) -> Tensor:
-    """Return the coarsest and the finest level of each block, uint8 [blocks, 2]."""
-    rest = level[-1:].expand(blocks * BLOCK_ROWS - len(level)) if blocks else level
-    of_block = torch.cat((level, rest)).view(-1, BLOCK_ROWS)
-    return torch.stack((of_block.amin(dim=1), of_block.amax(dim=1)), dim=1)
 
 
 _MAX_WORDS = 1 << 26  # words of a mask that are processed together

@@ -77,9 +77,8 @@ def open_capture(
     left = max(0, budget - taken)  # this rank's budget may be below that of the rank which made the memory
     background = config.model.background
     local = ranks.local_world_size
-    return capture, ImageStore(
-        capture, left // local, _decoder_threads(local), background=background, shared=shared
-    )
+    threads = min(max(len(os.sched_getaffinity(0)) // local - 2, 2), 32)  # this rank's cores, less two
+    return capture, ImageStore(capture, left // local, threads, background=background, shared=shared)
 
 
 def load_configured(data: DataConfig, find_damage: FindDamage = damaged) -> Capture:
@@ -158,11 +157,6 @@ def sharing_hint(
         "each rank decodes the photographs for itself: with "
         f"--data.cache_bytes={gigabytes}_000_000_000, the ranks of a host would share them"
     )
-
-
-def _decoder_threads(local_ranks: int) -> int:
-    """Return how many threads each rank of this host decodes with: its cores, less two, from 2 to 32."""
-    return min(max(len(os.sched_getaffinity(0)) // local_ranks - 2, 2), 32)
 
 
 def _host_memory() -> int:

@@ -106,7 +106,7 @@ class VisibleFinder:
             index = gaussians.load_for_views(cameras)
             table, rows_of = gaussians.held, gaussians.rows_of
         else:
-            table, rows_of = gaussians, _same_rows
+            table, rows_of = gaussians, lambda rows: rows
         assert index is not None
         rules = None if self._lod is None else self._lod.rules(table["level"], views.viewmats)
         # Either way, the host does not wait for the number of blocks.
@@ -116,7 +116,3 @@ class VisibleFinder:
         if rules is not None:
             gate_views_(active, table["means"], views.viewmats, rules)
         return VisibleRows(table, active, rows_of)
-
-
-def _same_rows(rows: Tensor) -> Tensor:
-    return rows

@@ -218,20 +218,9 @@ def open_city(path: Path, checked: bool = True) -> City:
         config = Config(model=ModelConfig(antialiased=is_antialiased(source), near=1e-3))
     else:
         space, config = run.space, run.config
-    return City(
-        source,
-        offset,
-        frame,
-        _city_scene(box.mean(axis=0), space, config, cameras, source.degree),
-        path.resolve().stem,
-    )
-
-
-def _city_scene(
-    middle: Array, space: Space, config: Config, cameras: Sequence[CameraLike], degree: int
-) -> WebScene:
-    world = World(space, cameras, middle / space.unit)
-    return web_scene(world, render_options(config, space, degree), space.unit)
+    world = World(space, cameras, box.mean(axis=0) / space.unit)
+    scene = web_scene(world, render_options(config, space, source.degree), space.unit)
+    return City(source, offset, frame, scene, path.resolve().stem)
 
 
 def to_globe(frame: WorldFrame, origin: Array) -> Array:
