@@ -192,18 +192,9 @@ def _rendered(scene: list[Tensor], viewmat: Tensor, K: Tensor, distributed: bool
 
     means, quats, scales, opacities, colors = scene
     return blitzgs.rasterization(
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        viewmat[None],
-        K[None],
-        _WIDTH,
-        _HEIGHT,
-        sh_degree=1,
+        means, quats, scales, opacities, colors, viewmat[None], K[None], _WIDTH, _HEIGHT, sh_degree=1,
         distributed=distributed,
-    )[0]
+    )[0]  # fmt: skip
 
 
 def _reference() -> tuple[list[Tensor], ReferenceImage]:

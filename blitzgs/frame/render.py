@@ -68,16 +68,10 @@ class RenderOptions:
     def projection(self, views: Views) -> ProjectionOptions:
         """Return the options for projecting into these views."""
         return ProjectionOptions(
-            width=views.width,
-            height=views.height,
-            tile_size=self.tile_size,
-            sh_degree=self.sh_degree,
-            near_plane=self.near_plane,
-            far_plane=self.far_plane,
-            eps2d=self.eps2d,
-            antialiased=self.antialiased,
-            fade=self.fade,
-        )
+            width=views.width, height=views.height, tile_size=self.tile_size, sh_degree=self.sh_degree,
+            near_plane=self.near_plane, far_plane=self.far_plane, eps2d=self.eps2d,
+            antialiased=self.antialiased, fade=self.fade,
+        )  # fmt: skip
 
 
 class ViewFilter(Protocol):

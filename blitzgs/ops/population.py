@@ -52,18 +52,9 @@ def density_stats_(
     """
     with below_autograd():
         torch.ops.blitzgs.density_stats_(
-            grad_sum,
-            grad_count,
-            max_radii,
-            visible_ids,
-            splat_offsets,
-            v_means2d,
-            conics,
-            phi,
-            width,
-            height,
-            weight,
-        )
+            grad_sum, grad_count, max_radii, visible_ids, splat_offsets, v_means2d, conics, phi, width,
+            height, weight,
+        )  # fmt: skip
 
 
 def position_noise_(

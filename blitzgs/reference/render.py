@@ -201,32 +201,14 @@ def render(
         tensor.double() for tensor in (means, quats, scales, opacities, colors, viewmat, K)
     )
     splats = project_splats(
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        viewmat,
-        K,
-        width,
-        height,
-        sh_degree=sh_degree,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        eps2d=eps2d,
-        antialiased=antialiased,
-    )
+        means, quats, scales, opacities, colors, viewmat, K, width, height, sh_degree=sh_degree,
+        near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, antialiased=antialiased,
+    )  # fmt: skip
     channels = torch.cat([splats.colors, splats.depths[:, None]], dim=1)
     result = composite(
-        splats.means2d,
-        splats.conics,
-        splats.opacities,
-        channels,
-        splats.depths,
-        width,
-        height,
+        splats.means2d, splats.conics, splats.opacities, channels, splats.depths, width, height,
         tolerance=tolerance,
-    )
+    )  # fmt: skip
     alpha = 1 - result.transmittances
     rgb, depth = result.values[..., :-1], result.values[..., -1:]
     if background is not None:
@@ -275,21 +257,9 @@ def contributions(
     )
     for v, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
         splats = project_splats(
-            means,
-            quats,
-            scales,
-            opacities,
-            means,
-            viewmat,
-            K,
-            width,
-            height,
-            sh_degree=None,
-            near_plane=near_plane,
-            far_plane=far_plane,
-            eps2d=eps2d,
-            antialiased=antialiased,
-        )
+            means, quats, scales, opacities, means, viewmat, K, width, height, sh_degree=None,
+            near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, antialiased=antialiased,
+        )  # fmt: skip
         weights, cut = composited_weights(
             splats.means2d, splats.conics, splats.opacities, splats.depths, width, height
         )

@@ -40,15 +40,9 @@ LINEAGE = "lineage"
 # Sections and fields that a resumed run may change, because they do not change the result beyond rounding.
 # The exception is `data.allow_missing`: a run whose photograph is lost could not be resumed without it.
 FREE_FIELDS = (
-    "log",
-    "memory",
-    "ranks",
-    "data.path",
-    "data.allow_missing",
-    "data.cache_bytes",
-    "schedule.checkpoint_every",
-    "schedule.evaluate_every",
-)
+    "log", "memory", "ranks", "data.path", "data.allow_missing", "data.cache_bytes",
+    "schedule.checkpoint_every", "schedule.evaluate_every",
+)  # fmt: skip
 
 
 @dataclass

@@ -16,17 +16,9 @@ from blitzgs.table.table import GaussianTable
 
 # In the order of the columns of `spawn_features`. The first eight are the paper's.
 FEATURES = (
-    "gradient",
-    "parent_opacity",
-    "parent_scale",
-    "parent_age",
-    "views",
-    "level",
-    "time",
-    "is_split",
-    "parent_color_gradient",
-    "parent_flatness",
-)
+    "gradient", "parent_opacity", "parent_scale", "parent_age", "views", "level", "time", "is_split",
+    "parent_color_gradient", "parent_flatness",
+)  # fmt: skip
 # The columns of a table that they are computed from.
 _COLUMNS_OF = itemgetter("grad_sum", "grad_count", "opacities", "scales", "birth", "level", "exp_avg_sq.sh")
 
