@@ -165,13 +165,8 @@ def watch_for_non_finite(
     On CUDA most calls check the cameras alone, see `EVERY_CUDA_CALLS`. SH coefficients, the largest part of a
     Gaussian, are only checked for visible Gaussians.
 
-    Args:
-        gaussians: the arguments of a call.
-        layout: its splats.
-        function: name of the public function.
-        nan_marks: a value for each Gaussian, NaN if its colours are values that are not finite, or its extra
-            signals are not.
-        suspects_cameras: whether a camera may be not finite.
+    `nan_marks`: a value for each Gaussian, NaN if its colours are values that are not finite, or its extra
+    signals are not.
     """
     named = gaussians.named
     first = named["means"][0]
@@ -196,10 +191,7 @@ def watch_for_non_finite(
 def warn_of_non_finite(gaussians: Gaussians, function: str, stacklevel: int) -> None:
     """Check all arguments, warn of values that are not finite, and name the first Gaussians or views.
 
-    Args:
-        gaussians: the arguments of a call, without colours.
-        function: name of the public function.
-        stacklevel: how many calls away the public function's caller is, from 1 for this function.
+    `stacklevel`: how many calls away the public function's caller is, from 1 for this function.
     """
     found = {name: indices[:5].tolist() for name, indices in non_finite(gaussians).items()}
     if found:

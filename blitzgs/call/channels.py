@@ -33,14 +33,8 @@ def background_rows(
 ) -> Tensor | None:
     """Return the background of each image, [I, channels], from `backgrounds`, [..., C, D] or [..., C, D + E].
 
-    Args:
-        backgrounds: of the colours and, as in gsplat, of the E extra signals if there are any.
-        gaussians: the Gaussians, with their extra signals.
-        render_mode: which channels are rendered.
-        normals: whether normals are.
-
-    Raises:
-        ValueError: the shape does not fit.
+    `backgrounds`: of the colours and, as in gsplat, of the E extra signals if there are any. ValueError: the
+    shape does not fit.
     """
     if "RGB" not in render_mode:
         return None
@@ -62,10 +56,7 @@ def channels_of(
 ) -> Tensor:
     """Return the channels to composite, [P, channels].
 
-    Args:
-        gaussians: the Gaussians, with colours and extra signals.
-        image: which channels are rendered.
-        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
+    `with_spare`: whether the last splats may be spare capacity, whose ids are undefined.
     """
     parts = []
     if gaussians.sh_degree is not None:
@@ -127,10 +118,7 @@ def _normals(splats: ProjectedSplats, gaussians: Gaussians, sparse_grad: bool, w
     The normal is gsplat's: the third axis of the Gaussian, turned so that it faces the camera centre.
     Differentiable in quats.
 
-    Args:
-        gaussians: the Gaussians, with rotations of any length.
-        sparse_grad: whether the gradient of quats is sparse.
-        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
+    `with_spare`: whether the last splats may be spare capacity, whose ids are undefined.
     """
     rows = _rows(splats, gaussians, False, with_spare)
     quats = embedding(rows, _joined([scene.quats for scene in gaussians.scenes]), sparse=sparse_grad)

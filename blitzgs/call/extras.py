@@ -28,14 +28,8 @@ class Signals(NamedTuple):
 def checked_signals(values: Tensor, sh_degree: int | None, batch: tuple[int, ...], C: int, N: int) -> Signals:
     """Check the shape of extra signals.
 
-    Args:
-        values: `extra_signals` of `blitzgs.rasterization`.
-        sh_degree: its `extra_signals_sh_degree`.
-        C: number of views of each scene.
-        N: number of Gaussians of each scene.
-
-    Raises:
-        ValueError: a shape or the degree does not fit.
+    `values`: `extra_signals` of `blitzgs.rasterization`. `sh_degree`: its `extra_signals_sh_degree`.
+    ValueError: a shape or the degree does not fit.
     """
     shape, per_view = tuple(values.shape), False
     if sh_degree is None:
@@ -68,16 +62,9 @@ class Pixels(NamedTuple):
 def checked_pixels(pixels: Tensor, image_ids: Tensor | None, images: int, width: int, height: int) -> Pixels:
     """Check a list of pixels.
 
-    Args:
-        pixels: integers [M, 2], (row, column).
-        image_ids: integers [M], the image of each pixel, counted through all batch dimensions; None: 0.
-        width: px.
-        height: px.
-
-    Raises:
-        TypeError: they are not tensors of integers.
-        ValueError: a shape does not fit, a pixel is outside the images, or there are several images and no
-            `image_ids`.
+    `pixels`: integers [M, 2], (row, column). `image_ids`: integers [M], the image of each pixel, counted
+    through all batch dimensions; None: 0. TypeError: they are not tensors of integers. ValueError: a shape
+    does not fit, a pixel is outside the images, or there are several images and no `image_ids`.
     """
     if image_ids is None:
         if images != 1:

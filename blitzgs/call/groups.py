@@ -192,11 +192,8 @@ def render_queued(
     If earlier calls had the same size, the host queues all work first and reads the number of splats while
     the GPU works.
 
-    Args:
-        inputs: inputs of `project_splats`.
-        image: options of compositing.
-        only_colors: whether the colours that the projection computes are all channels.
-        tables: the SH, if they are not part of `inputs`.
+    `only_colors`: whether the colours that the projection computes are all channels. `tables`: the SH, if
+    they are not part of `inputs`.
     """
     options, means, signals = inputs.options, inputs.gaussians[0], gaussians.signals
     rows_of, sh = ((), ()) if tables is None else (inputs.gaussians, tables.parts)

@@ -48,13 +48,9 @@ class Places(NamedTuple):
     def arrange(self, columns: Sequence[Tensor], under: Tensor | None = None) -> tuple[Tensor, ...]:
         """Arrange columns of splats.
 
-        Args:
-            columns: [P, ...] each, with elements of 4 or 8 bytes.
-            under: values of the Gaussians, [..., N], that entries of the last column have if they have no
-                splat; None: zeros, as in the other columns.
-
-        Returns:
-            The columns, [*shape, ...].
+        `columns`: [P, ...] each, with elements of 4 or 8 bytes. `under`: values of the Gaussians, [..., N],
+        that entries of the last column have if they have no splat; None: zeros, as in the other columns.
+        Returns the columns, [*shape, ...].
         """
         if torch.compiler.is_compiling():  # torch differentiates them, and tracing a Function is fragile
             return self._arranged_by_torch(columns, under)
@@ -130,10 +126,7 @@ class Layout:
     def __init__(self, splats: ProjectedSplats, shape: tuple[int, ...], packed: bool) -> None:
         """Compute the arrangement.
 
-        Args:
-            splats: as the attribute.
-            shape: batch dimensions, C, and the Gaussians N of a scene.
-            packed: as the attribute.
+        `shape`: batch dimensions, C, and the Gaussians N of a scene.
         """
         self.splats, self.packed = splats, packed
         self.places: Places | None = None
@@ -233,7 +226,6 @@ def lists_of(
     """Return the tile lists for meta, and those to composite.
 
     Args:
-        images: number of images I.
         projection: the size of the images, and the caller's tile size.
         count: number of entries of the lists for meta; -1: unknown.
         pixels: the pixels that are rendered: the lists of tiles without any are empty, and those of the

@@ -153,7 +153,6 @@ def make_meta(
     Under `torch.compile` it is a plain dict, and the compiler removes entries that the caller does not read.
 
     Args:
-        gaussians: the checked arguments of the call.
         known: the rendered columns in this arrangement, and further images.
         lead: batch dimensions, and the number of views that are rendered here.
         arrived: the splats that `lists` refers to, if ranks have exchanged splats; None: those of `layout`.

@@ -58,11 +58,8 @@ class FileCheck:
     ) -> None:
         """Start to check files.
 
-        Args:
-            cameras: all views.
-            order: those to check, in this order.
-            counted: decodes a view's mask, and tells whether some pixel counts.
-            whole: files of opaque photographs that others have checked meanwhile.
+        `counted`: decodes a view's mask, and tells whether some pixel counts. `whole`: files of opaque
+        photographs that others have checked meanwhile.
         """
         # What is wrong with the first damaged file that was found; None so far.
         self.damage: str | None = None

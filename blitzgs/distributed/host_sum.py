@@ -83,7 +83,6 @@ class HostSum:
         """Queue the sums.
 
         Args:
-            ranks: the job.
             parts: float64 [B, K, 2], sums of this rank's loss in parts (`photometric_fwd_bwd`); None: none.
             tile_work: int32 [T], number of list entries that were composited in each tile; None: none.
             tiles: the tiles of this rank, [first, one past last).

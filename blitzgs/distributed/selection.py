@@ -41,7 +41,6 @@ def smallest(keys: Tensor, ids: Tensor, k: int, ranks: Ranks) -> Tensor:
         keys: float32 [N_rank], no NaN; infinities are allowed.
         ids: int64 [N_rank], >= 0, unique over all ranks.
         k: number of rows to mark; all rows if k exceeds their number.
-        ranks: the job.
 
     Returns:
         bool [N_rank]; the same ids at every world size.
@@ -79,7 +78,6 @@ def mass_prefix(scores: Tensor, ids: Tensor, fraction: float, ranks: Ranks) -> T
         scores: float32 [N_rank], finite, >= 0.
         ids: int64 [N_rank], >= 0, unique over all ranks.
         fraction: share of the total of all ranks, in [0, 1]; its decimal value counts (0.99 is 99/100).
-        ranks: the job.
 
     Returns:
         bool [N_rank]; the same ids at every world size. The sums are exact. If the total is zero, nothing is
@@ -125,7 +123,6 @@ def integer_mass_prefix(
         owners: int32 [P], the row that each weight belongs to.
         ids: int64 [N], >= 0, ids of the rows; unique over all ranks within a segment.
         fraction: share of the total of all ranks, in [0, 1]; its decimal value counts, of at most 9 places.
-        ranks: the job.
         n_segments: number of segments.
 
     Returns:

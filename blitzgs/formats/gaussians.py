@@ -133,14 +133,8 @@ class Gaussians:
 def check_memory(holds: str, count: int, degree: int, copies: int = 2) -> None:
     """Refuse a number of Gaussians that the free memory cannot hold so often; readers need it twice.
 
-    Args:
-        holds: what has them, as the beginning of the sentence, for example "FILE holds".
-        count: number of Gaussians.
-        degree: their spherical-harmonics degree.
-        copies: how often.
-
-    Raises:
-        ValueError: it cannot; names both amounts.
+    `holds`: what has them, as the beginning of the sentence, for example "FILE holds". ValueError: it cannot;
+    names both amounts.
     """
     needed = copies * 4 * count * (11 + 3 * (degree + 1) ** 2)
     free = psutil.virtual_memory().available

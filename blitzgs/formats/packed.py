@@ -130,7 +130,6 @@ def _write_columns(
     """Write the rows of a block into the columns of a file, which follow each other from `begin` on.
 
     Args:
-        file: the file.
         begin: where its first column begins.
         content: the rows of the block, column after column.
         columns: of each column the first row, the rows of the block and of the file, and the bytes of a row.

@@ -170,11 +170,8 @@ def frame_bytes() -> int:
 def web_page(splats: WebSplats, scene: WebScene, title: str, left_out: str = "") -> str:
     """Return the page.
 
-    Args:
-        splats: at least one Gaussian.
-        scene: how they are shown.
-        title: heading.
-        left_out: what the file lacks of the model, for the reader of the page; empty: nothing.
+    `splats`: at least one Gaussian. `left_out`: what the file lacks of the model, for the reader of the page;
+    empty: nothing.
     """
     known = asdict(scene) | {"count": len(splats), "degree": splats.degree, "harmonic": HARMONIC}
     return _filled(

@@ -74,8 +74,6 @@ class TileOwners:
         Args:
             step: step of the batch; its division is stored until `forget_before`.
             keys: identifies each of the B views.
-            width: image width in pixels.
-            height: image height in pixels.
             halo: see `TileRanges`.
         """
         if step in self._planned:
@@ -137,15 +135,8 @@ class TileOwners:
     ) -> TileRanges:
         """Divide the tiles of a batch.
 
-        Args:
-            keys: identifies each of the B views.
-            width: image width in pixels.
-            height: image height in pixels.
-            tile_size: tile edge in pixels.
-            halo: see `TileRanges`.
-
-        Returns:
-            Ranges whose costs differ from equal shares by at most the cost of one tile.
+        `keys`: identifies each of the B views. `halo`: see `TileRanges`. Returns ranges whose costs differ
+        from equal shares by at most the cost of one tile.
         """
         tiles = math.prod(tile_counts(width, height, tile_size))
         found = [self._costs.get(key) for key in keys]

@@ -84,7 +84,6 @@ def densify(
 
     Args:
         table: changed in place; the rows are those of `placement.place`.
-        rules: thresholds.
         time: time of the event, in images.
         step: the latest optimiser step; new rows are current up to it.
         level_count: number of octree levels K; levels of children stay below it.
@@ -231,7 +230,6 @@ def death_causes(
 
     Args:
         table: the rows, with the largest radii since the last event.
-        rules: thresholds.
         opacities: the logits after all steps, if they are known.
         pending: the table's pending steps; None: there are none.
     """

@@ -49,7 +49,6 @@ class FirstGaussians:
         Args:
             sh_degree: highest degree of the table.
             opacity: of all of them, in (0, 1).
-            device: of the table.
             part: which of them the table gets.
         """
         means = self.means[part].to(device)
@@ -94,7 +93,6 @@ def octree_gaussians(
             cameras.
         most: largest number of Gaussians. Whole levels are kept, from the coarsest on, and of the first level
             that does not fit a random part. 0: no limit.
-        seed: seed of the draw.
 
     Raises:
         ValueError: no voxel is left.

@@ -63,7 +63,6 @@ class Saving:
             columns: name -> [N_rank, ...], this rank's shard; the same names, dtypes and widths on every
                 rank. They must not change before `finish` has returned, and neither must the following two.
             state: the rest of what a resumed run needs, as JSON values; rank 0's is stored.
-            ranks: the job.
             keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
             shared: tensors that are the same on all ranks; rank 0's are stored, in a separate file.
             reached: called at each point at which the save may be interrupted, with the point's name; the
@@ -199,8 +198,6 @@ def load_latest(
 
     Args:
         directory: folder given to `Saving`.
-        ranks: the job, of any world size.
-        device: where the columns go.
         problem: returns what is wrong with a shard's columns, or None.
         only: name of the one checkpoint to load; None: the newest.
 
@@ -238,17 +235,9 @@ def load(
     rows are redistributed: rank m gets the positions = m (mod M) of the global order
     (`sharding.global_positions`), and opens only the files that hold some of these rows.
 
-    Args:
-        path: folder returned by `Saving.finish`.
-        ranks: the job, of any world size.
-        device: where the columns go.
-
-    Returns:
-        The columns of this rank's shard, name -> [N_rank, ...]; the state; and the tensors that are the same
-        on all ranks, on the CPU.
-
-    Raises:
-        CheckpointError: on every rank, when a file is missing, torn or altered.
+    `path`: folder returned by `Saving.finish`. Returns the columns of this rank's shard, name ->
+    [N_rank, ...]; the state; and the tensors that are the same on all ranks, on the CPU. CheckpointError: on
+    every rank, when a file is missing, torn or altered.
     """
     path = Path(path)
     manifest, problem = None, None

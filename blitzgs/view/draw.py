@@ -69,11 +69,9 @@ class Drawer:
     def __init__(self, subject: Subject, owners: TileOwners, in_layers: bool = True) -> None:
         """Prepare.
 
-        Args:
-            subject: what is drawn.
-            owners: divides the tiles among the ranks.
-            in_layers: on one rank, composite large models layer by layer, which takes less memory. A pixel
-                may then get up to a hundredth of light that a whole pass would have left out.
+        `owners`: divides the tiles among the ranks. `in_layers`: on one rank, composite large models layer by
+        layer, which takes less memory. A pixel may then get up to a hundredth of light that a whole pass
+        would have left out.
         """
         self._subject, self._owners, self._in_layers = subject, owners, in_layers
         self._transport = LocalTransport() if owners.ranks.world_size == 1 else None

@@ -31,7 +31,6 @@ class Door:
         """Listen.
 
         Args:
-            host: address of this machine.
             port: 0: any free one.
             behind: port of 127.0.0.1 to forward to.
             token: beginning of the address's path; empty: none is needed.

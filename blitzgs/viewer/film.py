@@ -43,13 +43,8 @@ def tour(kind: Tour, world: World, fovs: list[float]) -> CameraPath:
       looks ahead, as far down as the cameras do, but at most 35 degrees.
     - "spline": a smooth way through up to 24 cameras, in the order of their names.
 
-    Args:
-        kind: which one.
-        world: of the scene; its poses are those of the cameras.
-        fovs: vertical fields of view of these cameras, radians.
-
-    Raises:
-        ValueError: a flight or a spline needs two cameras.
+    `world`: of the scene; its poses are those of the cameras. `fovs`: vertical fields of view of these
+    cameras, radians. ValueError: a flight or a spline needs two cameras.
     """
     if kind != "orbit" and len(world.poses) < 2:
         raise ValueError(f"--path {kind} needs the cameras of a capture: use orbit, or the file of a path")
@@ -127,13 +122,8 @@ class Film:
     def cameras(self, space: Space, cameras: Sequence[CameraLike], box: Array) -> list[RunCamera]:
         """Return the cameras of all frames, in the re-centred world.
 
-        Args:
-            space: of the model.
-            cameras: of its capture; may be empty.
-            box: corners of a box that holds nearly all Gaussians, [2, 3], trained units.
-
-        Raises:
-            ValueError: the path cannot be made without cameras.
+        `cameras`: of its capture; may be empty. `box`: corners of a box that holds nearly all Gaussians,
+        [2, 3], trained units. ValueError: the path cannot be made without cameras.
         """
         return [
             self._camera(number, frame, space)
@@ -267,7 +257,6 @@ def new_film(
         path: ends in .mp4.
         width: pixels, even.
         height: pixels, even.
-        fps: frames a second.
 
     Raises:
         OSError: the file cannot be written; an existing one is unchanged.

@@ -114,11 +114,7 @@ class Live:
     def __init__(self, exhibit: Exhibit, total: int, host: str = "127.0.0.1", port: int = 8080) -> None:
         """Start the page; errors are those of `Page`.
 
-        Args:
-            exhibit: the training.
-            total: images of the whole run.
-            host: address to listen on.
-            port: 0: any free one.
+        `total`: images of the whole run. `port`: 0: any free one.
         """
         self._share, self._total = SHARE, total
         self._curves = Curves()

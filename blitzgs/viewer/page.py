@@ -65,10 +65,8 @@ class Page:
         """Start to serve.
 
         Args:
-            exhibit: what is shown.
             host: address to listen on. If others than this machine reach it, a random token is part of `url`.
             port: 0: any free one.
-            folders: see the class.
             memory: returns the memory of the model as text.
             moving_ms: milliseconds that a picture may take while the camera moves.
 

@@ -62,8 +62,6 @@ def open_model(
     """Open the folder of a run, a checkpoint in it, or a file of Gaussians.
 
     Args:
-        path: the folder or the file.
-        ranks: the device.
         photograph: returns the photograph of a camera of the run; None: there are none.
         paths: folder for camera paths and screenshots; None: RUN/paths, or the folder of the file.
         most: Gaussians to read. Of a larger model, these are those of the largest opacity times length,

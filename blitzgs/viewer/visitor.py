@@ -78,12 +78,8 @@ class Visitor:
     ) -> None:
         """Begin with the browser's camera.
 
-        Args:
-            client: viser's handle.
-            world: the page's coordinates.
-            exhibit: what is shown.
-            wake: called whenever a picture is needed.
-            moving_ms: milliseconds that a picture may take while the camera moves.
+        `wake`: called whenever a picture is needed. `moving_ms`: milliseconds that a picture may take while
+        the camera moves.
         """
         self.client, self.world, self.exhibit, self._wake = client, world, exhibit, wake
         self.settings = Settings()
@@ -150,10 +146,8 @@ class Visitor:
     ) -> None:
         """Move the browser's camera to a stance.
 
-        Args:
-            stance: where to go.
-            distance: to the point around which the browser orbits, page units; None: as the motion needs.
-            up: the orbit's axis; None: the scene's up.
+        `distance`: to the point around which the browser orbits, page units; None: as the motion needs. `up`:
+        the orbit's axis; None: the scene's up.
         """
         camera = self.client.camera
         if distance is None:

@@ -131,10 +131,8 @@ class CollectiveWayBack(NamedTuple):
 def return_sums(sums: Tensor, places: Tensor, traffic: Traffic, ranks: Ranks) -> Tensor:
     """Send integer sums of splats to their owners and add them up; see `WayBack.return_sums`.
 
-    Args:
-        sums: int64 [R, C], sums of the splats that arrived here.
-        places: positions of this rank's own splats among those that it sent.
-        traffic: numbers of splats sent between the ranks.
+    `sums`: int64 [R, C], sums of the splats that arrived here. `places`: positions of this rank's own splats
+    among those that it sent.
     """
     returned = ranks.all_to_all(sums, traffic.received, traffic.sent)
     total = sums.new_zeros(traffic.own.splats, sums.shape[1])
