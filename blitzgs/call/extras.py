@@ -59,13 +59,19 @@ class Pixels(NamedTuple):
     columns: Tensor  # int64 [M]
 
 
-def checked_pixels(pixels: Tensor, image_ids: Tensor | None, images: int, width: int, height: int) -> Pixels:
-    """Check a list of pixels.
+def checked_pixels(
+    pixels: Tensor | None, image_ids: Tensor | None, images: int, width: int, height: int
+) -> Pixels | None:
+    """Check a list of pixels; None: there is none.
 
     `pixels`: integers [M, 2], (row, column). `image_ids`: integers [M], the image of each pixel, counted
     through all batch dimensions; None: 0. TypeError: they are not tensors of integers. ValueError: a shape
     does not fit, a pixel is outside the images, or there are several images and no `image_ids`.
     """
+    if pixels is None:
+        if image_ids is not None:
+            raise ValueError("image_ids need pixels; give both")
+        return None
     if image_ids is None:
         if images != 1:
             raise ValueError(f"pixels of {images} images need image_ids, the image of each pixel")

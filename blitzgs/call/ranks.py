@@ -64,7 +64,10 @@ def gather_views(
     inputs = scene._replace(Ks=scene.means)  # Ks get no gradient
     need = recorded and any(t is not None and t.requires_grad for t in inputs[:8])
     need_poses = recorded and scene.viewmats.requires_grad
-    _require_same((gaussians.views, *same, need, need_poses), scene.viewmats.device)
+    channels = None if gaussians.colors is None else gaussians.colors.shape[-1]
+    signals = None if gaussians.signals is None else gaussians.signals.channels
+    own = (gaussians.views, *same, channels, signals, need, need_poses)
+    _require_same(own, scene.viewmats.device)
     viewmats = _all_poses(scene.viewmats, job)
     Ks = _gathered(scene.Ks.detach(), job)
     scene = scene._replace(viewmats=viewmats, Ks=Ks)

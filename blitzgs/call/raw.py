@@ -127,11 +127,11 @@ def raw_rasterization(
         warn_of_gradient("raw_rasterization")
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
-    harmonics = [sh0] if shN is None else [sh0, shN]
     shaded = "RGB" in render_mode
     # The parameters themselves, not their other shapes: optimisers know these.
     params = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     sh_params = {"sh0": sh0} if shN is None else {"sh0": sh0, "shN": shN}
+    harmonics = list(sh_params.values())
     if opacities.dim() == 2 and opacities.shape[1] == 1:
         tensors["opacities"] = opacities = of_shape(opacities, opacities.shape[:1])
     if sh0.dim() == 2 and sh0.shape[1] == 3:
@@ -180,7 +180,6 @@ def _check_leaves(params: Mapping[str, Tensor]) -> None:
 
 
 def _lazy(optimizers: Any) -> list[CatchesUp]:
-    """Return the optimisers that may have pending steps, each once."""
     if isinstance(optimizers, torch.optim.Optimizer) or hasattr(optimizers, "catch_up"):
         optimizers = [optimizers]
     if not isinstance(optimizers, Iterable):

@@ -214,7 +214,6 @@ class ImageStore:
         return self.decoded.budget + (0 if self._shared is None else self._shared.size)
 
     def _decoded_budget(self) -> int:
-        """Return how many bytes the decoded images may take now."""
         if self._decoded_bytes is not None:
             return self._decoded_bytes
         budget = self.compressed.budget
@@ -378,7 +377,6 @@ def _uint8(pixels: npt.ArrayLike) -> UInt8:
 
 
 def _shrunk(pixels: UInt8, camera: Camera) -> UInt8:
-    """Average down to the camera's size."""
     if pixels.shape[:2] == (camera.height, camera.width):
         return pixels
     return _uint8(cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA))

@@ -176,7 +176,7 @@ def check_inside(paths: Iterable[Path], root: Path, allowed: Sequence[Path], ref
             warnings.warn(
                 f"{len(outside)} names of the capture lead outside {root} (first: {outside[0]}); "
                 "--data.inside_only=true refuses them",
-                stacklevel=3,
+                stacklevel=2,
             )
         return
     # A link inside the capture belongs to the capture, so it must not lead outside either.

@@ -180,7 +180,6 @@ def _importing(name: str) -> Iterator[None]:
 
 
 def _user_errors() -> tuple[type[BaseException], ...]:
-    """Return the errors that are reported as a message."""
     named = (path.rpartition(".") for path in _NAMED_ERRORS)
     return (*_USER_ERRORS, *(getattr(import_module(module), name) for module, _, name in named))
 

@@ -165,7 +165,6 @@ def run_command(command: Sequence[str]) -> str:
 
 
 def _last(errors: str) -> str:
-    """Return the last line of a traceback that says something."""
     lines = [line.strip() for line in errors.splitlines() if line.strip()]
     return lines[-1][:300] if lines else ""
 

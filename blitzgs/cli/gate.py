@@ -168,7 +168,6 @@ def run_replay(args: argparse.Namespace) -> int:
 
 
 def _spawns_of(folder: Path) -> gate_fit.Spawns:
-    """Read the spawns of a run."""
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is not the folder of a run")
     lineage = folder / run_files.LINEAGE
@@ -192,7 +191,6 @@ def _judgement(entry: dict[str, Any]) -> str:
 
 
 def _table(results: Sequence[dict[str, Any]]) -> str:
-    """Return a Markdown table of the arms, with differences from the first."""
     first = results[0]
     columns = "arm | PSNR | difference | SSIM | peak | difference | final | seconds | known to the oracle"
     lines = [f"| {columns} |", "|---" * 9 + "|"]

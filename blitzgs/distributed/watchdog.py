@@ -218,7 +218,6 @@ class Watchdog:
         return self._silence(rank) > 1.5 * self.period
 
     def _silence(self, rank: int) -> float:
-        """Return the seconds since the last report of a rank."""
         return time.monotonic() - self._heard[rank][1]
 
     def _late_ranks(self) -> str:

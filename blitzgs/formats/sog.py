@@ -159,7 +159,6 @@ def _codebook(values: Tensor) -> Tensor:
 
 
 def _labels(values: Tensor, book: Tensor) -> Bytes:
-    """Return for each value the nearest one of a codebook."""
     return torch.bucketize(values.double(), (book[1:] + book[:-1]) / 2).to(torch.uint8).numpy()
 
 

@@ -195,7 +195,6 @@ def as_html(text: str) -> str:
 
 
 def _filled(program: str, **fields: str) -> str:
-    """Return the page with a program that shows a model; the fields are HTML."""
     pieces = _part("page.html").split("{{")
     for index, piece in enumerate(pieces[1:], 1):
         name, _, text = piece.partition("}}")

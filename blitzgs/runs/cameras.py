@@ -69,7 +69,6 @@ def checked_camera(
 
 
 def _check(sizes: Float64, Ks: Float64, poses: Float64) -> None:  # noqa: N803
-    """Refuse impossible values of cameras: sizes [N, 2], Ks [N, 3, 3] and poses [N, 4, 4]."""
     rotations = poses[:, :3, :3]
     with np.errstate(invalid="ignore"):
         turned = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) < 1e-3
@@ -99,7 +98,6 @@ def _near(rows: Float64, expected: list[int]) -> npt.NDArray[np.bool_]:
 
 
 def _matrix(argument: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Return a copy of a matrix as float64."""
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

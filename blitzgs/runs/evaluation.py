@@ -253,8 +253,6 @@ def evenly_ordered(indices: Sequence[int]) -> list[int]:
 
 
 class _Files:
-    """The files that an evaluation writes into its folder."""
-
     def __init__(self, folder: Path, inputs: Iterable[Path], optional: bool) -> None:
         self.output = OutputFolder(folder, inputs)
         self._optional = optional
@@ -327,7 +325,6 @@ def preview_file(folder: Path, index: int, part: str) -> Path:
 
 
 def _extremes(psnr: Mapping[int, float]) -> set[int]:
-    """Return the cameras of the best and the worst views."""
     ordered = sorted(psnr, key=lambda index: (psnr[index], index))
     return {*ordered[:_EXTREMES], *ordered[-_EXTREMES:]}
 

@@ -234,7 +234,6 @@ def _check_same_schedule(runs: Sequence[Spawns]) -> None:
 
 
 def _train(xgboost: ModuleType, runs: Sequence[Spawns], rows: Sequence[NDArray[np.bool_]]) -> Any:
-    """Return a booster that is trained on the chosen rows of each run."""
     generator = np.random.default_rng(0)
     features, labels = [], []
     for run, mine in zip(runs, rows, strict=True):

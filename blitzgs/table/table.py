@@ -209,7 +209,6 @@ class GaussianTable:
         self._memory.pop(name, None)
 
     def _allocate(self, like: Tensor, rows: int) -> Tensor:
-        """Allocate memory for rows like those of a column."""
         return like.new_empty((rows, *like.shape[1:]))
 
     def _lengthen(self, name: str, count: int, most: int | None) -> Tensor:

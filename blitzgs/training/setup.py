@@ -115,28 +115,12 @@ def set_up(
     lineage = _start_lineage(config, capture, folder, table, progress, ranks)
     lap("table")
     return TrainingState(
-        config=config,
-        capture=capture,
-        images=images,
-        folder=folder,
-        ranks=ranks,
-        schedule=schedule,
-        space=space,
-        table=table,
-        progress=progress,
-        views=views,
-        sampler=sampler,
-        optimiser=optimiser,
-        stepper=stepper,
-        owners=owners,
-        run_id=run_id,
-        origin=_origin(restored, resume, folder, schedule.iterations),
-        save_clock=SaveClock(config.log.checkpoint_seconds),
-        veto=veto,
-        lineage=lineage,
-        curve=Curve(**progress.curve),
+        config, capture, images, folder, ranks, schedule, space, table, progress, views, sampler, optimiser,
+        stepper, owners, run_id, origin=_origin(restored, resume, folder, schedule.iterations),
+        save_clock=SaveClock(config.log.checkpoint_seconds), veto=veto, lineage=lineage,
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
-    )
+        curve=Curve(**progress.curve),
+    )  # fmt: skip
 
 
 def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
@@ -154,7 +138,6 @@ def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
 
 
 def _describe(folder: Path, config: Config, capture: Capture, run_id: str, is_new: bool) -> None:
-    """Write what the folder of a run tells of its configuration, its cameras and its world."""
     save_config(config, folder / run_files.CONFIG)
     if is_new or not (folder / CAMERAS).exists():
         save_cameras(folder, capture, run_id)
@@ -238,7 +221,6 @@ def _exposures(
 
 
 def _sampler(config: Config, capture: Capture, schedule: Schedule) -> BatchSampler:
-    """Return the sampler of batches, with a tour of the views if the Gaussians are in a pool."""
     cameras = [capture.cameras[i] for i in capture.train]
     tour = None
     if config.memory.resident_gb > 0 and config.memory.tour:

@@ -202,7 +202,6 @@ class Trainer:
             ) from error
 
     def _check_photographs(self) -> None:
-        """Raise an error on all ranks if one of them continued without a photograph (`BatchLoader.lost`)."""
         reasons = self.state.ranks.all_gather_object(self.loader.lost)
         lost = [f"rank {rank}: {reason}" for rank, reason in enumerate(reasons) if reason is not None]
         if lost:

@@ -291,7 +291,6 @@ class Visitor:
         return Shown(result.image, ask, picture, result.low, result.high, psnr)
 
     def _step_to_ground(self, ask: Ask, picture: Picture) -> None:
-        """Put a visitor who walks at eye height above the ground under them."""
         known = picture.values[picture.values > 0]
         if len(known) == 0 or self.motion != "walk" or ask.version != self.version:
             return
