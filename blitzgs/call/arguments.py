@@ -210,7 +210,7 @@ def gaussians_of(
     render_mode: str,
     raw: bool = False,
 ) -> Gaussians:
-    """Check shapes and fold the batch dimensions into one.
+    """Check shapes and fold the batch dimensions into one (ValueError: a shape that does not fit, by name).
 
     Args:
         means: [..., N, 3].
@@ -224,9 +224,6 @@ def gaussians_of(
         sh_degree: degree to evaluate; None when `colors` holds values.
         render_mode: as for `blitzgs.rasterization`; without "RGB", colours are not rendered.
         raw: whether scales and opacities are before their activation.
-
-    Raises:
-        ValueError: a shape that does not fit, by name.
     """
     if means.dim() < 2 or viewmats.dim() < 3:
         raise ValueError(

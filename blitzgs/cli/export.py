@@ -196,10 +196,7 @@ def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
 
     start, city = time.monotonic(), open_city(args.model, checked=selection is None)
     source, path = city.source, args.tiles or args.streamed_sog
-    sizes = {
-        "most": args.tile_gaussians or TILE,
-        "processes": args.processes or len(os.sched_getaffinity(0)),
-    }
+    sizes = {"most": args.tile_gaussians or TILE, "processes": args.processes or len(os.sched_getaffinity(0))}
     with image_progress("Exporting", unit="") as report:
         source = Watched(source, report)
         if selection is not None:

@@ -12,13 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from blitzgs.config.fields import (
-    MAX_STRETCH,
-    POSITION_LEFT,
-    SH_SHARE,
-    OptimiserConfig,
-    ScheduleConfig,
-)
+from blitzgs.config.fields import MAX_STRETCH, POSITION_LEFT, SH_SHARE, OptimiserConfig, ScheduleConfig
 
 
 class Pace:

@@ -70,7 +70,7 @@ class AdamSchedule(AdamTables):
     def __init__(
         self, lr_table: Tensor, beta1: float, beta2: float, eps: float, dtype: torch.dtype = torch.float32
     ) -> None:
-        """Make the tables.
+        """Make the tables (ValueError: decay rates outside their range).
 
         Args:
             lr_table: float32 [S + 1, 6], learning rates of means, quats, scales, opacities, SH DC and SH rest
@@ -79,9 +79,6 @@ class AdamSchedule(AdamTables):
             beta2: decay of the second moment, in (0, 1).
             eps: as the attribute.
             dtype: of the parameters.
-
-        Raises:
-            ValueError: decay rates outside their range.
         """
         self.betas, self.eps = (beta1, beta2), eps
         self.explicit_steps = explicit_steps(beta1, beta2, dtype)

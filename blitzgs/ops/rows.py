@@ -39,15 +39,12 @@ def take_rows(column: Tensor, rows: Tensor, out: Tensor | None = None) -> Tensor
 
 
 def put_rows_(column: Tensor, rows: Tensor, fresh: Tensor | None = None) -> None:
-    """Overwrite rows of a column, in place.
+    """Overwrite rows of a column, in place (RuntimeError: shapes or dtypes do not fit).
 
     Args:
         column: [N, ...], any dtype, contiguous.
         rows: int64 [M], from 0 to N - 1, each at most once; not checked.
         fresh: what the rows become, [M, ...], of the dtype and row shape of `column`; None: zeros.
-
-    Raises:
-        RuntimeError: shapes or dtypes do not fit.
     """
     torch.ops.blitzgs.put_rows_(column, rows, fresh)
 

@@ -73,16 +73,13 @@ class Pool:
     def __init__(
         self, table: HostTable, device: torch.device, budget_bytes: int, pending_table: Tensor | None
     ) -> None:
-        """Allocate the pool.
+        """Allocate the pool (PoolError: the budget is less than two blocks).
 
         Args:
             table: the table on the host; pinned if `device` is a GPU.
             device: device of the pool.
             budget_bytes: bytes of the device that the pool may take.
             pending_table: as for `BlockIndex`, on the device.
-
-        Raises:
-            PoolError: the budget is less than two blocks.
         """
         self.table, self._device, self._budget = table, device, budget_bytes
         self.moved = Moved()

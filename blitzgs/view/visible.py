@@ -82,12 +82,7 @@ class VisibleFinder:
         inner = {found[_DEPTHS * k // layers] for k in range(1, layers)}
         return [near, *sorted(depth for depth in inner if near < depth < far), far]
 
-    def find(
-        self,
-        views: Views,
-        limits: tuple[float, float, float],
-        room: int | None = None,
-    ) -> VisibleRows:
+    def find(self, views: Views, limits: tuple[float, float, float], room: int | None = None) -> VisibleRows:
         """Find the Gaussians to render for a batch of views. Collective if there is a gate.
 
         Args:

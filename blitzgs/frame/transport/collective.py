@@ -11,13 +11,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport.protocol import (
-    Arrived,
-    CapacityEstimate,
-    ExchangeResult,
-    Traffic,
-    stage_ended,
-)
+from blitzgs.frame.transport.protocol import Arrived, CapacityEstimate, ExchangeResult, Traffic, stage_ended
 from blitzgs.ops.exchange import PLACE_SPLATS, gather_splats, scatter_splats, words_per_splat
 from blitzgs.ops.host import to_host
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats
@@ -40,10 +34,7 @@ class CollectiveTransport:
         self._ranks = ranks
 
     def project_and_send(
-        self,
-        inputs: ProjectionInputs,
-        assignment: TileAssignment | None,
-        capacity: Sizes | None,
+        self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
     ) -> CollectiveExchange:
         """See `Transport.project_and_send`."""
         if assignment is None:
@@ -55,11 +46,7 @@ class CollectiveExchange:
     """See `Exchange`."""
 
     def __init__(
-        self,
-        ranks: Ranks,
-        inputs: ProjectionInputs,
-        assignment: TileAssignment,
-        capacity: Sizes | None,
+        self, ranks: Ranks, inputs: ProjectionInputs, assignment: TileAssignment, capacity: Sizes | None
     ) -> None:
         """Project, exchange the numbers of splats, and send the splats."""
         tiles, n_views = assignment.composited_by_rank, assignment.ranges.n_views

@@ -48,13 +48,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import SharedMemory
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.collective import return_sums
-from blitzgs.frame.transport.protocol import (
-    Arrived,
-    CapacityEstimate,
-    ExchangeResult,
-    Traffic,
-    stage_ended,
-)
+from blitzgs.frame.transport.protocol import Arrived, CapacityEstimate, ExchangeResult, Traffic, stage_ended
 from blitzgs.ops.exchange import place_runs
 from blitzgs.ops.host import current_stream
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of
@@ -124,10 +118,7 @@ class PeerTransport:
         self._counted = torch.cuda.Event()
 
     def project_and_send(
-        self,
-        inputs: ProjectionInputs,
-        assignment: TileAssignment | None,
-        capacity: Sizes | None,
+        self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
     ) -> PeerExchange:
         """See `Transport.project_and_send`."""
         if assignment is None:

@@ -162,10 +162,7 @@ class Transport(Protocol):
         """Estimate of a frame's sizes, the same on ranks that need equal sizes; None: each frame waits."""
 
     def project_and_send(
-        self,
-        inputs: ProjectionInputs,
-        assignment: TileAssignment | None,
-        capacity: Sizes | None,
+        self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
     ) -> Exchange:
         """Project this rank's Gaussians and send the splats to the ranks that composite them. Collective.
 
@@ -211,10 +208,7 @@ class LocalTransport:
         self.estimate = None if exact else estimate or CapacityEstimate()
 
     def project_and_send(
-        self,
-        inputs: ProjectionInputs,
-        assignment: TileAssignment | None,
-        capacity: Sizes | None,
+        self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
     ) -> LocalExchange:
         """See `Transport.project_and_send`."""
         if assignment is not None:
