@@ -102,20 +102,12 @@ def run(args: argparse.Namespace) -> int:
         indices = arguments.chosen_views(args.split, capture, path)
         with image_progress("Comparing", ranks.rank == 0) as report:
             result = evaluate(
-                model.gaussians_on(ranks.device),
-                ViewSet(list(capture.cameras), model.space, ranks.device),
-                capture.cameras,
-                images,
-                indices,
-                render_options(config, model.space, model.progress.sh_degree, gate),
-                folder,
-                TileOwners(ranks),
-                pictures=args.pictures,
-                lpips=load_lpips(args.lpips),
-                report=report,
-                inputs=input_files(capture),
-                lod=lod,
-            )
+                model.gaussians_on(ranks.device), ViewSet(list(capture.cameras), model.space, ranks.device),
+                capture.cameras, images, indices,
+                render_options(config, model.space, model.progress.sh_degree, gate), folder,
+                TileOwners(ranks), pictures=args.pictures, lpips=load_lpips(args.lpips), report=report,
+                inputs=input_files(capture), lod=lod,
+            )  # fmt: skip
         if ranks.rank == 0:
             print(json.dumps({name: value for name, value in result.items() if name != "views"}, indent=1))
             # Standard output has nothing but the JSON.

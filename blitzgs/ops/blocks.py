@@ -157,18 +157,9 @@ def cull_blocks(
         RuntimeError: wrong shapes or dtypes, more than 32 views, or as `gate_views_` says.
     """
     ids, views, length, blocks = torch.ops.blitzgs.cull_blocks(
-        bounds,
-        _rows(means, scales, pending),
-        viewmats,
-        Ks,
-        width,
-        height,
-        near_plane,
-        far_plane,
-        eps2d,
-        *(() if rules is None else (level_ranges, *rules)),
-        capacity_blocks=capacity_blocks,
-    )
+        bounds, _rows(means, scales, pending), viewmats, Ks, width, height, near_plane, far_plane, eps2d,
+        *(() if rules is None else (level_ranges, *rules)), capacity_blocks=capacity_blocks,
+    )  # fmt: skip
     return ActiveRows(ids, views, length, blocks)
 
 

@@ -280,16 +280,10 @@ def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
 
 
 def project_bwd_step_(
-    state: AdamState,
-    schedule: AdamSchedule,
-    step: int,
-    views: WeightedViews,
-    splats: ProjectedSplats,
-    options: ProjectionOptions,
-    gradients: SplatGradients,
-    level: Tensor | None = None,
+    state: AdamState, schedule: AdamSchedule, step: int, views: WeightedViews, splats: ProjectedSplats,
+    options: ProjectionOptions, gradients: SplatGradients, level: Tensor | None = None,
     means2d_sums: Tensor | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their splats.
 
     The result is that of the backward pass of `blitzgs.ops.project.project` followed by

@@ -175,15 +175,10 @@ class ProjectionInputs(NamedTuple):
             rank_tiles: for each rank the [begin, end) of the tiles that it composites, in ascending order.
         """
         *columns, splat_ids, totals = torch.ops.blitzgs.project_fwd(
-            self.gaussians,
-            *self.cameras,
-            *self.active_arguments,
-            self.ids,
-            self.level,
-            *self.options,
+            self.gaussians, *self.cameras, *self.active_arguments, self.ids, self.level, *self.options,
             [tile for tiles in rank_tiles for tile in tiles],
             *((None, None) if capacity is None else capacity[:2]),
-        )
+        )  # fmt: skip
         return ProjectionOutputs(ProjectedSplats._make((*columns, None)), splat_ids, totals)
 
 

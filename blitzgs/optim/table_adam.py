@@ -106,16 +106,11 @@ class TableAdam:
                 ranks.
         """
         project_bwd_step_(
-            _state_of(table),
-            self.schedule,
-            step,
-            WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg),
-            frame.projected,
-            frame.options.projection(frame.views),
-            gradients,
-            table["level"] if frame.options.fade else None,
+            _state_of(table), self.schedule, step,
+            WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg), frame.projected,
+            frame.options.projection(frame.views), gradients, table["level"] if frame.options.fade else None,
             means2d_sums,
-        )
+        )  # fmt: skip
 
 
 class Pending:

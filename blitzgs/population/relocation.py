@@ -241,14 +241,7 @@ class PositionNoise:
         `position_rate` is the step's learning rate of the means, in their unit.
         """
         position_noise_(
-            table["means"],
-            table["quats"],
-            table["scales"],
-            table["opacities"],
-            table["id"],
-            visible_ids,
-            seed=self._seed,
-            step=step,
-            threshold=self._threshold,
+            table["means"], table["quats"], table["scales"], table["opacities"], table["id"], visible_ids,
+            seed=self._seed, step=step, threshold=self._threshold,
             strength=self._factor * position_rate / self._extent**2,
-        )
+        )  # fmt: skip

@@ -143,23 +143,13 @@ class Model:
         poses = np.stack([viewmat(camera, self.space) for camera in cameras])
         background = torch.tensor([options.background] * len(cameras), device=device)
         return rasterization(
-            self.means,
-            self.quats,
-            self.scales.exp(),
-            self.opacities.sigmoid(),
-            self.sh,
+            self.means, self.quats, self.scales.exp(), self.opacities.sigmoid(), self.sh,
             torch.from_numpy(poses).float().to(device),
-            torch.from_numpy(np.stack([camera.K for camera in cameras])).float().to(device),
-            cameras[0].width,
-            cameras[0].height,
-            near_plane=options.near_plane,
-            far_plane=options.far_plane,
-            eps2d=options.eps2d,
-            sh_degree=self.sh_degree,
-            backgrounds=background,
-            render_mode=render_mode,
+            torch.from_numpy(np.stack([camera.K for camera in cameras])).float().to(device), cameras[0].width,
+            cameras[0].height, near_plane=options.near_plane, far_plane=options.far_plane,
+            eps2d=options.eps2d, sh_degree=self.sh_degree, backgrounds=background, render_mode=render_mode,
             rasterize_mode="antialiased" if antialiased else "classic",
-        )
+        )  # fmt: skip
 
     def camera(
         self, K: np.ndarray, world_to_camera: np.ndarray, width: int, height: int, name: str = "view"

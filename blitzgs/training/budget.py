@@ -204,13 +204,9 @@ def estimate(config: Config, capture: Capture, on_gpu: bool, cores: int) -> Esti
     sizes = [capture.cameras[i].width * capture.cameras[i].height for i in capture.train]
     population, coefficients = config.population, (config.model.sh_degree + 1) ** 2
     limit = growth_limit(
-        population.max_gaussians,
-        sum(sizes),
-        population.pixels_per_gaussian,
-        len(capture.points),
-        population.gaussians_per_point,
-        None,
-    )
+        population.max_gaussians, sum(sizes), population.pixels_per_gaussian, len(capture.points),
+        population.gaussians_per_point, None,
+    )  # fmt: skip
     first = int(_FIRST_PER_POINT * len(capture.points))
     if population.max_gaussians > 0:
         first = min(first, population.max_gaussians)

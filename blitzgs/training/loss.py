@@ -59,17 +59,12 @@ def loss_terms(
     if assignment is not None and assignment.ranges.halo < LOSS_HALO:
         raise ValueError(f"the loss reads {LOSS_HALO} px beyond a rank's tiles: divide them with that halo")
     parts, v_renders, scale_reg, opacity_reg = photometric_fwd_bwd(
-        frame.renders if shown is None else shown,
-        batch.targets,
-        batch.masks,
-        *_weights(config.ssim, count, batch.samples.device),
-        frame.options.tile_size,
-        *((0, -1) if assignment is None else assignment.own_tiles),
-        samples=batch.samples,
-        visible=frame.visible,
-        scale_weight=config.scale / (extent * config.scale_reference * count),
+        frame.renders if shown is None else shown, batch.targets, batch.masks,
+        *_weights(config.ssim, count, batch.samples.device), frame.options.tile_size,
+        *((0, -1) if assignment is None else assignment.own_tiles), samples=batch.samples,
+        visible=frame.visible, scale_weight=config.scale / (extent * config.scale_reference * count),
         opacity_weight=config.opacity,
-    )
+    )  # fmt: skip
     return LossTerms(
         parts, v_renders, scale_reg if config.scale > 0 else None, opacity_reg if config.opacity > 0 else None
     )

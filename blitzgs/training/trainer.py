@@ -306,18 +306,11 @@ class Trainer:
         """
         splats, views, table = frame.projected, frame.views, self.state.stepper.table
         density_stats_(
-            table["grad_sum"],
-            table["grad_count"],
-            table["max_radii"],
-            splats.visible_ids,
-            splats.splat_offsets,
-            v_means2d,
-            splats.conics if reduction == 1 else splats.conics / reduction**2,
-            views.width,
-            views.height,
-            float(len(views)),
-            table[PHI] if self.state.config.population.phi and PHI in table else None,
-        )
+            table["grad_sum"], table["grad_count"], table["max_radii"], splats.visible_ids,
+            splats.splat_offsets, v_means2d,
+            splats.conics if reduction == 1 else splats.conics / reduction**2, views.width, views.height,
+            float(len(views)), table[PHI] if self.state.config.population.phi and PHI in table else None,
+        )  # fmt: skip
 
     def _announce(self) -> None:
         """Log the start of the training: origin, population, views and ranks."""

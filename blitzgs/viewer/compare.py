@@ -130,15 +130,9 @@ def _labelled(image: UInt8, text: str) -> UInt8:
     size = max(0.4, image.shape[1] / 900)
     for colour, thickness in (((0, 0, 0), 4), ((255, 255, 255), 1)):
         cv2.putText(
-            out,
-            text,
-            (12, int(14 + 26 * size)),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            size,
-            colour,
-            thickness,
+            out, text, (12, int(14 + 26 * size)), cv2.FONT_HERSHEY_SIMPLEX, size, colour, thickness,
             cv2.LINE_AA,
-        )
+        )  # fmt: skip
     return out
 
 

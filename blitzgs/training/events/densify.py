@@ -78,13 +78,9 @@ def population_limit(state: TrainingState) -> GrowthLimit | None:
     """Return the tightest limit on the population; None if there is none. Every rank calls this."""
     population = state.config.population
     return growth_limit(
-        population.max_gaussians,
-        training_pixels(state),
-        population.pixels_per_gaussian,
-        len(state.capture.points),
-        population.gaussians_per_point,
-        memory_limit(state.table, state.ranks),
-    )
+        population.max_gaussians, training_pixels(state), population.pixels_per_gaussian,
+        len(state.capture.points), population.gaussians_per_point, memory_limit(state.table, state.ranks),
+    )  # fmt: skip
 
 
 def _over_all_ranks(state: TrainingState, counts: dict[str, int]) -> tuple[dict[str, int], int]:

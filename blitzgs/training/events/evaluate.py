@@ -80,21 +80,11 @@ def measure(
     state.catch_up()
     with state.log.work("views measured") as report:
         return evaluate(
-            state.stepper.gaussians,
-            state.views,
-            state.capture.cameras,
-            state.images,
-            indices,
-            state.render_options,
-            folder,
-            TileOwners(state.ranks),
-            pictures=PICTURES,
-            lpips=lpips,
-            report=report,
-            optional_files=True,
-            lod=model_gate(state.config, state.progress, state.table, state.ranks),
-            stops=state.stops,
-        )
+            state.stepper.gaussians, state.views, state.capture.cameras, state.images, indices,
+            state.render_options, folder, TileOwners(state.ranks), pictures=PICTURES, lpips=lpips,
+            report=report, optional_files=True,
+            lod=model_gate(state.config, state.progress, state.table, state.ranks), stops=state.stops,
+        )  # fmt: skip
 
 
 # The views are measured at most this often in a run, evenly.

@@ -40,16 +40,10 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
     views = len(state.capture.train)
     with state.log.work("views surveyed") as report:
         found = sweep(
-            state.stepper.gaussians,
-            _reported(view_batches(state), report, views),
-            views,
-            state.render_options,
-            state.ranks,
-            state.owners,
-            cast(ScoreRule, state.config.population.score),
-            model_gate(state.config, state.progress, state.table, state.ranks),
-            state.stops,
-        )
+            state.stepper.gaussians, _reported(view_batches(state), report, views), views,
+            state.render_options, state.ranks, state.owners, cast(ScoreRule, state.config.population.score),
+            model_gate(state.config, state.progress, state.table, state.ranks), state.stops,
+        )  # fmt: skip
     found.store(state.table, state.config.view.cull)
     before = state.population()
     causes = causes_of_death(state, event, found)

@@ -125,16 +125,9 @@ def _save(state: TrainingState, folder: Path, in_background: bool = False) -> Sa
     if state.stepper.exposures is not None:
         shared |= state.stepper.exposures.columns()
     return run_files.save(
-        folder,
-        state.table,
-        state.progress,
-        state.space,
-        state.config,
-        state.ranks,
-        state.run_id,
-        {name: column.clone() for name, column in shared.items()},
-        in_background,
-    )
+        folder, state.table, state.progress, state.space, state.config, state.ranks, state.run_id,
+        {name: column.clone() for name, column in shared.items()}, in_background,
+    )  # fmt: skip
 
 
 def _report(state: TrainingState, error: CheckpointError, what_next: str) -> None:
