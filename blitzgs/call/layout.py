@@ -124,10 +124,7 @@ class Layout:
     """
 
     def __init__(self, splats: ProjectedSplats, shape: tuple[int, ...], packed: bool) -> None:
-        """Compute the arrangement.
-
-        `shape`: batch dimensions, C, and the Gaussians N of a scene.
-        """
+        """Compute the arrangement. `shape`: batch dimensions, C, and the Gaussians N of a scene."""
         self.splats, self.packed = splats, packed
         self.places: Places | None = None
         if not packed:
