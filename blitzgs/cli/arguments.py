@@ -110,11 +110,9 @@ def number(
 def add_split(parser: argparse.ArgumentParser, verb: str) -> None:
     """Add the flag --split, which views of the run to use; `verb` says for what."""
     parser.add_argument(
-        "--split",
-        choices=("test", "train", "all"),
-        default="test",
+        "--split", choices=("test", "train", "all"), default="test",
         help=f"views to {verb} (default: %(default)s)",
-    )
+    )  # fmt: skip
 
 
 def chosen_views(split: str, cameras: Capture | RunCameras, folder: Path) -> Sequence[int]:

@@ -50,12 +50,9 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     arguments.add_split(parser, "measure")
     arguments.add_path(parser, "--out", "DIR", "folder for the results (default: RUN/evaluation/SPLIT)")
     parser.add_argument(
-        "--pictures",
-        type=int,
-        default=8,
-        metavar="N",
+        "--pictures", type=int, default=8, metavar="N",
         help="number of pictures that show a render, its photograph and its error (default: %(default)s)",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--lpips",
         metavar="FILE",

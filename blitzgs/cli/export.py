@@ -122,13 +122,9 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
         help="for viewers without antialiasing: write opacities that make up for it",
     )
     parser.add_argument(
-        "--clean",
-        type=int,
-        nargs="?",
-        const=1,
-        metavar="K",
+        "--clean", type=int, nargs="?", const=1, metavar="K",
         help="leave out floaters and fringes that at most K training photographs saw (default: %(const)s)",
-    )
+    )  # fmt: skip
     _add_selection(parser)
     for name, help_text in (
         ("tile-gaussians", "Gaussians of a tile (default: 32768)"),
@@ -139,12 +135,9 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
 
 def _add_selection(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--crop",
-        type=float,
-        nargs=6,
-        metavar=tuple("xyzXYZ"),
+        "--crop", type=float, nargs=6, metavar=tuple("xyzXYZ"),
         help="keep this box of the capture's coordinates",
-    )
+    )  # fmt: skip
     arguments.add_path(
         parser,
         "--crop-polygon",
@@ -158,12 +151,10 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
         "--min-opacity", type=float, metavar="O", help="keep Gaussians of at least this opacity"
     )
     parser.add_argument(
-        "--most",
-        type=int,
-        metavar="N",
+        "--most", type=int, metavar="N",
         help="keep the N Gaussians that contribute most to views of the capture (of a file: of the largest "
         "opacity times length)",
-    )
+    )  # fmt: skip
     parser.add_argument("--sh-degree", type=int, choices=range(4), help="write at most this SH degree")
     parser.add_argument(
         "--levels", type=_levels, metavar="FIRST-LAST", help="keep these octree levels, for example 0-3"

@@ -45,23 +45,17 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     add_path(fit, "runs", "RUN", "folder of a run with lineage, or a sample", nargs="+")
     add_path(fit, "--out", "FILE", "file for the gate, .json", required=True)
     fit.add_argument(
-        "--gate-from",
-        type=float,
-        default=ScheduleConfig.gate_from,
-        metavar="IMAGES",
+        "--gate-from", type=float, default=ScheduleConfig.gate_from, metavar="IMAGES",
         help="also evaluate separately the spawns (births during training) from this time on; take "
         "schedule.gate_from times schedule.scale of the runs that will use the gate (default: %(default)s)",
-    )
+    )  # fmt: skip
     sample = add_command(actions, "sample", run_sample, "reduce the lineage of a run to one file")
     add_path(sample, "folder", "RUN", "folder of a run with lineage")
     add_path(sample, "--out", "FILE", "file for the sample, .parquet", required=True)
     sample.add_argument(
-        "--rows",
-        type=int,
-        default=spawn_samples.MAX_ROWS,
-        metavar="N",
+        "--rows", type=int, default=spawn_samples.MAX_ROWS, metavar="N",
         help="approximate number of births in the file (default: %(default)s)",
-    )
+    )  # fmt: skip
     judge = add_command(actions, "evaluate", run_evaluate, "measure a gate on the lineage of runs")
     judge.add_argument(
         "gate", type=gate_file, metavar="GATE", help='file of a gate, or "default" (the included one)'

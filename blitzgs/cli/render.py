@@ -69,12 +69,10 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     arguments.add_pool(parser)
     arguments.add_split(parser, "render")
     arguments.add_path(
-        parser,
-        "--cameras",
-        "FILE",
+        parser, "--cameras", "FILE",
         "render the cameras of this transforms file or folder of a COLMAP model, in the capture's "
         "coordinates; no photographs are needed",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--path",
         metavar="PATH",

@@ -95,18 +95,14 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         "--resume", action="store_true", help="continue from the newest checkpoint in RUN, if any"
     )
     parser.add_argument(
-        "--extend",
-        type=_EXTENSION,
-        metavar="IMAGES|FACTOR",
+        "--extend", type=_EXTENSION, metavar="IMAGES|FACTOR",
         help="train the finished run in RUN longer: by a number of images (100 or more), or to a multiple of "
         "its length (--extend=1.5)",
-    )
+    )  # fmt: skip
     parser.add_argument(
-        "--minutes",
-        type=float,
-        metavar="M",
+        "--minutes", type=float, metavar="M",
         help="end after M minutes of training, with the whole schedule fitted into them (0: no limit)",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--show-config", action="store_true", help="print the resulting configuration and stop"
     )
@@ -129,20 +125,13 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
 
 def _add_helps(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "-h",
-        "--help",
-        nargs="?",
-        metavar="FIELD",
-        action=_Help,
+        "-h", "--help", nargs="?", metavar="FIELD", action=_Help,
         help="show this help, or explain a field or section of the configuration, and stop",
-    )
+    )  # fmt: skip
     parser.add_argument(
-        "--help-fields",
-        nargs="?",
-        choices=("text", "markdown"),
-        action=_Help,
+        "--help-fields", nargs="?", choices=("text", "markdown"), action=_Help,
         help="explain all fields of the configuration, as text or as a page, and stop",
-    )
+    )  # fmt: skip
 
 
 class _Help(argparse.Action):
@@ -319,19 +308,13 @@ _PORT = 8080
 def add_live_page(parser: argparse.ArgumentParser) -> None:
     """Add the flags."""
     parser.add_argument(
-        "--viewer",
-        type=int,
-        nargs="?",
-        const=_PORT,
-        metavar="PORT",
+        "--viewer", type=int, nargs="?", const=_PORT, metavar="PORT",
         help=f"show the training in the browser (default port: {_PORT}); needs the extra view",
-    )
+    )  # fmt: skip
     parser.add_argument(
-        "--viewer-host",
-        default="127.0.0.1",
-        metavar="HOST",
+        "--viewer-host", default="127.0.0.1", metavar="HOST",
         help="address to listen on (default: %(default)s, this machine only)",
-    )
+    )  # fmt: skip
 
 
 def live_page(state: TrainingState, port: int, host: str) -> Live | None:

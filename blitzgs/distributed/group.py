@@ -103,13 +103,9 @@ class Ranks:
         if chosen.type == "cuda":
             extend_memory_in_place()
         ranks = cls(
-            rank=rank,
-            world_size=world_size,
-            local_world_size=local_world_size,
-            device=chosen,
-            timeout_seconds=timeout_seconds,
-            shares_gpu=shared,
-        )
+            rank=rank, world_size=world_size, local_world_size=local_world_size, device=chosen,
+            timeout_seconds=timeout_seconds, shares_gpu=shared,
+        )  # fmt: skip
         if chosen.type == "cuda":
             torch.cuda.set_device(chosen)
             torch.cuda.synchronize()

@@ -161,10 +161,8 @@ def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[st
             raise ValueError(f"checkpoint: column {name} has dtype {column.dtype}, which safetensors lacks")
         end = offset + column.numel() * column.element_size()
         header[name] = {
-            "dtype": _DTYPES[column.dtype],
-            "shape": list(column.shape),
-            "data_offsets": [offset, end],
-        }
+            "dtype": _DTYPES[column.dtype], "shape": list(column.shape), "data_offsets": [offset, end],
+        }  # fmt: skip
         offset = end
     head = json.dumps(header).encode()
     head += b" " * (-len(head) % 8)

@@ -39,18 +39,11 @@ class Frustums:
             camera = cameras[index]
             stance = world.stance(world.poses[index], 2 * math.atan(camera.height / (2 * camera.K[1, 1])))
             handle = server.scene.add_camera_frustum(
-                f"/cameras/{index}",
-                fov=stance.fov,
-                aspect=camera.width / camera.height,
-                scale=size,
-                thickness=1.5,
-                thickness_units="screen",
-                color=TEST_COLOUR if index in test else TRAIN_COLOUR,
-                wxyz=rotation_to_quat(stance.rotation),
-                position=stance.position,
-                cast_shadow=False,
+                f"/cameras/{index}", fov=stance.fov, aspect=camera.width / camera.height, scale=size,
+                thickness=1.5, thickness_units="screen", color=TEST_COLOUR if index in test else TRAIN_COLOUR,
+                wxyz=rotation_to_quat(stance.rotation), position=stance.position, cast_shadow=False,
                 receive_shadow=False,
-            )
+            )  # fmt: skip
             handle.on_click(_click(stand, index))
             self._handles.append(handle)
 
