@@ -124,15 +124,8 @@ def project_groups(groups: Sequence[Group], sparse_grad: bool) -> ProjectedSplat
     images = [splats.camera_ids + group.first_image for splats, group in zip(parts, groups, strict=True)]
     joined = parts[0]._asdict()
     for name in (
-        "gaussian_ids",
-        "means2d",
-        "conics",
-        "depths",
-        "opacities",
-        "colors",
-        "radii",
-        "tiles_touched",
-    ):
+        "gaussian_ids", "means2d", "conics", "depths", "opacities", "colors", "radii", "tiles_touched",
+    ):  # fmt: skip
         joined[name] = torch.cat([getattr(splats, name) for splats in parts])
     joined["camera_ids"] = torch.cat(images)
     joined["counts"] = torch.stack([splats.counts for splats in parts]).sum(dim=0)

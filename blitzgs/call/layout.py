@@ -260,12 +260,9 @@ def _lists_of_pixels(splats: ProjectedSplats, grid: TileGrid, pixels: Pixels) ->
     kept = wanted.view(-1).repeat_interleave(lengths, output_size=count)
     ends = (lengths * wanted.view(-1)).cumsum(0)
     return Lists(
-        near.index_select(0, listed[:count][kept]).int(),
-        torch.cat([ends.new_zeros(1), ends]),
-        grid.width,
-        grid.height,
-        edge,
-    )
+        near.index_select(0, listed[:count][kept]).int(), torch.cat([ends.new_zeros(1), ends]), grid.width,
+        grid.height, edge,
+    )  # fmt: skip
 
 
 def _splats_near(splats: ProjectedSplats, wanted: Tensor, edge: int) -> Tensor:

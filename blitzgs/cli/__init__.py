@@ -61,15 +61,11 @@ COMMANDS = {
 # program and keeps its traceback. The second part is imported only when an error is to be judged.
 _USER_ERRORS: tuple[type[BaseException], ...] = (ValueError, OSError, ImportError, MemoryError)
 _NAMED_ERRORS = (
-    "blitzgs.capture.images.PhotographError",
-    "blitzgs.distributed.group.MismatchError",
-    "blitzgs.runs.checkpoint.CheckpointError",
-    "blitzgs.runs.folder_checks.FolderError",
-    "blitzgs.runs.guard.ModelLostError",
-    "blitzgs.runs.guard.NonFiniteError",
-    "blitzgs.table.host_table.HostMemoryError",
-    "blitzgs.table.pool.PoolError",
-)
+    "blitzgs.capture.images.PhotographError", "blitzgs.distributed.group.MismatchError",
+    "blitzgs.runs.checkpoint.CheckpointError", "blitzgs.runs.folder_checks.FolderError",
+    "blitzgs.runs.guard.ModelLostError", "blitzgs.runs.guard.NonFiniteError",
+    "blitzgs.table.host_table.HostMemoryError", "blitzgs.table.pool.PoolError",
+)  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -209,13 +209,8 @@ def _reference() -> tuple[list[Tensor], ReferenceImage]:
 
 
 PROBES: dict[str, Callable[..., dict[str, Any]]] = {
-    "torch": torch_,
-    "library": library,
-    "render": render,
-    "exchange": exchange,
-    "nccl": nccl,
-    "disk": disk,
-}
+    "torch": torch_, "library": library, "render": render, "exchange": exchange, "nccl": nccl, "disk": disk,
+}  # fmt: skip
 
 if __name__ == "__main__":
     print(json.dumps(PROBES[sys.argv[1]](*sys.argv[2:])))

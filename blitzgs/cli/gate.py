@@ -144,12 +144,9 @@ def run_replay(args: argparse.Namespace) -> int:
         config = changed(config, "data", path=str(args.data))
     results: list[dict[str, Any]] = []
     with Ranks.from_environment(
-        args.device,
-        config.ranks.timeout_seconds,
-        "auto",
-        args.share_gpus,
+        args.device, config.ranks.timeout_seconds, "auto", args.share_gpus,
         tables_on_host=config.memory.resident_gb > 0,
-    ) as ranks:
+    ) as ranks:  # fmt: skip
         capture, images = open_capture(config, ranks)
         for result in replay(config, capture, images, args.folder, args.out, gate, args.rate, ranks):
             results.append(result)

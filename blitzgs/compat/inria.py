@@ -238,13 +238,10 @@ def _project(
         rotations, scales = decomposed.quats, decomposed.scales
     assert rotations is not None and scales is not None
     options = ProjectionOptions(
-        int(settings.image_width),
-        int(settings.image_height),
-        sh_degree=int(settings.sh_degree) if sh is not None else 0,
-        near_plane=NEAR,
-        antialiased=bool(settings.antialiasing),
-        raw=False,
-    )
+        int(settings.image_width), int(settings.image_height),
+        sh_degree=int(settings.sh_degree) if sh is not None else 0, near_plane=NEAR,
+        antialiased=bool(settings.antialiasing), raw=False,
+    )  # fmt: skip
     cameras = (settings.viewmatrix.to(means).mT.contiguous()[None], K)
     gaussians = gaussian_tensors(means, rotations, scales, opacities.reshape(-1), sh)
     inputs = ProjectionInputs(gaussians, cameras, options)

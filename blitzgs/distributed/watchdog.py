@@ -49,13 +49,9 @@ def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
     """
     held_by_agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
     store = TCPStore(
-        os.environ["MASTER_ADDR"],
-        int(os.environ["MASTER_PORT"]),
-        is_master=host and not held_by_agent,
-        wait_for_workers=False,
-        multi_tenant=True,
-        timeout=timedelta(seconds=timeout_seconds),
-    )
+        os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"]), is_master=host and not held_by_agent,
+        wait_for_workers=False, multi_tenant=True, timeout=timedelta(seconds=timeout_seconds),
+    )  # fmt: skip
     return PrefixStore(f"blitzgs/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}/{name}", store)
 
 

@@ -80,15 +80,11 @@ class Gaussians:
     def rows(self, rows: Tensor | slice) -> Gaussians:
         """Return some of the Gaussians."""
         return replace(
-            self,
-            means=self.means[rows],
-            quats=self.quats[rows],
-            scales=self.scales[rows],
-            opacities=self.opacities[rows],
-            sh=self.sh[rows],
+            self, means=self.means[rows], quats=self.quats[rows], scales=self.scales[rows],
+            opacities=self.opacities[rows], sh=self.sh[rows],
             normals=None if self.normals is None else self.normals[rows],
             levels=None if self.levels is None else self.levels[rows],
-        )
+        )  # fmt: skip
 
     def blocks(self) -> Iterator[Gaussians]:
         """Yield all Gaussians in order, at most `BLOCK` at a time."""

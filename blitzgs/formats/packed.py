@@ -89,14 +89,10 @@ def unit_blocks(source: GaussianSource) -> Iterator[Gaussians]:
 def _gsdata(model: Gaussians) -> Any:
     rest = model.sh[:, 1:].contiguous().numpy()
     return _package("gsply").GSData.from_arrays(
-        means=model.means.numpy(),
-        scales=model.scales.numpy(),
-        quats=model.quats.numpy(),
-        opacities=model.opacities.numpy(),
-        sh0=model.sh[:, 0].contiguous().numpy(),
-        shN=rest if model.degree > 0 else None,
-        format="ply",
-    )
+        means=model.means.numpy(), scales=model.scales.numpy(), quats=model.quats.numpy(),
+        opacities=model.opacities.numpy(), sh0=model.sh[:, 0].contiguous().numpy(),
+        shN=rest if model.degree > 0 else None, format="ply",
+    )  # fmt: skip
 
 
 # --- compressed PLY: chunks of 256 Gaussians, as SuperSplat writes them ---

@@ -122,12 +122,9 @@ def densify(
         _log(lineage, table, new, (clones, splits), causes, died, time, step, extent, level_count)
     grown = len(clones) + len(splits)
     report = DensityReport(
-        cloned=len(clones),
-        split=len(splits),
-        pruned=grown + len(gone) - len(born),
-        held_back=int(wanted) - grown - vetoed,
-        vetoed=vetoed,
-    )
+        cloned=len(clones), split=len(splits), pruned=grown + len(gone) - len(born),
+        held_back=int(wanted) - grown - vetoed, vetoed=vetoed,
+    )  # fmt: skip
     parents = torch.cat((clones, *[splits] * CHILDREN_OF_A_SPLIT))
     if len(born) < len(parents):
         parents, new = parents[born], {name: column[born] for name, column in new.items()}

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from blitzgs.capture.cameras import MAX_SIDE, Float64
 from blitzgs.capture.capture import Capture
+from blitzgs.runs.checkpoint_files import DAMAGE
 from blitzgs.util.output import write_file
 from blitzgs.view.views import CameraLike
 
@@ -154,15 +155,7 @@ def load_cameras(folder: Path) -> RunCameras:
         return RunCameras(cameras, train, test, [Path(text) for text in content["inputs"]])
     except FileNotFoundError:
         raise
-    except (
-        OSError,
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-        RecursionError,
-    ) as error:
+    except (*DAMAGE, OverflowError) as error:
         raise ValueError(f"{path} is damaged ({error}): give the capture with --data DIR instead") from error
 
 

@@ -30,12 +30,9 @@ def lod_gate(config: Config, progress: Progress) -> LodGate | None:
     if progress.gated_views and "1" not in progress.gated_views:
         return None
     return LodGate(
-        progress.reference_distance,
-        level_fork(config),
-        progress.level_count,
-        progress.finest_level,
+        progress.reference_distance, level_fork(config), progress.level_count, progress.finest_level,
         config.view.lod == "smooth",
-    )
+    )  # fmt: skip
 
 
 def level_fork(config: Config) -> float:

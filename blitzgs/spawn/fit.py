@@ -26,14 +26,9 @@ from blitzgs.util.output import OutputFolder, write_file
 # Largest number of births that a fit takes from a scene, drawn evenly.
 MAX_ROWS = 4_000_000
 XGBOOST_PARAMETERS = {
-    "objective": "binary:logistic",
-    "tree_method": "hist",
-    "max_depth": 5,
-    "eta": 0.05,
-    "colsample_bytree": 0.5,
-    "subsample": 0.8,
-    "base_score": 0.5,
-}
+    "objective": "binary:logistic", "tree_method": "hist", "max_depth": 5, "eta": 0.05,
+    "colsample_bytree": 0.5, "subsample": 0.8, "base_score": 0.5,
+}  # fmt: skip
 ROUNDS = 150
 # Smallest share of the rows for a leaf. Leaves with fewer rows fit peculiarities of a scene, which lowers the
 # AUC on other scenes.
@@ -65,12 +60,9 @@ class Spawns:
     def only(self, rows: NDArray[np.bool_]) -> Spawns:
         """Return some of the spawns."""
         return dataclasses.replace(
-            self,
-            features=self.features[rows],
-            survived=self.survived[rows],
-            parents=self.parents[rows],
+            self, features=self.features[rows], survived=self.survived[rows], parents=self.parents[rows],
             positions=self.positions[rows],
-        )
+        )  # fmt: skip
 
 
 def read_spawns(folder: Path, gaussians: int | None = None) -> Spawns:

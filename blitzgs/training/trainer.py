@@ -78,13 +78,9 @@ class Trainer:
         self.warned: list[str] = []  # texts of warnings, which the log takes over at the end
         self._saves_first = extend is not None
         self.loader = BatchLoader(
-            images,
-            state.views,
-            capture.train,
-            state.sampler,
-            ranks.device,
+            images, state.views, capture.train, state.sampler, ranks.device,
             owners=state.owners if ranks.world_size > 1 else None,
-        )
+        )  # fmt: skip
         self._guard = LossGuard()
         self._unwritten: StepRecord | None = None  # the record of the last step
         # On CUDA a record is written one step later, so that the host does not wait for its figures.

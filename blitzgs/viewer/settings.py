@@ -41,19 +41,10 @@ class Settings:
         ValueError: a choice is impossible.
         """
         return Look(
-            viewmat,
-            K,
-            width,
-            height,
-            mode="RGB" if self.comparison != "off" else self.mode,
-            sh_degree=self.sh_degree,
-            background=self.background,
-            lod=self.lod,
-            smooth=self.smooth,
-            crop=self.box if self.crops else None,
-            near=self.near,
-            far=self.far,
-        )
+            viewmat, K, width, height, mode="RGB" if self.comparison != "off" else self.mode,
+            sh_degree=self.sh_degree, background=self.background, lod=self.lod, smooth=self.smooth,
+            crop=self.box if self.crops else None, near=self.near, far=self.far,
+        )  # fmt: skip
 
 
 # Sides of a picture relative to full quality.
