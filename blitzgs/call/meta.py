@@ -152,10 +152,9 @@ def make_meta(
 
     Under `torch.compile` it is a plain dict, and the compiler removes entries that the caller does not read.
 
-    Args:
-        known: the rendered columns in this arrangement, and further images.
-        lead: batch dimensions, and the number of views that are rendered here.
-        arrived: the splats that `lists` refers to, if ranks have exchanged splats; None: those of `layout`.
+    `known`: the rendered columns in this arrangement, and further images. `lead`: batch dimensions, and the
+    number of views that are rendered here. `arrived`: the splats that `lists` refers to, if ranks have
+    exchanged splats; None: those of `layout`.
     """
     entries = _Entries(gaussians, layout, lists, lead, arrived)
     numbers = {

@@ -197,13 +197,8 @@ class Ranks:
     def all_to_all(self, rows: Tensor, sent: Sequence[int], received: Sequence[int]) -> Tensor:
         """Send consecutive groups of rows, one to each rank, and return those received, by source rank.
 
-        Args:
-            rows: [sum(sent), ...]; the rows for rank 0 first.
-            sent: rows for each rank, M values.
-            received: rows from each rank, M values (see `exchange_counts`).
-
-        Returns:
-            [sum(received), ...].
+        `rows`: [sum(sent), ...]; the rows for rank 0 first. `sent`: rows for each rank, M values. `received`:
+        rows from each rank, M values (see `exchange_counts`). Returns [sum(received), ...].
         """
         if self.world_size == 1:
             return rows.clone()

@@ -82,10 +82,9 @@ class HostSum:
     ) -> None:
         """Queue the sums.
 
-        Args:
-            parts: float64 [B, K, 2], sums of this rank's loss in parts (`photometric_fwd_bwd`); None: none.
-            tile_work: int32 [T], number of list entries that were composited in each tile; None: none.
-            tiles: the tiles of this rank, [first, one past last).
+        `parts`: float64 [B, K, 2], sums of this rank's loss in parts (`photometric_fwd_bwd`); None: none.
+        `tile_work`: int32 [T], number of list entries that were composited in each tile; None: none. `tiles`:
+        the tiles of this rank, [first, one past last).
         """
         self._ranks = ranks
         self._sums = 0 if parts is None else 2 * parts.shape[0]

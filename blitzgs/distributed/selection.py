@@ -37,16 +37,9 @@ def decimal_share(share: float) -> Fraction:
 def smallest(keys: Tensor, ids: Tensor, k: int, ranks: Ranks) -> Tensor:
     """Mark the k rows, over all ranks, with the smallest (key, id).
 
-    Args:
-        keys: float32 [N_rank], no NaN; infinities are allowed.
-        ids: int64 [N_rank], >= 0, unique over all ranks.
-        k: number of rows to mark; all rows if k exceeds their number.
-
-    Returns:
-        bool [N_rank]; the same ids at every world size.
-
-    Raises:
-        ValueError: on every rank, when a key of any rank is NaN, or k < 0.
+    `keys`: float32 [N_rank], no NaN; infinities are allowed. `ids`: int64 [N_rank], >= 0, unique over all
+    ranks. `k`: number of rows to mark; all rows if k exceeds their number. Returns bool [N_rank]; the same
+    ids at every world size. ValueError: on every rank, when a key of any rank is NaN, or k < 0.
     """
     if k < 0:
         raise ValueError(f"smallest: k must not be negative, got {k}")

@@ -42,10 +42,8 @@ def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
     Keys have a prefix of `name` and the number of the restart: torchrun keeps the store over restarts, and a
     new rank must not read the addresses of the rank that it replaces.
 
-    Args:
-        name: name of this use of the store.
-        host: whether this process serves the store if torchrun's agent does not.
-        timeout_seconds: for connecting and waiting.
+    `name`: name of this use of the store. `host`: whether this process serves the store if torchrun's agent
+    does not. `timeout_seconds`: for connecting and waiting.
     """
     held_by_agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
     store = TCPStore(

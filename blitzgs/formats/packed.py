@@ -125,10 +125,8 @@ def _write_columns(
 ) -> None:
     """Write the rows of a block into the columns of a file, which follow each other from `begin` on.
 
-    Args:
-        begin: where its first column begins.
-        content: the rows of the block, column after column.
-        columns: of each column the first row, the rows of the block and of the file, and the bytes of a row.
+    `begin`: where its first column begins. `content`: the rows of the block, column after column. `columns`:
+    of each column the first row, the rows of the block and of the file, and the bytes of a row.
     """
     view, at = memoryview(content), 0
     for first, rows, count, width in columns:

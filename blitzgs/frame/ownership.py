@@ -71,10 +71,8 @@ class TileOwners:
     def plan(self, step: int, keys: Sequence[Hashable], width: int, height: int, halo: int) -> TileRanges:
         """Divide the tiles of the batch of a later step, as `divide` does, and store the division.
 
-        Args:
-            step: step of the batch; its division is stored until `forget_before`.
-            keys: identifies each of the B views.
-            halo: see `TileRanges`.
+        `step`: step of the batch; its division is stored until `forget_before`. `keys`: identifies each of
+        the B views. `halo`: see `TileRanges`.
         """
         if step in self._planned:
             ranges = TileRanges(self._planned[step], len(keys), width, height, halo=halo)
@@ -154,13 +152,9 @@ class TileOwners:
 
         On CUDA the host does not wait for a batch whose losses it has read.
 
-        Args:
-            tile_work: int32 [B * T], number of list entries that were composited in each tile.
-            ranges: the tiles of each rank; the cost of a tile is that measured by its owner.
-            parts: float64 [B, K, 2], sums of this rank's loss, which are sent together with the costs.
-
-        Returns:
-            The sums; see `HostSum.read`.
+        `tile_work`: int32 [B * T], number of list entries that were composited in each tile. `ranges`: the
+        tiles of each rank; the cost of a tile is that measured by its owner. `parts`: float64 [B, K, 2], sums
+        of this rank's loss, which are sent together with the costs. Returns the sums; see `HostSum.read`.
         """
         if len(self._delayed) == _DELAY:
             self._learn(self._delayed.popleft())

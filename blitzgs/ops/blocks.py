@@ -81,14 +81,8 @@ class ActiveRows(NamedTuple):
 def morton_keys(points: Tensor) -> Tensor:
     """Return each point's position along the Morton curve of the cloud's bounding cube.
 
-    Args:
-        points: float32 [N, 3].
-
-    Returns:
-        int64 [N]; 2^63 - 1 for a point that is not finite.
-
-    Raises:
-        RuntimeError: wrong shape or dtype.
+    `points`: float32 [N, 3]. Returns int64 [N]; 2^63 - 1 for a point that is not finite. RuntimeError: wrong
+    shape or dtype.
     """
     return torch.ops.blitzgs.morton_keys(points)
 
@@ -214,8 +208,7 @@ def sectors_of_rows(rows: Tensor) -> Tensor:
 def rows_of_sectors(sectors: Tensor, n: int) -> Tensor:
     """Convert a mask of N rows back to the layout by row, int32 [N, words]; the inverse of `sectors_of_rows`.
 
-    Raises:
-        RuntimeError: a wrong shape or dtype.
+    RuntimeError: a wrong shape or dtype.
     """
     return torch.ops.blitzgs.rows_of_sectors(sectors, n)
 

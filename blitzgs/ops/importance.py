@@ -217,8 +217,7 @@ class MassCut(NamedTuple):
     def take_steps(self, share: tuple[int, int], first: int, last: int) -> None:
         """Run the steps `first` to `last` - 1; `share` is a numerator and a denominator of at most 10^9.
 
-        Raises:
-            RuntimeError: wrong shapes, dtypes or numbers.
+        RuntimeError: wrong shapes, dtypes or numbers.
         """
         torch.ops.blitzgs.mass_cut_(
             *self.items, self.searches, self.sums, self.listed, self.chosen, *share, first, last

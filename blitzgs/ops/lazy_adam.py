@@ -121,8 +121,7 @@ class GrowingSchedule(AdamTables):
     ) -> None:
         """Begin with empty tables; the arguments are the attributes, and dtype and device of the parameter.
 
-        Raises:
-            ValueError: decay rates outside their range.
+        ValueError: decay rates outside their range.
         """
         self.betas, self.eps = betas, eps
         self.explicit_steps = explicit_steps(*betas, dtype)

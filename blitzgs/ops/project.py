@@ -311,10 +311,8 @@ def differentiable_splats(
 ) -> ProjectedSplats:
     """Project as `project` does, with grouped arguments.
 
-    Args:
-        sparse_grad: see `project`.
-        splats: the result of `project_splats` for these inputs, if it is already known.
-        rows: the visible rows of these inputs, if `splats` got their colours from them.
+    `sparse_grad`: see `project`. `splats`: the result of `project_splats` for these inputs, if it is already
+    known. `rows`: the visible rows of these inputs, if `splats` got their colours from them.
     """
     viewmats, Ks = inputs.cameras  # noqa: N806
     if not torch.compiler.is_compiling():

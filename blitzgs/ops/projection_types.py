@@ -68,10 +68,8 @@ class ProjectedSplats(NamedTuple):
 def splats_of(allocated: Sequence[Tensor], sizes: Sizes, counts: Tensor | None = None) -> ProjectedSplats:
     """Return the valid splats of columns that were allocated with more capacity.
 
-    Args:
-        allocated: a `ProjectedSplats`; its `counts` are not read.
-        sizes: numbers of valid Gaussians and splats; `blocks` is not read.
-        counts: the first three of `sizes` as a CPU tensor, if there is one.
+    `allocated`: a `ProjectedSplats`; its `counts` are not read. `sizes`: numbers of valid Gaussians and
+    splats; `blocks` is not read. `counts`: the first three of `sizes` as a CPU tensor, if there is one.
     """
     if allocated[0].shape[0] > sizes.splats or allocated[2].shape[0] > sizes.visible:
         visible, splats = sizes[:2]
@@ -169,10 +167,9 @@ class ProjectionInputs(NamedTuple):
     ) -> ProjectionOutputs:
         """Project the Gaussians, without gradients.
 
-        Args:
-            capacity: numbers of visible Gaussians and splats to allocate; CUDA then does not wait for the
-                true numbers. None: wait, and allocate exactly as many as there are.
-            rank_tiles: for each rank the [begin, end) of the tiles that it composites, in ascending order.
+        `capacity`: numbers of visible Gaussians and splats to allocate; CUDA then does not wait for the true
+        numbers. None: wait, and allocate exactly as many as there are. `rank_tiles`: for each rank the
+        [begin, end) of the tiles that it composites, in ascending order.
         """
         *columns, splat_ids, totals = torch.ops.blitzgs.project_fwd(
             self.gaussians, *self.cameras, *self.active_arguments, self.ids, self.level, *self.options,

@@ -24,11 +24,8 @@ _TABLE = "_blitzgs_gradient_table"
 def gradient_columns(table: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """View a table of splat gradients as columns, from which `gradient_table_of` takes the table.
 
-    Args:
-        table: [P, 12], as the op `rasterize_bwd` fills it.
-
-    Returns:
-        Gradients of means2d [P, 2], conics [P, 3], opacities [P] and colors [P, 3].
+    `table`: [P, 12], as the op `rasterize_bwd` fills it. Returns gradients of means2d [P, 2], conics [P, 3],
+    opacities [P] and colors [P, 3].
     """
     columns = (
         table[:, _MEAN2D : _MEAN2D + 2],

@@ -225,10 +225,8 @@ def death_causes(
 ) -> Tensor:
     """Return why each row of a table is pruned, see `causes_of`.
 
-    Args:
-        table: the rows, with the largest radii since the last event.
-        opacities: the logits after all steps, if they are known.
-        pending: the table's pending steps; None: there are none.
+    `table`: the rows, with the largest radii since the last event. `opacities`: the logits after all steps,
+    if they are known. `pending`: the table's pending steps; None: there are none.
     """
     if opacities is None:
         opacities = table["opacities"] if pending is None else pending.current("opacities")

@@ -46,10 +46,8 @@ class FirstGaussians:
     ) -> GaussianTable:
         """Make a table of them, without rotation; ids count from 0.
 
-        Args:
-            sh_degree: highest degree of the table.
-            opacity: of all of them, in (0, 1).
-            part: which of them the table gets.
+        `sh_degree`: highest degree of the table. `opacity`: of all of them, in (0, 1). `part`: which of them
+        the table gets.
         """
         means = self.means[part].to(device)
         sh = torch.zeros(len(means), (sh_degree + 1) ** 2, 3, device=device)

@@ -116,13 +116,8 @@ def shared_among_copies(opacities: Tensor, scales: Tensor, copies: Tensor) -> tu
 
     (Kheradmand et al. 2024, eq. 9; `blitzgs.ops.population.overlap`).
 
-    Args:
-        opacities: logits, [M].
-        scales: logarithms, [M, 3].
-        copies: N, int64 [M], 1 to `MAX_COPIES`.
-
-    Returns:
-        Logits and logarithms, float64.
+    `opacities`: logits, [M]. `scales`: logarithms, [M, 3]. `copies`: N, int64 [M], 1 to `MAX_COPIES`. Returns
+    logits and logarithms, float64.
     """
     logits = opacities.double()
     # -log(1 - o') = -log(1 - o) / N

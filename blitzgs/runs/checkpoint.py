@@ -196,16 +196,9 @@ def load_latest(
     A damaged checkpoint is refused, and the one before it is tried. A warning names the refused checkpoints,
     the reasons, and the checkpoint that is used.
 
-    Args:
-        directory: folder given to `Saving`.
-        problem: returns what is wrong with a shard's columns, or None.
-        only: name of the one checkpoint to load; None: the newest.
-
-    Returns:
-        The checkpoint; None if the folder has none.
-
-    Raises:
-        CheckpointError: checkpoints exist, but none is sound.
+    `directory`: folder given to `Saving`. `problem`: returns what is wrong with a shard's columns, or None.
+    `only`: name of the one checkpoint to load; None: the newest. Returns the checkpoint; None if the folder
+    has none. CheckpointError: checkpoints exist, but none is sound.
     """
     found = ranks.broadcast_object(names_of(Path(directory)) if ranks.rank == 0 else [])
     refused = []

@@ -336,10 +336,8 @@ class GaussianTable:
     def replace(self, placement: Placement, new: Mapping[str, Tensor], most: int | None = None) -> None:
         """Let rows leave and new ones join; all other rows stay where they are, except those that move.
 
-        Args:
-            placement: of `blitzgs.table.placement.place`.
-            new: as for `append`.
-            most: about the most rows that the table will ever have; None: unknown.
+        `placement`: of `blitzgs.table.placement.place`. `new`: as for `append`. `most`: about the most rows
+        that the table will ever have; None: unknown.
         """
         self._check_new(new)
         for name in self._to_change():

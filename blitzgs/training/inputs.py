@@ -133,13 +133,9 @@ def sharing_hint(
 ) -> str | None:
     """Return what to do if the decoded images are too many to be shared by the ranks of a host.
 
-    Args:
-        cache_bytes: `DataConfig.cache_bytes`.
-        local_ranks: number of ranks of the host.
-        factors: by which images are reduced in addition.
-
-    Returns:
-        None for a single rank, if the images fit already, or if they are too many for the host's memory.
+    `cache_bytes`: `DataConfig.cache_bytes`. `local_ranks`: number of ranks of the host. `factors`: by which
+    images are reduced in addition. Returns None for a single rank, if the images fit already, or if they are
+    too many for the host's memory.
     """
     size, memory = size_of(decoded_shapes(capture, factors)), _host_memory() // 2
     if local_ranks == 1 or size <= min(cache_bytes, memory) // 2 or size > memory // 2:

@@ -125,14 +125,9 @@ class OutputFolder:
         each keeps its own suffix before the new one; if they are still equal, later ones get a number. The
         same names always give the same paths.
 
-        Args:
-            names: names of images, as in their capture.
-            suffix: suffix of the new files, with its dot.
-            flat: put every file into the folder itself, `a/b.jpg` as `a_b` + suffix.
-
-        Raises:
-            OSError: a path is an input, is no regular file, leaves the folder through a link, or exists in a
-                folder without `MARK`.
+        `names`: names of images, as in their capture. `suffix`: suffix of the new files, with its dot.
+        `flat`: put every file into the folder itself, `a/b.jpg` as `a_b` + suffix. OSError: a path is an
+        input, is no regular file, leaves the folder through a link, or exists in a folder without `MARK`.
         """
         above = [_inner_parts(name)[:-1] for name in names if name.startswith("/")]
         shared = len(os.path.commonprefix(above)) if above else 0  # leading folders that all have

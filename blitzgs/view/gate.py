@@ -61,10 +61,7 @@ class LodGate:
     def weights(self, means: Tensor, level: Tensor, centre: Tensor) -> Tensor:
         """Return the factors of `fade` for the opacities of Gaussians in one view, float64 [N].
 
-        Args:
-            means: [N, 3].
-            level: uint8 [N].
-            centre: position of the camera, float64 [3].
+        `means`: [N, 3]. `level`: uint8 [N]. `centre`: position of the camera, float64 [3].
         """
         slope, *reach = self.fade()
         reaches = torch.tensor(reach, dtype=torch.float64, device=means.device)
@@ -152,10 +149,7 @@ class ModelGate:
     def rows(self, means: Tensor, level: Tensor, viewmat: Tensor) -> Tensor:
         """Return which Gaussians a view keeps, bool [N]; only for a single process.
 
-        Args:
-            means: float32 [N, 3].
-            level: uint8 [N].
-            viewmat: float32 [1, 4, 4].
+        `means`: float32 [N, 3]. `level`: uint8 [N]. `viewmat`: float32 [1, 4, 4].
         """
         active = self._gated(means, level, viewmat)
         return torch.ones_like(level, dtype=torch.bool) if active is None else active.views != 0

@@ -54,14 +54,9 @@ class VisibleFinder:
     def depths(self, views: Views, planes: Sequence[float], blocks: int) -> list[float]:
         """Divide the depths of one view such that about a number of blocks lies between two of them.
 
-        Args:
-            views: the view.
-            planes: the near and the far plane.
-            blocks: number of blocks.
-
-        Returns:
-            The near plane, depths in ascending order, the far plane. Only these planes if few blocks are in
-            the view, or if the Gaussians are in a pool, which bounds the memory anyway.
+        `views`: the view. `planes`: the near and the far plane. `blocks`: number of blocks. Returns the near
+        plane, depths in ascending order, the far plane. Only these planes if few blocks are in the view, or
+        if the Gaussians are in a pool, which bounds the memory anyway.
         """
         near, far = planes
         if self._index is None or len(self._index.bounds) <= blocks:
@@ -85,14 +80,9 @@ class VisibleFinder:
     def find(self, views: Views, limits: tuple[float, float, float], room: int | None = None) -> VisibleRows:
         """Find the Gaussians to render for a batch of views. Collective if there is a gate.
 
-        Args:
-            views: at most 32 views.
-            limits: near plane, far plane and eps2d.
-            room: the lists have room for so many blocks and their number tells whether that sufficed; None:
-                for all.
-
-        Raises:
-            PoolError: the pool is too small for the views.
+        `views`: at most 32 views. `limits`: near plane, far plane and eps2d. `room`: the lists have room for
+        so many blocks and their number tells whether that sufficed; None: for all. PoolError: the pool is too
+        small for the views.
         """
         gaussians, index = self._gaussians, self._index
         if isinstance(gaussians, Pool):

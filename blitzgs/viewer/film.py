@@ -253,13 +253,8 @@ def new_film(
 
     The file appears under its name when the context ends without an error; an interrupted film leaves none.
 
-    Args:
-        path: ends in .mp4.
-        width: pixels, even.
-        height: pixels, even.
-
-    Raises:
-        OSError: the file cannot be written; an existing one is unchanged.
+    `path`: ends in .mp4. `width`: pixels, even. `height`: pixels, even. OSError: the file cannot be written;
+    an existing one is unchanged.
     """
     av = require_av()
     with new_file(path) as partial:

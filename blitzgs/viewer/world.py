@@ -48,10 +48,8 @@ class World:
     def __init__(self, space: Space, cameras: Sequence[CameraLike], middle: Array | None = None) -> None:
         """Find up and the middle of a scene.
 
-        Args:
-            space: the trained world.
-            cameras: the capture's; may be empty.
-            middle: a point in the middle of the Gaussians, trained units; None: guess it from the cameras.
+        `space`: the trained world. `cameras`: the capture's; may be empty. `middle`: a point in the middle of
+        the Gaussians, trained units; None: guess it from the cameras.
         """
         self.space = space
         self.poses = [viewmat(camera, space) for camera in cameras]

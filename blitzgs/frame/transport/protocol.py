@@ -166,10 +166,9 @@ class Transport(Protocol):
     ) -> Exchange:
         """Project this rank's Gaussians and send the splats to the ranks that composite them. Collective.
 
-        Args:
-            inputs: inputs of the projection, with the Gaussians' ids.
-            assignment: the tiles of each rank; None: this rank composites all tiles.
-            capacity: the sizes to allocate; None: the host first waits for the numbers.
+        `inputs`: inputs of the projection, with the Gaussians' ids. `assignment`: the tiles of each rank;
+        None: this rank composites all tiles. `capacity`: the sizes to allocate; None: the host first waits
+        for the numbers.
         """
 
 
