@@ -277,12 +277,18 @@ def _scenes(whole: Scene, batch: tuple[int, ...]) -> tuple[Scene, ...]:
     return tuple(Scene(*tensors) for tensors in zip(*columns, strict=True))
 
 
-def with_covariances(gaussians: Gaussians, covars: Tensor) -> Gaussians:
+def with_covariances(
+    gaussians: Gaussians, covars: Tensor, sparse_grad: bool, return_normals: bool
+) -> Gaussians:
     """Return Gaussians whose quats and scales are those of covariances.
 
-    `gaussians`: with any quats and scales. `covars`: as for `blitzgs.rasterization`. ValueError: the shape
-    does not fit.
+    `gaussians`: with any quats and scales. `covars` and the switches: as for `blitzgs.rasterization`.
+    ValueError: the shape does not fit, or a switch is on.
     """
+    if sparse_grad:
+        raise ValueError("sparse_grad does not support covars; leave one of them out")
+    if return_normals:
+        raise ValueError("return_normals does not support covars, whose axes have no order; leave one out")
     batch = gaussians.lead[:-1]
     wanted = (*batch, gaussians.count, 3, 3)
     if covars.shape != wanted:

@@ -29,14 +29,14 @@ class ImageOptions(NamedTuple):
 
 
 def background_rows(
-    backgrounds: Tensor, gaussians: Gaussians, render_mode: str, normals: bool = False
+    backgrounds: Tensor | None, gaussians: Gaussians, render_mode: str, normals: bool = False
 ) -> Tensor | None:
     """Return the background of each image, [I, channels], from `backgrounds`, [..., C, D] or [..., C, D + E].
 
     `backgrounds`: of the colours and, as in gsplat, of the E extra signals if there are any. ValueError: the
     shape does not fit.
     """
-    if "RGB" not in render_mode:
+    if backgrounds is None or "RGB" not in render_mode:
         return None
     assert gaussians.colors is not None
     channels = given = gaussians.colors.shape[-1]

@@ -225,23 +225,14 @@ def rasterization(
     elif extra_signals_sh_degree is not None:
         raise ValueError("extra_signals_sh_degree needs extra_signals; give both")
     if covars is not None:
-        if sparse_grad:
-            raise ValueError("sparse_grad does not support covars; leave one of them out")
-        if return_normals:
-            raise ValueError(
-                "return_normals does not support covars, whose axes have no order; leave one out"
-            )
-        gaussians = with_covariances(gaussians, covars)
+        gaussians = with_covariances(gaussians, covars, sparse_grad, return_normals)
     if with_ut:
         gaussians = with_lenses(gaussians, camera_model, rolling_shutter, ut_params, **lens)
-    antialiased = rasterize_mode == "antialiased"
     projection = ProjectionOptions(
-        width, height, tile_size, sh_degree or 0, near_plane, far_plane, eps2d, radius_clip, antialiased,
-        raw=False,
+        width, height, tile_size, sh_degree or 0, near_plane, far_plane, eps2d, radius_clip,
+        antialiased=rasterize_mode == "antialiased", raw=False,
     )  # fmt: skip
-    background = None
-    if backgrounds is not None:
-        background = background_rows(backgrounds, gaussians, render_mode, return_normals)
+    background = background_rows(backgrounds, gaussians, render_mode, return_normals)
     if pixels is not None and (distributed or torch.compiler.is_compiling()):
         raise ValueError("pixels support neither distributed=True nor torch.compile; leave one out")
     listed = checked_pixels(pixels, image_ids, gaussians.images, width, height)

@@ -153,7 +153,7 @@ def raw_rasterization(
     named = {name: (tensor,) for name, tensor in given.items() if tensor is not None}
     colors, degree = (sh0, sh_degree) if shaded else (None, None)
     gaussians = Gaussians(whole.scenes, colors, opacities, degree, False, whole.lead, True, named)
-    background = None if backgrounds is None else background_rows(backgrounds, gaussians, render_mode)
+    background = background_rows(backgrounds, gaussians, render_mode)
     image = ImageOptions(render_mode, background, True, sparse_grad, absgrad)
 
     def catch_up_sh(rows: Tensor, count: Tensor | None) -> None:
