@@ -19,9 +19,8 @@ __all__ = ["below_autograd", "load_libraries", "schema_digest", "source_digest",
 def load_libraries() -> None:
     """Register the CPU kernels, and the CUDA kernels when this torch can use a GPU.
 
-    Raises:
-        ImportError: a library was not built, or was built before the list of ops changed; the message says
-            how to build it.
+    ImportError: a library was not built, or was built before the list of ops changed; the message says how to
+    build it.
     """
     _load(LIBRARY_DIR / "libblitzgs_cpu.so")
     if torch.cuda.is_available():

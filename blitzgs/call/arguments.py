@@ -51,60 +51,38 @@ RAW_DEFAULTS: dict[str, Any] = {
 
 
 class Scene(NamedTuple):
-    """N Gaussians and C views of them.
+    """N Gaussians and C views of them."""
 
-    Attributes:
-        means: [N, 3].
-        quats: [N, 4].
-        scales: [N, 3].
-        opacities: [N].
-        colors: SH [N, K, 3] or [C, N, K, 3], values [N, D] or [C, N, D]; None: depth alone.
-        viewmats: [C, 4, 4].
-        Ks: [C, 3, 3].
-        extra_signals: values [N, E] or [C, N, E], or SH [N, K, E], see `Signals`; None: none.
-        covariances: covariances given instead of quats and scales; quats and scales then are their
-            decomposition.
-        lenses: lenses and shutters of the views; None: pinhole cameras.
-    """
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    colors: Tensor | None
-    viewmats: Tensor
-    Ks: Tensor
+    means: Tensor  # [N, 3]
+    quats: Tensor  # [N, 4]
+    scales: Tensor  # [N, 3]
+    opacities: Tensor  # [N]
+    colors: Tensor | None  # SH [N, K, 3] or [C, N, K, 3], values [N, D] or [C, N, D]; None: depth alone
+    viewmats: Tensor  # [C, 4, 4]
+    Ks: Tensor  # [C, 3, 3]
+    # Values [N, E] or [C, N, E], or SH [N, K, E], see `Signals`; None: none.
     extra_signals: Tensor | None = None
+    # Covariances given instead of quats and scales; quats and scales then are their decomposition.
     covariances: Decomposed | None = None
-    lenses: Lenses | None = None
+    lenses: Lenses | None = None  # lenses and shutters of the views; None: pinhole cameras
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """The checked arguments of a call: S scenes of N Gaussians and C views each, I = S C images.
+    """The checked arguments of a call: S scenes of N Gaussians and C views each, I = S C images."""
 
-    Attributes:
-        scenes: the scenes, S >= 1. Without batch dimensions it has the caller's own tensors, so that a leaf
-            stays a leaf.
-        colors: colours of all scenes, as given by the caller.
-        opacities: opacities of all scenes, as given by the caller.
-        sh_degree: degree of the SH that are evaluated; None: colours are values, or not rendered.
-        per_view: whether every view has its own colours.
-        lead: the batch dimensions, and C.
-        raw: whether scales and opacities are before their activation.
-        named: the arguments of the call that have to be finite, a tensor for each scene.
-        signals: the extra signals; None: none.
-    """
-
+    # The scenes, S >= 1. Without batch dimensions it has the caller's own tensors, so that a leaf stays a
+    # leaf.
     scenes: tuple[Scene, ...]
-    colors: Tensor | None
-    opacities: Tensor
-    sh_degree: int | None
-    per_view: bool
-    lead: tuple[int, ...]
-    raw: bool
+    colors: Tensor | None  # colours of all scenes, as given by the caller
+    opacities: Tensor  # opacities of all scenes, as given by the caller
+    sh_degree: int | None  # degree of the SH that are evaluated; None: colours are values, or not rendered
+    per_view: bool  # whether every view has its own colours
+    lead: tuple[int, ...]  # the batch dimensions, and C
+    raw: bool  # whether scales and opacities are before their activation
+    # The arguments of the call that have to be finite, a tensor for each scene.
     named: Mapping[str, tuple[Tensor, ...]]
-    signals: Signals | None = None
+    signals: Signals | None = None  # the extra signals; None: none
 
     @property
     def views(self) -> int:
@@ -127,13 +105,8 @@ def check_further(
 ) -> None:
     """Check further keyword arguments: only gsplat's names with gsplat's default values are accepted.
 
-    Args:
-        function: name of the public function.
-        defaults: the names and the only values that the function takes.
-
-    Raises:
-        TypeError: gsplat has no such argument.
-        ValueError: the value is not gsplat's default.
+    `function`: name of the public function. `defaults`: the names and the only values that the function
+    takes. TypeError: gsplat has no such argument. ValueError: the value is not gsplat's default.
     """
     for name, value in further.items():
         if name not in defaults:
@@ -163,9 +136,8 @@ def check_options(
 ) -> None:
     """Check the arguments that are not tensors.
 
-    Raises:
-        TypeError: a size or the degree is not a whole number, or another option not a number.
-        ValueError: one is out of range or has an unknown value.
+    TypeError: a size or the degree is not a whole number, or another option not a number. ValueError: one is
+    out of range or has an unknown value.
     """
     whole = {"width": width, "height": height, "tile_size": tile_size}
     if sh_degree is not None:
@@ -209,15 +181,10 @@ def refuse_func_transforms() -> None:
 def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]) -> None:
     """Check that arguments are tensors on one device, all float32 or all float64.
 
-    Args:
-        optional: further arguments by name, which may be None.
-
-    Raises:
-        RuntimeError: the call is inside a transform of `torch.func`.
-        TypeError: an argument is not a tensor, but for example an array of another library, or has a dtype
-            that the kernels do not compute in.
-        ValueError: an argument has another dtype, or is on another device, whose memory the kernels could not
-            read.
+    `optional`: further arguments by name, which may be None. RuntimeError: the call is inside a transform of
+    `torch.func`. TypeError: an argument is not a tensor, but for example an array of another library, or has
+    a dtype that the kernels do not compute in. ValueError: an argument has another dtype, or is on another
+    device, whose memory the kernels could not read.
     """
     refuse_func_transforms()
     device, dtype, first = None, None, ""
@@ -248,7 +215,7 @@ def gaussians_of(
     render_mode: str,
     raw: bool = False,
 ) -> Gaussians:
-    """Check shapes and fold the batch dimensions into one.
+    """Check shapes and fold the batch dimensions into one (ValueError: a shape that does not fit, by name).
 
     Args:
         means: [..., N, 3].
@@ -262,9 +229,6 @@ def gaussians_of(
         sh_degree: degree to evaluate; None when `colors` holds values.
         render_mode: as for `blitzgs.rasterization`; without "RGB", colours are not rendered.
         raw: whether scales and opacities are before their activation.
-
-    Raises:
-        ValueError: a shape that does not fit, by name.
     """
     if means.dim() < 2 or viewmats.dim() < 3:
         raise ValueError(
@@ -318,16 +282,18 @@ def _scenes(whole: Scene, batch: tuple[int, ...]) -> tuple[Scene, ...]:
     return tuple(Scene(*tensors) for tensors in zip(*columns, strict=True))
 
 
-def with_covariances(gaussians: Gaussians, covars: Tensor) -> Gaussians:
+def with_covariances(
+    gaussians: Gaussians, covars: Tensor, sparse_grad: bool, return_normals: bool
+) -> Gaussians:
     """Return Gaussians whose quats and scales are those of covariances.
 
-    Args:
-        gaussians: with any quats and scales.
-        covars: as for `blitzgs.rasterization`.
-
-    Raises:
-        ValueError: the shape does not fit.
+    `gaussians`: with any quats and scales. `covars` and the switches: as for `blitzgs.rasterization`.
+    ValueError: the shape does not fit, or a switch is on.
     """
+    if sparse_grad:
+        raise ValueError("sparse_grad does not support covars; leave one of them out")
+    if return_normals:
+        raise ValueError("return_normals does not support covars, whose axes have no order; leave one out")
     batch = gaussians.lead[:-1]
     wanted = (*batch, gaussians.count, 3, 3)
     if covars.shape != wanted:

@@ -31,8 +31,7 @@ WRAPPED = {"raw_rasterization": 1}
 def warn_of_gradient(function: str) -> None:
     """Warn, once, that intrinsics which require a gradient get none, as in gsplat.
 
-    Args:
-        function: name of the public function.
+    `function`: name of the public function.
     """
     if not torch.compiler.is_compiling() and torch.is_grad_enabled():
         _warn_of_gradient(function)
@@ -52,11 +51,7 @@ def check_intrinsics(Ks: Sequence[Tensor]) -> None:  # noqa: N803
 
     The projection renders nothing with them, so that calls look only where a view shows nothing.
 
-    Args:
-        Ks: [C, 3, 3] of each scene.
-
-    Raises:
-        ValueError: a matrix has a skew, or another last row than 0, 0, 1.
+    `Ks`: [C, 3, 3] of each scene. ValueError: a matrix has a skew, or another last row than 0, 0, 1.
     """
     _check_rows(np.concatenate([to_host(matrices.detach()).numpy().reshape(-1, 9) for matrices in Ks]))
 
@@ -86,11 +81,7 @@ class CamerasOnHost:
         self._copy = HostCopy(torch.cat(matrices).double().view(torch.int64))
 
     def are_finite(self) -> bool:
-        """Tell whether all cameras are finite; waits for the copy.
-
-        Raises:
-            ValueError: see `check_intrinsics`.
-        """
+        """Tell whether all cameras are finite; waits for the copy (ValueError: see `check_intrinsics`)."""
         values = self._copy.read().view(torch.float64).numpy()
         _check_rows(values[: self._n_intrinsics].reshape(-1, 9))
         return bool(np.isfinite(values).all())
@@ -174,13 +165,8 @@ def watch_for_non_finite(
     On CUDA most calls check the cameras alone, see `EVERY_CUDA_CALLS`. SH coefficients, the largest part of a
     Gaussian, are only checked for visible Gaussians.
 
-    Args:
-        gaussians: the arguments of a call.
-        layout: its splats.
-        function: name of the public function.
-        nan_marks: a value for each Gaussian, NaN if its colours are values that are not finite, or its extra
-            signals are not.
-        suspects_cameras: whether a camera may be not finite.
+    `nan_marks`: a value for each Gaussian, NaN if its colours are values that are not finite, or its extra
+    signals are not.
     """
     named = gaussians.named
     first = named["means"][0]
@@ -205,10 +191,7 @@ def watch_for_non_finite(
 def warn_of_non_finite(gaussians: Gaussians, function: str, stacklevel: int) -> None:
     """Check all arguments, warn of values that are not finite, and name the first Gaussians or views.
 
-    Args:
-        gaussians: the arguments of a call, without colours.
-        function: name of the public function.
-        stacklevel: how many calls away the public function's caller is, from 1 for this function.
+    `stacklevel`: how many calls away the public function's caller is, from 1 for this function.
     """
     found = {name: indices[:5].tolist() for name, indices in non_finite(gaussians).items()}
     if found:

@@ -16,44 +16,27 @@ from blitzgs.ops.projection_types import ProjectedSplats
 
 
 class ImageOptions(NamedTuple):
-    """The options of compositing and of `meta`; see `blitzgs.rasterization`.
+    """The options of compositing and of `meta`; see `blitzgs.rasterization`."""
 
-    Attributes:
-        render_mode: which channels are rendered.
-        backgrounds: [I, channels] or None.
-        packed: whether `meta` has only the visible splats, or else an entry for every Gaussian and view.
-        sparse_grad: whether gradients are sparse.
-        absgrad: whether the backward pass also returns absolute gradients.
-        normals: whether normals are rendered.
-        median: whether the median depth is.
-        pixels: the pixels that are rendered; None: all.
-    """
-
-    render_mode: str
-    backgrounds: Tensor | None
-    packed: bool
-    sparse_grad: bool
-    absgrad: bool
-    normals: bool = False
-    median: bool = False
-    pixels: Pixels | None = None
+    render_mode: str  # which channels are rendered
+    backgrounds: Tensor | None  # [I, channels] or None
+    packed: bool  # whether `meta` has only the visible splats, or else an entry for every Gaussian and view
+    sparse_grad: bool  # whether gradients are sparse
+    absgrad: bool  # whether the backward pass also returns absolute gradients
+    normals: bool = False  # whether normals are rendered
+    median: bool = False  # whether the median depth is
+    pixels: Pixels | None = None  # the pixels that are rendered; None: all
 
 
 def background_rows(
-    backgrounds: Tensor, gaussians: Gaussians, render_mode: str, normals: bool = False
+    backgrounds: Tensor | None, gaussians: Gaussians, render_mode: str, normals: bool = False
 ) -> Tensor | None:
     """Return the background of each image, [I, channels], from `backgrounds`, [..., C, D] or [..., C, D + E].
 
-    Args:
-        backgrounds: of the colours and, as in gsplat, of the E extra signals if there are any.
-        gaussians: the Gaussians, with their extra signals.
-        render_mode: which channels are rendered.
-        normals: whether normals are.
-
-    Raises:
-        ValueError: the shape does not fit.
+    `backgrounds`: of the colours and, as in gsplat, of the E extra signals if there are any. ValueError: the
+    shape does not fit.
     """
-    if "RGB" not in render_mode:
+    if backgrounds is None or "RGB" not in render_mode:
         return None
     assert gaussians.colors is not None
     channels = given = gaussians.colors.shape[-1]
@@ -73,10 +56,7 @@ def channels_of(
 ) -> Tensor:
     """Return the channels to composite, [P, channels].
 
-    Args:
-        gaussians: the Gaussians, with colours and extra signals.
-        image: which channels are rendered.
-        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
+    `with_spare`: whether the last splats may be spare capacity, whose ids are undefined.
     """
     parts = []
     if gaussians.sh_degree is not None:
@@ -117,9 +97,8 @@ def _signals(splats: ProjectedSplats, gaussians: Gaussians, with_spare: bool) ->
     SH are evaluated as colours are, along the direction from the camera centre, but not clamped:
     sum of Y_k(direction) c_k, plus 0.5. Differentiable in the signals and, for SH, in means and viewmats.
 
-    Args:
-        gaussians: with signals.
-        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
+    `gaussians`: with signals. `with_spare`: whether the last splats may be spare capacity, whose ids are
+    undefined.
     """
     signals = gaussians.signals
     assert signals is not None
@@ -139,10 +118,7 @@ def _normals(splats: ProjectedSplats, gaussians: Gaussians, sparse_grad: bool, w
     The normal is gsplat's: the third axis of the Gaussian, turned so that it faces the camera centre.
     Differentiable in quats.
 
-    Args:
-        gaussians: the Gaussians, with rotations of any length.
-        sparse_grad: whether the gradient of quats is sparse.
-        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
+    `with_spare`: whether the last splats may be spare capacity, whose ids are undefined.
     """
     rows = _rows(splats, gaussians, False, with_spare)
     quats = embedding(rows, _joined([scene.quats for scene in gaussians.scenes]), sparse=sparse_grad)

@@ -113,7 +113,6 @@ def contributions(
 def _contributions_of_splats(
     splats: ProjectedSplats, n_views: int, width: int, height: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the weights and pixels of all splats of a projection."""
     geometry = splats.means2d, splats.conics, splats.opacities
     grid = TileGrid(n_views, width, height, CUDA_TILE_SIZE)
     lists = torch.ops.blitzgs.intersect(
@@ -260,11 +259,8 @@ def _splats_of_pixels(
             raise ValueError(f"{name} must be {[*wanted]}, got {[*tensor.shape]}")
     lead = tuple(tile_offsets.shape[:-2])
     images = tile_offsets[..., :1, :1].numel() if tile_offsets.numel() else 0
-    numbers = None
-    if pixels is not None:
-        numbers = checked_pixels(pixels, image_ids, images, width, height).numbers
-    elif image_ids is not None:
-        raise ValueError("image_ids need pixels; give both")
+    listed = checked_pixels(pixels, image_ids, images, width, height)
+    numbers = None if listed is None else listed.numbers
     end = torch.full((1,), len(flatten_ids), dtype=torch.int64, device=tile_offsets.device)
     found = pixel_splats(
         means2d.reshape(-1, 2),

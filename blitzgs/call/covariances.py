@@ -18,17 +18,11 @@ from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs
 
 @dataclass(frozen=True)
 class Decomposed:
-    """Covariances and their rotations and scales.
+    """Covariances and their rotations and scales."""
 
-    Attributes:
-        upper: [N, 6]: xx, xy, xz, yy, yz, zz; they get gradients.
-        quats: [N, 4], without gradients.
-        scales: [N, 3], without gradients; NaN if the covariance is not finite.
-    """
-
-    upper: Tensor
-    quats: Tensor
-    scales: Tensor
+    upper: Tensor  # [N, 6]: xx, xy, xz, yy, yz, zz; they get gradients
+    quats: Tensor  # [N, 4], without gradients
+    scales: Tensor  # [N, 3], without gradients; NaN if the covariance is not finite
 
 
 def decompose(covars: Tensor) -> Decomposed:
@@ -101,8 +95,7 @@ def shaped_by(splats: ProjectedSplats, inputs: ProjectionInputs, decomposed: Dec
 
     In double, because the determinant of a covariance loses the digits of a thin splat.
 
-    Args:
-        splats: of the decomposed covariances.
+    `splats`: of the decomposed covariances.
     """
     means, _, _, opacities, *_ = inputs.gaussians
     means, opacities, viewmats, Ks = (t.double() for t in (means, opacities, *inputs.cameras))

@@ -13,17 +13,11 @@ _MAX_DEGREE = 3
 
 
 class Signals(NamedTuple):
-    """The extra signals of a call.
+    """The extra signals of a call."""
 
-    Attributes:
-        values: of all scenes: [..., N, E], per view [..., C, N, E], or SH coefficients [..., N, K, E].
-        sh_degree: degree of the SH that are evaluated; None: the values are composited.
-        per_view: whether every view has its own values.
-    """
-
-    values: Tensor
-    sh_degree: int | None
-    per_view: bool
+    values: Tensor  # of all scenes: [..., N, E], per view [..., C, N, E], or SH coefficients [..., N, K, E]
+    sh_degree: int | None  # degree of the SH that are evaluated; None: the values are composited
+    per_view: bool  # whether every view has its own values
 
     @property
     def channels(self) -> int:
@@ -34,14 +28,8 @@ class Signals(NamedTuple):
 def checked_signals(values: Tensor, sh_degree: int | None, batch: tuple[int, ...], C: int, N: int) -> Signals:
     """Check the shape of extra signals.
 
-    Args:
-        values: `extra_signals` of `blitzgs.rasterization`.
-        sh_degree: its `extra_signals_sh_degree`.
-        C: number of views of each scene.
-        N: number of Gaussians of each scene.
-
-    Raises:
-        ValueError: a shape or the degree does not fit.
+    `values`: `extra_signals` of `blitzgs.rasterization`. `sh_degree`: its `extra_signals_sh_degree`.
+    ValueError: a shape or the degree does not fit.
     """
     shape, per_view = tuple(values.shape), False
     if sh_degree is None:
@@ -63,35 +51,27 @@ def checked_signals(values: Tensor, sh_degree: int | None, batch: tuple[int, ...
 
 
 class Pixels(NamedTuple):
-    """The pixels of a call.
+    """The pixels of a call."""
 
-    Attributes:
-        numbers: int64 [M], (image H + row) W + column.
-        images: int64 [M], the image of each.
-        rows: int64 [M].
-        columns: int64 [M].
+    numbers: Tensor  # int64 [M], (image H + row) W + column
+    images: Tensor  # int64 [M], the image of each
+    rows: Tensor  # int64 [M]
+    columns: Tensor  # int64 [M]
+
+
+def checked_pixels(
+    pixels: Tensor | None, image_ids: Tensor | None, images: int, width: int, height: int
+) -> Pixels | None:
+    """Check a list of pixels; None: there is none.
+
+    `pixels`: integers [M, 2], (row, column). `image_ids`: integers [M], the image of each pixel, counted
+    through all batch dimensions; None: 0. TypeError: they are not tensors of integers. ValueError: a shape
+    does not fit, a pixel is outside the images, or there are several images and no `image_ids`.
     """
-
-    numbers: Tensor
-    images: Tensor
-    rows: Tensor
-    columns: Tensor
-
-
-def checked_pixels(pixels: Tensor, image_ids: Tensor | None, images: int, width: int, height: int) -> Pixels:
-    """Check a list of pixels.
-
-    Args:
-        pixels: integers [M, 2], (row, column).
-        image_ids: integers [M], the image of each pixel, counted through all batch dimensions; None: 0.
-        width: px.
-        height: px.
-
-    Raises:
-        TypeError: they are not tensors of integers.
-        ValueError: a shape does not fit, a pixel is outside the images, or there are several images and no
-            `image_ids`.
-    """
+    if pixels is None:
+        if image_ids is not None:
+            raise ValueError("image_ids need pixels; give both")
+        return None
     if image_ids is None:
         if images != 1:
             raise ValueError(f"pixels of {images} images need image_ids, the image of each pixel")

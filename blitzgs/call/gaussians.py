@@ -314,15 +314,8 @@ def _constants(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return what the loss of views without a mask needs; each tensor would cost a launch in every step.
 
-    Args:
-        views: number of views B.
-        count: values that the mean of a view averages, at least 1.
-        weight: w of `l1_ssim`.
-        dtype: of the renders.
-        device: of the renders.
-
-    Returns:
-        The weights of the sums of L1 and SSIM and their divisors, [B] each.
+    `views`: number of views B. `count`: values that the mean of a view averages, at least 1. Returns the
+    weights of the sums of L1 and SSIM and their divisors, [B] each.
     """
     values = ((1 - weight) / views, -weight / views, count)
     l1, ssim, divisors = (torch.full((views,), value, dtype=dtype, device=device) for value in values)

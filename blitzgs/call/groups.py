@@ -35,34 +35,22 @@ from blitzgs.ops.unscented import Lenses, project_unscented
 
 
 class Group(NamedTuple):
-    """Views of one scene that are projected together.
-
-    Attributes:
-        inputs: of the projection.
-        first_image: number of its first view among the images of the call.
-        covariances: the covariances that the caller gave instead of quats and scales; None: none.
-        rows: the rows that `inputs` were gathered from, as long as these; None: `inputs` are the tables.
-        lenses: lenses and shutters of the views; None: pinhole cameras.
-    """
+    """Views of one scene that are projected together."""
 
     inputs: ProjectionInputs
-    first_image: int
+    first_image: int  # number of its first view among the images of the call
+    # The covariances that the caller gave instead of quats and scales; None: none.
     covariances: Decomposed | None
+    # The rows that `inputs` were gathered from, as long as these; None: `inputs` are the tables.
     rows: Gathered | None = None
-    lenses: Lenses | None = None
+    lenses: Lenses | None = None  # lenses and shutters of the views; None: pinhole cameras
 
 
 class Gathered(NamedTuple):
-    """Rows of tables that some view sees.
+    """Rows of tables that some view sees."""
 
-    Attributes:
-        ids: int32 [A], the rows.
-        tables: means, quats, scales and opacities.
-        sh: the SH.
-    """
-
-    ids: Tensor
-    tables: ProjectionInputs
+    ids: Tensor  # int32 [A], the rows
+    tables: ProjectionInputs  # means, quats, scales and opacities
     sh: ShTables
 
 
@@ -91,8 +79,7 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
 def gathered_groups(groups: Sequence[Group], sh: ShTables) -> list[Group]:
     """Return groups of the Gaussians alone that a view of any group sees.
 
-    Args:
-        groups: of one scene, without SH.
+    `groups`: of one scene, without SH.
     """
     ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
     sh.before(ids, None)
@@ -118,12 +105,8 @@ def _sh_of_views(gaussians: Gaussians, scene: Scene, parts: int) -> Sequence[Ten
 def project_groups(groups: Sequence[Group], sparse_grad: bool) -> ProjectedSplats:
     """Return the splats of all images, those of a group after those of the groups before.
 
-    Args:
-        sparse_grad: see `blitzgs.ops.project.project`.
-
-    Returns:
-        Splats whose camera_ids number all images of the call. Of several groups, visible_ids and
-        splat_offsets are those of the first.
+    `sparse_grad`: see `blitzgs.ops.project.project`. Returns splats whose camera_ids number all images of the
+    call. Of several groups, visible_ids and splat_offsets are those of the first.
     """
     parts = []
     for group in groups:
@@ -179,33 +162,21 @@ _LISTS, _IMAGES = 2, 8
 
 
 class Rendered(NamedTuple):
-    """The outputs of the ops; see each op for its fields.
-
-    Attributes:
-        splats: the splats.
-        lists: the tiles' lists.
-        composited: what `rasterize_fwd` returned, and alphas.
-        rows: the visible rows, if the SH are in tables of which only these are read.
-        has_blank_view: whether some view sees no Gaussian.
-    """
+    """The outputs of the ops; see each op for its fields."""
 
     splats: ProjectedSplats
     lists: Lists
-    composited: Sequence[Tensor]
-    rows: TableRows | None
-    has_blank_view: bool
+    composited: Sequence[Tensor]  # what `rasterize_fwd` returned, and alphas
+    rows: TableRows | None  # the visible rows, if the SH are in tables of which only these are read
+    has_blank_view: bool  # whether some view sees no Gaussian
 
 
 class ShTables(NamedTuple):
-    """SH of which only the rows of visible Gaussians are read.
+    """SH of which only the rows of visible Gaussians are read."""
 
-    Attributes:
-        parts: the SH of all Gaussians in parts, [N, L, 3] each; empty: no SH are rendered.
-        before: called before rows are read, with the rows, int32 [A], and the number of those that are
-            valid, int32 [1] on the device, or None if all are.
-    """
-
-    parts: Sequence[Tensor]
+    parts: Sequence[Tensor]  # the SH of all Gaussians in parts, [N, L, 3] each; empty: no SH are rendered
+    # Called before rows are read, with the rows, int32 [A], and the number of those that are valid, int32 [1]
+    # on the device, or None if all are.
     before: Callable[[Tensor, Tensor | None], object]
 
 
@@ -221,11 +192,8 @@ def render_queued(
     If earlier calls had the same size, the host queues all work first and reads the number of splats while
     the GPU works.
 
-    Args:
-        inputs: inputs of `project_splats`.
-        image: options of compositing.
-        only_colors: whether the colours that the projection computes are all channels.
-        tables: the SH, if they are not part of `inputs`.
+    `only_colors`: whether the colours that the projection computes are all channels. `tables`: the SH, if
+    they are not part of `inputs`.
     """
     options, means, signals = inputs.options, inputs.gaussians[0], gaussians.signals
     rows_of, sh = ((), ()) if tables is None else (inputs.gaussians, tables.parts)

@@ -159,9 +159,7 @@ def _median_depths(splats: ProjectedSplats, lists: Lists, images: int, pixels: P
 def _nan_or_zero(scene: Scene, valued: bool, signals: Signals | None) -> Tensor:
     """Return [N]: NaN for a Gaussian with a colour or signal, in some view, that is not finite, 0 for others.
 
-    Args:
-        valued: whether its colours are values.
-        signals: describes its extra signals.
+    `valued`: whether its colours are values. `signals`: describes its extra signals.
     """
     tables = []
     if valued:

@@ -28,17 +28,13 @@ CUDA_TILE_SIZE = 16
 
 
 class Places(NamedTuple):
-    """Where P splats are in an arrangement.
+    """Where P splats are in an arrangement."""
 
-    Attributes:
-        indices: (order,), int64 [P]: entry i is splat order[i], and each splat has one entry; or (images,
-            gaussians), int32 [P] each: a splat is the entry [image, Gaussian] of an arrangement of all
-            Gaussians in all images, and no two splats have the same entry.
-        shape: dimensions of the arrangement, [P] or [..., C, N], where the images are counted through
-            [..., C].
-    """
-
+    # (order,), int64 [P]: entry i is splat order[i], and each splat has one entry; or (images, gaussians),
+    # int32 [P] each: a splat is the entry [image, Gaussian] of an arrangement of all Gaussians in all images,
+    # and no two splats have the same entry.
     indices: tuple[Tensor, ...]
+    # Dimensions of the arrangement, [P] or [..., C, N], where the images are counted through [..., C].
     shape: tuple[int, ...]
 
     def flat(self) -> Tensor:
@@ -52,13 +48,9 @@ class Places(NamedTuple):
     def arrange(self, columns: Sequence[Tensor], under: Tensor | None = None) -> tuple[Tensor, ...]:
         """Arrange columns of splats.
 
-        Args:
-            columns: [P, ...] each, with elements of 4 or 8 bytes.
-            under: values of the Gaussians, [..., N], that entries of the last column have if they have no
-                splat; None: zeros, as in the other columns.
-
-        Returns:
-            The columns, [*shape, ...].
+        `columns`: [P, ...] each, with elements of 4 or 8 bytes. `under`: values of the Gaussians, [..., N],
+        that entries of the last column have if they have no splat; None: zeros, as in the other columns.
+        Returns the columns, [*shape, ...].
         """
         if torch.compiler.is_compiling():  # torch differentiates them, and tracing a Function is fragile
             return self._arranged_by_torch(columns, under)
@@ -132,13 +124,7 @@ class Layout:
     """
 
     def __init__(self, splats: ProjectedSplats, shape: tuple[int, ...], packed: bool) -> None:
-        """Compute the arrangement.
-
-        Args:
-            splats: as the attribute.
-            shape: batch dimensions, C, and the Gaussians N of a scene.
-            packed: as the attribute.
-        """
+        """Compute the arrangement. `shape`: batch dimensions, C, and the Gaussians N of a scene."""
         self.splats, self.packed = splats, packed
         self.places: Places | None = None
         if not packed:
@@ -158,8 +144,7 @@ class Layout:
     def rendered_columns(self, under: Tensor | None) -> dict[str, Tensor]:
         """Arrange the columns that the image depends on.
 
-        Args:
-            under: opacities of the Gaussians, [..., N], where they have no splat; None: zero.
+        `under`: opacities of the Gaussians, [..., N], where they have no splat; None: zero.
         """
         splats = self.splats
         columns = (splats.means2d, splats.conics, splats.depths, splats.opacities)
@@ -204,21 +189,13 @@ class Layout:
 
 @dataclass
 class Lists:
-    """The splats that each tile of all images composites.
+    """The splats that each tile of all images composites."""
 
-    Attributes:
-        splats: int32, splat indices; entries past the last offset are undefined.
-        offsets: int64 [I T + 1], where each tile's list begins.
-        width: image width in px.
-        height: image height in px.
-        tile_size: edge of a tile in px.
-    """
-
-    splats: Tensor
-    offsets: Tensor
-    width: int
-    height: int
-    tile_size: int
+    splats: Tensor  # int32, splat indices; entries past the last offset are undefined
+    offsets: Tensor  # int64 [I T + 1], where each tile's list begins
+    width: int  # image width in px
+    height: int  # image height in px
+    tile_size: int  # edge of a tile in px
     _listed: Tensor | None = None
 
     @property
@@ -246,7 +223,6 @@ def lists_of(
     """Return the tile lists for meta, and those to composite.
 
     Args:
-        images: number of images I.
         projection: the size of the images, and the caller's tile size.
         count: number of entries of the lists for meta; -1: unknown.
         pixels: the pixels that are rendered: the lists of tiles without any are empty, and those of the

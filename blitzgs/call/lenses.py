@@ -26,8 +26,7 @@ _UT_PARAMS = ("alpha", "beta", "kappa", "in_image_margin_factor", "require_all_s
 def check_without_ut(camera_model: str, rolling_shutter: Any, others: Mapping[str, object]) -> None:
     """Check a call without with_ut: it has none of the arguments that need it.
 
-    Raises:
-        ValueError: it has one, by name.
+    ValueError: it has one, by name.
     """
     given = [name for name, value in others.items() if value is not None]
     given += ["rolling_shutter"] if _shutter(rolling_shutter) != GLOBAL_SHUTTER else []
@@ -39,11 +38,8 @@ def check_without_ut(camera_model: str, rolling_shutter: Any, others: Mapping[st
 def check_with_ut(viewmats: Tensor, refused: Mapping[str, bool]) -> None:
     """Check that a call with with_ut has nothing that the unscented projection does not support.
 
-    Args:
-        refused: whether arguments that it does not support are given, by what to call them.
-
-    Raises:
-        ValueError: it has one, by name.
+    `refused`: whether arguments that it does not support are given, by what to call them. ValueError: it has
+    one, by name.
     """
     compiled = {"torch.compile": torch.compiler.is_compiling()}
     learned = {"a gradient of viewmats": torch.is_grad_enabled() and viewmats.requires_grad}
@@ -64,8 +60,7 @@ def with_lenses(
 ) -> Gaussians:
     """Return Gaussians whose scenes have lenses; the arguments are those of `blitzgs.rasterization`.
 
-    Raises:
-        ValueError: a shape or value is wrong, or two arguments do not go together.
+    ValueError: a shape or value is wrong, or two arguments do not go together.
     """
     fisheye = camera_model == "fisheye"
     lead, first = gaussians.lead, gaussians.scenes[0].viewmats

@@ -37,9 +37,8 @@ class LazyDict(dict[str, Any]):
     def __init__(self, given: Mapping[str, Any], compute: Callable[[str], Any]) -> None:
         """Begin with some values.
 
-        Args:
-            given: the values by key; `LATER` where they are not known.
-            compute: returns the value of such a key.
+        `given`: the values by key; `LATER` where they are not known. `compute`: returns the value of such a
+        key.
         """
         super().__init__(given)
         self._compute = compute
@@ -153,11 +152,9 @@ def make_meta(
 
     Under `torch.compile` it is a plain dict, and the compiler removes entries that the caller does not read.
 
-    Args:
-        gaussians: the checked arguments of the call.
-        known: the rendered columns in this arrangement, and further images.
-        lead: batch dimensions, and the number of views that are rendered here.
-        arrived: the splats that `lists` refers to, if ranks have exchanged splats; None: those of `layout`.
+    `known`: the rendered columns in this arrangement, and further images. `lead`: batch dimensions, and the
+    number of views that are rendered here. `arrived`: the splats that `lists` refers to, if ranks have
+    exchanged splats; None: those of `layout`.
     """
     entries = _Entries(gaussians, layout, lists, lead, arrived)
     numbers = {

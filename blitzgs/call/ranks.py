@@ -24,17 +24,11 @@ from blitzgs.ops.projection_types import ProjectedSplats
 
 
 class CallRanks(NamedTuple):
-    """The ranks of a call.
-
-    Attributes:
-        rank: rank of this process.
-        size: number of ranks M.
-        views: number of views C of each rank.
-    """
+    """The ranks of a call."""
 
     rank: int
-    size: int
-    views: int
+    size: int  # number of ranks M
+    views: int  # number of views C of each rank
 
 
 def gather_views(
@@ -70,7 +64,10 @@ def gather_views(
     inputs = scene._replace(Ks=scene.means)  # Ks get no gradient
     need = recorded and any(t is not None and t.requires_grad for t in inputs[:8])
     need_poses = recorded and scene.viewmats.requires_grad
-    _require_same((gaussians.views, *same, need, need_poses), scene.viewmats.device)
+    channels = None if gaussians.colors is None else gaussians.colors.shape[-1]
+    signals = None if gaussians.signals is None else gaussians.signals.channels
+    own = (gaussians.views, *same, channels, signals, need, need_poses)
+    _require_same(own, scene.viewmats.device)
     viewmats = _all_poses(scene.viewmats, job)
     Ks = _gathered(scene.Ks.detach(), job)
     scene = scene._replace(viewmats=viewmats, Ks=Ks)
@@ -95,13 +92,9 @@ def _require_same(given: tuple[Any, ...], device: torch.device) -> None:
 def send_splats(splats: ProjectedSplats, channels: Tensor, job: CallRanks) -> tuple[ProjectedSplats, Tensor]:
     """Send each splat to the rank that renders its view. Collective, as is its backward pass.
 
-    Args:
-        splats: of this rank's Gaussians in the views of all ranks.
-        channels: channels to composite, [P, D].
-
-    Returns:
-        The splats of this rank's views, ordered by (rank, Gaussian, view), and their channels. Only the
-        columns that tile lists and images need are valid.
+    `splats`: of this rank's Gaussians in the views of all ranks. `channels`: channels to composite, [P, D].
+    Returns the splats of this rank's views, ordered by (rank, Gaussian, view), and their channels. Only the
+    columns that tile lists and images need are valid.
     """
     images = splats.camera_ids.long()
     ranks = images // job.views

@@ -30,6 +30,12 @@ from blitzgs.util.errors import explain_memory
 _HALF = (torch.float16, torch.bfloat16)
 
 
+def _like_means(values: Any, means: Any) -> Any:
+    """Return half-precision values in the dtype of the means, and everything else as it is."""
+    is_half = isinstance(values, Tensor) and values.dtype in _HALF and isinstance(means, Tensor)
+    return values.to(means.dtype) if is_half else values
+
+
 def rasterization(
     means: Tensor,
     quats: Tensor | None,
@@ -190,10 +196,7 @@ def rasterization(
         width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, render_mode,
         rasterize_mode, camera_model,
     )  # fmt: skip
-    if isinstance(colors, Tensor) and colors.dtype in _HALF and isinstance(means, Tensor):
-        colors = colors.to(means.dtype)
-    if isinstance(extra_signals, Tensor) and extra_signals.dtype in _HALF and isinstance(means, Tensor):
-        extra_signals = extra_signals.to(means.dtype)
+    colors, extra_signals = _like_means(colors, means), _like_means(extra_signals, means)
     required: dict[str, object] = {"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks}
     if covars is None:
         required |= {"quats": quats, "scales": scales}
@@ -203,17 +206,11 @@ def rasterization(
         "thin_prism_coeffs": thin_prism_coeffs,
         "viewmats_rs": viewmats_rs,
     }
-    optional = {
-        "colors": colors,
-        "backgrounds": backgrounds,
-        "covars": covars,
-        "extra_signals": extra_signals,
-        **lens,
-    }
-    check_tensors(required, optional)
+    given = {"colors": colors, "backgrounds": backgrounds, "covars": covars, "extra_signals": extra_signals}
+    check_tensors(required, given | lens)
     if with_ut:
-        given = {"covars": covars is not None, "sparse_grad": sparse_grad, "distributed": distributed}
-        check_with_ut(viewmats, given)
+        refused = {"covars": covars is not None, "sparse_grad": sparse_grad, "distributed": distributed}
+        check_with_ut(viewmats, refused)
     elif camera_model != "pinhole" or (rolling_shutter, ut_params, *lens.values()) != (None,) * 6:
         check_without_ut(camera_model, rolling_shutter, {**lens, "ut_params": ut_params})
     if Ks.requires_grad:
@@ -225,19 +222,14 @@ def rasterization(
     gaussians = gaussians_of(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, render_mode)
     if sparse_grad and len(gaussians.lead) > 1:
         raise ValueError("sparse_grad does not support batch dimensions; leave one of them out")
-    if sparse_grad and covars is not None:
-        raise ValueError("sparse_grad does not support covars; leave one of them out")
-    if return_normals and covars is not None:
-        raise ValueError("return_normals does not support covars, whose axes have no order; leave one out")
     if extra_signals is not None:
         gaussians = with_signals(gaussians, extra_signals, extra_signals_sh_degree)
     elif extra_signals_sh_degree is not None:
         raise ValueError("extra_signals_sh_degree needs extra_signals; give both")
     if covars is not None:
-        gaussians = with_covariances(gaussians, covars)
+        gaussians = with_covariances(gaussians, covars, sparse_grad, return_normals)
     if with_ut:
         gaussians = with_lenses(gaussians, camera_model, rolling_shutter, ut_params, **lens)
-    antialiased = rasterize_mode == "antialiased"
     projection = ProjectionOptions(
         width,
         height,
@@ -247,26 +239,19 @@ def rasterization(
         far_plane,
         eps2d,
         radius_clip,
-        antialiased,
-        False,
+        antialiased=rasterize_mode == "antialiased",
+        raw=False,
     )
-    background = listed = None
-    if backgrounds is not None:
-        background = background_rows(backgrounds, gaussians, render_mode, return_normals)
-    if pixels is not None:
-        if distributed or torch.compiler.is_compiling():
-            raise ValueError("pixels support neither distributed=True nor torch.compile; leave one out")
-        listed = checked_pixels(pixels, image_ids, gaussians.images, width, height)
-    elif image_ids is not None:
-        raise ValueError("image_ids need pixels; give both")
+    background = background_rows(backgrounds, gaussians, render_mode, return_normals)
+    if pixels is not None and (distributed or torch.compiler.is_compiling()):
+        raise ValueError("pixels support neither distributed=True nor torch.compile; leave one out")
+    listed = checked_pixels(pixels, image_ids, gaussians.images, width, height)
     image = ImageOptions(
         render_mode, background, packed, sparse_grad, absgrad, return_normals, return_median, listed
     )
     job = None
     if distributed:
-        channels = None if gaussians.colors is None else gaussians.colors.shape[-1]
-        signals = None if gaussians.signals is None else gaussians.signals.channels
-        same = (width, height, tile_size, render_mode, channels, signals, return_normals)
+        same = (width, height, tile_size, render_mode, return_normals)
         gaussians, job = gather_views(gaussians, absgrad, same)
     try:
         return render("rasterization", gaussians, projection, image, job=job)

@@ -127,11 +127,11 @@ def raw_rasterization(
         warn_of_gradient("raw_rasterization")
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
-    harmonics = [sh0] if shN is None else [sh0, shN]
     shaded = "RGB" in render_mode
     # The parameters themselves, not their other shapes: optimisers know these.
     params = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     sh_params = {"sh0": sh0} if shN is None else {"sh0": sh0, "shN": shN}
+    harmonics = list(sh_params.values())
     if opacities.dim() == 2 and opacities.shape[1] == 1:
         tensors["opacities"] = opacities = of_shape(opacities, opacities.shape[:1])
     if sh0.dim() == 2 and sh0.shape[1] == 3:
@@ -153,7 +153,7 @@ def raw_rasterization(
     named = {name: (tensor,) for name, tensor in given.items() if tensor is not None}
     colors, degree = (sh0, sh_degree) if shaded else (None, None)
     gaussians = Gaussians(whole.scenes, colors, opacities, degree, False, whole.lead, True, named)
-    background = None if backgrounds is None else background_rows(backgrounds, gaussians, render_mode)
+    background = background_rows(backgrounds, gaussians, render_mode)
     image = ImageOptions(render_mode, background, True, sparse_grad, absgrad)
 
     def catch_up_sh(rows: Tensor, count: Tensor | None) -> None:
@@ -180,7 +180,6 @@ def _check_leaves(params: Mapping[str, Tensor]) -> None:
 
 
 def _lazy(optimizers: Any) -> list[CatchesUp]:
-    """Return the optimisers that may have pending steps, each once."""
     if isinstance(optimizers, torch.optim.Optimizer) or hasattr(optimizers, "catch_up"):
         optimizers = [optimizers]
     if not isinstance(optimizers, Iterable):

@@ -113,11 +113,8 @@ def _seen_grid(lens: Lens) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
             if not seen.any():
                 raise ValueError(_UNSEEN.format(lens))
             return u, v, seen
-        box = np.where(open_sides, box + np.array([-0.08, 0.08, -0.08, 0.08]) * _spans(box), box)
-
-
-def _spans(box: Array) -> Array:
-    return np.repeat([box[1] - box[0], box[3] - box[2]], 2)
+        spans = np.repeat([box[1] - box[0], box[3] - box[2]], 2)
+        box = np.where(open_sides, box + np.array([-0.08, 0.08, -0.08, 0.08]) * spans, box)
 
 
 def _inside(lens: Lens, x: npt.NDArray[Any], y: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:

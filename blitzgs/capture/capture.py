@@ -38,7 +38,6 @@ from blitzgs.capture.lens import Lens
 from blitzgs.capture.masks import check_mask_sizes, check_masks, find_masks
 from blitzgs.capture.names import MissingImagesError as MissingImagesError
 from blitzgs.capture.names import check_inside, existing, to_convert
-from blitzgs.capture.points import SourcePoints
 from blitzgs.capture.projects.find import FoundProject, folder_of, project_at
 from blitzgs.capture.usable import (
     check_lenses,
@@ -156,16 +155,7 @@ def load_capture(
         ValueError: a file is damaged, or sizes, poses or options are invalid.
     """
     root, project = _root_of(Path(path), images)
-    check_number("downscale", downscale)
-    if not downscale >= 1:  # NaN too
-        raise ValueError(f"downscale must be at least 1, got {downscale}")
-    for option, value, allowed in (
-        ("exif", exif, ("auto", "apply", "ignore")),
-        ("undistort", undistort, ("crop", "mask")),
-        ("stray_cameras", stray_cameras, ("drop", "keep")),
-    ):
-        if value not in allowed:
-            raise ValueError(f"{option} must be one of {', '.join(allowed)}, got {value!r}")
+    _check_options(downscale, exif, undistort, stray_cameras)
     views, points, source = read_layout(root, images, downscale, sparse, project)
     if not views:
         raise ValueError(f"{root}: its COLMAP model or transforms.json lists no images")
@@ -181,7 +171,10 @@ def load_capture(
     centres = camera_centres(np.stack([view.world_to_camera for view in views]))
     offset = centres[~apart].mean(axis=0)
     train_centres = centres[[i for i in train if not apart[i]] or train] - offset
-    _check_inside(root, views, points, images, masks, inside_only)
+    # The folders that the options name may be anywhere.
+    folders = [root / images, *([root / masks] if isinstance(masks, str) else [])]
+    named = [path for view in views for path in (view.path, view.mask_path)] + [points.path]
+    check_inside([path for path in named if path is not None], root, folders, inside_only)
     kept = existing([v.name for v in views], [v.path for v in views], root, images, allow_missing)
     missing = len(views) - len(kept)
     kept, found, damage = _with_files(views, kept, root, masks, find_damage if allow_missing else None)
@@ -192,16 +185,7 @@ def load_capture(
     apart_left = [place[index] for index in kept if apart[index]]
     if not train:
         raise MissingImagesError(f"{root}: no image of a training view is on disk and whole")
-    with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # the files may be on a slow network disk
-        headers = list(pool.map(lambda view: read_header(view.path), views))
-    extra_bands = [view for view, header in zip(views, headers, strict=True) if header.extra_bands]
-    check_masks([view.mask_path for view in views])
-    if extra_bands:
-        warnings.warn(
-            f"{len(extra_bands)} of {len(views)} photographs have a further band that their file does not "
-            f"call alpha (first: {extra_bands[0].name}), near infrared for example; it is not used",
-            stacklevel=2,
-        )
+    headers = _headers(views)
     plans: dict[Lens, Rectification] = {}
     cameras = [
         _camera(view, header, offset, downscale, undistort, exif, plans)
@@ -216,35 +200,65 @@ def load_capture(
     sight = Sight.of(cameras, points.positions)
     blind = sight.blind(cameras, points.positions)
     near = sight.near([i for i in train if i not in apart_left] if has_points else [], extent)
+    with_alpha = sum(header.has_alpha for header in headers)
+    about = About(
+        source,
+        why,
+        strays,
+        unused,
+        missing,
+        blind,
+        not has_points,
+        _relative(points.path, root),
+        points.colors_from,
+        with_alpha,
+        sum(header.extra_bands > 0 for header in headers),
+        len(damage),
+    )
     return Capture(
-        root=root,
-        cameras=cameras,
-        points=points.positions,
-        colors=points.colors,
-        track_lengths=points.track_lengths,
-        errors=points.errors,
-        offset=offset,
-        train=train,
-        test=test,
-        extent=extent,
-        has_alpha=any(header.has_alpha for header in headers),
+        root,
+        cameras,
+        points.positions,
+        points.colors,
+        points.track_lengths,
+        points.errors,
+        offset,
+        train,
+        test,
+        extent,
+        has_alpha=with_alpha > 0,
         near=near,
         apart=apart_left,
-        about=About(
-            source,
-            why,
-            strays,
-            unused,
-            missing,
-            blind,
-            not has_points,
-            points_from=_relative(points.path, root),
-            colors_from=points.colors_from,
-            with_alpha=sum(header.has_alpha for header in headers),
-            extra_bands=len(extra_bands),
-            damaged=len(damage),
-        ),
+        about=about,
     )
+
+
+def _check_options(downscale: float, exif: str, undistort: str, stray_cameras: str) -> None:
+    check_number("downscale", downscale)
+    if not downscale >= 1:  # NaN too
+        raise ValueError(f"downscale must be at least 1, got {downscale}")
+    for option, value, allowed in (
+        ("exif", exif, ("auto", "apply", "ignore")),
+        ("undistort", undistort, ("crop", "mask")),
+        ("stray_cameras", stray_cameras, ("drop", "keep")),
+    ):
+        if value not in allowed:
+            raise ValueError(f"{option} must be one of {', '.join(allowed)}, got {value!r}")
+
+
+def _headers(views: list[SourceView]) -> list[ImageHeader]:
+    """Read the headers of the photographs and check their masks; warn of bands that are not used."""
+    with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # the files may be on a slow network disk
+        headers = list(pool.map(lambda view: read_header(view.path), views))
+    check_masks([view.mask_path for view in views])
+    extra_bands = [view.name for view, header in zip(views, headers, strict=True) if header.extra_bands]
+    if extra_bands:
+        warnings.warn(
+            f"{len(extra_bands)} of {len(views)} photographs have a further band that their file does not "
+            f"call alpha (first: {extra_bands[0]}), near infrared for example; it is not used",
+            stacklevel=3,
+        )
+    return headers
 
 
 def _root_of(path: Path, images: str) -> tuple[Path, FoundProject | None]:
@@ -286,20 +300,6 @@ def _relative(path: Path | None, root: Path) -> str:
     if path is None:
         return ""
     return str(path.relative_to(root) if path.is_relative_to(root) else path)
-
-
-def _check_inside(
-    root: Path,
-    views: Sequence[SourceView],
-    points: SourcePoints,
-    images: str,
-    masks: str | bool | None,
-    refuse: bool,
-) -> None:
-    """See `names.check_inside`; the folders that the options name may be anywhere."""
-    named = [path for view in views for path in (view.path, view.mask_path) if path is not None]
-    folders = [root / images] + ([root / masks] if isinstance(masks, str) else [])
-    check_inside(named + ([points.path] if points.path else []), root, folders, refuse)
 
 
 def _camera(

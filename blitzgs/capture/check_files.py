@@ -47,11 +47,7 @@ def damaged(files: Sequence[tuple[Path, Path | None]]) -> dict[int, str]:
 
 
 class FileCheck:
-    """Checks the files of views one after the other in a thread of its own, while others are in use.
-
-    Attributes:
-        damage: what is wrong with the first damaged file that was found; None so far.
-    """
+    """Checks the files of views one after the other in a thread of its own, while others are in use."""
 
     def __init__(
         self,
@@ -62,12 +58,10 @@ class FileCheck:
     ) -> None:
         """Start to check files.
 
-        Args:
-            cameras: all views.
-            order: those to check, in this order.
-            counted: decodes a view's mask, and tells whether some pixel counts.
-            whole: files of opaque photographs that others have checked meanwhile.
+        `counted`: decodes a view's mask, and tells whether some pixel counts. `whole`: files of opaque
+        photographs that others have checked meanwhile.
         """
+        # What is wrong with the first damaged file that was found; None so far.
         self.damage: str | None = None
         self._cameras, self._order, self._counted, self._whole = cameras, order, counted, whole
         self._stop = threading.Event()

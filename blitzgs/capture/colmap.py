@@ -219,7 +219,6 @@ def _check(model: ColmapModel) -> None:
 
 
 def _bytes_of(model: ColmapModel) -> Iterator[bytes]:
-    """Yield the binary files of a model."""
     ids = {name: number for number, name, _ in native.camera_models()}
     cameras = (
         struct.pack(f"<IiQQ{len(c.params)}d", c.id, ids[c.model], c.width, c.height, *c.params)

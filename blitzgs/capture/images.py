@@ -216,7 +216,6 @@ class ImageStore:
         return self.decoded.budget + (0 if self._shared is None else self._shared.size)
 
     def _decoded_budget(self) -> int:
-        """Return how many bytes the decoded images may take now."""
         if self._decoded_bytes is not None:
             return self._decoded_bytes
         budget = self.compressed.budget
@@ -309,21 +308,18 @@ class ImageStore:
         packed = self.compressed.get(index)
         if packed is not None:
             return _uint8(native.decode_qoi(packed))
-        pixels = self._prepare(camera, self._decode(camera, self._read_whole(camera.image_path)))
-        if self._shared is None:
-            packed = native.encode_qoi(pixels)
-            self.compressed.put(index, packed, len(packed))
-        return pixels
-
-    def _prepare(self, camera: Camera, pixels: UInt8) -> UInt8:
-        """Undistort and downscale."""
+        pixels = self._decode(camera, self._read_whole(camera.image_path))
         if not camera.rectification.is_identity:
             columns, rows, _ = self._maps_of(camera.rectification)
             # Linear interpolation blurs by up to a pixel, and is two times as fast.
             is_halved = 2 * camera.width <= camera.rectification.lens.width
             how = cv2.INTER_LINEAR if is_halved else cv2.INTER_CUBIC
             pixels = _uint8(cv2.remap(pixels, columns, rows, how, borderMode=cv2.BORDER_REPLICATE))
-        return _shrunk(pixels, camera)
+        pixels = _shrunk(pixels, camera)
+        if self._shared is None:
+            packed = native.encode_qoi(pixels)
+            self.compressed.put(index, packed, len(packed))
+        return pixels
 
     def _make_mask(self, index: int) -> UInt8:
         camera = self.capture.cameras[index]
@@ -382,7 +378,6 @@ def _uint8(pixels: npt.ArrayLike) -> UInt8:
 
 
 def _shrunk(pixels: UInt8, camera: Camera) -> UInt8:
-    """Average down to the camera's size."""
     if pixels.shape[:2] == (camera.height, camera.width):
         return pixels
     return _uint8(cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA))

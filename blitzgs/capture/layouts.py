@@ -74,7 +74,10 @@ def read_layout(
         incomplete = colmap.find_incomplete_model(root)
         if incomplete is not None:
             _read_colmap(root, incomplete, images, downscale)  # raises an error that names the missing file
-        raise _no_capture(root)
+        raise FileNotFoundError(
+            f"{root} holds no capture: expected a COLMAP model (sparse/0 with cameras, images and points3D "
+            f"as .bin or .txt), transforms.json, or a project of another program{_hint(root)}"
+        )
     if source.frame is None:
         source = replace(source, frame=frame_beside(root))
     return views, points, _with_photographs(root, source, views)
@@ -91,13 +94,6 @@ def _read_project(
     file = project.file.relative_to(root) if project.file.is_relative_to(root) else project.file
     cameras = f"{file} ({project.kind.program})"
     return views, points, Source(cameras, notes=tuple(content.notes), frame=content.frame)
-
-
-def _no_capture(root: Path) -> FileNotFoundError:
-    return FileNotFoundError(
-        f"{root} holds no capture: expected a COLMAP model (sparse/0 with cameras, images and points3D as "
-        f".bin or .txt), transforms.json, or a project of another program{_hint(root)}"
-    )
 
 
 def _hint(root: Path) -> str:

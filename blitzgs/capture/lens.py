@@ -87,12 +87,10 @@ class Lens:
         sx, sy = width / self.width, height / self.height
         fx, fy, cx, cy = self.intrinsics
         intrinsics = (fx * sx, fy * sy, cx * sx, cy * sy)
-        return Lens(_WITH_TWO_FOCALS.get(self.model, self.model), width, height, (*intrinsics, *self._full()))
-
-    def _full(self) -> tuple[float, ...]:
-        """Return the distortion parameters of the model with two focal lengths."""
+        # Coefficients that the model with two focal lengths has in addition.
         padding = {"SIMPLE_RADIAL": 3, "RADIAL": 2, "SIMPLE_RADIAL_FISHEYE": 3, "RADIAL_FISHEYE": 2}
-        return self.distortion + (0.0,) * padding.get(self.model, 0)
+        params = (*intrinsics, *self.distortion, *[0.0] * padding.get(self.model, 0))
+        return Lens(_WITH_TWO_FOCALS.get(self.model, self.model), width, height, params)
 
     def distort(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Map normalised coordinates to distorted ones; NaN if the model does not see the direction."""

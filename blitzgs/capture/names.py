@@ -47,10 +47,6 @@ def _last(name: str) -> str:
     return PurePosixPath(_any_case(name)).name
 
 
-def _joined(name: str) -> str:
-    return _any_case(name).replace("/", "_")
-
-
 # What is ignored, and whether files that were found by stricter rules rule it out: where some photographs are
 # in the folders that the names say, one of the same name in another folder is another photograph.
 _Rule = tuple[str, Callable[[str], str], bool]
@@ -59,7 +55,7 @@ _RULES: tuple[_Rule, ...] = (
     ("upper and lower case", _any_case, False),
     ("suffixes", _without_suffix, True),
     ("folders", _last, True),
-    ("folders that became part of the name", _joined, True),
+    ("folders that became part of the name", lambda name: _any_case(name).replace("/", "_"), True),
     ("folders and suffixes", lambda name: _without_suffix(_last(name)), True),
 )
 
@@ -94,7 +90,12 @@ def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dic
         }
         if not new:
             continue
-        _say(new, len(found) + len(wanted), folder, ignored)
+        name, file = next(iter(new.items()))
+        warnings.warn(
+            f"{len(new)} of {len(found) + len(wanted)} files have other names in {folder} than in the "
+            f"capture's file: {file} is used for {name} (names that differ only in {ignored})",
+            stacklevel=3,
+        )
         matches |= {name: folder / file for name, file in new.items()}
         used = set(new.values())
         free = [file for file in free if file not in used]
@@ -107,15 +108,6 @@ def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dic
 
 def _is_alike(name: str, file: str) -> bool:
     return bool(_BY_PRODUCT.search(unified(name))) == bool(_BY_PRODUCT.search(file))
-
-
-def _say(new: dict[str, str], count: int, folder: Path, ignored: str) -> None:
-    name, file = next(iter(new.items()))
-    warnings.warn(
-        f"{len(new)} of {count} files have other names in {folder} than in the capture's file: {file} is "
-        f"used for {name} (names that differ only in {ignored})",
-        stacklevel=4,
-    )
 
 
 def files_below(folder: Path) -> list[str]:
@@ -184,7 +176,7 @@ def check_inside(paths: Iterable[Path], root: Path, allowed: Sequence[Path], ref
             warnings.warn(
                 f"{len(outside)} names of the capture lead outside {root} (first: {outside[0]}); "
                 "--data.inside_only=true refuses them",
-                stacklevel=3,
+                stacklevel=2,
             )
         return
     # A link inside the capture belongs to the capture, so it must not lead outside either.

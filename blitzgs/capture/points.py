@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture import colmap
-from blitzgs.capture.cameras import Float64, SourceView, camera_centres
+from blitzgs.capture.cameras import Float64, camera_centres
 from blitzgs.capture.names import unified
 from blitzgs.capture.transforms import Transforms
 from blitzgs.formats.ply import read_point_cloud
@@ -201,17 +200,13 @@ def _differs(model: colmap.ColmapModel, content: Transforms) -> str | None:
     pairs = [(i, places[stem]) for i, n in enumerate(model.images.names) if (stem := _stem(n)) in places]
     if len(pairs) < 2 or len(places) < len(content.frames):
         return "its images are called otherwise than the frames, so their worlds cannot be compared"
-    ours = _centres([frame for _, frame in pairs])
+    ours = camera_centres(np.stack([frame.world_to_camera for _, frame in pairs]))
     theirs = content.moved(camera_centres(colmap.world_to_camera(model.images))[[i for i, _ in pairs]])
     apart = float(np.median(np.linalg.norm(ours - theirs, axis=1)))
     spread = float(np.linalg.norm(ours - ours.mean(axis=0), axis=1).max())
     if not apart <= _SAME_PLACE * spread:  # NaN too
         return f"its cameras are elsewhere, {apart:.3g} apart, so its world is another one"
     return None
-
-
-def _centres(frames: Sequence[SourceView]) -> Float64:
-    return camera_centres(np.stack([frame.world_to_camera for frame in frames]))
 
 
 def _stem(name: str) -> str:

@@ -28,19 +28,13 @@ V = TypeVar("V")
 
 
 class BoundedCache(Generic[K, V]):
-    """A least-recently-used cache with a budget of bytes; an entry larger than the budget is not stored.
-
-    Attributes:
-        budget: the largest size, in bytes.
-        bytes: the size now.
-        most_bytes: the largest size so far.
-    """
+    """A least-recently-used cache with a budget of bytes; an entry larger than the budget is not stored."""
 
     def __init__(self, budget: int) -> None:
         """Hold at most `budget` bytes."""
-        self.budget = budget
-        self.bytes = 0
-        self.most_bytes = 0
+        self.budget = budget  # the largest size, in bytes
+        self.bytes = 0  # the size now
+        self.most_bytes = 0  # the largest size so far
         self._entries: OrderedDict[K, tuple[V, int]] = OrderedDict()
         self._lock = threading.Lock()
 

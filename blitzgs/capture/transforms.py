@@ -97,7 +97,11 @@ def read_transforms(root: Path, files: Sequence[Path] | None = None) -> Transfor
                 raise ValueError(f"{path}: frame {index}: {reason}") from error
             ignored |= dict.fromkeys(key for key in entry if key not in _KNOWN | _OF_OTHERS)
         ignored |= dict.fromkeys(key for key in content if key not in _KNOWN | _OF_OTHERS)
-        _check_lists(path, lists, own)
+        if lost := set().union(*lists.values()) - {frame.name for frame in own}:
+            keys = " or ".join(f"{part}_filenames" for part in lists)
+            raise ValueError(
+                f"{path}: {keys} name {len(lost)} images that are no frames (first: {min(lost)})"
+            )
         frames += own
     if ignored:
         shown = ", ".join(f"{key:.40}" for key in list(ignored)[:8]) + (", ..." if len(ignored) > 8 else "")
@@ -169,14 +173,6 @@ def _lists(file: Path, content: Mapping[str, Any]) -> dict[str, set[str]]:
             raise ValueError(f"{file}: {key} must be a list of the file_path of frames")
         lists[part] = {_name(name) for name in names}
     return lists
-
-
-def _check_lists(file: Path, lists: Mapping[str, set[str]], frames: Sequence[SourceView]) -> None:
-    names = {frame.name for frame in frames}
-    lost = set().union(*lists.values()) - names
-    if lost:
-        keys = " or ".join(f"{part}_filenames" for part in lists)
-        raise ValueError(f"{file}: {keys} name {len(lost)} images that are no frames (first: {min(lost)})")
 
 
 def _part(file: Path, lists: Mapping[str, set[str]], name: str) -> str | None:

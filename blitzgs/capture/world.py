@@ -30,21 +30,13 @@ _AXIS, _E2 = 6378137.0, (2 - 1 / 298.257223563) / 298.257223563
 
 @dataclass(frozen=True, eq=False)
 class WorldFrame:
-    """Maps coordinates of a capture to the world: world = scale * rotation @ capture + translation.
+    """Maps coordinates of a capture to the world: world = scale * rotation @ capture + translation."""
 
-    Attributes:
-        crs: the world's reference system, as "EPSG:32633" or WKT; empty: a local one.
-        scale: world units per unit of the capture.
-        rotation: [3, 3].
-        translation: [3], world units.
-        source: what says so, for messages.
-    """
-
-    crs: str = ""
-    scale: float = 1.0
-    rotation: Float64 = field(default_factory=lambda: np.eye(3))
-    translation: Float64 = field(default_factory=lambda: np.zeros(3))
-    source: str = ""
+    crs: str = ""  # the world's reference system, as "EPSG:32633" or WKT; empty: a local one
+    scale: float = 1.0  # world units per unit of the capture
+    rotation: Float64 = field(default_factory=lambda: np.eye(3))  # [3, 3]
+    translation: Float64 = field(default_factory=lambda: np.zeros(3))  # [3], world units
+    source: str = ""  # what says so, for messages
 
     def __post_init__(self) -> None:
         rotation, translation = np.asarray(self.rotation, float), np.asarray(self.translation, float)

@@ -113,7 +113,11 @@ def _run(given: list[str]) -> int:
             raise
         # Those of Python's imports and of YAML have lines.
         lines = isinstance(error, ImportError) or type(error).__name__ == "ConfigError"
-        _print_error(f"{name}: {printable(_message(error), lines)}")
+        from rich.console import Console
+
+        text = f"{name}: {printable(_message(error), lines)}"
+        console = Console(stderr=True, highlight=False, emoji=False)
+        console.print(text, style="red", markup=False, soft_wrap=True)
         return 1
 
 
@@ -179,16 +183,8 @@ def _importing(name: str) -> Iterator[None]:
 
 
 def _user_errors() -> tuple[type[BaseException], ...]:
-    """Return the errors that are reported as a message."""
     named = (path.rpartition(".") for path in _NAMED_ERRORS)
     return (*_USER_ERRORS, *(getattr(import_module(module), name) for module, _, name in named))
-
-
-def _print_error(text: str) -> None:
-    from rich.console import Console
-
-    console = Console(stderr=True, highlight=False, emoji=False)
-    console.print(text, style="red", markup=False, soft_wrap=True)
 
 
 def _message(error: BaseException) -> str:

@@ -98,12 +98,7 @@ def examine(folder: Path | None = None) -> list[Line]:
     lines = [Line("blitzgs", "ok", f"{__version__} in {_PACKAGE}"), _system(), _memory(), *_packages()]
     torch_line = _torch()
     gpus = torch_line.values.get("gpus", [])
-    lines += [
-        torch_line,
-        _driver(),
-        *(_gpu(number, gpu) for number, gpu in enumerate(gpus)),
-        _nvcc(),
-    ]
+    lines += [torch_line, _driver(), *(_gpu(number, gpu) for number, gpu in enumerate(gpus)), _nvcc()]
     works = torch_line.state in ("ok", "warning")
     checks: list[Callable[[], Line]] = [lambda: _library("io")]
     if works:
@@ -165,7 +160,6 @@ def run_command(command: Sequence[str]) -> str:
 
 
 def _last(errors: str) -> str:
-    """Return the last line of a traceback that says something."""
     lines = [line.strip() for line in errors.splitlines() if line.strip()]
     return lines[-1][:300] if lines else ""
 

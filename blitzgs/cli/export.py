@@ -129,6 +129,15 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
         metavar="K",
         help="leave out floaters and fringes that at most K training photographs saw (default: %(const)s)",
     )
+    _add_selection(parser)
+    for name, help_text in (
+        ("tile-gaussians", "Gaussians of a tile (default: 32768)"),
+        ("processes", "processes that write tiles (default: as many as CPU cores)"),
+    ):
+        parser.add_argument(f"--{name}", type=_COUNT, metavar="N", help=f"with {_TILES}: {help_text}")
+
+
+def _add_selection(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--crop",
         type=float,
@@ -159,11 +168,6 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     parser.add_argument(
         "--levels", type=_levels, metavar="FIRST-LAST", help="keep these octree levels, for example 0-3"
     )
-    for name, help_text in (
-        ("tile-gaussians", "Gaussians of a tile (default: 32768)"),
-        ("processes", "processes that write tiles (default: as many as CPU cores)"),
-    ):
-        parser.add_argument(f"--{name}", type=_COUNT, metavar="N", help=f"with {_TILES}: {help_text}")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -185,7 +189,6 @@ def _refuse(args: argparse.Namespace, flags: Iterable[str], reason: str) -> None
 
 
 def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
-    """Write the Gaussians that meet a selection as tiles; returns the exit status."""
     _refuse(args, ("max_mb", "coordinates", "classic", "clean"), f"is not for {_TILES}")
     from blitzgs.formats.streamed_sog import write_streamed_sog
     from blitzgs.formats.tiles import TILE, write_tiles
@@ -193,10 +196,7 @@ def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
 
     start, city = time.monotonic(), open_city(args.model, checked=selection is None)
     source, path = city.source, args.tiles or args.streamed_sog
-    sizes = {
-        "most": args.tile_gaussians or TILE,
-        "processes": args.processes or len(os.sched_getaffinity(0)),
-    }
+    sizes = {"most": args.tile_gaussians or TILE, "processes": args.processes or len(os.sched_getaffinity(0))}
     with image_progress("Exporting", unit="") as report:
         source = Watched(source, report)
         if selection is not None:

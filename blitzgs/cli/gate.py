@@ -92,7 +92,10 @@ def run_fit(args: argparse.Namespace) -> int:
         raise ValueError(f"--out {args.out}: a gate's file ends in .json")
     if not args.gate_from >= 0:
         raise ValueError(f"--gate-from: must be 0 or more, got {args.gate_from}")
-    runs = [_spawns(path) for path in args.runs]
+    runs = [
+        spawn_samples.read_sample(path) if path.suffix == spawn_samples.SUFFIX else _spawns_of(path)
+        for path in args.runs
+    ]
     args.out.parent.mkdir(parents=True, exist_ok=True)
     figures = gate_fit.fit(runs, args.out, args.gate_from)
     print(f"{args.out}: fitted on {len(runs)} run{'s' * (len(runs) > 1)}; {figures['protocol']}:")
@@ -164,15 +167,7 @@ def run_replay(args: argparse.Namespace) -> int:
     return 0
 
 
-def _spawns(path: Path) -> gate_fit.Spawns:
-    """Read the spawns of a run, or a sample of them."""
-    if path.suffix == spawn_samples.SUFFIX:
-        return spawn_samples.read_sample(path)
-    return _spawns_of(path)
-
-
 def _spawns_of(folder: Path) -> gate_fit.Spawns:
-    """Read the spawns of a run."""
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is not the folder of a run")
     lineage = folder / run_files.LINEAGE
@@ -196,7 +191,6 @@ def _judgement(entry: dict[str, Any]) -> str:
 
 
 def _table(results: Sequence[dict[str, Any]]) -> str:
-    """Return a Markdown table of the arms, with differences from the first."""
     first = results[0]
     columns = "arm | PSNR | difference | SSIM | peak | difference | final | seconds | known to the oracle"
     lines = [f"| {columns} |", "|---" * 9 + "|"]

@@ -124,8 +124,7 @@ def understood_alone(config: Config) -> str | None:
 def _photographs_alone(config: Config) -> Path | None:
     """Return the folder of photographs that have no poses; None: they have.
 
-    Raises:
-        FileNotFoundError: the folder is a run or a part of a capture, whose pictures need no poses.
+    FileNotFoundError: the folder is a run or a part of a capture, whose pictures need no poses.
     """
     root = Path(config.data.path)
     if not config.data.path or not has_photographs_alone(root, config.data.images):

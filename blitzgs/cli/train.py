@@ -77,21 +77,7 @@ With torchrun's --max-restarts=K and --resume, a job that loses a process contin
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "train", run, summary, HELP, add_help=False)
-    parser.add_argument(
-        "-h",
-        "--help",
-        nargs="?",
-        metavar="FIELD",
-        action=_Help,
-        help="show this help, or explain a field or section of the configuration, and stop",
-    )
-    parser.add_argument(
-        "--help-fields",
-        nargs="?",
-        choices=("text", "markdown"),
-        action=_Help,
-        help="explain all fields of the configuration, as text or as a page, and stop",
-    )
+    _add_helps(parser)
     parser.add_argument(
         "--config",
         metavar="RECIPE",
@@ -139,6 +125,24 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser.add_argument("--no-sfm", action="store_true", help="refuse photographs without poses")
     add_live_page(parser)
     add_device(parser, shares_gpus=True)
+
+
+def _add_helps(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "-h",
+        "--help",
+        nargs="?",
+        metavar="FIELD",
+        action=_Help,
+        help="show this help, or explain a field or section of the configuration, and stop",
+    )
+    parser.add_argument(
+        "--help-fields",
+        nargs="?",
+        choices=("text", "markdown"),
+        action=_Help,
+        help="explain all fields of the configuration, as text or as a page, and stop",
+    )
 
 
 class _Help(argparse.Action):
@@ -229,7 +233,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace, config: Config) -> int:
-    """Print what is understood of the capture, and what a training will take."""
     if not args.no_sfm and (text := understood_alone(config)) is not None:
         print(text)
         return 0

@@ -15,14 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.cli.arguments import (
-    Commands,
-    add_capture,
-    add_command,
-    add_device,
-    add_model,
-    add_path,
-)
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_model, add_path
 from blitzgs.distributed.group import Ranks, extend_memory_in_place, resolve_device
 from blitzgs.formats.tiles import PAGE, TILESET
 from blitzgs.runs import run_files

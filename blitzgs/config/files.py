@@ -227,22 +227,18 @@ def _build(kind: type, values: Any, where: str) -> Any:
     for name, value in values.items():
         path = f"{where}.{name}" if where else str(name)
         if path in REMOVED:
-            _check_removed(path, value, {f"{where}.{other}": found for other, found in values.items()})
-            continue
+            # A value that stood for what BlitzGS does without the field changes nothing.
+            if without_effect(path, value, {f"{where}.{other}": found for other, found in values.items()}):
+                continue
+            raise ConfigError(
+                f"{path}: this field was removed: BlitzGS now does what {REMOVED[path]!r} stood for, got "
+                f"{value!r}; leave the field out, or go on with a run that was trained with it by the "
+                "version that wrote it"
+            )
         if name not in hints:
             raise ConfigError(f"{path}: unknown field; {_hint(str(name), list(hints))}")
         arguments[name] = _convert(hints[name], value, path)
     return kind(**arguments)
-
-
-def _check_removed(name: str, value: Any, values: Mapping[str, Any]) -> None:
-    """Refuse a value of a removed field, unless it stood for what BlitzGS does without the field."""
-    if not without_effect(name, value, values):
-        raise ConfigError(
-            f"{name}: this field was removed: BlitzGS now does what {REMOVED[name]!r} stood for, got "
-            f"{value!r}; leave the field out, or go on with a run that was trained with it by the version "
-            "that wrote it"
-        )
 
 
 def without_effect(name: str, value: Any, values: Mapping[str, Any]) -> bool:

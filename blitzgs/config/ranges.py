@@ -132,7 +132,6 @@ def _numbers(value: Any) -> list[Any]:
 
 
 def _problems_of_length(schedule: ScheduleConfig) -> Iterator[str]:
-    """Name the problems with the length of a run."""
     images = [image for image, _ in schedule.pace]
     if any(image >= after for image, after in itertools.pairwise([0, *images])):
         yield f"schedule.pace: its images must be above 0 and increase, got {images}"
@@ -154,7 +153,6 @@ def _problems_of_length(schedule: ScheduleConfig) -> Iterator[str]:
 
 
 def _problems_of_resolution(schedule: ScheduleConfig) -> Iterator[str]:
-    """Name the problems with the resolution of the photographs."""
     factors, times = [pair[0] for pair in schedule.resolution], [pair[1] for pair in schedule.resolution]
     if any(factor not in REDUCTIONS for factor in factors) or factors != sorted(set(factors), reverse=True):
         yield f"schedule.resolution: its factors must be 8, 4 or 2 and decrease, got {factors}"
@@ -239,7 +237,6 @@ def _sections() -> dict[str, type]:
 
 
 def _fields(kind: type) -> dict[str, Any]:
-    """Return the types of a section's fields."""
     hints = typing.get_type_hints(kind)
     return {name: hint for name, hint in hints.items() if not dataclasses.is_dataclass(hint)}
 
@@ -249,7 +246,6 @@ def _joined(section: str, field: str) -> str:
 
 
 def _section(name: str) -> str:
-    """Return the description of a section and of all of its fields."""
     kind = _sections()[name]
     about = f"{name}: {_about(kind)}" if name else _about(kind)
     return "\n\n".join([about, *(_field(name, field) for field in _fields(kind))])
@@ -272,7 +268,6 @@ def _field(section: str, field: str) -> str:
 
 
 def _default(kind: type, field: str) -> str:
-    """Return the default of a field as YAML."""
     value = getattr(kind(), field)
     plain = list(value) if isinstance(value, tuple) else value
     return yaml.safe_dump(plain, default_flow_style=True).split("\n...")[0].strip()

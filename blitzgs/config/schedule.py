@@ -12,13 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from blitzgs.config.fields import (
-    MAX_STRETCH,
-    POSITION_LEFT,
-    SH_SHARE,
-    OptimiserConfig,
-    ScheduleConfig,
-)
+from blitzgs.config.fields import MAX_STRETCH, POSITION_LEFT, SH_SHARE, OptimiserConfig, ScheduleConfig
 
 
 class Pace:
@@ -201,12 +195,8 @@ class Schedule:
         rates fall exponentially from `densify_until` to `position_decay`, where `final` of them is left.
         Every rate is multiplied by sqrt(B).
 
-        Args:
-            config: the rates for B = 1.
-            extent: the scene's extent in its own unit.
-
-        Returns:
-            float32 [S + 1, 6]: row s holds the rates of step s = 1..S for `RATES`; row 0 is zero.
+        `config`: the rates for B = 1. `extent`: the scene's extent in its own unit. Returns float32
+        [S + 1, 6]: row s holds the rates of step s = 1..S for `RATES`; row 0 is zero.
         """
         begin = torch.arange(self.steps, dtype=torch.float64) * self.batch_size
         times = self.pace.times(begin)

@@ -37,30 +37,20 @@ class MismatchError(RuntimeError):
 
 @dataclass
 class Ranks:
-    """One process's view of the job. With `world_size` 1 no process group exists and every call is local.
+    """One process's view of the job. With `world_size` 1 no process group exists and every call is local."""
 
-    Attributes:
-        rank: index of this process, 0 <= rank < world_size.
-        world_size: number of processes M.
-        local_world_size: number of processes on this host.
-        device: where this rank computes.
-        timeout_seconds: the job ends if a rank does not arrive at a collective within this time.
-        shares_gpu: several ranks of this host compute on one GPU.
-        watchdog: ends the job if a rank waits for another for too long; collectives and other waits for ranks
-            run in its `Watchdog.waiting`, and long work on the host in its `Watchdog.working`.
-        memory: memory that the ranks share; None: splats are sent by collectives.
-        transport: describes for the log how splats are sent.
-    """
-
-    rank: int = 0
-    world_size: int = 1
-    local_world_size: int = 1
-    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    rank: int = 0  # index of this process, 0 <= rank < world_size
+    world_size: int = 1  # number of processes M
+    local_world_size: int = 1  # number of processes on this host
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))  # where this rank computes
+    # The job ends if a rank does not arrive at a collective within this time.
     timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS
-    shares_gpu: bool = False
+    shares_gpu: bool = False  # several ranks of this host compute on one GPU
+    # Ends the job if a rank waits for another for too long; collectives and other waits for ranks run in its
+    # `Watchdog.waiting`, and long work on the host in its `Watchdog.working`.
     watchdog: Watchdog | NoWatchdog = field(default_factory=NoWatchdog)
-    memory: SharedMemory | None = None
-    transport: str = "none: one rank"
+    memory: SharedMemory | None = None  # memory that the ranks share; None: splats are sent by collectives
+    transport: str = "none: one rank"  # describes for the log how splats are sent
 
     @classmethod
     def from_environment(
@@ -198,11 +188,8 @@ class Ranks:
     def exchange_counts(self, counts: Tensor) -> Tensor:
         """Exchange the numbers of items that the ranks will send each other.
 
-        Args:
-            counts: int64 [M] or [M, C] on `device`; row m is what goes to rank m.
-
-        Returns:
-            A tensor of the same shape: row m is what comes from rank m.
+        `counts`: int64 [M] or [M, C] on `device`; row m is what goes to rank m. Returns a tensor of the same
+        shape: row m is what comes from rank m.
         """
         if self.world_size == 1:
             return counts.clone()
@@ -214,13 +201,8 @@ class Ranks:
     def all_to_all(self, rows: Tensor, sent: Sequence[int], received: Sequence[int]) -> Tensor:
         """Send consecutive groups of rows, one to each rank, and return those received, by source rank.
 
-        Args:
-            rows: [sum(sent), ...]; the rows for rank 0 first.
-            sent: rows for each rank, M values.
-            received: rows from each rank, M values (see `exchange_counts`).
-
-        Returns:
-            [sum(received), ...].
+        `rows`: [sum(sent), ...]; the rows for rank 0 first. `sent`: rows for each rank, M values. `received`:
+        rows from each rank, M values (see `exchange_counts`). Returns [sum(received), ...].
         """
         if self.world_size == 1:
             return rows.clone()
@@ -269,11 +251,8 @@ class Ranks:
     def compare_across_ranks(self, fields: Mapping[str, object]) -> None:
         """Check that every rank has the same values: configuration, code version, data fingerprint.
 
-        Args:
-            fields: name -> value; values are compared by their `repr`.
-
-        Raises:
-            MismatchError: on every rank, naming the first differing field, the ranks and their values.
+        `fields`: name -> value; values are compared by their `repr`. MismatchError: on every rank, naming the
+        first differing field, the ranks and their values.
         """
         mine = {name: repr(value) for name, value in fields.items()}
         everyone = self.all_gather_object((socket.gethostname(), mine))
@@ -284,7 +263,7 @@ class Ranks:
                 holders.setdefault(values.get(name, "(missing)"), []).append(rank)
             if len(holders) > 1:
                 detail = "; ".join(
-                    f"rank{'s' if len(ranks) > 1 else ''} {_list(ranks)}"
+                    f"rank{'s' if len(ranks) > 1 else ''} {', '.join(map(str, ranks))}"
                     f" ({everyone[ranks[0]][0]}): {_shorten(value)}"
                     for value, ranks in holders.items()
                 )
@@ -315,10 +294,6 @@ def extend_memory_in_place() -> None:
     """
     if not any(name in os.environ for name in ALLOCATOR_VARIABLES):
         os.environ[ALLOCATOR_VARIABLES[0]] = "expandable_segments:True"
-
-
-def _list(ranks: Sequence[int]) -> str:
-    return ", ".join(map(str, ranks))
 
 
 def _shorten(text: str) -> str:

@@ -20,15 +20,12 @@ class _Side:
 
     Only one thread at a time may use it: a second thread could record `ready` again before the first one has
     made the stream wait for it.
-
-    Attributes:
-        stream: the second stream.
-        ready: event by which the second stream waits for the step's stream. It is recorded on the step's
-            stream before each use of the second one; a new record does not change waits that are queued.
     """
 
     def __init__(self, device: torch.device) -> None:
-        self.stream = torch.cuda.Stream(device)
+        self.stream = torch.cuda.Stream(device)  # the second stream
+        # Event by which the second stream waits for the step's stream. It is recorded on the step's stream
+        # before each use of the second one; a new record does not change waits that are queued.
         self.ready = torch.cuda.Event()
 
 
@@ -85,11 +82,9 @@ class HostSum:
     ) -> None:
         """Queue the sums.
 
-        Args:
-            ranks: the job.
-            parts: float64 [B, K, 2], sums of this rank's loss in parts (`photometric_fwd_bwd`); None: none.
-            tile_work: int32 [T], number of list entries that were composited in each tile; None: none.
-            tiles: the tiles of this rank, [first, one past last).
+        `parts`: float64 [B, K, 2], sums of this rank's loss in parts (`photometric_fwd_bwd`); None: none.
+        `tile_work`: int32 [T], number of list entries that were composited in each tile; None: none. `tiles`:
+        the tiles of this rank, [first, one past last).
         """
         self._ranks = ranks
         self._sums = 0 if parts is None else 2 * parts.shape[0]

@@ -37,17 +37,9 @@ def decimal_share(share: float) -> Fraction:
 def smallest(keys: Tensor, ids: Tensor, k: int, ranks: Ranks) -> Tensor:
     """Mark the k rows, over all ranks, with the smallest (key, id).
 
-    Args:
-        keys: float32 [N_rank], no NaN; infinities are allowed.
-        ids: int64 [N_rank], >= 0, unique over all ranks.
-        k: number of rows to mark; all rows if k exceeds their number.
-        ranks: the job.
-
-    Returns:
-        bool [N_rank]; the same ids at every world size.
-
-    Raises:
-        ValueError: on every rank, when a key of any rank is NaN, or k < 0.
+    `keys`: float32 [N_rank], no NaN; infinities are allowed. `ids`: int64 [N_rank], >= 0, unique over all
+    ranks. `k`: number of rows to mark; all rows if k exceeds their number. Returns bool [N_rank]; the same
+    ids at every world size. ValueError: on every rank, when a key of any rank is NaN, or k < 0.
     """
     if k < 0:
         raise ValueError(f"smallest: k must not be negative, got {k}")
@@ -79,7 +71,6 @@ def mass_prefix(scores: Tensor, ids: Tensor, fraction: float, ranks: Ranks) -> T
         scores: float32 [N_rank], finite, >= 0.
         ids: int64 [N_rank], >= 0, unique over all ranks.
         fraction: share of the total of all ranks, in [0, 1]; its decimal value counts (0.99 is 99/100).
-        ranks: the job.
 
     Returns:
         bool [N_rank]; the same ids at every world size. The sums are exact. If the total is zero, nothing is
@@ -125,7 +116,6 @@ def integer_mass_prefix(
         owners: int32 [P], the row that each weight belongs to.
         ids: int64 [N], >= 0, ids of the rows; unique over all ranks within a segment.
         fraction: share of the total of all ranks, in [0, 1]; its decimal value counts, of at most 9 places.
-        ranks: the job.
         n_segments: number of segments.
 
     Returns:
@@ -178,8 +168,7 @@ def _mass_threshold(keys: Tensor, mantissas: Tensor, share: Fraction, ranks: Ran
 
     Masses are integers: a score is mantissa * 2^max(exponent, 1), in units of the smallest positive float.
 
-    Returns:
-        threshold (-1: select nothing), and how many rows equal to it are needed.
+    Returns the threshold (-1: select nothing), and how many rows equal to it are needed.
     """
     prefix, shift = 0, sum(_SCORE_DIGITS)
     missing: int | None = None
@@ -214,8 +203,7 @@ def _histogram(
 ) -> Tensor:
     """Count (or add up the weights of) the keys under a prefix, by their next digit.
 
-    Returns:
-        int64 [2^width], summed over the ranks.
+    Returns int64 [2^width], summed over the ranks.
     """
     heads = keys >> shift
     under = (heads >> width == prefix).nonzero().squeeze(1)

@@ -54,18 +54,13 @@ class Job(Protocol):
 
 
 class Shared(NamedTuple):
-    """The numbers that all ranks wrote for a barrier.
+    """The numbers that all ranks wrote for a barrier."""
 
-    Attributes:
-        everyone: int64 [M, n], the numbers of each rank; valid until the next barrier with numbers.
-        sums: int64 [n], sums over the ranks; valid until this rank queues the second barrier with numbers
-            after this.
-        host: `everyone` on the CPU, valid after the work queued on the current stream has ended, and as long
-            as `sums`.
-    """
-
-    everyone: Tensor
+    everyone: Tensor  # int64 [M, n], the numbers of each rank; valid until the next barrier with numbers
+    # int64 [n], sums over the ranks; valid until this rank queues the second barrier with numbers after this.
     sums: Tensor
+    # `everyone` on the CPU, valid after the work queued on the current stream has ended, and as long as
+    # `sums`.
     host: Tensor
 
 
@@ -83,10 +78,6 @@ class SharedMemory:
         device: where this rank computes.
         control: this rank's control words, symmetric memory, `control_words` zeros.
         timeout_seconds: longest wait in a barrier.
-
-    Attributes:
-        buffers: int32 [words] of each rank, mapped here.
-        generation: how many times splats were written into the buffers; identifies the frame they belong to.
     """
 
     def __init__(
@@ -94,7 +85,8 @@ class SharedMemory:
     ) -> None:
         self.rank, self.world_size, self.device = rank, world_size, device
         self.timeout_seconds = timeout_seconds
-        self.buffers: list[Tensor] = []
+        self.buffers: list[Tensor] = []  # int32 [words] of each rank, mapped here
+        # How many times splats were written into the buffers; identifies the frame they belong to.
         self.generation = 0
         self._barriers = 0
         self._shared = 0  # number of barriers that gathered numbers
@@ -131,8 +123,7 @@ class SharedMemory:
     def share(self, values: Tensor) -> Shared:
         """Queue a barrier that also gathers numbers from all ranks.
 
-        Args:
-            values: int64 [n], n <= MAX_VALUES, the same n on all ranks.
+        `values`: int64 [n], n <= MAX_VALUES, the same n on all ranks.
         """
         # Use the other half: a rank may have left the last barrier without having read its numbers yet.
         half = self._shared % 2
@@ -202,9 +193,7 @@ def connect(job: Job, timeout_seconds: float) -> SharedMemory | str:
 
     Collective.
 
-    Args:
-        job: the ranks, joined.
-        timeout_seconds: longest wait in a barrier.
+    `job`: the ranks, joined. `timeout_seconds`: longest wait in a barrier.
     """
     location = (socket.gethostname(), job.device.index if job.device.type == "cuda" else None)
     locations = job.all_gather_object(location)

@@ -44,10 +44,8 @@ def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
     Keys have a prefix of `name` and the number of the restart: torchrun keeps the store over restarts, and a
     new rank must not read the addresses of the rank that it replaces.
 
-    Args:
-        name: name of this use of the store.
-        host: whether this process serves the store if torchrun's agent does not.
-        timeout_seconds: for connecting and waiting.
+    `name`: name of this use of the store. `host`: whether this process serves the store if torchrun's agent
+    does not. `timeout_seconds`: for connecting and waiting.
     """
     held_by_agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
     store = TCPStore(
@@ -63,19 +61,12 @@ def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
 
 @dataclass(frozen=True)
 class _Report:
-    """The latest report of a rank.
+    """The latest report of a rank."""
 
-    Attributes:
-        calls: number of collectives entered.
-        name: name of the last one.
-        stamp: when it was published, seconds since 1970 by the rank's own clock.
-        busy: the work on its host, or an empty string.
-    """
-
-    calls: int
-    name: str
-    stamp: float
-    busy: str
+    calls: int  # number of collectives entered
+    name: str  # name of the last one
+    stamp: float  # when it was published, seconds since 1970 by the rank's own clock
+    busy: str  # the work on its host, or an empty string
 
 
 class NoWatchdog:
@@ -140,12 +131,9 @@ class Watchdog:
 
         Enter it for collectives, and to wait for this rank's device, which may itself be waiting for other
         ranks. A rank that has entered fewer of these contexts than another is called late, so all ranks must
-        enter the same ones.
-
-        Raises:
-            RuntimeError: the work in the context failed; the message names the rank that caused it. If this
-                rank is out of memory, its own `torch.OutOfMemoryError` is raised instead, and its message is
-                for the other ranks.
+        enter the same ones. RuntimeError: the work in the context failed; the message names the rank that
+        caused it. If this rank is out of memory, its own `torch.OutOfMemoryError` is raised instead, and its
+        message is for the other ranks.
         """
         self.calls += 1
         self.name = name
@@ -230,7 +218,6 @@ class Watchdog:
         return self._silence(rank) > 1.5 * self.period
 
     def _silence(self, rank: int) -> float:
-        """Return the seconds since the last report of a rank."""
         return time.monotonic() - self._heard[rank][1]
 
     def _late_ranks(self) -> str:

@@ -106,9 +106,8 @@ class Gaussians:
     def check(self) -> None:
         """Check shapes and values.
 
-        Raises:
-            TypeError: a field is not a tensor.
-            ValueError: shapes disagree, or a viewer cannot show a value: NaN, infinite.
+        TypeError: a field is not a tensor. ValueError: shapes disagree, or a viewer cannot show a value: NaN,
+        infinite.
         """
         n, k = len(self.means), self.sh.shape[1] if isinstance(self.sh, Tensor) and self.sh.ndim == 3 else 0
         shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}
@@ -116,7 +115,13 @@ class Gaussians:
         given = {name: getattr(self, name) for name in shapes if getattr(self, name) is not None}
         for name, tensor in given.items():
             check_tensor(name, tensor)
-            _check_values(name, tensor)
+            rows = _bad_rows(name, tensor)
+            if bool(rows.any()):
+                first = int(rows.nonzero()[0])
+                raise ValueError(
+                    f"{name} has NaN or infinite values in {int(rows.sum()):,} Gaussians, the first is "
+                    f"number {first}: leave these Gaussians out"
+                )
         if k not in (1, 4, 9, 16):
             raise ValueError(
                 f"sh has the shape {list(self.sh.shape)}, expected [N, K, 3] with K = 1, 4, 9 or 16"
@@ -129,14 +134,8 @@ class Gaussians:
 def check_memory(holds: str, count: int, degree: int, copies: int = 2) -> None:
     """Refuse a number of Gaussians that the free memory cannot hold so often; readers need it twice.
 
-    Args:
-        holds: what has them, as the beginning of the sentence, for example "FILE holds".
-        count: number of Gaussians.
-        degree: their spherical-harmonics degree.
-        copies: how often.
-
-    Raises:
-        ValueError: it cannot; names both amounts.
+    `holds`: what has them, as the beginning of the sentence, for example "FILE holds". ValueError: it cannot;
+    names both amounts.
     """
     needed = copies * 4 * count * (11 + 3 * (degree + 1) ** 2)
     free = psutil.virtual_memory().available
@@ -175,17 +174,6 @@ def _bad_rows(name: str, tensor: Tensor) -> Tensor:
     if name == "scales":
         bad = ~(tensor < _LARGEST_SCALE)
     return bad.flatten(1).any(dim=1) if bad.dim() > 1 else bad
-
-
-def _check_values(name: str, tensor: Tensor) -> None:
-    """Refuse values that no viewer can show."""
-    rows = _bad_rows(name, tensor)
-    if bool(rows.any()):
-        first = int(rows.nonzero()[0])
-        raise ValueError(
-            f"{name} has NaN or infinite values in {int(rows.sum()):,} Gaussians, the first is number "
-            f"{first}: leave these Gaussians out"
-        )
 
 
 def unit_quats(quats: Tensor) -> Tensor:

@@ -21,25 +21,16 @@ _HEADER = 1 << 16
 
 @dataclass(frozen=True)
 class Format:
-    """A format that models are written in.
+    """A format that models are written in."""
 
-    Attributes:
-        title: what it is.
-        suffix: end of its files' names.
-        write: writes a file block by block; it appears under its name only when it is complete.
-        starts: how its files begin, of which one is true; empty: nothing tells.
-        states: what its viewers find in the file besides the Gaussians.
-        harmonics: whether it holds SH coefficients beyond the DC.
-        quantised: whether positions are finer near the origin than float32 makes them.
-    """
-
-    title: str
-    suffix: str
+    title: str  # what it is
+    suffix: str  # end of its files' names
+    # Writes a file block by block; it appears under its name only when it is complete.
     write: Callable[[Path, GaussianSource], None]
-    starts: tuple[bytes, ...] = ()
-    states: tuple[str, ...] = ()
-    harmonics: bool = True
-    quantised: bool = True
+    starts: tuple[bytes, ...] = ()  # how its files begin, of which one is true; empty: nothing tells
+    states: tuple[str, ...] = ()  # what its viewers find in the file besides the Gaussians
+    harmonics: bool = True  # whether it holds SH coefficients beyond the DC
+    quantised: bool = True  # whether positions are finer near the origin than float32 makes them
 
     def unstated(self, source: GaussianSource) -> list[str]:
         """Return what a viewer of the file will not know of a model, each a sentence without a full stop."""
@@ -74,10 +65,8 @@ FORMATS = {
 def check_replaces(path: Path, kind: Format) -> None:
     """Check the name of a file to write, and that no file of another format is replaced.
 
-    Raises:
-        ValueError: the name has another suffix than files of the format.
-        FileExistsError: the file is not empty and no file of the format.
-        OSError: it is no regular file.
+    ValueError: the name has another suffix than files of the format. FileExistsError: the file is not empty
+    and no file of the format. OSError: it is no regular file.
     """
     check_replaceable(path, kind.starts, f" and is not a {kind.title} file")
     if path.suffix.lower() != kind.suffix:
@@ -87,10 +76,8 @@ def check_replaces(path: Path, kind: Format) -> None:
 def open_gaussians(path: Path, checked: bool = True) -> GaussianSource:
     """Open a model that any program wrote; one in INRIA's layout is read block by block, others at once.
 
-    Without `checked`, the blocks have values that cannot be shown, which a `Selected` leaves out.
-
-    Raises:
-        ValueError, ImportError: see `read_gaussians`.
+    Without `checked`, the blocks have values that cannot be shown, which a `Selected` leaves out. ValueError,
+    ImportError: see `read_gaussians`.
     """
     with open(path, "rb") as file:
         header = file.read(_HEADER).partition(b"end_header")[0]
@@ -101,11 +88,8 @@ def open_gaussians(path: Path, checked: bool = True) -> GaussianSource:
 def read_gaussians(path: Path | str) -> Gaussians:
     """Read a model that any program wrote: PLY (INRIA's layout or compressed), SPZ, SOG or .splat.
 
-    SPZ needs the packages of `pip install "blitzgs[formats]"`.
-
-    Raises:
-        ValueError: the file is damaged, no model, or holds values that cannot be shown; names the file.
-        ImportError: a package is missing; says which.
+    SPZ needs the packages of `pip install "blitzgs[formats]"`. ValueError: the file is damaged, no model, or
+    holds values that cannot be shown; names the file. ImportError: a package is missing; says which.
     """
     path = Path(path)
     with open(path, "rb") as file:

@@ -48,8 +48,7 @@ class _Column(ctypes.Structure):
 def _library(kind: type[ctypes.CDLL]) -> ctypes.CDLL:
     """Load libblitzgs_io.so, whose functions keep the GIL if it is loaded as a `ctypes.PyDLL`.
 
-    Raises:
-        ImportError: it was not built, or cannot be loaded; says how to build it.
+    ImportError: it was not built, or cannot be loaded; says how to build it.
     """
     path = LIBRARY_DIR / "libblitzgs_io.so"
     try:
@@ -181,9 +180,8 @@ def read_ply(
 ) -> tuple[list[str], list[tuple[str, str]], int, Array, int]:
     """Read up to `most` vertices of a PLY from number `first` on.
 
-    Returns:
-        Comments, names and numpy types, number of vertices read, their packed rows (uint8), and the number
-        of vertices of the file.
+    Returns comments, names and numpy types, number of vertices read, their packed rows (uint8), and the
+    number of vertices of the file.
     """
     numbers = (_array([first], "u8"), _array([most], "u8"))
     comments, comment_ends, names, name_ends, types, type_ends, count, rows, total = _call(

@@ -65,8 +65,7 @@ def _package(name: str) -> ModuleType:
 def unit_blocks(source: GaussianSource) -> Iterator[Gaussians]:
     """Yield all Gaussians, `BLOCK` at a time and the rest, with unit quaternions and without normals.
 
-    Raises:
-        ValueError: there is none, or a value cannot be shown.
+    ValueError: there is none, or a value cannot be shown.
     """
     if len(source) == 0:
         raise ValueError("the model has no Gaussian, and this format holds no empty model")
@@ -130,11 +129,8 @@ def _write_columns(
 ) -> None:
     """Write the rows of a block into the columns of a file, which follow each other from `begin` on.
 
-    Args:
-        file: the file.
-        begin: where its first column begins.
-        content: the rows of the block, column after column.
-        columns: of each column the first row, the rows of the block and of the file, and the bytes of a row.
+    `begin`: where its first column begins. `content`: the rows of the block, column after column. `columns`:
+    of each column the first row, the rows of the block and of the file, and the bytes of a row.
     """
     view, at = memoryview(content), 0
     for first, rows, count, width in columns:
@@ -146,8 +142,7 @@ def _write_columns(
 def read_compressed_ply(path: Path) -> Gaussians:
     """Read a compressed PLY file in the layout of SuperSplat.
 
-    Raises:
-        ValueError: the file is damaged; names the file and the reason.
+    ValueError: the file is damaged; names the file and the reason.
     """
     with open(path, "rb") as file:
         start = file.read(1 << 16)
@@ -266,8 +261,7 @@ def write_splat(path: Path, source: GaussianSource) -> None:
 def read_splat(path: Path) -> Gaussians:
     """Read a .splat file: positions, linear scales, RGB and opacity as bytes, quaternion (w first) as bytes.
 
-    Raises:
-        ValueError: the size fits no number of Gaussians, or a scale is not positive.
+    ValueError: the size fits no number of Gaussians, or a scale is not positive.
     """
     size = path.stat().st_size
     if size % _SPLAT.itemsize:
@@ -324,11 +318,7 @@ def write_spz(path: Path, source: GaussianSource) -> None:
 
 
 def read_spz(path: Path) -> Gaussians:
-    """Read an SPZ file of version 1 to 4.
-
-    Raises:
-        ValueError: the file is damaged; names the file and the reason.
-    """
+    """Read an SPZ file of version 1 to 4 (ValueError: the file is damaged; names the file and the reason)."""
     with open(path, "rb") as file:
         start = file.read(32)
     deflated = not start.startswith(b"NGSP")

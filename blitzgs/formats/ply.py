@@ -46,8 +46,7 @@ class PlySource:
     def __init__(self, path: Path, checked: bool = True) -> None:
         """Read the header; without `checked`, `blocks` yields values that cannot be shown.
 
-        Raises:
-            ValueError: see `read_ply`.
+        ValueError: see `read_ply`.
         """
         self._path, self._checked = path, checked
         found, self._count = self._read(0, 0)
@@ -57,11 +56,7 @@ class PlySource:
         return self._count
 
     def blocks(self) -> Iterator[Gaussians]:
-        """Yield all Gaussians in order.
-
-        Raises:
-            ValueError: a value cannot be shown; names the file.
-        """
+        """Yield all Gaussians in order (ValueError: a value cannot be shown; names the file)."""
         for first in range(0, self._count, BLOCK):
             block, _ = self._read(first, BLOCK)
             try:
@@ -81,8 +76,7 @@ class PlySource:
 def read_ply(path: Path | str) -> Gaussians:
     """Read Gaussians; properties may come in any order, and normals may be missing.
 
-    Raises:
-        ValueError: the file is damaged or has no such Gaussians; names the file and the reason.
+    ValueError: the file is damaged or has no such Gaussians; names the file and the reason.
     """
     path = Path(path)
     return _gaussians(path, *_read_table(path))
@@ -202,10 +196,8 @@ def _rows(block: Gaussians, width: int, offset: npt.NDArray[np.float64] | None) 
 def check_replaces_ply(path: Path) -> None:
     """Check that writing a PLY file replaces no file of another format, and that its folder exists.
 
-    Raises:
-        FileExistsError: there is a file that is not empty and no PLY.
-        FileNotFoundError: there is no such folder.
-        OSError: `path` is no regular file.
+    FileExistsError: there is a file that is not empty and no PLY. FileNotFoundError: there is no such folder.
+    OSError: `path` is no regular file.
     """
     check_replaceable(path, (b"ply",), " and is not a PLY file")
     if not path.parent.is_dir():
@@ -259,8 +251,7 @@ def read_points(path: Path | str) -> tuple[npt.NDArray[np.float64], npt.NDArray[
 def read_point_cloud(path: Path | str) -> PointCloud:
     """Read points; those of a file of Gaussians are their centres in the colours that all sides show.
 
-    Raises:
-        ValueError: the file is damaged, has no x, y, z, or has colours of another kind.
+    ValueError: the file is damaged, has no x, y, z, or has colours of another kind.
     """
     _, table = _read_table(Path(path))
     stored = {name.lower(): name for name in reversed(table.dtype.names or ())}

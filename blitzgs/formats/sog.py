@@ -46,9 +46,8 @@ _TABLE = 1 << 25
 def write_sog(path: Path, source: GaussianSource) -> None:
     """Write an SOG file. The model is read twice, block by block; its codes are 20 bytes a Gaussian.
 
-    Raises:
-        ValueError: there is no Gaussian, or a value cannot be shown.
-        OSError: the file cannot be written, or `path` is no regular file.
+    ValueError: there is no Gaussian, or a value cannot be shown. OSError: the file cannot be written, or
+    `path` is no regular file.
     """
     count, survey = len(source), _survey(source)
     scales_book, colors_book = _codebook(survey.scales), _codebook(survey.colors)
@@ -160,7 +159,6 @@ def _codebook(values: Tensor) -> Tensor:
 
 
 def _labels(values: Tensor, book: Tensor) -> Bytes:
-    """Return for each value the nearest one of a codebook."""
     return torch.bucketize(values.double(), (book[1:] + book[:-1]) / 2).to(torch.uint8).numpy()
 
 
@@ -235,8 +233,7 @@ def _quats(quats: Tensor) -> Bytes:
 def read_sog(path: Path) -> Gaussians:
     """Read an SOG file (a ZIP archive).
 
-    Raises:
-        ValueError: the file is damaged, or inflates to more than its pictures can need.
+    ValueError: the file is damaged, or inflates to more than its pictures can need.
     """
     try:
         with zipfile.ZipFile(path) as archive:

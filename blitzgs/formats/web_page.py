@@ -38,23 +38,14 @@ Bytes = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class WebSplats:
-    """N Gaussians in an order that puts neighbours in space next to each other.
+    """N Gaussians in an order that puts neighbours in space next to each other."""
 
-    Attributes:
-        means: float32 [N, 3].
-        quats: float32 [N, 4], w, x, y, z, of any length.
-        scales: float32 [N, 3], logarithms.
-        opacities: float32 [N] in [0, 1].
-        sh: float32 [N, K, 3].
-        levels: octree levels, uint8 [N]; None: there are none.
-    """
-
-    means: npt.NDArray[np.float32]
-    quats: npt.NDArray[np.float32]
-    scales: npt.NDArray[np.float32]
-    opacities: npt.NDArray[np.float32]
-    sh: npt.NDArray[np.float32]
-    levels: Bytes | None = None
+    means: npt.NDArray[np.float32]  # float32 [N, 3]
+    quats: npt.NDArray[np.float32]  # float32 [N, 4], w, x, y, z, of any length
+    scales: npt.NDArray[np.float32]  # float32 [N, 3], logarithms
+    opacities: npt.NDArray[np.float32]  # float32 [N] in [0, 1]
+    sh: npt.NDArray[np.float32]  # float32 [N, K, 3]
+    levels: Bytes | None = None  # octree levels, uint8 [N]; None: there are none
 
     def __len__(self) -> int:
         return len(self.means)
@@ -77,56 +68,35 @@ class WebSplats:
 
 @dataclass(frozen=True)
 class WebLevels:
-    """How views leave out Gaussians by their octree levels; see `blitzgs.view.gate.ModelGate`.
+    """How views leave out Gaussians by their octree levels; see `blitzgs.view.gate.ModelGate`."""
 
-    Attributes:
-        reach: distance up to which views keep each level; None: any; negative: none.
-        slope: f / (f - 1) for levels that fade; 0: they are cut off.
-        most: share of all Gaussians from which on a view has no gate; None: it always has.
-        least: share of all Gaussians below which a view has no gate.
-    """
-
-    reach: list[float | None]
-    slope: float
-    most: float | None
-    least: float
+    reach: list[float | None]  # distance up to which views keep each level; None: any; negative: none
+    slope: float  # f / (f - 1) for levels that fade; 0: they are cut off
+    most: float | None  # share of all Gaussians from which on a view has no gate; None: it always has
+    least: float  # share of all Gaussians below which a view has no gate
 
 
 @dataclass(frozen=True)
 class WebScene:
-    """What the page knows besides the Gaussians; lengths in the unit of the means.
+    """What the page knows besides the Gaussians; lengths in the unit of the means."""
 
-    Attributes:
-        near: near plane.
-        far: far plane.
-        blur: screen-space blur, pixels squared.
-        antialiased: compensate that blur in the opacities.
-        background: RGB in [0, 1].
-        up: upward direction.
-        eye: position of the first view.
-        target: point that it looks at, and that it turns about.
-        fov: vertical field of view in radians.
-        lod: octree levels; None: views leave out nothing.
-    """
-
-    near: float
-    far: float
-    blur: float
-    antialiased: bool
-    background: tuple[float, float, float]
-    up: tuple[float, float, float]
-    eye: tuple[float, float, float]
-    target: tuple[float, float, float]
-    fov: float
-    lod: WebLevels | None = None
+    near: float  # near plane
+    far: float  # far plane
+    blur: float  # screen-space blur, pixels squared
+    antialiased: bool  # compensate that blur in the opacities
+    background: tuple[float, float, float]  # RGB in [0, 1]
+    up: tuple[float, float, float]  # upward direction
+    eye: tuple[float, float, float]  # position of the first view
+    target: tuple[float, float, float]  # point that it looks at, and that it turns about
+    fov: float  # vertical field of view in radians
+    lod: WebLevels | None = None  # octree levels; None: views leave out nothing
 
 
 def check_replaces_page(path: Path) -> None:
     """Check that writing a page replaces no file of another program.
 
-    Raises:
-        FileExistsError: there is a file that is not empty and no page of ours.
-        OSError: `path` is no regular file.
+    FileExistsError: there is a file that is not empty and no page of ours. OSError: `path` is no regular
+    file.
     """
     mark = b'<meta name="generator" content="BlitzGS">'
     check_replaceable(path, (mark,), ", and blitzgs did not write it")
@@ -200,11 +170,8 @@ def frame_bytes() -> int:
 def web_page(splats: WebSplats, scene: WebScene, title: str, left_out: str = "") -> str:
     """Return the page.
 
-    Args:
-        splats: at least one Gaussian.
-        scene: how they are shown.
-        title: heading.
-        left_out: what the file lacks of the model, for the reader of the page; empty: nothing.
+    `splats`: at least one Gaussian. `left_out`: what the file lacks of the model, for the reader of the page;
+    empty: nothing.
     """
     known = asdict(scene) | {"count": len(splats), "degree": splats.degree, "harmonic": HARMONIC}
     return _filled(
@@ -228,7 +195,6 @@ def as_html(text: str) -> str:
 
 
 def _filled(program: str, **fields: str) -> str:
-    """Return the page with a program that shows a model; the fields are HTML."""
     pieces = _part("page.html").split("{{")
     for index, piece in enumerate(pieces[1:], 1):
         name, _, text = piece.partition("}}")

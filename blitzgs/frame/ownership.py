@@ -71,12 +71,8 @@ class TileOwners:
     def plan(self, step: int, keys: Sequence[Hashable], width: int, height: int, halo: int) -> TileRanges:
         """Divide the tiles of the batch of a later step, as `divide` does, and store the division.
 
-        Args:
-            step: step of the batch; its division is stored until `forget_before`.
-            keys: identifies each of the B views.
-            width: image width in pixels.
-            height: image height in pixels.
-            halo: see `TileRanges`.
+        `step`: step of the batch; its division is stored until `forget_before`. `keys`: identifies each of
+        the B views. `halo`: see `TileRanges`.
         """
         if step in self._planned:
             ranges = TileRanges(self._planned[step], len(keys), width, height, halo=halo)
@@ -94,11 +90,10 @@ class TileOwners:
     def columns(self) -> dict[str, Tensor]:
         """Return what a resumed run needs to make the same divisions; the same on every rank.
 
-        Returns:
-            views int64 [V], tiles int64 [V] and costs float16 [sum of pieces]: the measured views, their
-            numbers of tiles and their costs; ages int64 [V]: 0 if divisions already use the costs, k if they
-            are from the k-th of the latest batches, whose costs are not used yet; steps int64 [S] and bounds
-            int64 [S, M + 1]: the stored divisions. Keys must be integers.
+        Returns views int64 [V], tiles int64 [V] and costs float16 [sum of pieces]: the measured views, their
+        numbers of tiles and their costs; ages int64 [V]: 0 if divisions already use the costs, k if they are
+        from the k-th of the latest batches, whose costs are not used yet; steps int64 [S] and bounds int64
+        [S, M + 1]: the stored divisions. Keys must be integers.
         """
         batches = [list(self._costs.values()), *(measured() for measured in self._delayed)]
         ages = [age for age, batch in enumerate(batches) for _ in batch]
@@ -138,15 +133,8 @@ class TileOwners:
     ) -> TileRanges:
         """Divide the tiles of a batch.
 
-        Args:
-            keys: identifies each of the B views.
-            width: image width in pixels.
-            height: image height in pixels.
-            tile_size: tile edge in pixels.
-            halo: see `TileRanges`.
-
-        Returns:
-            Ranges whose costs differ from equal shares by at most the cost of one tile.
+        `keys`: identifies each of the B views. `halo`: see `TileRanges`. Returns ranges whose costs differ
+        from equal shares by at most the cost of one tile.
         """
         tiles = math.prod(tile_counts(width, height, tile_size))
         found = [self._costs.get(key) for key in keys]
@@ -164,13 +152,9 @@ class TileOwners:
 
         On CUDA the host does not wait for a batch whose losses it has read.
 
-        Args:
-            tile_work: int32 [B * T], number of list entries that were composited in each tile.
-            ranges: the tiles of each rank; the cost of a tile is that measured by its owner.
-            parts: float64 [B, K, 2], sums of this rank's loss, which are sent together with the costs.
-
-        Returns:
-            The sums; see `HostSum.read`.
+        `tile_work`: int32 [B * T], number of list entries that were composited in each tile. `ranges`: the
+        tiles of each rank; the cost of a tile is that measured by its owner. `parts`: float64 [B, K, 2], sums
+        of this rank's loss, which are sent together with the costs. Returns the sums; see `HostSum.read`.
         """
         if len(self._delayed) == _DELAY:
             self._learn(self._delayed.popleft())

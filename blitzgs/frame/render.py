@@ -47,29 +47,17 @@ from blitzgs.table.table import GaussianTable
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How Gaussians become an image; lengths in the unit of the table.
+    """How Gaussians become an image; lengths in the unit of the table."""
 
-    Attributes:
-        sh_degree: spherical-harmonics degree that is evaluated.
-        near_plane: Gaussians with z <= near_plane are not seen.
-        far_plane: Gaussians with z > far_plane are not seen.
-        eps2d: screen-space blur, pixels squared.
-        antialiased: compensate that blur in the opacities.
-        background: RGB behind everything.
-        tile_size: pixels.
-        deterministic: gradients repeat bit for bit on CUDA too (they always do on the CPU).
-        fade: opacities fade by octree level and distance, `blitzgs.view.gate.LodGate.fade`; empty: they do
-            not.
-    """
-
-    sh_degree: int
-    near_plane: float
-    far_plane: float
-    eps2d: float = 0.3
-    antialiased: bool = False
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    tile_size: int = 16
-    deterministic: bool = False
+    sh_degree: int  # spherical-harmonics degree that is evaluated
+    near_plane: float  # Gaussians with z <= near_plane are not seen
+    far_plane: float  # Gaussians with z > far_plane are not seen
+    eps2d: float = 0.3  # screen-space blur, pixels squared
+    antialiased: bool = False  # compensate that blur in the opacities
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB behind everything
+    tile_size: int = 16  # pixels
+    deterministic: bool = False  # gradients repeat bit for bit on CUDA too (they always do on the CPU)
+    # Opacities fade by octree level and distance, `blitzgs.view.gate.LodGate.fade`; empty: they do not.
     fade: tuple[float, ...] = ()
 
     @property
@@ -104,37 +92,22 @@ class ViewFilter(Protocol):
 
 
 class Frame(NamedTuple):
-    """The images that `render_frame` rendered, and the data that `backward_splats` needs.
-
-    Attributes:
-        views: the views.
-        options: the options.
-        projected: the P splats of the Gaussians that this rank owns.
-        splats: the splats that this rank composited: its own, or those that it received.
-        assignment: the tiles of each rank; None: one rank composites all.
-        way_back: returns the gradients of splats to their owners; None: one rank owns all.
-        traffic: numbers of splats sent between the ranks; None: none were sent.
-        visible: int64 [B], Gaussians visible in each view, over all ranks; valid until the next exchange.
-        active: rows that were considered, and the views of each; None: all.
-        renders: [B, H, W, 3]; undefined in pixels that only other ranks composite.
-        tile_work: int32 [B * T], list entries each composited tile went through.
-        saved: the tensors that the backward pass of compositing reads.
-        gradients: memory in which the gradients of the splats are summed.
-    """
+    """The images that `render_frame` rendered, and the data that `backward_splats` needs."""
 
     views: Views
     options: RenderOptions
-    projected: ProjectedSplats
-    splats: Splats
-    assignment: TileAssignment | None
-    way_back: WayBack | None
-    traffic: Traffic | None
+    projected: ProjectedSplats  # the P splats of the Gaussians that this rank owns
+    splats: Splats  # the splats that this rank composited: its own, or those that it received
+    assignment: TileAssignment | None  # the tiles of each rank; None: one rank composites all
+    way_back: WayBack | None  # returns the gradients of splats to their owners; None: one rank owns all
+    traffic: Traffic | None  # numbers of splats sent between the ranks; None: none were sent
+    # int64 [B], Gaussians visible in each view, over all ranks; valid until the next exchange.
     visible: Tensor
-    active: ActiveRows | None
-    renders: Tensor
-    tile_work: Tensor
-    saved: RasterizeSaved
-    gradients: GradientBuffer
+    active: ActiveRows | None  # rows that were considered, and the views of each; None: all
+    renders: Tensor  # [B, H, W, 3]; undefined in pixels that only other ranks composite
+    tile_work: Tensor  # int32 [B * T], list entries each composited tile went through
+    saved: RasterizeSaved  # the tensors that the backward pass of compositing reads
+    gradients: GradientBuffer  # memory in which the gradients of the splats are summed
 
 
 def render_frame(
@@ -260,11 +233,8 @@ def _backgrounds(colour: tuple[float, float, float], count: int, device: torch.d
 def backward_splats(frame: Frame, v_renders: Tensor) -> SplatGradients:
     """Compute the gradients of this rank's projected splats from the gradients of the images.
 
-    Args:
-        v_renders: gradient of the loss by the images, [B, H, W, 3]; only this rank's tiles are read.
-
-    Raises:
-        RuntimeError: the ranks share memory, and a later frame has overwritten this frame's splats.
+    `v_renders`: gradient of the loss by the images, [B, H, W, 3]; only this rank's tiles are read.
+    RuntimeError: the ranks share memory, and a later frame has overwritten this frame's splats.
     """
     views, options, way_back = frame.views, frame.options, frame.way_back
     tiles = (0, -1) if frame.assignment is None else frame.assignment.own_tiles

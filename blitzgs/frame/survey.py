@@ -17,18 +17,12 @@ from blitzgs.table.table import GaussianTable
 
 
 class Survey(NamedTuple):
-    """The contributions of this rank's P splats to their views.
+    """The contributions of this rank's P splats to their views."""
 
-    Attributes:
-        splats: the projected Gaussians.
-        weights: int64 [P], sum of alpha T over the pixels in units of 2^-32.
-        pixels: int32 [P], the number of pixels at which a splat is composited.
-        squares: int64 [P], sum of (alpha T)^2 over these pixels in the same units, if asked for.
-    """
-
-    splats: ProjectedSplats
-    weights: Tensor
-    pixels: Tensor
+    splats: ProjectedSplats  # the projected Gaussians
+    weights: Tensor  # int64 [P], sum of alpha T over the pixels in units of 2^-32
+    pixels: Tensor  # int32 [P], the number of pixels at which a splat is composited
+    # int64 [P], sum of (alpha T)^2 over these pixels in the same units, if asked for.
     squares: Tensor | None = None
 
 

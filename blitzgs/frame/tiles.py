@@ -26,23 +26,16 @@ class TileRanges:
     """The tiles of B views of one size, one contiguous range per rank.
 
     Tile (b, ty, tx) has index (b * tiles_y + ty) * tiles_x + tx; rank m owns [bounds[m], bounds[m + 1]).
-
-    Attributes:
-        bounds: M + 1 ascending tile indices, 0 first and B * tiles_y * tiles_x last.
-        n_views: B.
-        width: image width in pixels.
-        height: image height in pixels.
-        tile_size: tile edge in pixels.
-        halo: a rank also composites the tiles within this many pixels of its own; a tile that several ranks
-            composite has the same bits on each. With `LOSS_HALO` a rank can compute its loss without pixels
-            of other ranks. 0: only its own tiles.
     """
 
-    bounds: tuple[int, ...]
-    n_views: int
-    width: int
-    height: int
-    tile_size: int = 16
+    bounds: tuple[int, ...]  # M + 1 ascending tile indices, 0 first and B * tiles_y * tiles_x last
+    n_views: int  # B
+    width: int  # image width in pixels
+    height: int  # image height in pixels
+    tile_size: int = 16  # tile edge in pixels
+    # A rank also composites the tiles within this many pixels of its own; a tile that several ranks composite
+    # has the same bits on each. With `LOSS_HALO` a rank can compute its loss without pixels of other ranks.
+    # 0: only its own tiles.
     halo: int = 0
 
     @cached_property
@@ -115,9 +108,8 @@ class TileAssignment:
 def collect_images(renders: Tensor, ranges: TileRanges, ranks: Ranks, destination: int) -> None:
     """Send all pixels of a rendering to one rank, which stores them in its `renders`, bit for bit.
 
-    Args:
-        renders: [B, H, W, C], contiguous; valid in this rank's tiles.
-        destination: the rank whose `renders` is complete afterwards.
+    `renders`: [B, H, W, C], contiguous; valid in this rank's tiles. `destination`: the rank whose `renders`
+    is complete afterwards.
     """
     if ranks.world_size == 1:
         return

@@ -20,25 +20,15 @@ BLOCK_ROWS = 256
 
 
 class PendingSteps(NamedTuple):
-    """Optimiser state that bounds how far rows may move when their pending steps are applied.
+    """Optimiser state that bounds how far rows may move when their pending steps are applied."""
 
-    Attributes:
-        exp_avg_means: first moment of the means, float32 [N, 3].
-        exp_avg_sq_means: second moment of the means, float32 [N, 3].
-        exp_avg_scales: first moment of the log scales, float32 [N, 3].
-        exp_avg_sq_scales: second moment of the log scales, float32 [N, 3].
-        last_step: int32 [N], step up to which each row's parameters are current.
-        moment_step: int32 [N], step up to which each row's moments are current.
-        table: float64 [S + 1, 30], from `AdamSchedule.table`.
-    """
-
-    exp_avg_means: Tensor
-    exp_avg_sq_means: Tensor
-    exp_avg_scales: Tensor
-    exp_avg_sq_scales: Tensor
-    last_step: Tensor
-    moment_step: Tensor
-    table: Tensor
+    exp_avg_means: Tensor  # first moment of the means, float32 [N, 3]
+    exp_avg_sq_means: Tensor  # second moment of the means, float32 [N, 3]
+    exp_avg_scales: Tensor  # first moment of the log scales, float32 [N, 3]
+    exp_avg_sq_scales: Tensor  # second moment of the log scales, float32 [N, 3]
+    last_step: Tensor  # int32 [N], step up to which each row's parameters are current
+    moment_step: Tensor  # int32 [N], step up to which each row's moments are current
+    table: Tensor  # float64 [S + 1, 30], from `AdamSchedule.table`
 
 
 class GateRules(NamedTuple):
@@ -68,19 +58,13 @@ class ActiveRows(NamedTuple):
     """The rows that at least one view may see: the first `length` entries of lists with capacity R.
 
     `length` stays on the device, so the host need not wait for it; ops that take the lists take `length` too.
-
-    Attributes:
-        ids: int32 [R], ascending.
-        views: int32 [R], bit v set when view v may see the row.
-        length: int32 [1], number of valid entries, on the device of the lists.
-        blocks: int32 [1] on the same device, number of blocks of which a view may see a part. If the lists
-            had capacity for fewer blocks, they are incomplete and `length` is 0. None: the lists are
-            complete.
     """
 
-    ids: Tensor
-    views: Tensor
-    length: Tensor
+    ids: Tensor  # int32 [R], ascending
+    views: Tensor  # int32 [R], bit v set when view v may see the row
+    length: Tensor  # int32 [1], number of valid entries, on the device of the lists
+    # int32 [1] on the same device, number of blocks of which a view may see a part. If the lists had capacity
+    # for fewer blocks, they are incomplete and `length` is 0. None: the lists are complete.
     blocks: Tensor | None = None
 
     def listed(self) -> tuple[Tensor, Tensor]:
@@ -97,14 +81,8 @@ class ActiveRows(NamedTuple):
 def morton_keys(points: Tensor) -> Tensor:
     """Return each point's position along the Morton curve of the cloud's bounding cube.
 
-    Args:
-        points: float32 [N, 3].
-
-    Returns:
-        int64 [N]; 2^63 - 1 for a point that is not finite.
-
-    Raises:
-        RuntimeError: wrong shape or dtype.
+    `points`: float32 [N, 3]. Returns int64 [N]; 2^63 - 1 for a point that is not finite. RuntimeError: wrong
+    shape or dtype.
     """
     return torch.ops.blitzgs.morton_keys(points)
 
@@ -239,8 +217,7 @@ def sectors_of_rows(rows: Tensor) -> Tensor:
 def rows_of_sectors(sectors: Tensor, n: int) -> Tensor:
     """Convert a mask of N rows back to the layout by row, int32 [N, words]; the inverse of `sectors_of_rows`.
 
-    Raises:
-        RuntimeError: a wrong shape or dtype.
+    RuntimeError: a wrong shape or dtype.
     """
     return torch.ops.blitzgs.rows_of_sectors(sectors, n)
 

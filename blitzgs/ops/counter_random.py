@@ -19,11 +19,8 @@ _MIX_2 = 0x94D049BB133111EB - (1 << 64)
 def hash_keys(*keys: Tensor | int) -> Tensor:
     """Hash tuples of integers to 64 well-mixed bits.
 
-    Args:
-        keys: int64 tensors of one shape (or broadcastable) and integers; at least one tensor.
-
-    Returns:
-        int64 of the broadcast shape, all 64 bits random. The order of the keys matters.
+    `keys`: int64 tensors of one shape (or broadcastable) and integers; at least one tensor. Returns int64 of
+    the broadcast shape, all 64 bits random. The order of the keys matters.
     """
     tensors = [key for key in keys if isinstance(key, Tensor)]
     state = torch.zeros((), dtype=torch.int64, device=tensors[0].device)

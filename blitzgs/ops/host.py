@@ -15,17 +15,12 @@ from blitzgs._torch import current_stream_numbers
 
 
 class PinnedNumbers(NamedTuple):
-    """A piece of pinned memory of the host, into which the device writes numbers, with an event.
+    """A piece of pinned memory of the host, into which the device writes numbers, with an event."""
 
-    Attributes:
-        memory: [n] numbers.
-        written: event of one device; the user records it after the work that writes the memory.
-        idle: the pieces of this length, dtype and device that are not in use.
-    """
-
-    memory: Tensor
+    memory: Tensor  # [n] numbers
+    # Event of one device; the user records it after the work that writes the memory.
     written: torch.cuda.Event
-    idle: list[PinnedNumbers]
+    idle: list[PinnedNumbers]  # the pieces of this length, dtype and device that are not in use
 
     @classmethod
     def take(cls, n: int, dtype: torch.dtype, device: torch.device) -> PinnedNumbers:

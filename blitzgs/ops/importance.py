@@ -71,19 +71,13 @@ DIVISIONS = {"weight": 0, "root": 1, "density": 2}
 
 
 class ViewSums(NamedTuple):
-    """Sums over views of N Gaussians, changed in place.
+    """Sums over views of N Gaussians, changed in place."""
 
-    Attributes:
-        score: int64 [N].
-        seen: int32 [N], number of views in which the Gaussian is visible (radius > 0).
-        counted: int32 [N], number of views in which it counts (it is in the top 99 % of the view's weight).
-        cull: int32 [N, words], bit v % 32 of word v / 32 set where it does not count in view v.
-    """
-
-    score: Tensor
-    seen: Tensor
+    score: Tensor  # int64 [N]
+    seen: Tensor  # int32 [N], number of views in which the Gaussian is visible (radius > 0)
+    # int32 [N], number of views in which it counts (it is in the top 99 % of the view's weight).
     counted: Tensor
-    cull: Tensor
+    cull: Tensor  # int32 [N, words], bit v % 32 of word v / 32 set where it does not count in view v
 
 
 @torch.no_grad()
@@ -125,22 +119,14 @@ def view_sums_(
 
 
 class PixelSplats(NamedTuple):
-    """What R pixels composite; see `pixel_splats`.
+    """What R pixels composite; see `pixel_splats`."""
 
-    Attributes:
-        transmittances: [R], the share of light that passes all splats.
-        counts: int32 [R], the number of composited splats.
-        medians: int32 [R], the last composited splat with a transmittance above 0.5 in front of it, -1 for
-            none.
-        ids: int32 [R, k], the splats of the largest alpha T, front to back; then -1.
-        weights: [R, k], their alpha T; then 0.
-    """
-
-    transmittances: Tensor
-    counts: Tensor
+    transmittances: Tensor  # [R], the share of light that passes all splats
+    counts: Tensor  # int32 [R], the number of composited splats
+    # int32 [R], the last composited splat with a transmittance above 0.5 in front of it, -1 for none.
     medians: Tensor
-    ids: Tensor
-    weights: Tensor
+    ids: Tensor  # int32 [R, k], the splats of the largest alpha T, front to back; then -1
+    weights: Tensor  # [R, k], their alpha T; then 0
 
 
 @torch.no_grad()
@@ -207,22 +193,15 @@ class MassCut(NamedTuple):
     A search has rounds of two steps. Step 2 r of round r scans this rank's items and fills `sums`. The caller
     then adds up `sums` over the ranks. Step 2 r + 1 reads and clears them. Steps from `TIES_STEP` on do
     nothing unless `has_ties` is true. The last step fills `chosen`.
-
-    Attributes:
-        items: weights int64 [P] >= 0; segments int32 [P]; owners int32 [P], the row that each weight belongs
-            to; and the rows' ids int64 [N], in [0, 2^63). The weights of a segment must add up to less than
-            2^62.
-        searches: int64 [S, 8].
-        sums: int64 [S, DIGITS].
-        listed: int32 [1 + P].
-        chosen: bool [P].
     """
 
+    # Weights int64 [P] >= 0; segments int32 [P]; owners int32 [P], the row that each weight belongs to; and
+    # the rows' ids int64 [N], in [0, 2^63). The weights of a segment must add up to less than 2^62.
     items: tuple[Tensor, Tensor, Tensor, Tensor]
-    searches: Tensor
-    sums: Tensor
-    listed: Tensor
-    chosen: Tensor
+    searches: Tensor  # int64 [S, 8]
+    sums: Tensor  # int64 [S, DIGITS]
+    listed: Tensor  # int32 [1 + P]
+    chosen: Tensor  # bool [P]
 
     @classmethod
     def begin(cls, weights: Tensor, segments: Tensor, owners: Tensor, ids: Tensor, count: int) -> MassCut:
@@ -238,8 +217,7 @@ class MassCut(NamedTuple):
     def take_steps(self, share: tuple[int, int], first: int, last: int) -> None:
         """Run the steps `first` to `last` - 1; `share` is a numerator and a denominator of at most 10^9.
 
-        Raises:
-            RuntimeError: wrong shapes, dtypes or numbers.
+        RuntimeError: wrong shapes, dtypes or numbers.
         """
         torch.ops.blitzgs.mass_cut_(
             *self.items, self.searches, self.sums, self.listed, self.chosen, *share, first, last

@@ -25,21 +25,14 @@ _NEGLIGIBLE = {torch.float32: 2.0**-27, torch.float64: 2.0**-56}
 
 
 class AdamState(NamedTuple):
-    """The optimiser's state of a table of N rows, as the ops that move parameters take it.
+    """The optimiser's state of a table of N rows, as the ops that move parameters take it."""
 
-    Attributes:
-        params: (means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3]), or one parameter.
-        exp_avgs: first moments, shaped like `params`.
-        exp_avg_sqs: second moments, shaped like `params`.
-        last_step: int32 [N], the step that each row's parameters stand at.
-        moment_step: int32 [N], <= `last_step`, the step that its moments stand at.
-    """
-
+    # (means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3]), or one parameter.
     params: Sequence[Tensor]
-    exp_avgs: Sequence[Tensor]
-    exp_avg_sqs: Sequence[Tensor]
-    last_step: Tensor
-    moment_step: Tensor
+    exp_avgs: Sequence[Tensor]  # first moments, shaped like `params`
+    exp_avg_sqs: Sequence[Tensor]  # second moments, shaped like `params`
+    last_step: Tensor  # int32 [N], the step that each row's parameters stand at
+    moment_step: Tensor  # int32 [N], <= `last_step`, the step that its moments stand at
 
     @property
     def tensors(self) -> list[Tensor]:
@@ -48,19 +41,12 @@ class AdamState(NamedTuple):
 
 
 class AdamTables:
-    """Adam's constants and the tables of a schedule that the ops read, see csrc/adam/lazy_adam.h.
+    """Adam's constants and the tables of a schedule that the ops read, see csrc/adam/lazy_adam.h."""
 
-    Attributes:
-        betas: decay rates of the moments.
-        eps: added to the root of the second moment.
-        explicit_steps: number of steps without a gradient for which a row still moves.
-        tables: the group `tables` of the ops.
-    """
-
-    betas: tuple[float, float]
-    eps: float
-    explicit_steps: int
-    tables: list[Tensor]
+    betas: tuple[float, float]  # decay rates of the moments
+    eps: float  # added to the root of the second moment
+    explicit_steps: int  # number of steps without a gradient for which a row still moves
+    tables: list[Tensor]  # the group `tables` of the ops
 
     def constants(self, step: int) -> tuple[int, int, float, float, float]:
         """Return the arguments of the ops from `step` to `eps` for a row of the tables."""
@@ -84,7 +70,7 @@ class AdamSchedule(AdamTables):
     def __init__(
         self, lr_table: Tensor, beta1: float, beta2: float, eps: float, dtype: torch.dtype = torch.float32
     ) -> None:
-        """Make the tables.
+        """Make the tables (ValueError: decay rates outside their range).
 
         Args:
             lr_table: float32 [S + 1, 6], learning rates of means, quats, scales, opacities, SH DC and SH rest
@@ -93,9 +79,6 @@ class AdamSchedule(AdamTables):
             beta2: decay of the second moment, in (0, 1).
             eps: as the attribute.
             dtype: of the parameters.
-
-        Raises:
-            ValueError: decay rates outside their range.
         """
         self.betas, self.eps = (beta1, beta2), eps
         self.explicit_steps = explicit_steps(beta1, beta2, dtype)
@@ -138,8 +121,7 @@ class GrowingSchedule(AdamTables):
     ) -> None:
         """Begin with empty tables; the arguments are the attributes, and dtype and device of the parameter.
 
-        Raises:
-            ValueError: decay rates outside their range.
+        ValueError: decay rates outside their range.
         """
         self.betas, self.eps = betas, eps
         self.explicit_steps = explicit_steps(*betas, dtype)

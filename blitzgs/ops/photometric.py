@@ -172,7 +172,7 @@ def report_(
     n_ranks: int,
     targets: Sequence[Tensor],
 ) -> None:
-    """Write this rank's part of the report into all targets.
+    """Write this rank's part of the report into all targets (RuntimeError: wrong shapes or dtypes).
 
     A target has the loss sums of the M ranks, [M, 2, B], and then the work of the T tiles.
 
@@ -183,8 +183,5 @@ def report_(
         rank: this rank.
         n_ranks: M.
         targets: float32 [2 M B + T] each, on this device or in peer-accessible memory of other devices.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
     """
     torch.ops.blitzgs.report_(parts, tile_work, *tiles, rank, n_ranks, targets)

@@ -25,18 +25,12 @@ from blitzgs.ops.splat_gradients import gradient_table_of
 
 
 class TableRows(NamedTuple):
-    """The visible rows of tables, gathered for the colours and the backward pass.
+    """The visible rows of tables, gathered for the colours and the backward pass."""
 
-    Attributes:
-        inputs: the inputs of the projection with these Gaussians alone, and their SH.
-        numbers: int32 [U], the rows of `inputs` that are visible.
-        indices: int64 [U], their numbers in the tables, as the indices of sparse gradients.
-        sh: the SH of all Gaussians in parts, from which the rows' SH were joined; empty: without SH.
-    """
-
-    inputs: ProjectionInputs
-    numbers: Tensor
-    indices: Tensor
+    inputs: ProjectionInputs  # the inputs of the projection with these Gaussians alone, and their SH
+    numbers: Tensor  # int32 [U], the rows of `inputs` that are visible
+    indices: Tensor  # int64 [U], their numbers in the tables, as the indices of sparse gradients
+    # The SH of all Gaussians in parts, from which the rows' SH were joined; empty: without SH.
     sh: Sequence[Tensor]
 
 
@@ -69,21 +63,14 @@ class _Differentiable(NamedTuple):
 
 
 class _Saved(NamedTuple):
-    """The tensors that `_save` saved, in its groups.
+    """The tensors that `_save` saved, in its groups."""
 
-    Attributes:
-        gaussians: the rows that were projected: whole tables, or rows that were gathered from tables.
-        cameras: viewmats, Ks.
-        splats: camera_ids, visible_ids, splat_offsets.
-        level: octree levels, if opacities fade with them; else None.
-        ids: for gathered rows, their numbers in the tables; else None.
-    """
-
+    # The rows that were projected: whole tables, or rows that were gathered from tables.
     gaussians: Sequence[Tensor]
-    cameras: Sequence[Tensor]
-    splats: Sequence[Tensor]
-    level: Tensor | None
-    ids: Tensor | None
+    cameras: Sequence[Tensor]  # viewmats, Ks
+    splats: Sequence[Tensor]  # camera_ids, visible_ids, splat_offsets
+    level: Tensor | None  # octree levels, if opacities fade with them; else None
+    ids: Tensor | None  # for gathered rows, their numbers in the tables; else None
 
     @classmethod
     def of(cls, ctx: Any) -> _Saved:
@@ -324,10 +311,8 @@ def differentiable_splats(
 ) -> ProjectedSplats:
     """Project as `project` does, with grouped arguments.
 
-    Args:
-        sparse_grad: see `project`.
-        splats: the result of `project_splats` for these inputs, if it is already known.
-        rows: the visible rows of these inputs, if `splats` got their colours from them.
+    `sparse_grad`: see `project`. `splats`: the result of `project_splats` for these inputs, if it is already
+    known. `rows`: the visible rows of these inputs, if `splats` got their colours from them.
     """
     viewmats, Ks = inputs.cameras  # noqa: N806
     if not torch.compiler.is_compiling():

@@ -23,19 +23,12 @@ VIEW_TOTALS = 4
 
 @dataclass(frozen=True)
 class Views:
-    """B pinhole views of one image size, rendered together.
+    """B pinhole views of one image size, rendered together."""
 
-    Attributes:
-        viewmats: world to camera, float32 [B, 4, 4].
-        Ks: intrinsics in pixels, float32 [B, 3, 3].
-        width: pixels.
-        height: pixels.
-    """
-
-    viewmats: Tensor
-    Ks: Tensor
-    width: int
-    height: int
+    viewmats: Tensor  # world to camera, float32 [B, 4, 4]
+    Ks: Tensor  # intrinsics in pixels, float32 [B, 3, 3]
+    width: int  # pixels
+    height: int  # pixels
 
     def __len__(self) -> int:
         return self.viewmats.shape[0]
@@ -75,10 +68,8 @@ class ProjectedSplats(NamedTuple):
 def splats_of(allocated: Sequence[Tensor], sizes: Sizes, counts: Tensor | None = None) -> ProjectedSplats:
     """Return the valid splats of columns that were allocated with more capacity.
 
-    Args:
-        allocated: a `ProjectedSplats`; its `counts` are not read.
-        sizes: numbers of valid Gaussians and splats; `blocks` is not read.
-        counts: the first three of `sizes` as a CPU tensor, if there is one.
+    `allocated`: a `ProjectedSplats`; its `counts` are not read. `sizes`: numbers of valid Gaussians and
+    splats; `blocks` is not read. `counts`: the first three of `sizes` as a CPU tensor, if there is one.
     """
     if allocated[0].shape[0] > sizes.splats or allocated[2].shape[0] > sizes.visible:
         visible, splats = sizes[:2]
@@ -99,25 +90,15 @@ def first_rows(columns: Sequence[Tensor], lengths: Sequence[int]) -> list[Tensor
 
 
 class Splats(NamedTuple):
-    """P splats with the columns that compositing reads.
+    """P splats with the columns that compositing reads."""
 
-    Attributes:
-        means2d: [P, 2] pixels.
-        conics: [P, 3], inverse 2D covariance (a, b, c).
-        opacities: [P].
-        colors: [P, D].
-        depths: [P].
-        camera_ids: int32 [P].
-        ids: int64 [P], persistent ids of the Gaussians, which order splats of equal depth.
-    """
-
-    means2d: Tensor
-    conics: Tensor
-    opacities: Tensor
-    colors: Tensor
-    depths: Tensor
-    camera_ids: Tensor
-    ids: Tensor
+    means2d: Tensor  # [P, 2] pixels
+    conics: Tensor  # [P, 3], inverse 2D covariance (a, b, c)
+    opacities: Tensor  # [P]
+    colors: Tensor  # [P, D]
+    depths: Tensor  # [P]
+    camera_ids: Tensor  # int32 [P]
+    ids: Tensor  # int64 [P], persistent ids of the Gaussians, which order splats of equal depth
 
     def first(self, count: int) -> Splats:
         """Return the first `count` splats."""
@@ -144,19 +125,13 @@ N_OPTIONS = len(ProjectionOptions._fields)
 
 
 class WeightedViews(NamedTuple):
-    """B views as the backward ops take them, in this order: cameras, and weights of regularisers.
+    """B views as the backward ops take them, in this order: cameras, and weights of regularisers."""
 
-    Attributes:
-        viewmats: [B, 4, 4], world to camera.
-        Ks: [B, 3, 3], intrinsics in px.
-        scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such
-            term.
-        opacity_reg: the same of the opacity (without the compensation of antialiased splats).
-    """
-
-    viewmats: Tensor
-    Ks: Tensor
+    viewmats: Tensor  # [B, 4, 4], world to camera
+    Ks: Tensor  # [B, 3, 3], intrinsics in px
+    # Weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such term.
     scale_reg: Tensor | None = None
+    # The same of the opacity (without the compensation of antialiased splats).
     opacity_reg: Tensor | None = None
 
 
@@ -164,23 +139,17 @@ _ALL_ROWS = (None, None, None, None)
 
 
 class ProjectionInputs(NamedTuple):
-    """The inputs of a projection.
+    """The inputs of a projection."""
 
-    Attributes:
-        gaussians: means, quats, scales, opacities and, if given, sh.
-        cameras: viewmats, Ks.
-        options: all other options.
-        active: the Gaussians to consider: the fields of `ActiveRows` (ids, views, length, blocks), of which
-            only ids are required. Empty: all Gaussians in all views.
-        ids: int64 [N], persistent ids of the Gaussians; None: do not return the splats' ids.
-        level: uint8 [N], octree levels, if opacities fade with them (`ProjectionOptions.fade`); else None.
-    """
-
-    gaussians: Sequence[Tensor]
-    cameras: Sequence[Tensor]
-    options: ProjectionOptions
+    gaussians: Sequence[Tensor]  # means, quats, scales, opacities and, if given, sh
+    cameras: Sequence[Tensor]  # viewmats, Ks
+    options: ProjectionOptions  # all other options
+    # The Gaussians to consider: the fields of `ActiveRows` (ids, views, length, blocks), of which only ids
+    # are required. Empty: all Gaussians in all views.
     active: Sequence[Tensor | None] = ()
+    # int64 [N], persistent ids of the Gaussians; None: do not return the splats' ids.
     ids: Tensor | None = None
+    # uint8 [N], octree levels, if opacities fade with them (`ProjectionOptions.fade`); else None.
     level: Tensor | None = None
 
     @property
@@ -198,10 +167,9 @@ class ProjectionInputs(NamedTuple):
     ) -> ProjectionOutputs:
         """Project the Gaussians, without gradients.
 
-        Args:
-            capacity: numbers of visible Gaussians and splats to allocate; CUDA then does not wait for the
-                true numbers. None: wait, and allocate exactly as many as there are.
-            rank_tiles: for each rank the [begin, end) of the tiles that it composites, in ascending order.
+        `capacity`: numbers of visible Gaussians and splats to allocate; CUDA then does not wait for the true
+        numbers. None: wait, and allocate exactly as many as there are. `rank_tiles`: for each rank the
+        [begin, end) of the tiles that it composites, in ascending order.
         """
         *columns, splat_ids, totals = torch.ops.blitzgs.project_fwd(
             self.gaussians,
@@ -217,19 +185,15 @@ class ProjectionInputs(NamedTuple):
 
 
 class ProjectionOutputs(NamedTuple):
-    """What `ProjectionInputs.project` returns.
+    """What `ProjectionInputs.project` returns."""
 
-    Attributes:
-        splats: columns as long as the given capacity, if there was one; `counts` is None. The contents are
-            undefined if the capacity was too small.
-        ids: int64 [P], persistent ids of the splats' Gaussians; [0] if `ProjectionInputs.ids` is None.
-        totals: int64 [VIEW_TOTALS + B + 2 M], on the device, right even if the capacity was too small:
-            `Sizes` (with an upper bound of the entries); the number of splats of each view; and for each rank
-            the number of its splats and of the tiles that these touch there.
-    """
-
+    # Columns as long as the given capacity, if there was one; `counts` is None. The contents are undefined if
+    # the capacity was too small.
     splats: ProjectedSplats
-    ids: Tensor
+    ids: Tensor  # int64 [P], persistent ids of the splats' Gaussians; [0] if `ProjectionInputs.ids` is None
+    # int64 [VIEW_TOTALS + B + 2 M], on the device, right even if the capacity was too small: `Sizes` (with an
+    # upper bound of the entries); the number of splats of each view; and for each rank the number of its
+    # splats and of the tiles that these touch there.
     totals: Tensor
 
     @property

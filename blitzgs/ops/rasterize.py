@@ -22,21 +22,16 @@ _ONE = torch.ones((), device="cpu")
 
 
 class RasterizeSaved(NamedTuple):
-    """The tensors that a forward pass saves for the ops of the backward pass, in the groups that these take.
+    """What a forward pass saves for the ops of the backward pass, in the groups that these take."""
 
-    Attributes:
-        splats: means2d [P, 2], conics [P, 3], splat_opacities [P], colors [P, D].
-        backgrounds: [B, D]; None: black.
-        lists: isect_splats, int32 [I], the splats of each tile, front to back; tile_offsets, int64
-            [B * T + 1], where each tile's list begins.
-        composited: transmittances [B, H, W], the weight of the background in each pixel; last_ids, int32
-            [B, H, W], where each pixel's list ended; packed_splats and tile_order, the splats and the order
-            of the tiles in layouts that only the kernels of the backend read.
-    """
-
-    splats: list[Tensor]
-    backgrounds: Tensor | None
+    splats: list[Tensor]  # means2d [P, 2], conics [P, 3], splat_opacities [P], colors [P, D]
+    backgrounds: Tensor | None  # [B, D]; None: black
+    # Isect_splats, int32 [I], the splats of each tile, front to back; tile_offsets, int64 [B * T + 1], where
+    # each tile's list begins.
     lists: list[Tensor]
+    # Transmittances [B, H, W], the weight of the background in each pixel; last_ids, int32 [B, H, W], where
+    # each pixel's list ended; packed_splats and tile_order, the splats and the order of the tiles in layouts
+    # that only the kernels of the backend read.
     composited: list[Tensor]
 
 
@@ -48,14 +43,10 @@ class MetaGeometry(NamedTuple):
 
     `rasterize` composites the splats themselves. Its backward pass arranges the gradients of their geometry
     and gives them to these tensors, so that a caller finds them in `.grad` of `meta["means2d"]`.
-
-    Attributes:
-        arrange: arranges columns of splats.
-        columns: means2d, conics and splat_opacities in it.
     """
 
-    arrange: Arrange
-    columns: Sequence[Tensor]
+    arrange: Arrange  # arranges columns of splats
+    columns: Sequence[Tensor]  # means2d, conics and splat_opacities in it
 
 
 def rasterize(

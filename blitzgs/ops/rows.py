@@ -39,15 +39,10 @@ def take_rows(column: Tensor, rows: Tensor, out: Tensor | None = None) -> Tensor
 
 
 def put_rows_(column: Tensor, rows: Tensor, fresh: Tensor | None = None) -> None:
-    """Overwrite rows of a column, in place.
+    """Overwrite rows of a column, in place (RuntimeError: shapes or dtypes do not fit).
 
-    Args:
-        column: [N, ...], any dtype, contiguous.
-        rows: int64 [M], from 0 to N - 1, each at most once; not checked.
-        fresh: what the rows become, [M, ...], of the dtype and row shape of `column`; None: zeros.
-
-    Raises:
-        RuntimeError: shapes or dtypes do not fit.
+    `column`: [N, ...], any dtype, contiguous. `rows`: int64 [M], from 0 to N - 1, each at most once; not
+    checked. `fresh`: what the rows become, [M, ...], of the dtype and row shape of `column`; None: zeros.
     """
     torch.ops.blitzgs.put_rows_(column, rows, fresh)
 
@@ -55,10 +50,8 @@ def put_rows_(column: Tensor, rows: Tensor, fresh: Tensor | None = None) -> None
 def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
     """Return a sparse tensor of a table in which only the given rows are not zero.
 
-    Args:
-        ids: int32 or int64 [U], ascending, each once.
-        values: the rows, [U, ...].
-        shape: shape of the table.
+    `ids`: int32 or int64 [U], ascending, each once. `values`: the rows, [U, ...]. `shape`: shape of the
+    table.
     """
     indices = ids.long()[None]
     if indices.shape[1] == 0:
@@ -126,9 +119,7 @@ class KeptMarks:
 def of_shape(table: Tensor, shape: Sequence[int]) -> Tensor:
     """Return a table with rows of another shape and as many values, whose gradient may be sparse.
 
-    Args:
-        table: [N, ...].
-        shape: (N, ...).
+    `table`: [N, ...]. `shape`: (N, ...).
     """
 
     def back(_saved: Any, _needed: Any, v: Sequence[Tensor | None]) -> list[Tensor | None]:
@@ -144,8 +135,7 @@ def of_shape(table: Tensor, shape: Sequence[int]) -> Tensor:
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
     """Return the rows int64 [1, U], each once, and the values [U, ...] of a sparse tensor.
 
-    Args:
-        table: a tensor whose only sparse dimension is the first.
+    `table`: a tensor whose only sparse dimension is the first.
     """
     if not table.is_coalesced():
         table = table.coalesce()

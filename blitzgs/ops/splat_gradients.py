@@ -24,11 +24,8 @@ _TABLE = "_blitzgs_gradient_table"
 def gradient_columns(table: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """View a table of splat gradients as columns, from which `gradient_table_of` takes the table.
 
-    Args:
-        table: [P, 12], as the op `rasterize_bwd` fills it.
-
-    Returns:
-        Gradients of means2d [P, 2], conics [P, 3], opacities [P] and colors [P, 3].
+    `table`: [P, 12], as the op `rasterize_bwd` fills it. Returns gradients of means2d [P, 2], conics [P, 3],
+    opacities [P] and colors [P, 3].
     """
     columns = (
         table[:, _MEAN2D : _MEAN2D + 2],
@@ -53,19 +50,15 @@ def gradient_table_of(columns: Sequence[Tensor | None]) -> Tensor | None:
 
 
 class SplatGradients(NamedTuple):
-    """Gradients of P splats in one of three forms.
+    """Gradients of P splats in one of three forms."""
 
-    Attributes:
-        parts: columns (v_means2d [P, 2], v_conics [P, 3], v_opacities [P], v_colors [P, 3]); or (CUDA) one
-            table [P, 12]; or, with `places`, this rank's part of such a table at each of the M ranks that
-            composited splats, in memory that the ranks share. A splat's gradient is then the sum over the
-            ranks, in their order.
-        places: int64 [ceil(P / 32), M], the position of each splat in each rank's part of the table, as
-            `scatter_splats` returns it. Such gradients are valid until the next frame, or the next backward
-            pass of this one.
-    """
-
+    # Columns (v_means2d [P, 2], v_conics [P, 3], v_opacities [P], v_colors [P, 3]); or (CUDA) one table [P,
+    # 12]; or, with `places`, this rank's part of such a table at each of the M ranks that composited splats,
+    # in memory that the ranks share. A splat's gradient is then the sum over the ranks, in their order.
     parts: Sequence[Tensor]
+    # int64 [ceil(P / 32), M], the position of each splat in each rank's part of the table, as
+    # `scatter_splats` returns it. Such gradients are valid until the next frame, or the next backward pass of
+    # this one.
     places: Tensor | None = None
 
     @property
@@ -131,14 +124,12 @@ class GradientBuffer:
     """Memory in which the CUDA backward pass sums the gradients of splats; the forward pass has zeroed it.
 
     It serves one backward pass; each later one gets other memory.
-
-    Attributes:
-        zeros: [P or more, 12], the last output of `rasterize_fwd`; [0, 12] or None if there is none.
-        others: returns zeroed memory for later backward passes. If it is None or returns None, memory is
-            allocated instead.
     """
 
+    # [P or more, 12], the last output of `rasterize_fwd`; [0, 12] or None if there is none.
     zeros: Tensor | None
+    # Returns zeroed memory for later backward passes. If it is None or returns None, memory is allocated
+    # instead.
     others: Callable[[], Tensor | None] | None = None
 
     def take(self, means2d: Tensor) -> Tensor:

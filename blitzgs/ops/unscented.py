@@ -19,24 +19,20 @@ _ANGLES = 4096
 
 
 class Lenses(NamedTuple):
-    """What B views have besides viewmats and intrinsics.
+    """What B views have besides viewmats and intrinsics."""
 
-    Attributes:
-        lenses: [B, 13]: OpenCV's k1 to k6, p1, p2, s1 to s4 and the largest angle of a fisheye, radians, see
-            `largest_angles`.
-        viewmats_rs: [B, 4, 4], poses at the end of the frame; viewmats then are those at its begin. None:
-            with a global shutter.
-        fisheye: whether k1 to k4 are those of OpenCV's fisheye, and the others unused.
-        shutter: what is exposed first: 0 the top row, 1 the left column, 2 the bottom row, 3 the right
-            column, 4 all at once.
-        transform: alpha, beta, kappa; how many image sizes beside the image a sigma point is valid; and
-            whether all (1) or some (0) of the points of a Gaussian have to be valid.
-    """
-
+    # [B, 13]: OpenCV's k1 to k6, p1, p2, s1 to s4 and the largest angle of a fisheye, radians, see
+    # `largest_angles`.
     lenses: Tensor
+    # [B, 4, 4], poses at the end of the frame; viewmats then are those at its begin. None: with a global
+    # shutter.
     viewmats_rs: Tensor | None = None
-    fisheye: bool = False
+    fisheye: bool = False  # whether k1 to k4 are those of OpenCV's fisheye, and the others unused
+    # What is exposed first: 0 the top row, 1 the left column, 2 the bottom row, 3 the right column, 4 all at
+    # once.
     shutter: int = GLOBAL_SHUTTER
+    # Alpha, beta, kappa; how many image sizes beside the image a sigma point is valid; and whether all (1) or
+    # some (0) of the points of a Gaussian have to be valid.
     transform: tuple[float, ...] = (0.1, 2.0, 0.0, 0.1, 0.0)
 
     def rows(self, begin: int, end: int) -> Lenses:

@@ -150,7 +150,6 @@ class LazyAdam(torch.optim.Optimizer):
         return loss
 
     def _step_alone(self, group: dict[str, Any], index: int, param: Tensor, gradient: Tensor) -> None:
-        """Take the step of one parameter."""
         rows = None
         if gradient.is_sparse:
             if gradient.sparse_dim() != 1:

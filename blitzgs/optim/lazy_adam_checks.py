@@ -17,9 +17,8 @@ Groups = Mapping[str, dict[str, Any]]  # parameter groups of one parameter each,
 def check_group(group: dict[str, Any]) -> None:
     """Check the parameters and options of a group.
 
-    Raises:
-        ValueError: a parameter has no rows, or an option is outside its range, or is one of
-            `torch.optim.Adam` that is not supported.
+    ValueError: a parameter has no rows, or an option is outside its range, or is one of `torch.optim.Adam`
+    that is not supported.
     """
     if any(isinstance(param, Tensor) and param.dim() == 0 for param in group["params"]):
         raise ValueError("LazyAdam: a parameter must have rows, [N, ...], got a single number; use Adam")
@@ -37,8 +36,7 @@ def check_group(group: dict[str, Any]) -> None:
 def check_param(param: Tensor) -> None:
     """Check that a parameter has a form that the op takes.
 
-    Raises:
-        ValueError: it has another dtype, or is not contiguous.
+    ValueError: it has another dtype, or is not contiguous.
     """
     if param.dtype not in (torch.float32, torch.float64):
         raise ValueError(
@@ -50,11 +48,7 @@ def check_param(param: Tensor) -> None:
 
 
 def check_rows(param: Tensor, state: Mapping[str, Any]) -> None:
-    """Check that a parameter's state has as many rows as the parameter.
-
-    Raises:
-        ValueError: it has not.
-    """
+    """Check that a parameter's state has as many rows as the parameter (ValueError: it has not)."""
     for name, value in state.items():
         if name != "step" and value.shape[0] != param.shape[0]:
             raise ValueError(
@@ -66,11 +60,8 @@ def check_rows(param: Tensor, state: Mapping[str, Any]) -> None:
 def check_saved(saved: Mapping[str, Any], params: Sequence[Tensor]) -> None:
     """Check the state that `load_state_dict` takes.
 
-    Args:
-        params: all parameters; `torch.optim.Optimizer` checks their number.
-
-    Raises:
-        ValueError: as `LazyAdam.load_state_dict`.
+    `params`: all parameters; `torch.optim.Optimizer` checks their number. ValueError: as
+    `LazyAdam.load_state_dict`.
     """
     for group in saved["param_groups"]:
         if missing := {"lr", "betas", "eps"} - group.keys():
@@ -98,11 +89,7 @@ def check_saved(saved: Mapping[str, Any], params: Sequence[Tensor]) -> None:
 
 
 def groups_by_name(groups: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return the groups by name.
-
-    Raises:
-        ValueError: a group has no name of its own, or several parameters.
-    """
+    """Return the groups by name (ValueError: a group has no name of its own, or several parameters)."""
     named = {group.get("name"): group for group in groups if len(group["params"]) == 1}
     if None in named or len(named) != len(groups):
         raise ValueError("LazyAdam: to change rows, each group needs one parameter and a 'name' of its own")
@@ -112,8 +99,7 @@ def groups_by_name(groups: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]
 def check_new_rows(rows: Mapping[str, Tensor], named: Groups) -> int:
     """Check the rows that `append` takes; return their number.
 
-    Raises:
-        TypeError, ValueError: as `LazyAdam.append`.
+    TypeError, ValueError: as `LazyAdam.append`.
     """
     if rows.keys() != named.keys():
         raise ValueError(f"LazyAdam.append: rows for {sorted(named)} are needed, got {sorted(rows)}")
@@ -130,11 +116,7 @@ def check_new_rows(rows: Mapping[str, Tensor], named: Groups) -> int:
 
 
 def check_mask(mask: Tensor, named: Groups) -> None:
-    """Check the mask that `keep` takes.
-
-    Raises:
-        TypeError, ValueError: as `LazyAdam.keep`.
-    """
+    """Check the mask that `keep` takes (TypeError, ValueError: as `LazyAdam.keep`)."""
     _check_tensor("keep: mask", mask)
     if mask.dtype != torch.bool:
         raise ValueError(f"LazyAdam.keep: mask must be bool, got {mask.dtype}")
@@ -149,11 +131,7 @@ def check_mask(mask: Tensor, named: Groups) -> None:
 
 
 def check_order(order: Tensor, named: Groups) -> None:
-    """Check the order that `permute` takes.
-
-    Raises:
-        TypeError, ValueError: as `LazyAdam.permute`.
-    """
+    """Check the order that `permute` takes (TypeError, ValueError: as `LazyAdam.permute`)."""
     _check_tensor("permute: order", order)
     if order.dtype != torch.int64 or order.dim() != 1:
         raise ValueError(

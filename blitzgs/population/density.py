@@ -27,50 +27,34 @@ _ID_MASK = (1 << 63) - 1
 
 @dataclass(frozen=True)
 class DensityRules:
-    """The thresholds of a density event, with lengths in the unit of the means.
+    """The thresholds of a density event, with lengths in the unit of the means."""
 
-    Attributes:
-        grad_threshold: mean 2D-mean gradient norm (half-image units) from which a Gaussian is densified.
-        clone_scale: Gaussians with a largest axis up to this are cloned, larger ones split; 0:
-            all are split.
-        min_opacity: Gaussians of lower opacity are pruned.
-        max_screen_radius: pixels; Gaussians with a larger radius since the last event are pruned. None: none
-            are.
-        max_scale: Gaussians with a larger axis are pruned. None: none are.
-        max_gaussians: limit of the population after the event. None: no limit.
-        min_observations: a Gaussian is judged when it has at least this many gradients; with fewer, its
-            statistics are kept for the next event. A mean of few gradients is noisy, and the largest of many
-            noisy means would make Gaussians without need.
-    """
-
-    grad_threshold: float
+    grad_threshold: float  # mean 2D-mean gradient norm (half-image units) from which a Gaussian is densified
+    # Gaussians with a largest axis up to this are cloned, larger ones split; 0: all are split.
     clone_scale: float
-    min_opacity: float
+    min_opacity: float  # Gaussians of lower opacity are pruned
+    # Pixels; Gaussians with a larger radius since the last event are pruned. None: none are.
     max_screen_radius: float | None = None
+    # Gaussians with a larger axis are pruned. None: none are.
     max_scale: float | None = None
+    # Limit of the population after the event. None: no limit.
     max_gaussians: int | None = None
+    # A Gaussian is judged when it has at least this many gradients; with fewer, its statistics are kept for
+    # the next event. A mean of few gradients is noisy, and the largest of many noisy means would make
+    # Gaussians without need.
     min_observations: int = 1
 
 
 @dataclass(frozen=True)
 class DensityReport:
-    """What a density event did on this rank, as numbers of Gaussians.
+    """What a density event did on this rank, as numbers of Gaussians."""
 
-    Attributes:
-        cloned: copies made.
-        split: Gaussians that were replaced by two children.
-        pruned: Gaussians removed.
-        held_back: candidates (with relocation: copies) that the limit of the population held back.
-        vetoed: candidates that the veto withheld.
-        relocated: dead Gaussians that were replaced by copies of live ones; the copies count as cloned.
-    """
-
-    cloned: int
-    split: int
-    pruned: int
-    held_back: int
-    vetoed: int = 0
-    relocated: int = 0
+    cloned: int  # copies made
+    split: int  # Gaussians that were replaced by two children
+    pruned: int  # Gaussians removed
+    held_back: int  # candidates (with relocation: copies) that the limit of the population held back
+    vetoed: int = 0  # candidates that the veto withheld
+    relocated: int = 0  # dead Gaussians that were replaced by copies of live ones; the copies count as cloned
 
 
 def densify(
@@ -100,7 +84,6 @@ def densify(
 
     Args:
         table: changed in place; the rows are those of `placement.place`.
-        rules: thresholds.
         time: time of the event, in images.
         step: the latest optimiser step; new rows are current up to it.
         level_count: number of octree levels K; levels of children stay below it.
@@ -162,9 +145,7 @@ def cap_opacities(table: GaussianTable, opacity: float) -> None:
 
     This is the opacity reset of 3DGS (Kerbl et al. 2023, section 5.2).
 
-    Args:
-        table: changed in place.
-        opacity: the cap, in (0, 1).
+    `table`: changed in place. `opacity`: the cap, in (0, 1).
     """
     table["opacities"].clamp_(max=opacity_logit(opacity))
     table["exp_avg.opacities"].zero_()
@@ -247,11 +228,8 @@ def death_causes(
 ) -> Tensor:
     """Return why each row of a table is pruned, see `causes_of`.
 
-    Args:
-        table: the rows, with the largest radii since the last event.
-        rules: thresholds.
-        opacities: the logits after all steps, if they are known.
-        pending: the table's pending steps; None: there are none.
+    `table`: the rows, with the largest radii since the last event. `opacities`: the logits after all steps,
+    if they are known. `pending`: the table's pending steps; None: there are none.
     """
     if opacities is None:
         opacities = table["opacities"] if pending is None else pending.current("opacities")

@@ -17,15 +17,11 @@ MEMORY_SHARE = 0.9
 
 @dataclass(frozen=True)
 class GrowthLimit:
-    """The largest population that a density event may make.
+    """The largest population that a density event may make."""
 
-    Attributes:
-        count: Gaussians, over all ranks.
-        reason: the limit that applies, for the log: "memory", or the configuration field
-            "population.max_gaussians", "population.pixels_per_gaussian" or "population.gaussians_per_point".
-    """
-
-    count: int
+    count: int  # Gaussians, over all ranks
+    # The limit that applies, for the log: "memory", or the configuration field "population.max_gaussians",
+    # "population.pixels_per_gaussian" or "population.gaussians_per_point".
     reason: str
 
 
@@ -71,7 +67,7 @@ def memory_limit(table: GaussianTable, ranks: Ranks) -> int | None:
     """
     if ranks.device.type != "cuda":
         return None
-    row_bytes, widest = _row_bytes(table)
+    sizes = table.row_bytes.values()
     if table.device.type == "cpu":
         free = available_bytes()
         if free is None:
@@ -83,7 +79,7 @@ def memory_limit(table: GaussianTable, ranks: Ranks) -> int | None:
         allocated, reserved = (statistics[name]["all"] for name in ("allocated_bytes", "reserved_bytes"))
         available = torch.cuda.mem_get_info(ranks.device)[0] + reserved["current"]
         scratch = allocated["peak"] - allocated["current"]
-    count = rows_that_fit(len(table), row_bytes, widest, available, scratch)
+    count = rows_that_fit(len(table), sum(sizes), max(sizes), available, scratch)
     # The ranks' shards stay equal to within `MAX_IMBALANCE`, so the fullest GPU decides for all.
     fewest = ranks.all_reduce(torch.tensor([-count], device=ranks.device), "max")
     return -int(fewest.item()) * ranks.world_size
@@ -101,9 +97,3 @@ def rows_that_fit(rows: int, row_bytes: int, widest_column: int, available: int,
     """
     each = row_bytes + widest_column + scratch / max(rows, 1)
     return int(MEMORY_SHARE * available / each)
-
-
-def _row_bytes(table: GaussianTable) -> tuple[int, int]:
-    """Return the bytes of one row in all columns, and in the widest."""
-    sizes = list(table.row_bytes.values())
-    return sum(sizes), max(sizes)

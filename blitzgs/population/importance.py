@@ -57,32 +57,21 @@ class SweepStoppedError(Exception):
 
 @dataclass(frozen=True)
 class ViewBatch:
-    """Views of one image size that are surveyed together.
+    """Views of one image size that are surveyed together."""
 
-    Attributes:
-        columns: the views' columns in the cull matrix, ascending.
-        views: the views.
-        keys: keys of the views in `TileOwners`; None: their columns.
-    """
-
-    columns: Sequence[int]
+    columns: Sequence[int]  # the views' columns in the cull matrix, ascending
     views: Views
-    keys: Sequence[Hashable] | None = None
+    keys: Sequence[Hashable] | None = None  # keys of the views in `TileOwners`; None: their columns
 
 
 @dataclass(frozen=True)
 class Importance:
-    """The result of a sweep for this rank's N Gaussians.
+    """The result of a sweep for this rank's N Gaussians."""
 
-    Attributes:
-        score: float32 [N], summed over the views.
-        phi: float32 [N], share of the views that see a Gaussian in which it counts, in [0, 1).
-        cull: int32 [N, ceil(V / 32)]; bit v % 32 of word v / 32 is set where the Gaussian does not count in
-            view v. Bits from V on are zero.
-    """
-
-    score: Tensor
-    phi: Tensor
+    score: Tensor  # float32 [N], summed over the views
+    phi: Tensor  # float32 [N], share of the views that see a Gaussian in which it counts, in [0, 1)
+    # int32 [N, ceil(V / 32)]; bit v % 32 of word v / 32 is set where the Gaussian does not count in view v.
+    # Bits from V on are zero.
     cull: Tensor
 
     def store(self, table: GaussianTable, with_cull: bool) -> None:

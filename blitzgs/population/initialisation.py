@@ -26,21 +26,13 @@ INITIAL_OPACITY = 0.1
 
 @dataclass(frozen=True)
 class FirstGaussians:
-    """What distinguishes the first Gaussians of a model from each other.
+    """What distinguishes the first Gaussians of a model from each other."""
 
-    Attributes:
-        means: float32 [C, 3].
-        log_scales: float32 [C], the same on all axes.
-        colors: float32 [C, 3], their SH coefficients of degree 0.
-        levels: uint8 [C], octree levels.
-        found: number of Gaussians before they were thinned to a limit.
-    """
-
-    means: Tensor
-    log_scales: Tensor
-    colors: Tensor
-    levels: Tensor
-    found: int
+    means: Tensor  # float32 [C, 3]
+    log_scales: Tensor  # float32 [C], the same on all axes
+    colors: Tensor  # float32 [C, 3], their SH coefficients of degree 0
+    levels: Tensor  # uint8 [C], octree levels
+    found: int  # number of Gaussians before they were thinned to a limit
 
     def __len__(self) -> int:
         return len(self.means)
@@ -54,11 +46,8 @@ class FirstGaussians:
     ) -> GaussianTable:
         """Make a table of them, without rotation; ids count from 0.
 
-        Args:
-            sh_degree: highest degree of the table.
-            opacity: of all of them, in (0, 1).
-            device: of the table.
-            part: which of them the table gets.
+        `sh_degree`: highest degree of the table. `opacity`: of all of them, in (0, 1). `part`: which of them
+        the table gets.
         """
         means = self.means[part].to(device)
         sh = torch.zeros(len(means), (sh_degree + 1) ** 2, 3, device=device)
@@ -102,12 +91,13 @@ def octree_gaussians(
             cameras.
         most: largest number of Gaussians. Whole levels are kept, from the coarsest on, and of the first level
             that does not fit a random part. 0: no limit.
-        seed: seed of the draw.
 
     Raises:
         ValueError: no voxel is left.
     """
-    origin = _grid_origin(points, levels)
+    # The lower corner of the grids: below all points, unless outliers overflow the finest grid.
+    reach = levels.voxel_size_of(levels.count - 1) * 2 ** (CELL_BITS - 1)
+    origin = torch.maximum(points.amin(dim=0), points.median(dim=0).values - reach)
     parts = []
     for level in range(levels.count):
         means, mean_colors = _voxels(points, colors, origin, levels.voxel_size_of(level))
@@ -136,12 +126,6 @@ def _thinned(levels: Tensor, most: int, seed: int) -> Tensor:
     order = torch.argsort(draws, stable=True)
     order = order[torch.argsort(levels[order].long(), stable=True)]
     return order[:most].sort().values
-
-
-def _grid_origin(points: Tensor, levels: Levels) -> Tensor:
-    """Return the lower corner of the grids: below all points, unless outliers overflow the finest grid."""
-    reach = levels.voxel_size_of(levels.count - 1) * 2 ** (CELL_BITS - 1)
-    return torch.maximum(points.amin(dim=0), points.median(dim=0).values - reach)
 
 
 def _voxels(points: Tensor, colors: Tensor, origin: Tensor, size: float) -> tuple[Tensor, Tensor]:

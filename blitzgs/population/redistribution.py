@@ -20,13 +20,8 @@ def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = MAX_
 
     Collective: every rank calls it. All columns are moved; each shard has its rows in the global order.
 
-    Args:
-        table: this rank's shard, changed in place.
-        max_imbalance: nothing happens up to this ratio of the largest to the smallest shard; 0: always
-            redistribute.
-
-    Returns:
-        Whether rows were redistributed.
+    `table`: this rank's shard, changed in place. `max_imbalance`: nothing happens up to this ratio of the
+    largest to the smallest shard; 0: always redistribute. Returns whether rows were redistributed.
     """
     if ranks.world_size == 1:
         return False
@@ -49,12 +44,8 @@ def global_positions(sizes: Sequence[int], rank: int) -> Tensor:
     are skipped. So a table that was divided round-robin keeps its order. Shards whose sizes differ by at most
     one (the larger ones first) already have exactly the positions = rank (mod M).
 
-    Args:
-        sizes: rows on each rank, M values.
-        rank: the rank of the shard.
-
-    Returns:
-        int64 [sizes[rank]], ascending.
+    `sizes`: rows on each rank, M values. `rank`: the rank of the shard. Returns int64 [sizes[rank]],
+    ascending.
     """
     rows = torch.arange(sizes[rank], dtype=torch.int64)
     positions = torch.zeros_like(rows)

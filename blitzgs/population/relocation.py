@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -115,13 +116,8 @@ def shared_among_copies(opacities: Tensor, scales: Tensor, copies: Tensor) -> tu
 
     (Kheradmand et al. 2024, eq. 9; `blitzgs.ops.population.overlap`).
 
-    Args:
-        opacities: logits, [M].
-        scales: logarithms, [M, 3].
-        copies: N, int64 [M], 1 to `MAX_COPIES`.
-
-    Returns:
-        Logits and logarithms, float64.
+    `opacities`: logits, [M]. `scales`: logarithms, [M, 3]. `copies`: N, int64 [M], 1 to `MAX_COPIES`. Returns
+    logits and logarithms, float64.
     """
     logits = opacities.double()
     # -log(1 - o') = -log(1 - o) / N
@@ -216,6 +212,7 @@ def _copies(table: GaussianTable, rows: Tensor, counts: Tensor, time: int, step:
     }
 
 
+@dataclass(frozen=True)
 class PositionNoise:
     """The noise term of 3DGS-MCMC (Kheradmand et al. 2024, eq. 8), for the Gaussians that a step sees.
 
@@ -223,17 +220,10 @@ class PositionNoise:
     length. Here it is divided by the squared extent of the scene, so that it does not.
     """
 
-    def __init__(self, factor: float, extent: float, threshold: float, seed: int) -> None:
-        """Prepare the noise of a run.
-
-        Args:
-            factor: `optimiser.position_noise`.
-            extent: extent of the scene, in the unit of the means.
-            threshold: opacity at which the noise falls to a half; Gaussians below it are pruned.
-            seed: seed of the run.
-        """
-        self._factor, self._extent = factor, extent
-        self._threshold, self._seed = threshold, seed
+    factor: float  # `optimiser.position_noise`
+    extent: float  # of the scene, in the unit of the means
+    threshold: float  # opacity at which the noise falls to a half; Gaussians below it are pruned
+    seed: int
 
     def add(self, table: GaussianTable, visible_ids: Tensor, step: int, position_rate: float) -> None:
         """Add noise to the means of rows `visible_ids` (int32 [U]), which are current up to `step`.
@@ -247,8 +237,8 @@ class PositionNoise:
             table["opacities"],
             table["id"],
             visible_ids,
-            seed=self._seed,
+            seed=self.seed,
             step=step,
-            threshold=self._threshold,
-            strength=self._factor * position_rate / self._extent**2,
+            threshold=self.threshold,
+            strength=self.factor * position_rate / self.extent**2,
         )

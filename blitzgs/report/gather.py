@@ -275,7 +275,6 @@ def digits(value: float, count: int = 5) -> float:
 
 
 def _views_of(file: Path, problems: list[str]) -> dict[str, dict[str, float]]:
-    """Read the metrics of each view of an evaluation."""
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
         return {

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from blitzgs.capture.cameras import MAX_SIDE, Float64
 from blitzgs.capture.capture import Capture
+from blitzgs.runs.checkpoint_files import DAMAGE
 from blitzgs.util.output import write_file
 from blitzgs.view.views import CameraLike
 
@@ -30,39 +31,25 @@ _PIECE, _NAMED, _THREADS = 4096, 4, 16
 
 @dataclass(frozen=True, eq=False)
 class RunCamera:
-    """A pinhole camera with the fields of `blitzgs.capture.cameras.Camera` that rendering reads.
+    """A pinhole camera with the fields of `blitzgs.capture.cameras.Camera` that rendering reads."""
 
-    Attributes:
-        name: name of the image.
-        width: image width in pixels.
-        height: image height in pixels.
-        K: intrinsics in pixels, float64 [3, 3]; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
-        world_to_camera: rigid pose, float64 [4, 4], in the re-centred world (capture position - the run's
-            offset).
-    """
-
-    name: str
-    width: int
-    height: int
+    name: str  # name of the image
+    width: int  # image width in pixels
+    height: int  # image height in pixels
+    # Intrinsics in pixels, float64 [3, 3]; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
     K: npt.NDArray[np.float64]
+    # Rigid pose, float64 [4, 4], in the re-centred world (capture position - the run's offset).
     world_to_camera: npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RunCameras:
-    """All cameras of a run.
+    """All cameras of a run."""
 
-    Attributes:
-        cameras: all cameras in the order of the capture.
-        train: indices of the training cameras.
-        test: indices of the held-out cameras.
-        inputs: paths of the photographs and masks during training.
-    """
-
-    cameras: Sequence[CameraLike]
-    train: list[int]
-    test: list[int]
-    inputs: list[Path]
+    cameras: Sequence[CameraLike]  # all cameras in the order of the capture
+    train: list[int]  # indices of the training cameras
+    test: list[int]  # indices of the held-out cameras
+    inputs: list[Path]  # paths of the photographs and masks during training
 
     def __repr__(self) -> str:
         return (
@@ -89,7 +76,6 @@ def checked_camera(
 
 
 def _check(sizes: Float64, Ks: Float64, poses: Float64) -> None:  # noqa: N803
-    """Refuse impossible values of cameras: sizes [N, 2], Ks [N, 3, 3] and poses [N, 4, 4]."""
     rotations = poses[:, :3, :3]
     with np.errstate(invalid="ignore"):
         turned = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) < 1e-3
@@ -119,7 +105,6 @@ def _near(rows: Float64, expected: list[int]) -> npt.NDArray[np.bool_]:
 
 
 def _matrix(argument: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Return a copy of a matrix as float64."""
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -222,15 +207,7 @@ def load_cameras(folder: Path) -> RunCameras:
         return RunCameras(cameras, train, test, [Path(text) for text in content["inputs"]])
     except FileNotFoundError:
         raise
-    except (
-        OSError,
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-        RecursionError,
-    ) as error:
+    except (*DAMAGE, OverflowError) as error:
         raise ValueError(f"{path} is damaged ({error}): give the capture with --data DIR instead") from error
 
 

@@ -36,23 +36,15 @@ _UNFINISHED = ".unfinished_"
 
 
 class CheckpointError(RuntimeError):
-    """A checkpoint could not be written or read; the message names the checkpoint and the reason.
-
-    Attributes:
-        lacks_space: whether it could be written if there were more space on the disk.
-    """
+    """A checkpoint could not be written or read; the message names the checkpoint and the reason."""
 
     def __init__(self, message: str, lacks_space: bool = False) -> None:
         super().__init__(message)
-        self.lacks_space = lacks_space
+        self.lacks_space = lacks_space  # whether it could be written if there were more space on the disk
 
 
 class Saving:
-    """A checkpoint that a thread of each rank writes; there is none until `finish` has returned.
-
-    Attributes:
-        deleting: deletes older checkpoints on rank 0, after `finish`.
-    """
+    """A checkpoint that a thread of each rank writes; there is none until `finish` has returned."""
 
     def __init__(
         self,
@@ -71,7 +63,6 @@ class Saving:
             columns: name -> [N_rank, ...], this rank's shard; the same names, dtypes and widths on every
                 rank. They must not change before `finish` has returned, and neither must the following two.
             state: the rest of what a resumed run needs, as JSON values; rank 0's is stored.
-            ranks: the job.
             keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
             shared: tensors that are the same on all ranks; rank 0's are stored, in a separate file.
             reached: called at each point at which the save may be interrupted, with the point's name; the
@@ -89,8 +80,9 @@ class Saving:
         name, problem = "", None
         if ranks.rank == 0:
             try:
-                name = _next_name(self._directory)
-                _delete_unfinished(self._directory)
+                names = names_of(self._directory)
+                name = f"checkpoint_{_number(names[-1]) + 1 if names else 0:06d}"
+                _delete(self._directory.glob(_UNFINISHED + "*"))  # of interrupted saves and deletions
             except OSError as error:
                 problem = f"no checkpoint was saved, because rank 0 could not read {directory}: {error}."
         self._name, problem = ranks.broadcast_object((name, problem))
@@ -101,7 +93,7 @@ class Saving:
         device = next(iter(columns.values())).device
         ready = torch.cuda.current_stream(device).record_event() if device.type == "cuda" else None
         pool = ThreadPoolExecutor(1, "blitzgs-checkpoint")
-        self.deleting: Thread | None = None
+        self.deleting: Thread | None = None  # deletes older checkpoints on rank 0, after `finish`
         self._written = pool.submit(self._write, columns, shared or {}, device, ready)
         pool.shutdown(wait=False)
 
@@ -146,13 +138,9 @@ class Saving:
     def finish(self) -> Path:
         """Wait until all ranks have written, and give the checkpoint its name. Collective.
 
-        Returns:
-            The folder of the new checkpoint, `directory/checkpoint_NNNNNN`; later numbers may have more
-            digits.
-
-        Raises:
-            CheckpointError: on every rank, if any rank could not write; earlier checkpoints are unchanged.
-            ValueError: a column has a dtype that the format lacks.
+        Returns the folder of the new checkpoint, `directory/checkpoint_NNNNNN`; later numbers may have more
+        digits. CheckpointError: on every rank, if any rank could not write; earlier checkpoints are
+        unchanged. ValueError: a column has a dtype that the format lacks.
         """
         ranks, path = self._ranks, self._directory / self._name
         with ranks.watchdog.working("writing a checkpoint"):
@@ -187,21 +175,13 @@ class Saving:
 
 @dataclass
 class Loaded:
-    """A checkpoint in memory.
+    """A checkpoint in memory."""
 
-    Attributes:
-        columns: columns of this rank's shard.
-        state: the state that was saved with them.
-        shared: tensors that are the same on all ranks; empty if none were stored.
-        name: name of the checkpoint.
-        refused: for each newer checkpoint, why it was not used.
-    """
-
-    columns: dict[str, Tensor]
-    state: dict[str, Any]
-    shared: dict[str, Tensor]
-    name: str
-    refused: list[str]
+    columns: dict[str, Tensor]  # columns of this rank's shard
+    state: dict[str, Any]  # the state that was saved with them
+    shared: dict[str, Tensor]  # tensors that are the same on all ranks; empty if none were stored
+    name: str  # name of the checkpoint
+    refused: list[str]  # for each newer checkpoint, why it was not used
 
 
 def load_latest(
@@ -216,18 +196,9 @@ def load_latest(
     A damaged checkpoint is refused, and the one before it is tried. A warning names the refused checkpoints,
     the reasons, and the checkpoint that is used.
 
-    Args:
-        directory: folder given to `Saving`.
-        ranks: the job, of any world size.
-        device: where the columns go.
-        problem: returns what is wrong with a shard's columns, or None.
-        only: name of the one checkpoint to load; None: the newest.
-
-    Returns:
-        The checkpoint; None if the folder has none.
-
-    Raises:
-        CheckpointError: checkpoints exist, but none is sound.
+    `directory`: folder given to `Saving`. `problem`: returns what is wrong with a shard's columns, or None.
+    `only`: name of the one checkpoint to load; None: the newest. Returns the checkpoint; None if the folder
+    has none. CheckpointError: checkpoints exist, but none is sound.
     """
     found = ranks.broadcast_object(names_of(Path(directory)) if ranks.rank == 0 else [])
     refused = []
@@ -257,17 +228,9 @@ def load(
     rows are redistributed: rank m gets the positions = m (mod M) of the global order
     (`sharding.global_positions`), and opens only the files that hold some of these rows.
 
-    Args:
-        path: folder returned by `Saving.finish`.
-        ranks: the job, of any world size.
-        device: where the columns go.
-
-    Returns:
-        The columns of this rank's shard, name -> [N_rank, ...]; the state; and the tensors that are the same
-        on all ranks, on the CPU.
-
-    Raises:
-        CheckpointError: on every rank, when a file is missing, torn or altered.
+    `path`: folder returned by `Saving.finish`. Returns the columns of this rank's shard, name ->
+    [N_rank, ...]; the state; and the tensors that are the same on all ranks, on the CPU. CheckpointError: on
+    every rank, when a file is missing, torn or altered.
     """
     path = Path(path)
     manifest, problem = None, None
@@ -332,11 +295,6 @@ def _delete_old(directory: Path, keep: int, reached: Callable[[str], None]) -> T
     return deleting
 
 
-def _delete_unfinished(directory: Path) -> None:
-    """Delete the files that interrupted saves and deletions have left."""
-    _delete(directory.glob(_UNFINISHED + "*"))
-
-
 def _delete(folders: Iterable[Path]) -> None:
     for folder in folders:
         shutil.rmtree(folder, ignore_errors=True)
@@ -352,11 +310,6 @@ def names_of(directory: Path) -> list[str]:
 
 def _number(name: str) -> int:
     return int(name.rpartition("_")[2])
-
-
-def _next_name(directory: Path) -> str:
-    names = names_of(directory)
-    return f"checkpoint_{_number(names[-1]) + 1 if names else 0:06d}"
 
 
 def _common_length(columns: Mapping[str, Tensor]) -> int:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -183,8 +183,9 @@ def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[st
         put(len(head).to_bytes(8, "little"))
         put(head)
         for index, name in enumerate(names):
-            for chunk in _chunks(columns[name]):
-                put(chunk)
+            flat = columns[name].detach().contiguous().view(-1).view(torch.uint8)
+            for part in flat.split(_CHUNK_BYTES):
+                put(memoryview(part.cpu().numpy()))
             if index == len(names) // 2:
                 file.flush()
                 reached("shard half written")
@@ -195,12 +196,6 @@ def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[st
     # The end of the block has waited for the thread.
     reached("shard synced")
     return size, digest.hexdigest()
-
-
-def _chunks(column: Tensor) -> Iterator[memoryview]:
-    flat = column.detach().contiguous().view(-1).view(torch.uint8)
-    for part in flat.split(_CHUNK_BYTES):
-        yield memoryview(part.cpu().numpy())
 
 
 def header_of(path: Path) -> dict[str, ColumnSpec]:

@@ -114,7 +114,6 @@ def _rows(model: Model, rows: Tensor) -> Model:
 
 
 def _psnr(model: Model, cameras: RunCameras, photograph: Callable[[int], npt.NDArray[np.uint8]]) -> float:
-    """Return the mean PSNR of the held-out views."""
     found = []
     for index in cameras.test:
         target = torch.from_numpy(photograph(index))

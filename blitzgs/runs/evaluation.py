@@ -89,8 +89,7 @@ def _psnr(pixels: Tensor, wanted: Tensor) -> float:
 def load_lpips(path: str | None) -> Lpips | None:
     """Load a perceptual metric: a TorchScript module (render, target) -> distance, [1, 3, H, W] in [-1, 1].
 
-    Raises:
-        ValueError: the file is missing or not a TorchScript module.
+    ValueError: the file is missing or not a TorchScript module.
     """
     if path is None:
         return None
@@ -254,8 +253,6 @@ def evenly_ordered(indices: Sequence[int]) -> list[int]:
 
 
 class _Files:
-    """The files that an evaluation writes into its folder."""
-
     def __init__(self, folder: Path, inputs: Iterable[Path], optional: bool) -> None:
         self.output = OutputFolder(folder, inputs)
         self._optional = optional
@@ -328,7 +325,6 @@ def preview_file(folder: Path, index: int, part: str) -> Path:
 
 
 def _extremes(psnr: Mapping[int, float]) -> set[int]:
-    """Return the cameras of the best and the worst views."""
     ordered = sorted(psnr, key=lambda index: (psnr[index], index))
     return {*ordered[:_EXTREMES], *ordered[-_EXTREMES:]}
 

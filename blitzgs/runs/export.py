@@ -101,8 +101,7 @@ def export(
 def export_file(source: GaussianSource, kind: Format, path: Path) -> Exported:
     """Write the model of a file, with its offset; where it is far from the origin, with one that is near it.
 
-    Raises:
-        ValueError, OSError: as `export`.
+    ValueError, OSError: as `export`.
     """
     check_replaces(path, kind)
     offset, shift = np.array(offset_of(source.comments)), np.zeros(3)

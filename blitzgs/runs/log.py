@@ -218,8 +218,6 @@ class _JsonLines:
 
 
 class _Board:
-    """Writes TensorBoard events while that is possible."""
-
     def __init__(self, folder: Path, done: int, failures: _Failures) -> None:
         self._folder, self._done, self._failures = folder, done, failures
         self._writer: Any = None

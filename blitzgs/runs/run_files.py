@@ -180,7 +180,7 @@ def restore(
     the newest is of another version or of another run.
     """
     loaded = checkpoint.load_latest(
-        folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns, only
+        folder / CHECKPOINTS, ranks, device or ranks.device, lambda c: bad_column(GaussianTable(c)), only
     )
     if loaded is None:
         return None
@@ -208,10 +208,6 @@ def parsed(state: Mapping[str, Any], path: Path) -> tuple[Progress, Space, Confi
         return progress, space, from_dict(state["config"])
     except (LookupError, TypeError, AttributeError, ConfigError) as error:
         raise CheckpointError(f"checkpoint {path} belongs to another version of BlitzGS: {error}") from error
-
-
-def _problem_of_columns(columns: dict[str, torch.Tensor]) -> str | None:
-    return bad_column(GaussianTable(columns))
 
 
 def run_and_checkpoint(path: Path) -> tuple[Path, str | None]:

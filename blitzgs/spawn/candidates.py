@@ -56,7 +56,6 @@ def spawn_features(
         is_split: bool [M], whether the candidate is split; false: cloned.
         time: time of the event, in images.
         extent: extent of the scene, in the unit of the means.
-        level_count: number of octree levels.
 
     Returns:
         float32 [M, 10]: mean gradient over the views that saw the parent (half-image units), the parent's

@@ -187,7 +187,8 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0) -> dict[str,
                 check_outcomes(run.survived[part], f"{run.name}, of which a part is held out")
             booster = _train(xgboost, runs, [_hash_uniform(o.parents) >= HELD_OUT for o in runs])
         held_out = run.only(judged)
-        figures.append(judge(held_out, _predict(xgboost, booster, held_out.features), gate_from))
+        data = xgboost.DMatrix(held_out.features, feature_names=list(FEATURES))
+        figures.append(judge(held_out, booster.predict(data, output_margin=True), gate_from))
     protocol = "leave one scene out" if len(scenes) > 1 else "a quarter of the parents held out"
     result = {"protocol": protocol, "held_out": figures}
     booster = _train(xgboost, runs, [np.ones(len(run.survived), bool) for run in runs])
@@ -233,7 +234,6 @@ def _check_same_schedule(runs: Sequence[Spawns]) -> None:
 
 
 def _train(xgboost: ModuleType, runs: Sequence[Spawns], rows: Sequence[NDArray[np.bool_]]) -> Any:
-    """Return a booster that is trained on the chosen rows of each run."""
     generator = np.random.default_rng(0)
     features, labels = [], []
     for run, mine in zip(runs, rows, strict=True):
@@ -246,13 +246,6 @@ def _train(xgboost: ModuleType, runs: Sequence[Spawns], rows: Sequence[NDArray[n
     # A row's weight in a leaf is p (1 - p), at most 1/4.
     least = {"min_child_weight": LEAF_SHARE * data.num_row() / 4}
     return xgboost.train(XGBOOST_PARAMETERS | least | {"seed": 0}, data, ROUNDS)
-
-
-def _predict(xgboost: ModuleType, booster: Any, features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the log odds of survival, [K], that a booster predicts."""
-    data = xgboost.DMatrix(features, feature_names=list(FEATURES))
-    scores: NDArray[np.float32] = booster.predict(data, output_margin=True)
-    return scores
 
 
 def _hash_uniform(ids: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -122,18 +122,14 @@ def read_info(path: Path) -> GateInfo:
 
 
 class SpawnGate:
-    """A predictor of survival.
-
-    Attributes:
-        info: what it was fitted on.
-    """
+    """A predictor of survival."""
 
     def __init__(self, path: Path) -> None:
         """Read a model in XGBoost's JSON and its metadata.
 
         GateError: a file is missing, damaged or of another kind; for UBJSON it says how to convert it.
         """
-        self.info = read_info(path)
+        self.info = read_info(path)  # what it was fitted on
         if path.suffix == ".ubj":
             raise GateError(
                 f"{path}: only XGBoost's JSON is read: xgboost.Booster(model_file='{path.name}').save_model("

@@ -145,13 +145,14 @@ class Lineage:
         ledger = Ledger(
             self.ledger.births + births,
             self.ledger.deaths + deaths,
-            _wrapped(self.ledger.id_sum + change),
+            (self.ledger.id_sum + change + (1 << 63)) % (1 << 64) - (1 << 63),  # as int64 wraps around
             self._parts,
         )
         if ledger.births - ledger.deaths != live or ledger.id_sum != id_sum:
+            same = " (their numbers agree, their ids do not)" if ledger.births - ledger.deaths == live else ""
             raise LineageError(
                 f"lineage: {ledger.births:,} births less {ledger.deaths:,} deaths is not the live population "
-                f"of {live:,} Gaussians{_same_number(ledger, live)}; the log in {self._folder} is "
+                f"of {live:,} Gaussians{same}; the log in {self._folder} is "
                 "not to be trusted. Please report this; population.lineage=false trains without it."
             )
         self.ledger = ledger
@@ -204,12 +205,3 @@ def _is_later(name: re.Match[str], step: int, ledger: Ledger) -> bool:
     if ledger.births == 0 or its_step > step:
         return True
     return its_step == step and 0 < ledger.parts <= number
-
-
-def _wrapped(value: int) -> int:
-    """Return an integer modulo 2^64, as a signed integer."""
-    return (value + (1 << 63)) % (1 << 64) - (1 << 63)
-
-
-def _same_number(ledger: Ledger, live: int) -> str:
-    return " (their numbers agree, their ids do not)" if ledger.births - ledger.deaths == live else ""

@@ -85,23 +85,23 @@ class BlockIndex:
 
     Build a new index whenever rows were added, removed or reordered. Sort the table by `morton_order` first:
     the active set is right in any order, but in a random order blocks are large and no block is skipped.
-
-    Attributes:
-        bounds: the bounds of each block, float32 [blocks, 8]; see `update_block_bounds_` for their layout.
-        level_ranges: the coarsest and the finest level of each block, uint8 [blocks, 2].
     """
 
     def __init__(self, table: GaussianTable, pending_table: Tensor | None = None) -> None:
         """Compute the bounds of every block of the table.
 
-        Args:
-            pending_table: `AdamSchedule.table` of the lazy optimiser, if rows may have pending steps; None:
-                they have none.
+        `pending_table`: `AdamSchedule.table` of the lazy optimiser, if rows may have pending steps; None:
+        they have none.
         """
         self._pending_table = pending_table
         count = -(-len(table) // BLOCK_ROWS)
+        # The bounds of each block, float32 [blocks, 8]; see `update_block_bounds_` for their layout.
         self.bounds = torch.empty(count, 8, dtype=torch.float32, device=table.device)
-        self.level_ranges = _level_ranges(table["level"], count)
+        # The coarsest and the finest level of each block, uint8 [blocks, 2].
+        level = table["level"]
+        rest = level[-1:].expand(count * BLOCK_ROWS - len(level)) if count else level
+        of_block = torch.cat((level, rest)).view(-1, BLOCK_ROWS)
+        self.level_ranges = torch.stack((of_block.amin(dim=1), of_block.amax(dim=1)), dim=1)
         self.update(table, None)
 
     @classmethod
@@ -150,19 +150,11 @@ def spread(bounds: Tensor, limit: float) -> Tensor:
     The number of boxes that a plane cuts is proportional to this, if the plane lies anywhere with the same
     probability (Crofton's formula). A step reads the rows of the blocks that the border of a view cuts.
 
-    Args:
-        bounds: float32 [blocks, 8], as `BlockIndex.bounds`.
-        limit: a larger width counts as this one: single far rows have no more weight.
+    `bounds`: float32 [blocks, 8], as `BlockIndex.bounds`. `limit`: a larger width counts as this one: single
+    far rows have no more weight.
     """
     widths = (bounds[:, 3:6].double() - bounds[:, :3]).clamp(min=0).sum(dim=1) / 2
     return widths.clamp(max=limit).sum()
-
-
-def _level_ranges(level: Tensor, blocks: int) -> Tensor:
-    """Return the coarsest and the finest level of each block, uint8 [blocks, 2]."""
-    rest = level[-1:].expand(blocks * BLOCK_ROWS - len(level)) if blocks else level
-    of_block = torch.cat((level, rest)).view(-1, BLOCK_ROWS)
-    return torch.stack((of_block.amin(dim=1), of_block.amax(dim=1)), dim=1)
 
 
 _MAX_WORDS = 1 << 26  # words of a mask that are processed together
@@ -170,20 +162,14 @@ UNSEEN = MAX_VIEWS  # above the numbers of all batches
 
 
 class Cameras(NamedTuple):
-    """Views of any sizes, on the device, and the limits they share.
+    """Views of any sizes, on the device, and the limits they share."""
 
-    Attributes:
-        viewmats: float32 [V, 4, 4], world to camera.
-        Ks: float32 [V, 3, 3], pixels.
-        sizes: int32 [V, 2], width and height, pixels.
-        limits: near plane, far plane and eps2d, as `blitzgs.ops.blocks.cull_blocks` has them.
-        columns: the views' columns in the cull matrix, int64 [V]; None: the views have no mask.
-    """
-
-    viewmats: Tensor
-    Ks: Tensor
-    sizes: Tensor
+    viewmats: Tensor  # float32 [V, 4, 4], world to camera
+    Ks: Tensor  # float32 [V, 3, 3], pixels
+    sizes: Tensor  # int32 [V, 2], width and height, pixels
+    # Near plane, far plane and eps2d, as `blitzgs.ops.blocks.cull_blocks` has them.
     limits: tuple[float, float, float]
+    # The views' columns in the cull matrix, int64 [V]; None: the views have no mask.
     columns: Tensor | None = None
 
 
@@ -245,8 +231,7 @@ class BlockVisibility:
 def culled_blocks(cull: Tensor) -> Tensor:
     """Return, as bits, the views that leave out all rows of each block, int32 [N, columns / 32].
 
-    Args:
-        cull: int32 [N, columns, 8], see `blitzgs.ops.blocks`; of whole blocks.
+    `cull`: int32 [N, columns, 8], see `blitzgs.ops.blocks`; of whole blocks.
     """
     bits = torch.arange(WORD_BITS, device=cull.device)
     length = max(1, _MAX_WORDS // max(1, cull[:1].numel()))

@@ -32,12 +32,8 @@ class HostTable(GaussianTable):
     def __init__(self, columns: dict[str, Tensor], pinned: bool) -> None:
         """Move the given columns, one by one, into memory that the table owns.
 
-        Args:
-            columns: as for `GaussianTable`, on the CPU; the dictionary is emptied.
-            pinned: whether a GPU will read and write the columns.
-
-        Raises:
-            HostMemoryError: the columns do not fit into the host's memory.
+        `columns`: as for `GaussianTable`, on the CPU; the dictionary is emptied. `pinned`: whether a GPU will
+        read and write the columns. HostMemoryError: the columns do not fit into the host's memory.
         """
         super().__init__(columns)
         self._pinned = pinned

@@ -39,21 +39,13 @@ class PoolError(RuntimeError):
 
 
 class Moved(NamedTuple):
-    """Counts of what moved between host and device.
+    """Counts of what moved between host and device."""
 
-    Attributes:
-        steps: training steps.
-        needed: blocks that the views of these steps see.
-        loaded: blocks that were copied to the device because views see them.
-        bytes_in: bytes copied to the device, for any reason.
-        bytes_out: bytes written back to the host.
-    """
-
-    steps: int = 0
-    needed: int = 0
-    loaded: int = 0
-    bytes_in: int = 0
-    bytes_out: int = 0
+    steps: int = 0  # training steps
+    needed: int = 0  # blocks that the views of these steps see
+    loaded: int = 0  # blocks that were copied to the device because views see them
+    bytes_in: int = 0  # bytes copied to the device, for any reason
+    bytes_out: int = 0  # bytes written back to the host
 
     def since(self, earlier: Moved) -> Moved:
         """Return the difference from an earlier count."""
@@ -82,16 +74,13 @@ class Pool:
     def __init__(
         self, table: HostTable, device: torch.device, budget_bytes: int, pending_table: Tensor | None
     ) -> None:
-        """Allocate the pool.
+        """Allocate the pool (PoolError: the budget is less than two blocks).
 
         Args:
             table: the table on the host; pinned if `device` is a GPU.
             device: device of the pool.
             budget_bytes: bytes of the device that the pool may take.
             pending_table: as for `BlockIndex`, on the device.
-
-        Raises:
-            PoolError: the budget is less than two blocks.
         """
         self.table, self._device, self._budget = table, device, budget_bytes
         self.moved = Moved()
@@ -193,8 +182,7 @@ class Pool:
     def catch_up(self, function: Callable[[GaussianTable], None]) -> None:
         """Load every block of the table into the pool, one part after the other, and change its rows there.
 
-        Args:
-            function: changes the pool in place, and must tolerate that some rows are passed to it twice.
+        `function`: changes the pool in place, and must tolerate that some rows are passed to it twice.
         """
         self.write_back()
         self._open()
@@ -213,15 +201,9 @@ class Pool:
     def load_for_step(self, step: int, cameras: Cameras, batch_size: int) -> BlockIndex:
         """Load the blocks that the views of a step see into the pool.
 
-        Args:
-            cameras: views of this step and of the following steps, in order, at most 32.
-            batch_size: views per step.
-
-        Returns:
-            The index of the pool's blocks. The step updates its bounds; pass it to `store_bounds` afterwards.
-
-        Raises:
-            PoolError: the blocks do not fit into the pool.
+        `cameras`: views of this step and of the following steps, in order, at most 32. `batch_size`: views
+        per step. Returns the index of the pool's blocks. The step updates its bounds; pass it to
+        `store_bounds` afterwards. PoolError: the blocks do not fit into the pool.
         """
         self._open()
         self._begun = self._mark()
@@ -313,8 +295,7 @@ class Pool:
         loads at the lowest steady rate at which all blocks that are known to be needed come in time. They
         take slots whose block is not known to be needed.
 
-        Args:
-            loading: blocks that are already being loaded during this step.
+        `loading`: blocks that are already being loaded during this step.
         """
         due, batches = self._visibility.next_use, self._visibility.batches
         missing = ((self._slot_of < 0) & (due < UNSEEN)).nonzero()[0]

@@ -50,34 +50,23 @@ class Column:
 
 
 class Placement(NamedTuple):
-    """Which row of a table each new Gaussian gets, and which others move.
+    """Which row of a table each new Gaussian gets, and which others move."""
 
-    Attributes:
-        total: number of rows afterwards.
-        new: int64 [M], the row of each new Gaussian.
-        moved_from: int64 [K], rows that move because the table becomes shorter.
-        moved_to: int64 [K], where they move.
-    """
-
-    total: int
-    new: Tensor
-    moved_from: Tensor
-    moved_to: Tensor
+    total: int  # number of rows afterwards
+    new: Tensor  # int64 [M], the row of each new Gaussian
+    moved_from: Tensor  # int64 [K], rows that move because the table becomes shorter
+    moved_to: Tensor  # int64 [K], where they move
 
 
 def schema(sh_degree: int) -> dict[str, Column]:
     """Return the columns of a table, in their order.
 
-    Args:
-        sh_degree: highest spherical-harmonics degree D; `sh` has K = (D + 1)^2 coefficients.
-
-    Returns:
-        means [3], quats [4], scales [3] (log), opacities [] (logit), sh [K, 3] as float32, their Adam moments
-        `exp_avg.*` and `exp_avg_sq.*`; last_step and moment_step int32 (the optimiser step up to which the
-        row's parameters, and its moments, are current); id int64 (persistent, unique over ranks), parent
-        int64 (-1: none), birth int32 (images seen when it was born), level uint8 (octree level); grad_sum
-        float32, grad_count int32, max_radii float32 (pixels): density statistics since the last density
-        event.
+    `sh_degree`: highest spherical-harmonics degree D; `sh` has K = (D + 1)^2 coefficients. Returns means [3],
+    quats [4], scales [3] (log), opacities [] (logit), sh [K, 3] as float32, their Adam moments `exp_avg.*`
+    and `exp_avg_sq.*`; last_step and moment_step int32 (the optimiser step up to which the row's parameters,
+    and its moments, are current); id int64 (persistent, unique over ranks), parent int64 (-1: none), birth
+    int32 (images seen when it was born), level uint8 (octree level); grad_sum float32, grad_count int32,
+    max_radii float32 (pixels): density statistics since the last density event.
     """
     f = torch.float32
     rows = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": ((sh_degree + 1) ** 2, 3)}
@@ -116,19 +105,13 @@ class GaussianTable:
     only the rows that change; for that, columns that grow have memory for more rows than they hold.
 
     A column of `LAYOUTS` is converted whenever it is set, read or moved.
-
-    Attributes:
-        columns: the columns by name, those of `LAYOUTS` in their stored form.
     """
 
     def __init__(self, columns: Mapping[str, Tensor]) -> None:
         """Take over the given columns.
 
-        Args:
-            columns: name -> tensor [N, ...]; at least those of `schema`, all on one device.
-
-        Raises:
-            ValueError: a column is missing, or its length, row shape, dtype or device does not fit.
+        `columns`: name -> tensor [N, ...]; at least those of `schema`, all on one device. ValueError: a
+        column is missing, or its length, row shape, dtype or device does not fit.
         """
         if "sh" not in columns:
             raise ValueError(f"GaussianTable: column 'sh' is missing; got {sorted(columns)}")
@@ -145,6 +128,7 @@ class GaussianTable:
                     f"GaussianTable: column '{name}' must be {column.dtype} {list(wanted)} on {sh.device}, "
                     f"got {tensor.dtype} {list(tensor.shape)} on {tensor.device}"
                 )
+        # The columns by name, those of `LAYOUTS` in their stored form.
         self.columns: dict[str, Tensor] = {name: as_stored(name, column) for name, column in columns.items()}
         # The memory of columns that have more of it than rows; they are its first rows.
         self._memory: dict[str, Tensor] = {}
@@ -174,8 +158,7 @@ class GaussianTable:
     def of_parameters(cls, columns: Mapping[str, Tensor]) -> GaussianTable:
         """Build a table for rendering only: the columns of the optimiser are zeros that take no memory.
 
-        Args:
-            columns: `PARAMETERS`, and "level" and "id" if known.
+        `columns`: `PARAMETERS`, and "level" and "id" if known.
         """
         sh = columns["sh"]
         count, known = len(sh), dict(columns)
@@ -226,7 +209,6 @@ class GaussianTable:
         self._memory.pop(name, None)
 
     def _allocate(self, like: Tensor, rows: int) -> Tensor:
-        """Allocate memory for rows like those of a column."""
         return like.new_empty((rows, *like.shape[1:]))
 
     def _lengthen(self, name: str, count: int, most: int | None) -> Tensor:
@@ -291,11 +273,8 @@ class GaussianTable:
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Add rows at the end.
 
-        Args:
-            rows: name -> tensor [M, ...] of every column; those of `ZERO_AT_BIRTH` may be absent.
-
-        Raises:
-            ValueError: a column is missing, an unknown one is given, or shapes or dtypes differ.
+        `rows`: name -> tensor [M, ...] of every column; those of `ZERO_AT_BIRTH` may be absent. ValueError: a
+        column is missing, an unknown one is given, or shapes or dtypes differ.
         """
         count = self._check_new(rows)
         for name in self._to_change():
@@ -357,10 +336,8 @@ class GaussianTable:
     def replace(self, placement: Placement, new: Mapping[str, Tensor], most: int | None = None) -> None:
         """Let rows leave and new ones join; all other rows stay where they are, except those that move.
 
-        Args:
-            placement: of `blitzgs.table.placement.place`.
-            new: as for `append`.
-            most: about the most rows that the table will ever have; None: unknown.
+        `placement`: of `blitzgs.table.placement.place`. `new`: as for `append`. `most`: about the most rows
+        that the table will ever have; None: unknown.
         """
         self._check_new(new)
         for name in self._to_change():
@@ -377,8 +354,7 @@ class GaussianTable:
     def move_rows(self, destination_ranks: Tensor, ranks: Ranks) -> None:
         """Move every row to a rank. Collective: every rank calls it. Rows arrive ordered by source rank.
 
-        Args:
-            destination_ranks: int64 [N], the rank each row goes to.
+        `destination_ranks`: int64 [N], the rank each row goes to.
         """
         order = torch.argsort(destination_ranks, stable=True)
         counts = torch.bincount(destination_ranks, minlength=ranks.world_size)

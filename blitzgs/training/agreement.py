@@ -60,14 +60,11 @@ class StopRequest:
 
 
 class SaveClock:
-    """Tells when the next checkpoint by wall time is due.
-
-    Attributes:
-        saving: the checkpoint that is being written; None: there is none. No other one is due meanwhile.
-    """
+    """Tells when the next checkpoint by wall time is due."""
 
     def __init__(self, seconds: float) -> None:
         """Start the clock; `seconds` is the time between two checkpoints; 0: none by wall time."""
+        # The checkpoint that is being written; None: there is none. No other one is due meanwhile.
         self.saving: Saving | None = None
         self._seconds = seconds or math.inf
         self.restart()

@@ -219,12 +219,10 @@ class BatchLoader:
         self._worker.shutdown(wait=True, cancel_futures=True)
 
     def _use_stream(self) -> None:
-        """Make the loader's stream the current stream of its thread."""
         if self._stream is not None:
             torch.cuda.set_stream(self._stream)
 
     def _plan(self, step: int) -> _Plan:
-        """Choose the views of a step and divide their tiles."""
         indices = [self._train[view] for view in self._sampler.batch(step)]
         reduction = self._sampler.reduction(step)
         width, height = self._views.size(indices, reduction)
@@ -237,7 +235,6 @@ class BatchLoader:
         return _Plan(indices, ranges, ranges.pixel_rows(self._owners.ranks.rank), reduction)
 
     def _drop(self, step: int) -> None:
-        """Forget the plan of a step, and its batch if that is prepared."""
         del self._plans[step]
         self._prefetched.discard(step)
         if step in self._pending:
@@ -245,7 +242,6 @@ class BatchLoader:
                 self._give_back(self._pending.pop(step).result()[1])
 
     def _prefetch(self, step: int) -> None:
-        """Start to decode the photographs and masks of a planned batch."""
         plan = self._plans[step]
         self._prefetched.add(step)
         needed = [index for index, (y0, y1) in zip(plan.indices, plan.rows, strict=True) if y0 < y1]
@@ -271,12 +267,10 @@ class BatchLoader:
             raise
 
     def _give_back(self, slot: _Slot) -> None:
-        """Let a later batch use a slot."""
         assert slot not in self._free, "two batches would share this memory; this is a bug, please report it"
         self._free.append(slot)
 
     def _read(self, index: int, y0: int, y1: int, reduction: int) -> _Photograph:
-        """Read pixel rows [y0, y1) and the mask of a view."""
         size = self._views.size([index], reduction)
         try:
             mask = self._images.mask(index, reduction)
@@ -293,7 +287,6 @@ class BatchLoader:
         return _Photograph(strip, mask, self._sample_counts[index, reduction])
 
     def _fill(self, slot: _Slot, plan: _Plan, photographs: list[_Photograph]) -> Batch:
-        """Assemble a batch in a slot and start to upload it."""
         indices, ranges, rows, reduction = plan
         count, (width, height) = len(indices), self._views.size(indices, reduction)
         strips, masks, samples = zip(*photographs, strict=True)

@@ -57,14 +57,9 @@ def open_capture(
     The processes of one host share the budget for images in memory, which is at most half of its memory, and
     the decoded images if they all fit into half of that. Collective.
 
-    Args:
-        remedy: the flag of the caller's command that leaves out views without a photograph, for the error
-            message.
-        reading: of `read_ahead`.
-
-    Raises:
-        ConfigError: `data.path` is not set.
-        FileNotFoundError, ValueError: the capture is incomplete or damaged.
+    `remedy`: the flag of the caller's command that leaves out views without a photograph, for the error
+    message. `reading`: of `read_ahead`. ConfigError: `data.path` is not set. FileNotFoundError, ValueError:
+    the capture is incomplete or damaged.
     """
     data = config.data
     if not data.path:
@@ -82,9 +77,8 @@ def open_capture(
     left = max(0, budget - taken)  # this rank's budget may be below that of the rank which made the memory
     background = config.model.background
     local = ranks.local_world_size
-    return capture, ImageStore(
-        capture, left // local, _decoder_threads(local), background=background, shared=shared
-    )
+    threads = min(max(len(os.sched_getaffinity(0)) // local - 2, 2), 32)  # this rank's cores, less two
+    return capture, ImageStore(capture, left // local, threads, background=background, shared=shared)
 
 
 def load_configured(data: DataConfig, find_damage: FindDamage = damaged) -> Capture:
@@ -118,11 +112,10 @@ def _share_decoded(
 ) -> tuple[SharedImages | None, int]:
     """Open memory for decoded images of these shapes that the ranks of this host share. Collective.
 
-    Returns:
-        The memory, and the bytes that it takes from this host. The memory is None if this is the host's only
-        rank, the images would take more bytes than the budget, or the system does not let the ranks share
-        memory; then every rank keeps those that it needs for itself. If the system only keeps this rank from
-        the memory, the bytes count all the same.
+    Returns the memory, and the bytes that it takes from this host. The memory is None if this is the host's
+    only rank, the images would take more bytes than the budget, or the system does not let the ranks share
+    memory; then every rank keeps those that it needs for itself. If the system only keeps this rank from the
+    memory, the bytes count all the same.
     """
     if ranks.world_size == 1:
         return None, 0
@@ -148,13 +141,9 @@ def sharing_hint(
 ) -> str | None:
     """Return what to do if the decoded images are too many to be shared by the ranks of a host.
 
-    Args:
-        cache_bytes: `DataConfig.cache_bytes`.
-        local_ranks: number of ranks of the host.
-        factors: by which images are reduced in addition.
-
-    Returns:
-        None for a single rank, if the images fit already, or if they are too many for the host's memory.
+    `cache_bytes`: `DataConfig.cache_bytes`. `local_ranks`: number of ranks of the host. `factors`: by which
+    images are reduced in addition. Returns None for a single rank, if the images fit already, or if they are
+    too many for the host's memory.
     """
     size, memory = size_of(decoded_shapes(capture, factors)), _host_memory() // 2
     if local_ranks == 1 or size <= min(cache_bytes, memory) // 2 or size > memory // 2:
@@ -164,11 +153,6 @@ def sharing_hint(
         "each rank decodes the photographs for itself: with "
         f"--data.cache_bytes={gigabytes}_000_000_000, the ranks of a host would share them"
     )
-
-
-def _decoder_threads(local_ranks: int) -> int:
-    """Return how many threads each rank of this host decodes with: its cores, less two, from 2 to 32."""
-    return min(max(len(os.sched_getaffinity(0)) // local_ranks - 2, 2), 32)
 
 
 def _host_memory() -> int:
@@ -184,8 +168,7 @@ def _host_memory() -> int:
 def check_capture(space: Space, capture: Capture, folder: Path) -> None:
     """Check that a capture is the one that the run in `folder` was trained on.
 
-    Raises:
-        ValueError: its cameras are elsewhere.
+    ValueError: its cameras are elsewhere.
     """
     if Space.of(capture.offset, capture.extent) != space:
         raise ValueError(f"{capture.root} is not the capture of the run in {folder}: its cameras differ")
@@ -194,8 +177,7 @@ def check_capture(space: Space, capture: Capture, folder: Path) -> None:
 def check_resolution(config: Config, capture: Capture) -> None:
     """Check that the photographs are large enough for `schedule.resolution`.
 
-    Raises:
-        ConfigError: one of them is not.
+    ConfigError: one of them is not.
     """
     most = max((factor for factor, _ in config.schedule.resolution), default=1)
     sizes = {(capture.cameras[index].width, capture.cameras[index].height) for index in capture.train}
@@ -210,8 +192,7 @@ def check_resolution(config: Config, capture: Capture) -> None:
 def check_alike(config: Config, capture: Capture, ranks: Ranks, resume: bool) -> None:
     """Check that all ranks run the same code with the same configuration and flag on the same capture.
 
-    Raises:
-        MismatchError: on every rank, naming the field and the ranks.
+    MismatchError: on every rank, naming the field and the ranks.
     """
     if ranks.world_size == 1:
         return

@@ -51,13 +51,9 @@ def loss_terms(
 ) -> LossTerms:
     """Compare rendered views with their photographs; on several ranks each compares its own tiles.
 
-    Args:
-        extent: size of the scene in the unit of the means; L_scale is relative to it.
-        shown: the images to compare, [B, H, W, 3], instead of the frame's; `v_renders` is then their
-            gradient.
-
-    Raises:
-        ValueError: a rank has not composited all pixels that its loss reads.
+    `extent`: size of the scene in the unit of the means; L_scale is relative to it. `shown`: the images to
+    compare, [B, H, W, 3], instead of the frame's; `v_renders` is then their gradient. ValueError: a rank has
+    not composited all pixels that its loss reads.
     """
     count, assignment = len(frame.views), frame.assignment
     if assignment is not None and assignment.ranges.halo < LOSS_HALO:

@@ -98,11 +98,7 @@ class OffloadingStepper(Stepper):
         return moved.values()
 
     def forward(
-        self,
-        step: int,
-        options: RenderOptions,
-        batch: Batch,
-        view_filter: ViewFilter | None = None,
+        self, step: int, options: RenderOptions, batch: Batch, view_filter: ViewFilter | None = None
     ) -> tuple[Frame, LossTerms, HostSum]:
         """See `Stepper.forward`."""
         self._up_to_date_at = None

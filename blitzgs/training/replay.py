@@ -124,9 +124,8 @@ def label_events(lineage: Path) -> tuple[Tensor, Tensor]:
 def branch_point(folder: Path, config: Config) -> Path:
     """Return the last checkpoint of a run before the gate's onset.
 
-    Raises:
-        FileNotFoundError: there is none.
-        ValueError: the run or its densification ends before the gate's onset, or a checkpoint is damaged.
+    FileNotFoundError: there is none. ValueError: the run or its densification ends before the gate's onset,
+    or a checkpoint is damaged.
     """
     schedule, found = Schedule(config.schedule), []
     if not schedule.has_spawn_gate(schedule.iterations - 1):
@@ -198,27 +197,15 @@ def replay(
             summary = trainer.train()
         if summary is None:
             raise InterruptedError(f"arm {name} was stopped by a signal")
-        return {
-            "arm": name,
-            "psnr": summary["psnr"],
-            "ssim": summary["ssim"],
-            "peak": summary["peak_gaussians"],
-            "final": summary["gaussians"],
-            "seconds": summary["seconds"] - began,
-        }
+        figures = {"psnr": "psnr", "ssim": "ssim", "peak": "peak_gaussians", "final": "gaussians"}
+        found = {short: summary[long] for short, long in figures.items()}
+        return {"arm": name, **found, "seconds": summary["seconds"] - began}
 
     record = CandidateRecord()
     reference = train(REFERENCE, record)
     known = record.of_all_ranks(ranks)
     spawned, dead = label_events(out / REFERENCE / run_files.LINEAGE)
-    held_back = int(torch.isin(known, spawned, invert=True).sum()) / max(1, len(known))
-    if held_back > 0.5 and ranks.rank == 0:
-        warnings.warn(
-            f"the limit of the population held back {held_back:.0%} of the reference's candidates, so all "
-            "arms may end alike: replay a run with a higher limit (population.max_gaussians, "
-            "pixels_per_gaussian, gaussians_per_point)",
-            stacklevel=2,
-        )
+    held_back = _held_back(known, spawned, ranks)
     if ranks.rank == 0:
         (out / REFERENCE / BEGUN).unlink()
     yield reference | {"dead": len(dead) / max(1, len(spawned)), "held_back": held_back}
@@ -231,6 +218,19 @@ def replay(
     yield train("gate", RankVeto(gate, rate))
     yield train("gate_sampled", SampledVeto(gate, rate, config.seed))
     yield train("random", RandomVeto(rate, config.seed))
+
+
+def _held_back(known: Tensor, spawned: Tensor, ranks: Ranks) -> float:
+    """Return the share of the reference's candidates that became no Gaussians; warn if it is large."""
+    share = int(torch.isin(known, spawned, invert=True).sum()) / max(1, len(known))
+    if share > 0.5 and ranks.rank == 0:
+        warnings.warn(
+            f"the limit of the population held back {share:.0%} of the reference's candidates, so all "
+            "arms may end alike: replay a run with a higher limit (population.max_gaussians, "
+            "pixels_per_gaussian, gaussians_per_point)",
+            stacklevel=3,
+        )
+    return share
 
 
 def _check_unclaimed(out: Path, ranks: Ranks) -> None:

@@ -156,7 +156,6 @@ def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
 
 
 def _describe(folder: Path, config: Config, capture: Capture, run_id: str, is_new: bool) -> None:
-    """Write what the folder of a run tells of its configuration, its cameras and its world."""
     save_config(config, folder / run_files.CONFIG)
     if is_new or not (folder / CAMERAS).exists():
         save_cameras(folder, capture, run_id)
@@ -240,7 +239,6 @@ def _exposures(
 
 
 def _sampler(config: Config, capture: Capture, schedule: Schedule) -> BatchSampler:
-    """Return the sampler of batches, with a tour of the views if the Gaussians are in a pool."""
     cameras = [capture.cameras[i] for i in capture.train]
     tour = None
     if config.memory.resident_gb > 0 and config.memory.tour:

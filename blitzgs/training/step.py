@@ -76,11 +76,7 @@ class Stepper:
         return {}
 
     def forward(
-        self,
-        step: int,
-        options: RenderOptions,
-        batch: Batch,
-        view_filter: ViewFilter | None = None,
+        self, step: int, options: RenderOptions, batch: Batch, view_filter: ViewFilter | None = None
     ) -> tuple[Frame, LossTerms, HostSum]:
         """Apply pending steps of the rows that the views may see, render, and compare with the photographs.
 

@@ -101,17 +101,12 @@ class Trainer:
     def train(self) -> dict[str, Any] | None:
         """Train to the end, evaluate, and write the summary.
 
-        Returns:
-            The summary; None if the run was asked to stop early. It has then saved a checkpoint to resume
-            from.
-
-        Raises:
-            NonFiniteError: a loss or a parameter is not finite.
-            PhotographError: a photograph cannot be read; the steps before it are saved.
-            ModelLostError: no Gaussian is left.
-            PoolError: the Gaussians that a step or an event needs do not fit into the pool of
-                `memory.resident_gb`; with one rank, the steps before it are saved.
-            CheckpointError: the model could not be saved, although the run waited for disk space.
+        Returns the summary; None if the run was asked to stop early. It has then saved a checkpoint to resume
+        from. NonFiniteError: a loss or a parameter is not finite. PhotographError: a photograph cannot be
+        read; the steps before it are saved. ModelLostError: no Gaussian is left. PoolError: the Gaussians
+        that a step or an event needs do not fit into the pool of `memory.resident_gb`; with one rank, the
+        steps before it are saved. CheckpointError: the model could not be saved, although the run waited for
+        disk space.
         """
         state = self.state
         folder = state.folder if state.ranks.rank == 0 else None
@@ -207,7 +202,6 @@ class Trainer:
             ) from error
 
     def _check_photographs(self) -> None:
-        """Raise an error on all ranks if one of them continued without a photograph (`BatchLoader.lost`)."""
         reasons = self.state.ranks.all_gather_object(self.loader.lost)
         lost = [f"rank {rank}: {reason}" for rank, reason in enumerate(reasons) if reason is not None]
         if lost:

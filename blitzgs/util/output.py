@@ -127,16 +127,12 @@ class OutputFolder:
         each keeps its own suffix before the new one; if they are still equal, later ones get a number. The
         same names always give the same paths.
 
-        Args:
-            names: names of images, as in their capture.
-            suffix: suffix of the new files, with its dot.
-            flat: put every file into the folder itself, `a/b.jpg` as `a_b` + suffix.
-
-        Raises:
-            OSError: a path is an input, is no regular file, leaves the folder through a link, or exists in a
-                folder without `MARK`.
+        `names`: names of images, as in their capture. `suffix`: suffix of the new files, with its dot.
+        `flat`: put every file into the folder itself, `a/b.jpg` as `a_b` + suffix. OSError: a path is an
+        input, is no regular file, leaves the folder through a link, or exists in a folder without `MARK`.
         """
-        shared = _shared_parts([name for name in names if name.startswith("/")])
+        above = [_inner_parts(name)[:-1] for name in names if name.startswith("/")]
+        shared = len(os.path.commonprefix(above)) if above else 0  # leading folders that all have
         parts = [_inner_parts(name, shared if name.startswith("/") else 0) for name in names]
         if flat:
             parts = [("_".join(inner),) for inner in parts]
@@ -196,12 +192,6 @@ def _inner_parts(name: str, shared: int = 0) -> tuple[str, ...]:
     """Return the parts of a name that stay inside a folder, without the first `shared`; at least one."""
     parts = [part for part in PurePath(name.replace("\0", "_")).parts if part not in ("/", "//", "..", ".")]
     return tuple(_shortened(part) for part in parts[shared:]) or ("image",)
-
-
-def _shared_parts(names: Sequence[str]) -> int:
-    """Return the number of leading folders that all names have in common."""
-    folders = [_inner_parts(name)[:-1] for name in names]
-    return len(os.path.commonprefix(folders)) if folders else 0
 
 
 def _shortened(part: str) -> str:

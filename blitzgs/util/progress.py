@@ -58,15 +58,11 @@ def image_progress(what: str, shown: bool = True, unit: str = "images") -> Itera
 
 
 class Laps:
-    """The seconds of consecutive parts.
-
-    Attributes:
-        seconds: of each part so far, in order.
-    """
+    """The seconds of consecutive parts."""
 
     def __init__(self, since_start: bool = False) -> None:
         """Begin the first part now, or (`since_start`) at the start of this process."""
-        self.seconds: dict[str, float] = {}
+        self.seconds: dict[str, float] = {}  # of each part so far, in order
         self._last = psutil.Process().create_time() if since_start else time.time()
 
     def lap(self, name: str) -> None:

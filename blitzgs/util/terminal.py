@@ -33,18 +33,13 @@ def amount(size: float) -> str:
 
 
 class Output(io.FileIO):
-    """One of the process's output streams, which keeps the program running when it cannot be written.
-
-    Attributes:
-        title: "standard output" or "standard error".
-        lost: why text was lost; None: all was written.
-        has_reader: false: the reader has gone (a pipe that `head` closed, a terminal that hung up).
-    """
+    """One of the process's output streams, which keeps the program running when it cannot be written."""
 
     def __init__(self, title: str, descriptor: int) -> None:
         super().__init__(descriptor, "w", closefd=False)
-        self.title = title
-        self.lost: str | None = None
+        self.title = title  # "standard output" or "standard error"
+        self.lost: str | None = None  # why text was lost; None: all was written
+        # False: the reader has gone (a pipe that `head` closed, a terminal that hung up).
         self.has_reader = True
 
     def write(self, data: Any) -> int:

@@ -49,20 +49,14 @@ LEVEL_COLOURS = (
 
 @dataclass(frozen=True)
 class Subject:
-    """The model that is drawn, as it is at one moment.
+    """The model that is drawn, as it is at one moment."""
 
-    Attributes:
-        gaussians: this rank's. Pending optimiser steps are not applied, so that looking at a training does
-            not change it; the rows that wait for them are off by far less than a pixel.
-        options: how the model is rendered, at its present spherical-harmonics degree.
-        unit: length of a trained unit in the capture's unit.
-        lod: the LOD gate; None: there is none.
-    """
-
+    # This rank's. Pending optimiser steps are not applied, so that looking at a training does not change it;
+    # the rows that wait for them are off by far less than a pixel.
     gaussians: TableOrPool
-    options: RenderOptions
-    unit: float
-    lod: ModelGate | None
+    options: RenderOptions  # how the model is rendered, at its present spherical-harmonics degree
+    unit: float  # length of a trained unit in the capture's unit
+    lod: ModelGate | None  # the LOD gate; None: there is none
 
 
 class DrawingError(RuntimeError):
@@ -75,11 +69,9 @@ class Drawer:
     def __init__(self, subject: Subject, owners: TileOwners, in_layers: bool = True) -> None:
         """Prepare.
 
-        Args:
-            subject: what is drawn.
-            owners: divides the tiles among the ranks.
-            in_layers: on one rank, composite large models layer by layer, which takes less memory. A pixel
-                may then get up to a hundredth of light that a whole pass would have left out.
+        `owners`: divides the tiles among the ranks. `in_layers`: on one rank, composite large models layer by
+        layer, which takes less memory. A pixel may then get up to a hundredth of light that a whole pass
+        would have left out.
         """
         self._subject, self._owners, self._in_layers = subject, owners, in_layers
         self._transport = LocalTransport() if owners.ranks.world_size == 1 else None
@@ -89,11 +81,8 @@ class Drawer:
     def draw(self, look: Look) -> Picture | None:
         """Render one look; every rank of the job calls this with the same look.
 
-        Returns:
-            The picture on rank 0; None elsewhere.
-
-        Raises:
-            DrawingError: a rank lacks the memory, or cannot find what the view sees.
+        Returns the picture on rank 0; None elsewhere. DrawingError: a rank lacks the memory, or cannot find
+        what the view sees.
         """
         begin, subject, ranks = time.perf_counter(), self._subject, self._owners.ranks
         device = ranks.device
@@ -135,9 +124,8 @@ class Drawer:
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """Composite the Gaussians between two depths behind what is in front of them.
 
-        Returns:
-            How many are seen, int64 [1]; what is composited by now, float32 [1, H, W, C], and the light that
-            still comes through it, [1, H, W].
+        Returns how many are seen, int64 [1]; what is composited by now, float32 [1, H, W, C], and the light
+        that still comes through it, [1, H, W].
         """
         gaussians, painted = self._subject.gaussians, look.mode == "level"
         table: GaussianTable
@@ -214,8 +202,7 @@ class Drawer:
 def _reserve(gaussians: TableOrPool, look: Look, device: torch.device) -> None:
     """Allocate the memory of a frame, which torch keeps for it: without, one rank would fail in its middle.
 
-    Raises:
-        RuntimeError: it cannot.
+    RuntimeError: it cannot.
     """
     if device.type == "cuda":
         rows = len(gaussians.held if isinstance(gaussians, Pool) else gaussians)

@@ -32,20 +32,13 @@ _MAX_DISTANCES = 1 << 24
 
 @dataclass(frozen=True)
 class LodGate:
-    """The LOD gate: the distance up to which views keep the Gaussians of each octree level.
+    """The LOD gate: the distance up to which views keep the Gaussians of each octree level."""
 
-    Attributes:
-        reference_distance: d_0, in the unit of the means.
-        fork: f, ratio of neighbouring levels.
-        count: number of levels K.
-        finest: the finest level that views keep, L_max in 0..K - 1.
-        smooth: opacities fade out over half a level, centred at these distances, instead of being cut off.
-    """
-
-    reference_distance: float
-    fork: float
-    count: int
-    finest: int
+    reference_distance: float  # d_0, in the unit of the means
+    fork: float  # f, ratio of neighbouring levels
+    count: int  # number of levels K
+    finest: int  # the finest level that views keep, L_max in 0..K - 1
+    # Opacities fade out over half a level, centred at these distances, instead of being cut off.
     smooth: bool = False
 
     def reach(self) -> list[float]:
@@ -61,18 +54,14 @@ class LodGate:
         Let r be the reach of a Gaussian's level and d its distance from the camera. Its opacity is multiplied
         by clamp((1 - d^2 / r^2) f / (f - 1), 0, 1), which is 1 up to r / sqrt(f) and 0 from r on.
 
-        Returns:
-            f / (f - 1), then `reach`.
+        Returns f / (f - 1), then `reach`.
         """
         return (self.fork / (self.fork - 1), *self.reach()) if self.smooth else ()
 
     def weights(self, means: Tensor, level: Tensor, centre: Tensor) -> Tensor:
         """Return the factors of `fade` for the opacities of Gaussians in one view, float64 [N].
 
-        Args:
-            means: [N, 3].
-            level: uint8 [N].
-            centre: position of the camera, float64 [3].
+        `means`: [N, 3]. `level`: uint8 [N]. `centre`: position of the camera, float64 [3].
         """
         slope, *reach = self.fade()
         reaches = torch.tensor(reach, dtype=torch.float64, device=means.device)
@@ -83,17 +72,11 @@ class LodGate:
 
 @dataclass(frozen=True)
 class ViewGate:
-    """LOD gate and cull mask of the views of one batch (`blitzgs.frame.render.ViewFilter`).
+    """LOD gate and cull mask of the views of one batch (`blitzgs.frame.render.ViewFilter`)."""
 
-    Attributes:
-        reach: `LodGate.reach`.
-        lod_views: bit v is set when view v has an LOD gate.
-        columns: the views' columns in the cull matrix; empty: no view has a mask.
-    """
-
-    reach: Sequence[float]
-    lod_views: int
-    columns: Sequence[int] = ()
+    reach: Sequence[float]  # `LodGate.reach`
+    lod_views: int  # bit v is set when view v has an LOD gate
+    columns: Sequence[int] = ()  # the views' columns in the cull matrix; empty: no view has a mask
 
     def rules(self, table: GaussianTable) -> GateRules:
         """See `blitzgs.frame.render.ViewFilter.rules`."""
@@ -141,8 +124,7 @@ class ModelGate:
     def kept(self, centres: Tensor) -> list[float]:
         """Predict the share of all Gaussians that each view keeps. Collective.
 
-        Args:
-            centres: positions of the cameras, float64 [V, 3].
+        `centres`: positions of the cameras, float64 [V, 3].
         """
         counts = torch.zeros(len(centres), dtype=torch.int64, device=self._means.device)
         length = max(1, _MAX_DISTANCES // max(1, len(self._means)))
@@ -160,19 +142,14 @@ class ModelGate:
     def active(self, table: GaussianTable, viewmats: Tensor) -> ActiveRows | None:
         """Return the rows that each of B views keeps; None if every view keeps every row. Collective.
 
-        Args:
-            table: this rank's Gaussians, caught up.
-            viewmats: float32 [B, 4, 4], B <= 32.
+        `table`: this rank's Gaussians, caught up. `viewmats`: float32 [B, 4, 4], B <= 32.
         """
         return self._gated(table["means"], table["level"], viewmats)
 
     def rows(self, means: Tensor, level: Tensor, viewmat: Tensor) -> Tensor:
         """Return which Gaussians a view keeps, bool [N]; only for a single process.
 
-        Args:
-            means: float32 [N, 3].
-            level: uint8 [N].
-            viewmat: float32 [1, 4, 4].
+        `means`: float32 [N, 3]. `level`: uint8 [N]. `viewmat`: float32 [1, 4, 4].
         """
         active = self._gated(means, level, viewmat)
         return torch.ones_like(level, dtype=torch.bool) if active is None else active.views != 0

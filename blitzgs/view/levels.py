@@ -56,10 +56,7 @@ def farthest(level: int, reference_distance: float, fork: float) -> float:
     BlitzGS Eq. 1 rounds log_f(d_0 / d) to the nearest integer, so level l is resolvable up to
     d = d_0 f^(1/2 - l). Level 0 is resolvable from any distance.
 
-    Args:
-        level: l.
-        reference_distance: d_0.
-        fork: f.
+    `level`: l. `reference_distance`: d_0. `fork`: f.
     """
     return math.inf if level == 0 else reference_distance * fork ** (0.5 - level)
 
@@ -72,9 +69,7 @@ def footprint_sizes(scales: Tensor, opacities: Tensor) -> Tensor:
     nothing in front, pi times the square of the footprint is the sum of alpha^2, to which the squared error
     is proportional that leaving the Gaussian out makes.
 
-    Args:
-        scales: logarithms, [N, 3].
-        opacities: logits, [N].
+    `scales`: logarithms, [N, 3]. `opacities`: logits, [N].
     """
     broad = scales.double().sum(1) - scales.double().amin(1)
     return 0.5 * broad + torch.nn.functional.logsigmoid(opacities.double())
@@ -166,10 +161,8 @@ def _values_needed(count: int, q: float) -> int:
 def _quantile(values: Tensor, q: float, count: int | None = None) -> Tensor:
     """Return the linearly interpolated quantile of values near one of their ends, without a full sort.
 
-    Args:
-        values: [..., M], or as many of them as include `_values_needed`.
-        q: quantile.
-        count: M; None: `values` has all.
+    `values`: [..., M], or as many of them as include `_values_needed`. `q`: quantile. `count`: M; None:
+    `values` has all.
     """
     count = count or values.shape[-1]
     position = (1.0 - q if q > 0.5 else q) * (count - 1)
@@ -224,13 +217,8 @@ class PointBlocks:
     def distances_of(self, centres: Tensor, chosen: Tensor, filling: float) -> Tensor:
         """Return the distances of cameras to all points of some blocks.
 
-        Args:
-            centres: float64 [P, 3].
-            chosen: int64 [P, k], the blocks of each camera.
-            filling: what stands for the points that fill up the last block.
-
-        Returns:
-            float64 [P, k, `BLOCK_POINTS`].
+        `centres`: float64 [P, 3]. `chosen`: int64 [P, k], the blocks of each camera. `filling`: what stands
+        for the points that fill up the last block. Returns float64 [P, k, `BLOCK_POINTS`].
         """
         distances = (self.points[chosen] - centres[:, None, None]).norm(dim=3)
         count = len(self.order) - (len(self) - 1) * BLOCK_POINTS

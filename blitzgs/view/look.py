@@ -18,44 +18,29 @@ MAX_PIXELS = 8192
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """One view of a model, with what to show of it; lengths in trained units.
+    """One view of a model, with what to show of it; lengths in trained units."""
 
-    Attributes:
-        viewmat: trained world to camera, float64 [4, 4].
-        K: intrinsics in pixels, float64 [3, 3].
-        width: pixels.
-        height: pixels.
-        mode: "RGB"; "depth", the expected depth in the capture's unit; "alpha", the opacity; "count", how
-            many entries of its tile's list a pixel goes through; "level", RGB with a colour for each octree
-            level.
-        sh_degree: spherical-harmonics degree; None: the model's. At most the model's is used.
-        background: RGB in [0, 1]; None: the model's.
-        lod: apply the model's LOD gate, if it has one.
-        smooth: fade the levels of the gate; None: as the model was trained.
-        crop: two opposite corners of a box; Gaussians with their centres outside are left out. None: none
-            are.
-        near: near plane; None: the model's.
-        far: far plane; None: the model's.
-    """
-
-    viewmat: npt.NDArray[np.float64]
-    K: npt.NDArray[np.float64]
-    width: int
-    height: int
+    viewmat: npt.NDArray[np.float64]  # trained world to camera, float64 [4, 4]
+    K: npt.NDArray[np.float64]  # intrinsics in pixels, float64 [3, 3]
+    width: int  # pixels
+    height: int  # pixels
+    # "RGB"; "depth", the expected depth in the capture's unit; "alpha", the opacity; "count", how many
+    # entries of its tile's list a pixel goes through; "level", RGB with a colour for each octree level.
     mode: Mode = "RGB"
+    # Spherical-harmonics degree; None: the model's. At most the model's is used.
     sh_degree: int | None = None
-    background: tuple[float, float, float] | None = None
-    lod: bool = True
-    smooth: bool | None = None
+    background: tuple[float, float, float] | None = None  # RGB in [0, 1]; None: the model's
+    lod: bool = True  # apply the model's LOD gate, if it has one
+    smooth: bool | None = None  # fade the levels of the gate; None: as the model was trained
+    # Two opposite corners of a box; Gaussians with their centres outside are left out. None: none are.
     crop: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
-    near: float | None = None
-    far: float | None = None
+    near: float | None = None  # near plane; None: the model's
+    far: float | None = None  # far plane; None: the model's
 
     def __post_init__(self) -> None:
         """Check the values, which come from a browser.
 
-        Raises:
-            ValueError: a value is impossible; the message names it.
+        ValueError: a value is impossible; the message names it.
         """
         if self.mode not in MODES:
             raise ValueError(f"mode must be one of {', '.join(MODES)}, got {self.mode!r}")
@@ -74,18 +59,13 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A rendered `Look`.
+    """A rendered `Look`."""
 
-    Attributes:
-        values: uint8 [H, W, 3] for "RGB" and "level"; else float32 [H, W]: depth in the capture's unit (0
-            where nothing is), opacity in [0, 1], or a number of entries.
-        gaussians: number of Gaussians that the view sees.
-        milliseconds: time that rendering took, with the copy to the host.
-    """
-
+    # uint8 [H, W, 3] for "RGB" and "level"; else float32 [H, W]: depth in the capture's unit (0 where nothing
+    # is), opacity in [0, 1], or a number of entries.
     values: npt.NDArray[np.uint8] | npt.NDArray[np.float32]
-    gaussians: int
-    milliseconds: float
+    gaussians: int  # number of Gaussians that the view sees
+    milliseconds: float  # time that rendering took, with the copy to the host
 
 
 class Wish(NamedTuple):

@@ -49,23 +49,17 @@ class Space:
 
     The unit is the power of two for which the scene's extent is in [1, 2). Scaling by a power of two is
     exact, so a capture that is scaled by one trains to the same bits.
-
-    Attributes:
-        offset: origin of the trained world in the capture's coordinates.
-        unit: length of one trained unit in the capture's.
-        extent: extent of the scene, in trained units.
     """
 
-    offset: tuple[float, float, float]
-    unit: float
-    extent: float
+    offset: tuple[float, float, float]  # origin of the trained world in the capture's coordinates
+    unit: float  # length of one trained unit in the capture's
+    extent: float  # extent of the scene, in trained units
 
     @classmethod
     def of(cls, offset: npt.NDArray[np.float64], extent: float) -> Space:
         """Choose the unit for a scene of this extent (in the capture's unit).
 
-        Raises:
-            ValueError: the extent is not positive: there are fewer than two different camera positions.
+        ValueError: the extent is not positive: there are fewer than two different camera positions.
         """
         if not (math.isfinite(extent) and extent > 0):
             raise ValueError(
@@ -110,8 +104,7 @@ class ViewSet:
     def size(self, indices: list[int], factor: int = 1) -> tuple[int, int]:
         """Return the width and height that cameras share, divided by `factor` and rounded down.
 
-        Raises:
-            ValueError: the cameras differ in size.
+        ValueError: the cameras differ in size.
         """
         sizes = {self._sizes[index] for index in indices}
         if len(sizes) != 1:
@@ -142,8 +135,7 @@ class ViewSet:
     def pick(self, indices: list[int]) -> Views:
         """Return the views of same-size cameras as one batch on the device.
 
-        Raises:
-            ValueError: the cameras differ in size.
+        ValueError: the cameras differ in size.
         """
         numbers = torch.empty(VIEW_NUMBERS * len(indices))
         self.write(indices, numbers.numpy())

@@ -24,17 +24,11 @@ _DEPTHS = 64
 
 
 class VisibleRows(NamedTuple):
-    """The Gaussians to render for a batch of views.
+    """The Gaussians to render for a batch of views."""
 
-    Attributes:
-        table: a table on the device of the views.
-        active: rows of `table` to render, and the views of each.
-        rows_of: maps rows of `table` to rows of the model, both int32.
-    """
-
-    table: GaussianTable
-    active: ActiveRows
-    rows_of: Callable[[Tensor], Tensor]
+    table: GaussianTable  # a table on the device of the views
+    active: ActiveRows  # rows of `table` to render, and the views of each
+    rows_of: Callable[[Tensor], Tensor]  # maps rows of `table` to rows of the model, both int32
 
 
 def table_of(gaussians: TableOrPool) -> GaussianTable:
@@ -51,9 +45,8 @@ class VisibleFinder:
     def __init__(self, gaussians: TableOrPool, lod: ModelGate | None = None) -> None:
         """Compute the bounds of the blocks, unless a pool has them.
 
-        Args:
-            gaussians: this rank's Gaussians, without pending optimiser steps.
-            lod: leaves out rows whose octree level is too fine for their distance; None: no gate.
+        `gaussians`: this rank's Gaussians, without pending optimiser steps. `lod`: leaves out rows whose
+        octree level is too fine for their distance; None: no gate.
         """
         self._gaussians, self._lod = gaussians, lod
         self._index = None if isinstance(gaussians, Pool) else BlockIndex(gaussians)
@@ -61,14 +54,9 @@ class VisibleFinder:
     def depths(self, views: Views, planes: Sequence[float], blocks: int) -> list[float]:
         """Divide the depths of one view such that about a number of blocks lies between two of them.
 
-        Args:
-            views: the view.
-            planes: the near and the far plane.
-            blocks: number of blocks.
-
-        Returns:
-            The near plane, depths in ascending order, the far plane. Only these planes if few blocks are in
-            the view, or if the Gaussians are in a pool, which bounds the memory anyway.
+        `views`: the view. `planes`: the near and the far plane. `blocks`: number of blocks. Returns the near
+        plane, depths in ascending order, the far plane. Only these planes if few blocks are in the view, or
+        if the Gaussians are in a pool, which bounds the memory anyway.
         """
         near, far = planes
         if self._index is None or len(self._index.bounds) <= blocks:
@@ -89,22 +77,12 @@ class VisibleFinder:
         inner = {found[_DEPTHS * k // layers] for k in range(1, layers)}
         return [near, *sorted(depth for depth in inner if near < depth < far), far]
 
-    def find(
-        self,
-        views: Views,
-        limits: tuple[float, float, float],
-        room: int | None = None,
-    ) -> VisibleRows:
+    def find(self, views: Views, limits: tuple[float, float, float], room: int | None = None) -> VisibleRows:
         """Find the Gaussians to render for a batch of views. Collective if there is a gate.
 
-        Args:
-            views: at most 32 views.
-            limits: near plane, far plane and eps2d.
-            room: the lists have room for so many blocks and their number tells whether that sufficed; None:
-                for all.
-
-        Raises:
-            PoolError: the pool is too small for the views.
+        `views`: at most 32 views. `limits`: near plane, far plane and eps2d. `room`: the lists have room for
+        so many blocks and their number tells whether that sufficed; None: for all. PoolError: the pool is too
+        small for the views.
         """
         gaussians, index = self._gaussians, self._index
         if isinstance(gaussians, Pool):
@@ -113,7 +91,7 @@ class VisibleFinder:
             index = gaussians.load_for_views(cameras)
             table, rows_of = gaussians.held, gaussians.rows_of
         else:
-            table, rows_of = gaussians, _same_rows
+            table, rows_of = gaussians, lambda rows: rows
         assert index is not None
         rules = None if self._lod is None else self._lod.rules(table["level"], views.viewmats)
         # Either way, the host does not wait for the number of blocks.
@@ -123,7 +101,3 @@ class VisibleFinder:
         if rules is not None:
             gate_views_(active, table["means"], views.viewmats, rules)
         return VisibleRows(table, active, rows_of)
-
-
-def _same_rows(rows: Tensor) -> Tensor:
-    return rows

@@ -106,8 +106,7 @@ def _gridded(parts: list[UInt8], columns: int) -> UInt8:
 def _placed(photograph: UInt8, camera: CameraLike, K: Matrix, width: int, height: int) -> tuple[UInt8, UInt8]:
     """Draw a photograph where an image with the same pose and the intrinsics `K` shows its pixels.
 
-    Returns:
-        The photograph, uint8 [H, W, 3], and where it is: uint8 [H, W], 0 outside.
+    Returns the photograph, uint8 [H, W, 3], and where it is: uint8 [H, W], 0 outside.
     """
     focal = np.array([K[0, 0] / camera.K[0, 0], K[1, 1] / camera.K[1, 1]])
     shrink = np.minimum(

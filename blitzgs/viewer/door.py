@@ -28,16 +28,10 @@ class Door:
     """
 
     def __init__(self, host: str, port: int, behind: int, token: str) -> None:
-        """Listen.
+        """Listen (OSError: the address is not this machine's, or the port is in use).
 
-        Args:
-            host: address of this machine.
-            port: 0: any free one.
-            behind: port of 127.0.0.1 to forward to.
-            token: beginning of the address's path; empty: none is needed.
-
-        Raises:
-            OSError: the address is not this machine's, or the port is in use.
+        `port`: 0: any free one. `behind`: port of 127.0.0.1 to forward to. `token`: beginning of the
+        address's path; empty: none is needed.
         """
         self._behind, self._token, self.port = behind, token, port
         self._loop = asyncio.new_event_loop()

@@ -43,13 +43,8 @@ def tour(kind: Tour, world: World, fovs: list[float]) -> CameraPath:
       looks ahead, as far down as the cameras do, but at most 35 degrees.
     - "spline": a smooth way through up to 24 cameras, in the order of their names.
 
-    Args:
-        kind: which one.
-        world: of the scene; its poses are those of the cameras.
-        fovs: vertical fields of view of these cameras, radians.
-
-    Raises:
-        ValueError: a flight or a spline needs two cameras.
+    `world`: of the scene; its poses are those of the cameras. `fovs`: vertical fields of view of these
+    cameras, radians. ValueError: a flight or a spline needs two cameras.
     """
     if kind != "orbit" and len(world.poses) < 2:
         raise ValueError(f"--path {kind} needs the cameras of a capture: use orbit, or the file of a path")
@@ -114,36 +109,21 @@ SIZE, FPS = (1920, 1080), 30.0
 
 @dataclass(frozen=True)
 class Film:
-    """What is known of a film before the model is open.
+    """What is known of a film before the model is open."""
 
-    Attributes:
-        path: its path; None: it is made from the scene.
-        frames: viewpoints as the path's file has them; empty: computed from the keyframes.
-        kind: how the path is made from the scene.
-        width: pixels.
-        height: pixels.
-        fps: frames a second.
-        seconds: duration; None: the path's own.
-    """
-
-    path: CameraPath | None
-    frames: list[Keyframe]
-    kind: str
-    width: int
-    height: int
-    fps: float
-    seconds: float | None
+    path: CameraPath | None  # its path; None: it is made from the scene
+    frames: list[Keyframe]  # viewpoints as the path's file has them; empty: computed from the keyframes
+    kind: str  # how the path is made from the scene
+    width: int  # pixels
+    height: int  # pixels
+    fps: float  # frames a second
+    seconds: float | None  # duration; None: the path's own
 
     def cameras(self, space: Space, cameras: Sequence[CameraLike], box: Array) -> list[RunCamera]:
         """Return the cameras of all frames, in the re-centred world.
 
-        Args:
-            space: of the model.
-            cameras: of its capture; may be empty.
-            box: corners of a box that holds nearly all Gaussians, [2, 3], trained units.
-
-        Raises:
-            ValueError: the path cannot be made without cameras.
+        `cameras`: of its capture; may be empty. `box`: corners of a box that holds nearly all Gaussians,
+        [2, 3], trained units. ValueError: the path cannot be made without cameras.
         """
         return [
             self._camera(number, frame, space)
@@ -209,11 +189,8 @@ def read_film(
 def _back(file: Path) -> Callable[[Keyframe], Keyframe]:
     """Return a function that takes a viewpoint from nerfstudio's world to that of its capture.
 
-    nerfstudio has x' = scale (R x + t), with [R | t] the "transform" of its file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is damaged.
+    nerfstudio has x' = scale (R x + t), with [R | t] the "transform" of its file. FileNotFoundError: there is
+    no such file. ValueError: it is damaged.
     """
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
@@ -242,8 +219,7 @@ _QUALITY = "17"
 def require_av() -> ModuleType:
     """Import the optional package that encodes films.
 
-    Raises:
-        ImportError: it is not installed; the message says how to install it.
+    ImportError: it is not installed; the message says how to install it.
     """
     try:
         import av
@@ -255,11 +231,8 @@ def require_av() -> ModuleType:
 def check_film(path: Path, width: int, height: int) -> None:
     """Check before rendering that a film can be written.
 
-    Raises:
-        ImportError: a package is missing.
-        FileExistsError: there is a file that is not empty and no film.
-        OSError: `path` is no regular file.
-        ValueError: a side is an odd number of pixels.
+    ImportError: a package is missing. FileExistsError: there is a file that is not empty and no film.
+    OSError: `path` is no regular file. ValueError: a side is an odd number of pixels.
     """
     require_av()
     check_replaceable(path)
@@ -280,14 +253,8 @@ def new_film(
 
     The file appears under its name when the context ends without an error; an interrupted film leaves none.
 
-    Args:
-        path: ends in .mp4.
-        width: pixels, even.
-        height: pixels, even.
-        fps: frames a second.
-
-    Raises:
-        OSError: the file cannot be written; an existing one is unchanged.
+    `path`: ends in .mp4. `width`: pixels, even. `height`: pixels, even. OSError: the file cannot be written;
+    an existing one is unchanged.
     """
     av = require_av()
     with new_file(path) as partial:

@@ -21,11 +21,7 @@ TRAIN_COLOUR, TEST_COLOUR = (64, 170, 255), (255, 150, 40)
 
 
 class Frustums:
-    """The frustums of all visitors.
-
-    Attributes:
-        indices: cameras that have a frustum.
-    """
+    """The frustums of all visitors."""
 
     def __init__(
         self,
@@ -36,7 +32,7 @@ class Frustums:
     ) -> None:
         """Add the frustums; `stand` is called with the number of the visitor who clicks, and the camera."""
         cameras, test = exhibit.cameras, set(exhibit.test)
-        self.indices = shown_cameras(len(cameras), test)
+        self.indices = shown_cameras(len(cameras), test)  # cameras that have a frustum
         self._handles: list[Any] = []
         size = frustum_size(world)
         for index in self.indices:

@@ -25,14 +25,10 @@ _SERIES = {
 
 
 class Curves:
-    """The numbers of a run's log that are drawn.
-
-    Attributes:
-        version: grows with every record.
-    """
+    """The numbers of a run's log that are drawn."""
 
     def __init__(self) -> None:
-        self.version = 0
+        self.version = 0  # grows with every record
         self._points: dict[str, list[tuple[int, float]]] = {name: [] for name in _SERIES}
         self._held_out: list[tuple[int, float]] = []
         self._last: dict[str, Any] = {}
@@ -113,20 +109,12 @@ MOVING_MS = 12.0
 
 
 class Live:
-    """Watches a training (`blitzgs.view.look.Watcher`), and shows it on a page.
-
-    Attributes:
-        page: the page.
-    """
+    """Watches a training (`blitzgs.view.look.Watcher`), and shows it on a page."""
 
     def __init__(self, exhibit: Exhibit, total: int, host: str = "127.0.0.1", port: int = 8080) -> None:
         """Start the page; errors are those of `Page`.
 
-        Args:
-            exhibit: the training.
-            total: images of the whole run.
-            host: address to listen on.
-            port: 0: any free one.
+        `total`: images of the whole run. `port`: 0: any free one.
         """
         self._share, self._total = SHARE, total
         self._curves = Curves()

@@ -34,8 +34,7 @@ _FIGURES_SECONDS = 0.2
 def require_viser() -> None:
     """Check that the optional package of the viewer is installed.
 
-    Raises:
-        ImportError: it is not; the message says how to install it.
+    ImportError: it is not; the message says how to install it.
     """
     try:
         import viser  # noqa: F401
@@ -66,10 +65,8 @@ class Page:
         """Start to serve.
 
         Args:
-            exhibit: what is shown.
             host: address to listen on. If others than this machine reach it, a random token is part of `url`.
             port: 0: any free one.
-            folders: see the class.
             memory: returns the memory of the model as text.
             moving_ms: milliseconds that a picture may take while the camera moves.
 

@@ -31,13 +31,9 @@ KEYS = "Keys: W A S D move level, Q down, E up, arrows turn. Click a frustum to 
 
 
 class Panel:
-    """Builds the controls, and changes the visitor's settings as they are used.
+    """Builds the controls, and changes the visitor's settings as they are used."""
 
-    Attributes:
-        figures: the element with the figures over the picture.
-    """
-
-    figures: Any
+    figures: Any  # the element with the figures over the picture
 
     def __init__(self, visitor: Visitor, frustums: Frustums) -> None:
         """Prepare the controls of a visitor."""

@@ -32,23 +32,14 @@ class Keyframe:
 
 @dataclass
 class CameraPath:
-    """Keyframes, and how they are played.
+    """Keyframes, and how they are played."""
 
-    Attributes:
-        keyframes: at least one.
-        width: pixels of a rendered frame.
-        height: pixels.
-        fps: frames a second.
-        seconds: duration of the film.
-        is_cycle: whether the last keyframe leads to the first.
-    """
-
-    keyframes: list[Keyframe] = field(default_factory=list)
-    width: int = 1920
-    height: int = 1080
-    fps: float = 24.0
-    seconds: float = 4.0
-    is_cycle: bool = False
+    keyframes: list[Keyframe] = field(default_factory=list)  # at least one
+    width: int = 1920  # pixels of a rendered frame
+    height: int = 1080  # pixels
+    fps: float = 24.0  # frames a second
+    seconds: float = 4.0  # duration of the film
+    is_cycle: bool = False  # whether the last keyframe leads to the first
 
     def frames(self) -> list[Keyframe]:
         """Return the viewpoints of all frames: positions on a Catmull-Rom spline, rotations interpolated."""
@@ -117,8 +108,7 @@ def to_json(path: CameraPath) -> str:
 def from_json(text: str) -> CameraPath:
     """Read a path; one without keyframes has its frames as keyframes.
 
-    Raises:
-        ValueError: it is no camera path; the message says where and why.
+    ValueError: it is no camera path; the message says where and why.
     """
     content = _content(text)
     keys = _viewpoints(content, "keyframes") or _viewpoints(content, "camera_path")
@@ -137,8 +127,7 @@ def from_json(text: str) -> CameraPath:
 def frames_from_json(text: str) -> list[Keyframe]:
     """Return the frames that a path has as its program computed them; empty if it has only keyframes.
 
-    Raises:
-        ValueError: as `from_json`.
+    ValueError: as `from_json`.
     """
     return _viewpoints(_content(text), "camera_path")
 

@@ -15,47 +15,30 @@ Triple = tuple[float, float, float]
 
 @dataclass
 class Settings:
-    """The choices of one visitor; lengths in trained units.
+    """The choices of one visitor; lengths in trained units."""
 
-    Attributes:
-        mode: see `Look.mode`.
-        sh_degree: None: the model's.
-        background: RGB in [0, 1].
-        lod: apply the LOD gate.
-        smooth: fade its levels.
-        crops: leave out what is outside of the box.
-        box: the box's corners.
-        near: None: the model's.
-        far: None: the model's.
-        comparison: one of `blitzgs.viewer.compare.KINDS`.
-        wipe: share of the width that shows the photograph.
-        exposure: where a photograph was taken, show the render with its exposure, if the model has one.
-        most_side: longest side in pixels of a picture at full quality.
-        adapts: whether pictures are coarser while the camera moves.
-    """
-
-    mode: Mode = "RGB"
-    sh_degree: int | None = None
-    background: Triple | None = None
-    lod: bool = True
-    smooth: bool | None = None
-    crops: bool = False
-    box: tuple[Triple, Triple] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    near: float | None = None
-    far: float | None = None
-    comparison: str = "off"
-    wipe: float = 0.5
+    mode: Mode = "RGB"  # see `Look.mode`
+    sh_degree: int | None = None  # None: the model's
+    background: Triple | None = None  # RGB in [0, 1]
+    lod: bool = True  # apply the LOD gate
+    smooth: bool | None = None  # fade its levels
+    crops: bool = False  # leave out what is outside of the box
+    box: tuple[Triple, Triple] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))  # the box's corners
+    near: float | None = None  # None: the model's
+    far: float | None = None  # None: the model's
+    comparison: str = "off"  # one of `blitzgs.viewer.compare.KINDS`
+    wipe: float = 0.5  # share of the width that shows the photograph
+    # Where a photograph was taken, show the render with its exposure, if the model has one.
     exposure: bool = False
-    most_side: int = 1920
-    adapts: bool = True
+    most_side: int = 1920  # longest side in pixels of a picture at full quality
+    adapts: bool = True  # whether pictures are coarser while the camera moves
 
     def look(
         self, viewmat: npt.NDArray[np.float64], K: npt.NDArray[np.float64], width: int, height: int
     ) -> Look:
         """Return what to draw for a pose; comparisons with a photograph are in RGB.
 
-        Raises:
-            ValueError: a choice is impossible.
+        ValueError: a choice is impossible.
         """
         return Look(
             viewmat,
@@ -105,9 +88,8 @@ class Pace:
     def next_scale(self, drawn: float | None, moving: bool) -> float | None:
         """Return the scale of the next picture; None: the one that is shown is good enough.
 
-        Args:
-            drawn: scale of the picture that shows the present viewpoint and choices; None: there is none.
-            moving: whether the camera moved just now.
+        `drawn`: scale of the picture that shows the present viewpoint and choices; None: there is none.
+        `moving`: whether the camera moved just now.
         """
         coarse = self.coarse()
         if drawn is None:

@@ -62,8 +62,6 @@ def open_model(
     """Open the folder of a run, a checkpoint in it, or a file of Gaussians.
 
     Args:
-        path: the folder or the file.
-        ranks: the device.
         photograph: returns the photograph of a camera of the run; None: there are none.
         paths: folder for camera paths and screenshots; None: RUN/paths, or the folder of the file.
         most: Gaussians to read. Of a larger model, these are those of the largest opacity times length,
@@ -164,20 +162,15 @@ def box_of(means: Tensor) -> npt.NDArray[np.float64]:
 
 
 class Studio:
-    """Draws for the visitors of a page until it is closed.
-
-    Attributes:
-        page: the page.
-        drawn: number of pictures so far.
-    """
+    """Draws for the visitors of a page until it is closed."""
 
     def __init__(self, opened: Opened, host: str = "127.0.0.1", port: int = 8080) -> None:
         """Start the page and the thread that draws; errors are those of `Page`."""
         self._drawer = Drawer(opened.subject, TileOwners(opened.ranks))
         count, size = len(opened.table), opened.bytes / 1e6
         memory = f"{count:,} in all &middot; {size:,.0f} MB"
-        self.page = Page(opened.exhibit, host, port, memory=lambda: memory)
-        self.drawn = 0
+        self.page = Page(opened.exhibit, host, port, memory=lambda: memory)  # the page
+        self.drawn = 0  # number of pictures so far
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._draw, daemon=True, name="viewer studio")
         self._thread.start()

@@ -33,27 +33,17 @@ EYE_HEIGHT = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Ask:
-    """A picture that a visitor waits for.
+    """A picture that a visitor waits for."""
 
-    Attributes:
-        look: what to draw.
-        version: number of the visitor's viewpoint and choices.
-        scale: side relative to full quality.
-        settings: the choices.
-        camera: index of the photograph's camera to compare with; None: no comparison.
-        columns: of the grid of images side by side.
-        exposure: gain and bias, float64 [2, 3], of the photograph whose exposure is shown, or None.
-        is_sounding: the look is down from the camera, to find the ground.
-    """
-
-    look: Look
-    version: int
-    scale: float
+    look: Look  # what to draw
+    version: int  # number of the visitor's viewpoint and choices
+    scale: float  # side relative to full quality
     settings: Settings
-    camera: int | None = None
-    columns: int = 1
+    camera: int | None = None  # index of the photograph's camera to compare with; None: no comparison
+    columns: int = 1  # of the grid of images side by side
+    # Gain and bias, float64 [2, 3], of the photograph whose exposure is shown, or None.
     exposure: npt.NDArray[np.float64] | None = None
-    is_sounding: bool = False
+    is_sounding: bool = False  # the look is down from the camera, to find the ground
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +78,8 @@ class Visitor:
     ) -> None:
         """Begin with the browser's camera.
 
-        Args:
-            client: viser's handle.
-            world: the page's coordinates.
-            exhibit: what is shown.
-            wake: called whenever a picture is needed.
-            moving_ms: milliseconds that a picture may take while the camera moves.
+        `wake`: called whenever a picture is needed. `moving_ms`: milliseconds that a picture may take while
+        the camera moves.
         """
         self.client, self.world, self.exhibit, self._wake = client, world, exhibit, wake
         self.settings = Settings()
@@ -160,10 +146,8 @@ class Visitor:
     ) -> None:
         """Move the browser's camera to a stance.
 
-        Args:
-            stance: where to go.
-            distance: to the point around which the browser orbits, page units; None: as the motion needs.
-            up: the orbit's axis; None: the scene's up.
+        `distance`: to the point around which the browser orbits, page units; None: as the motion needs. `up`:
+        the orbit's axis; None: the scene's up.
         """
         camera = self.client.camera
         if distance is None:
@@ -307,7 +291,6 @@ class Visitor:
         return Shown(result.image, ask, picture, result.low, result.high, psnr)
 
     def _step_to_ground(self, ask: Ask, picture: Picture) -> None:
-        """Put a visitor who walks at eye height above the ground under them."""
         known = picture.values[picture.values > 0]
         if len(known) == 0 or self.motion != "walk" or ask.version != self.version:
             return

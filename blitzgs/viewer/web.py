@@ -39,19 +39,12 @@ _VIEWS = 32
 
 @dataclass(frozen=True)
 class WebFile:
-    """A page, and what it has of the model.
+    """A page, and what it has of the model."""
 
-    Attributes:
-        text: the HTML.
-        gaussians: number of Gaussians in it.
-        of: number of Gaussians of the model.
-        left_out: what is missing, in words; empty: nothing that can be seen.
-    """
-
-    text: str
-    gaussians: int
-    of: int
-    left_out: str
+    text: str  # the HTML
+    gaussians: int  # number of Gaussians in it
+    of: int  # number of Gaussians of the model
+    left_out: str  # what is missing, in words; empty: nothing that can be seen
 
 
 def web_file(opened: Opened, max_bytes: int) -> WebFile:
@@ -61,12 +54,8 @@ def web_file(opened: Opened, max_bytes: int) -> WebFile:
     of Gaussians. Then the Gaussians that contribute least to views of the capture are left out; without
     cameras, those of the least opacity times length.
 
-    Args:
-        opened: the model.
-        max_bytes: size of the file.
-
-    Raises:
-        ValueError: the model has no visible Gaussian, or none fits.
+    `opened`: the model. `max_bytes`: size of the file. ValueError: the model has no visible Gaussian, or none
+    fits.
     """
     table, exhibit, full_degree = opened.table, opened.exhibit, opened.exhibit.sh_degree
     degree, space = opened.subject.options.sh_degree, max_bytes - frame_bytes()
@@ -181,28 +170,18 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class City:
-    """A model that need not fit into memory, with what its tiles say besides its Gaussians.
+    """A model that need not fit into memory, with what its tiles say besides its Gaussians."""
 
-    Attributes:
-        source: the Gaussians, in the capture's unit around `offset`.
-        offset: origin of the source in the capture's coordinates, [3].
-        frame: where the capture lies in the world; None: nobody says.
-        scene: how the page shows the model, in the coordinates of the source.
-        title: name of the run or the file.
-    """
-
-    source: GaussianSource
-    offset: Array
-    frame: WorldFrame | None
-    scene: WebScene
-    title: str
+    source: GaussianSource  # the Gaussians, in the capture's unit around `offset`
+    offset: Array  # origin of the source in the capture's coordinates, [3]
+    frame: WorldFrame | None  # where the capture lies in the world; None: nobody says
+    scene: WebScene  # how the page shows the model, in the coordinates of the source
+    title: str  # name of the run or the file
 
     def transform(self) -> Array:
         """Return the map [4, 4] from the source's coordinates to EPSG:4978, or to an upright local frame.
 
-        Raises:
-            ImportError: pyproj is missing.
-            ValueError: pyproj does not know the reference system.
+        ImportError: pyproj is missing. ValueError: pyproj does not know the reference system.
         """
         if self.frame is None or not self.frame.crs:
             return upright(self.scene.up)
@@ -212,11 +191,9 @@ class City:
 def open_city(path: Path, checked: bool = True) -> City:
     """Open a run, a checkpoint in it or a file, without reading a run's or a PLY's Gaussians into memory.
 
-    Files and `checked` are as for `blitzgs.formats.models.open_gaussians`.
-
-    Raises:
-        FileNotFoundError: there is no such file, or no run or checkpoint in the folder.
-        ValueError: the file is damaged or no model, or holds no Gaussians.
+    Files and `checked` are as for `blitzgs.formats.models.open_gaussians`. FileNotFoundError: there is no
+    such file, or no run or checkpoint in the folder. ValueError: the file is damaged or no model, or holds no
+    Gaussians.
     """
     cameras: Sequence[CameraLike] = ()
     run, frame = None, None
@@ -241,20 +218,9 @@ def open_city(path: Path, checked: bool = True) -> City:
         config = Config(model=ModelConfig(antialiased=is_antialiased(source), near=1e-3))
     else:
         space, config = run.space, run.config
-    return City(
-        source,
-        offset,
-        frame,
-        _city_scene(box.mean(axis=0), space, config, cameras, source.degree),
-        path.resolve().stem,
-    )
-
-
-def _city_scene(
-    middle: Array, space: Space, config: Config, cameras: Sequence[CameraLike], degree: int
-) -> WebScene:
-    world = World(space, cameras, middle / space.unit)
-    return web_scene(world, render_options(config, space, degree), space.unit)
+    world = World(space, cameras, box.mean(axis=0) / space.unit)
+    scene = web_scene(world, render_options(config, space, source.degree), space.unit)
+    return City(source, offset, frame, scene, path.resolve().stem)
 
 
 def to_globe(frame: WorldFrame, origin: Array) -> Array:
@@ -264,13 +230,8 @@ def to_globe(frame: WorldFrame, origin: Array) -> Array:
     scale of a map projection there; at a distance of 2 km, the earth's curvature departs from it by 0.3 m.
     Heights are taken as above the ellipsoid, unless the reference system says otherwise.
 
-    Args:
-        frame: of the capture; it has a reference system.
-        origin: [3], capture coordinates.
-
-    Raises:
-        ImportError: pyproj is missing.
-        ValueError: pyproj does not know the reference system, or the place is outside of it.
+    `frame`: of the capture; it has a reference system. `origin`: [3], capture coordinates. ImportError:
+    pyproj is missing. ValueError: pyproj does not know the reference system, or the place is outside of it.
     """
     # Central differences over this length, in the unit of the capture.
     step = 10.0

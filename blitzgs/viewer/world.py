@@ -24,17 +24,11 @@ _NEAR_Z = math.cos(math.radians(40))
 
 @dataclass(frozen=True)
 class Stance:
-    """A camera of the page: where it is, how it is turned, and its vertical field of view in radians.
+    """A camera of the page: where it is, how it is turned, and its vertical field of view in radians."""
 
-    Attributes:
-        position: [3], page units.
-        rotation: camera to world, [3, 3]; the axes are right, down and forward.
-        fov: radians.
-    """
-
-    position: Array
-    rotation: Array
-    fov: float
+    position: Array  # [3], page units
+    rotation: Array  # camera to world, [3, 3]; the axes are right, down and forward
+    fov: float  # radians
 
     @property
     def forward(self) -> Array:
@@ -54,10 +48,8 @@ class World:
     def __init__(self, space: Space, cameras: Sequence[CameraLike], middle: Array | None = None) -> None:
         """Find up and the middle of a scene.
 
-        Args:
-            space: the trained world.
-            cameras: the capture's; may be empty.
-            middle: a point in the middle of the Gaussians, trained units; None: guess it from the cameras.
+        `space`: the trained world. `cameras`: the capture's; may be empty. `middle`: a point in the middle of
+        the Gaussians, trained units; None: guess it from the cameras.
         """
         self.space = space
         self.poses = [viewmat(camera, space) for camera in cameras]
@@ -139,40 +131,24 @@ def up_direction(poses: Sequence[Array]) -> Array:
 
 @dataclass(frozen=True)
 class Exhibit:
-    """A model or a training to show.
+    """A model or a training to show."""
 
-    Attributes:
-        title: shown on the page.
-        space: maps the trained world to the capture's.
-        sh_degree: highest spherical-harmonics degree.
-        near: near plane, trained units.
-        far: far plane, trained units.
-        background: RGB in [0, 1].
-        levels: whether the Gaussians have octree levels.
-        lod: whether the model has an LOD gate.
-        smooth: whether its levels fade.
-        box: corners of a box that holds nearly all Gaussians, float64 [2, 3], trained units.
-        cameras: the capture's cameras.
-        test: indices of those that are held out.
-        photograph: returns the photograph of a camera, uint8 [H, W, 3]; None: there are none.
-        exposures: gain and bias of photographs by their cameras, float64 [2, 3]; empty: the model has none.
-        paths: folder for camera paths and screenshots.
-        frame: where the capture lies in the world; None: unknown.
-    """
-
-    title: str
-    space: Space
-    sh_degree: int
-    near: float
-    far: float
-    background: tuple[float, float, float]
-    levels: bool
-    lod: bool
-    smooth: bool
+    title: str  # shown on the page
+    space: Space  # maps the trained world to the capture's
+    sh_degree: int  # highest spherical-harmonics degree
+    near: float  # near plane, trained units
+    far: float  # far plane, trained units
+    background: tuple[float, float, float]  # RGB in [0, 1]
+    levels: bool  # whether the Gaussians have octree levels
+    lod: bool  # whether the model has an LOD gate
+    smooth: bool  # whether its levels fade
+    # Corners of a box that holds nearly all Gaussians, float64 [2, 3], trained units.
     box: npt.NDArray[np.float64]
-    cameras: Sequence[CameraLike] = ()
-    test: Sequence[int] = ()
+    cameras: Sequence[CameraLike] = ()  # the capture's cameras
+    test: Sequence[int] = ()  # indices of those that are held out
+    # Returns the photograph of a camera, uint8 [H, W, 3]; None: there are none.
     photograph: Callable[[int], npt.NDArray[np.uint8]] | None = None
+    # Gain and bias of photographs by their cameras, float64 [2, 3]; empty: the model has none.
     exposures: dict[int, npt.NDArray[np.float64]] = field(default_factory=dict)
-    paths: Path = field(default_factory=lambda: Path("paths"))
-    frame: WorldFrame | None = None
+    paths: Path = field(default_factory=lambda: Path("paths"))  # folder for camera paths and screenshots
+    frame: WorldFrame | None = None  # where the capture lies in the world; None: unknown

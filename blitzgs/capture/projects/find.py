@@ -168,7 +168,6 @@ def _lenses(found: FoundProject, project: Project, names: Sequence[str], finder:
 
 
 def _points(root: Path, found: FoundProject, project: Project, lenses: Sequence[Lens]) -> SourcePoints:
-    """Return the points of the project, else those of a file beside it."""
     if project.points is not None and len(project.points.positions):
         return project.points
     poses = [view.world_to_camera for view in project.views]

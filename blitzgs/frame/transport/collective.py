@@ -11,13 +11,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport.protocol import (
-    Arrived,
-    CapacityEstimate,
-    ExchangeResult,
-    Traffic,
-    stage_ended,
-)
+from blitzgs.frame.transport.protocol import Arrived, CapacityEstimate, ExchangeResult, Traffic, stage_ended
 from blitzgs.ops.exchange import PLACE_SPLATS, gather_splats, scatter_splats, words_per_splat
 from blitzgs.ops.host import to_host
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats
@@ -40,10 +34,7 @@ class CollectiveTransport:
         self._ranks = ranks
 
     def project_and_send(
-        self,
-        inputs: ProjectionInputs,
-        assignment: TileAssignment | None,
-        capacity: Sizes | None,
+        self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
     ) -> CollectiveExchange:
         """See `Transport.project_and_send`."""
         if assignment is None:
@@ -55,11 +46,7 @@ class CollectiveExchange:
     """See `Exchange`."""
 
     def __init__(
-        self,
-        ranks: Ranks,
-        inputs: ProjectionInputs,
-        assignment: TileAssignment,
-        capacity: Sizes | None,
+        self, ranks: Ranks, inputs: ProjectionInputs, assignment: TileAssignment, capacity: Sizes | None
     ) -> None:
         """Project, exchange the numbers of splats, and send the splats."""
         tiles, n_views = assignment.composited_by_rank, assignment.ranges.n_views
@@ -105,17 +92,11 @@ class CollectiveExchange:
 
 
 class CollectiveWayBack(NamedTuple):
-    """Returns gradients by an all-to-all, and adds them up at the owner in the order of ranks.
-
-    Attributes:
-        ranks: the job.
-        traffic: numbers of splats sent between the ranks.
-        places: positions of this rank's own splats among those that it sent, from `scatter_splats`.
-    """
+    """Returns gradients by an all-to-all, and adds them up at the owner in the order of ranks."""
 
     ranks: Ranks
-    traffic: Traffic
-    places: Tensor
+    traffic: Traffic  # numbers of splats sent between the ranks
+    places: Tensor  # positions of this rank's own splats among those that it sent, from `scatter_splats`
 
     def check_still_valid(self) -> None:
         """Do nothing, because a frame does not overwrite the data of an earlier one."""
@@ -137,10 +118,8 @@ class CollectiveWayBack(NamedTuple):
 def return_sums(sums: Tensor, places: Tensor, traffic: Traffic, ranks: Ranks) -> Tensor:
     """Send integer sums of splats to their owners and add them up; see `WayBack.return_sums`.
 
-    Args:
-        sums: int64 [R, C], sums of the splats that arrived here.
-        places: positions of this rank's own splats among those that it sent.
-        traffic: numbers of splats sent between the ranks.
+    `sums`: int64 [R, C], sums of the splats that arrived here. `places`: positions of this rank's own splats
+    among those that it sent.
     """
     returned = ranks.all_to_all(sums, traffic.received, traffic.sent)
     total = sums.new_zeros(traffic.own.splats, sums.shape[1])

@@ -48,13 +48,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import SharedMemory
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.collective import return_sums
-from blitzgs.frame.transport.protocol import (
-    Arrived,
-    CapacityEstimate,
-    ExchangeResult,
-    Traffic,
-    stage_ended,
-)
+from blitzgs.frame.transport.protocol import Arrived, CapacityEstimate, ExchangeResult, Traffic, stage_ended
 from blitzgs.ops.exchange import place_runs
 from blitzgs.ops.host import current_stream
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of
@@ -89,26 +83,21 @@ def room_for(splats: int, words: int) -> int:
 
 
 class PeerBuffers:
-    """The parts of the buffers of all ranks.
-
-    Attributes:
-        buffers: int32 [words] of each rank, mapped here.
-        length: capacity of each buffer, in splats.
-        splats: columns in this rank's buffer, [length].
-        tables: table of splat gradients of each rank, float32 [length, 12].
-    """
+    """The parts of the buffers of all ranks."""
 
     def __init__(self, buffers: Sequence[Tensor], rank: int) -> None:
         """Divide buffers of equal length."""
-        self.buffers = list(buffers)
+        self.buffers = list(buffers)  # int32 [words] of each rank, mapped here
+        # Capacity of each buffer, in splats.
         self.length = len(buffers[0]) // WORDS_PER_SPLAT // _ALIGNMENT * _ALIGNMENT
         columns, begin = [], 0
         for dtype, words, shape in _COLUMNS:
             end = begin + self.length * words
             columns.append(buffers[rank][begin:end].view(dtype).view(self.length, *shape))
             begin = end
-        self.splats = Splats(*columns)
+        self.splats = Splats(*columns)  # columns in this rank's buffer, [length]
         end = begin + self.length * SPLAT_GRADIENT
+        # Table of splat gradients of each rank, float32 [length, 12].
         self.tables = [
             buffer[begin:end].view(torch.float32).view(self.length, SPLAT_GRADIENT) for buffer in buffers
         ]
@@ -129,10 +118,7 @@ class PeerTransport:
         self._counted = torch.cuda.Event()
 
     def project_and_send(
-        self,
-        inputs: ProjectionInputs,
-        assignment: TileAssignment | None,
-        capacity: Sizes | None,
+        self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
     ) -> PeerExchange:
         """See `Transport.project_and_send`."""
         if assignment is None:
@@ -211,23 +197,14 @@ class PeerExchange:
 
 
 class PeerWayBack(NamedTuple):
-    """Lets owners read gradients in the memory of the ranks that added them up.
-
-    Attributes:
-        ranks: the job.
-        memory: the memory that the ranks share.
-        generation: number of the frame, `SharedMemory.generation`.
-        tables: table of splat gradients of each rank, float32 [length, 12], mapped here.
-        traffic: numbers of splats sent between the ranks.
-        places: positions of this rank's own splats among those that it sent, as from `scatter_splats`.
-    """
+    """Lets owners read gradients in the memory of the ranks that added them up."""
 
     ranks: Ranks
-    memory: SharedMemory
-    generation: int
-    tables: Sequence[Tensor]
-    traffic: Traffic
-    places: Tensor
+    memory: SharedMemory  # the memory that the ranks share
+    generation: int  # number of the frame, `SharedMemory.generation`
+    tables: Sequence[Tensor]  # table of splat gradients of each rank, float32 [length, 12], mapped here
+    traffic: Traffic  # numbers of splats sent between the ranks
+    places: Tensor  # positions of this rank's own splats among those that it sent, as from `scatter_splats`
 
     def check_still_valid(self) -> None:
         """See `WayBack.check_still_valid`."""

@@ -53,29 +53,18 @@ def stage_ended(stage: str) -> None:
 
 
 class Traffic(NamedTuple):
-    """The numbers of splats that the ranks send each other.
+    """The numbers of splats that the ranks send each other."""
 
-    Attributes:
-        own: numbers of this rank's visible Gaussians, splats, tiles that they touch, and blocks.
-        splats: splats[s][d] is the number of splats that rank s sends to rank d.
-        sent: number of splats sent to each rank.
-        received: number of splats received from each rank.
-        starts: for each rank, the position of this rank's first splat among all that the rank receives.
-        most: largest number of splats that any rank has, sends or receives.
-        n_isects: upper bound of the tile entries of the splats received.
-        most_isects: largest `n_isects` of any rank.
-        most_blocks: largest number of blocks of which a view may see a part, of any rank.
-    """
-
-    own: Sizes
-    splats: list[list[int]]
-    sent: list[int]
-    received: list[int]
+    own: Sizes  # numbers of this rank's visible Gaussians, splats, tiles that they touch, and blocks
+    splats: list[list[int]]  # splats[s][d] is the number of splats that rank s sends to rank d
+    sent: list[int]  # number of splats sent to each rank
+    received: list[int]  # number of splats received from each rank
+    # For each rank, the position of this rank's first splat among all that the rank receives.
     starts: list[int]
-    most: int
-    n_isects: int
-    most_isects: int
-    most_blocks: int
+    most: int  # largest number of splats that any rank has, sends or receives
+    n_isects: int  # upper bound of the tile entries of the splats received
+    most_isects: int  # largest `n_isects` of any rank
+    most_blocks: int  # largest number of blocks of which a view may see a part, of any rank
 
     @classmethod
     def of(cls, totals: list[list[int]], n_views: int, rank: int) -> Traffic:
@@ -105,55 +94,36 @@ class Traffic(NamedTuple):
 
 
 class Arrived(NamedTuple):
-    """The splats that this rank composites.
+    """The splats that this rank composites."""
 
-    Attributes:
-        splats: the splats; the columns are longer than their number if the host does not know it yet.
-        n_splats: int64 [1], number of valid splats, on the device; None: all are valid.
-        n_isects: upper bound of the tile entries, or capacity for them; -1: they must be counted.
-    """
-
-    splats: Splats
-    n_splats: Tensor | None
-    n_isects: int
+    splats: Splats  # the splats; the columns are longer than their number if the host does not know it yet
+    n_splats: Tensor | None  # int64 [1], number of valid splats, on the device; None: all are valid
+    n_isects: int  # upper bound of the tile entries, or capacity for them; -1: they must be counted
 
 
 class ExchangeResult(NamedTuple):
-    """The splats after an exchange, cut to their numbers, which the host knows by now.
+    """The splats after an exchange, cut to their numbers, which the host knows by now."""
 
-    Attributes:
-        projected: this rank's own splats, only valid ones.
-        splats: the splats that this rank composites, only valid ones.
-        visible: int64 [B], splats of each view over all ranks; valid until the next exchange.
-        traffic: numbers of splats sent between the ranks; None: there is one rank.
-        way_back: returns the gradients; None: there is one rank, which has them already.
-    """
-
-    projected: ProjectedSplats
-    splats: Splats
-    visible: Tensor
-    traffic: Traffic | None
-    way_back: WayBack | None
+    projected: ProjectedSplats  # this rank's own splats, only valid ones
+    splats: Splats  # the splats that this rank composites, only valid ones
+    visible: Tensor  # int64 [B], splats of each view over all ranks; valid until the next exchange
+    traffic: Traffic | None  # numbers of splats sent between the ranks; None: there is one rank
+    way_back: WayBack | None  # returns the gradients; None: there is one rank, which has them already
 
 
 class Exchange(Protocol):
-    """The exchange of one frame's splats: queued work, whose sizes the host may not know until `finish`.
+    """The exchange of one frame's splats: queued work, whose sizes the host may not know until `finish`."""
 
-    Attributes:
-        arrived: the splats that this rank composites.
-        gradient_table: memory, [R, 12], in which the gradients of these splats must be added up, because
-            other ranks read them there; compositing must zero it. None: any memory can be used.
-    """
-
-    arrived: Arrived
+    arrived: Arrived  # the splats that this rank composites
+    # Memory, [R, 12], in which the gradients of these splats must be added up, because other ranks read them
+    # there; compositing must zero it. None: any memory can be used.
     gradient_table: Tensor | None
 
     def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """Wait for the numbers.
 
-        Returns:
-            The sizes that the frame needs, from which `Transport.estimate` learns; and the result, None if
-            the capacity was too small and the frame must be started again.
+        Returns the sizes that the frame needs, from which `Transport.estimate` learns; and the result, None
+        if the capacity was too small and the frame must be started again.
         """
 
 
@@ -163,8 +133,7 @@ class WayBack(Protocol):
     def check_still_valid(self) -> None:
         """Check that gradients of this frame can still be returned.
 
-        Raises:
-            RuntimeError: a later frame has overwritten this frame's splats.
+        RuntimeError: a later frame has overwritten this frame's splats.
         """
 
     def cleared_table(self) -> Tensor | None:
@@ -173,19 +142,15 @@ class WayBack(Protocol):
     def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
         """Return the gradients of this rank's own splats. Collective.
 
-        Args:
-            gradients: gradients of the splats that arrived, in `gradient_table` if there is one.
+        `gradients`: gradients of the splats that arrived, in `gradient_table` if there is one.
         """
 
     def return_sums(self, sums: Tensor) -> Tensor:
         """Return integer sums over the tiles of each rank to the splats' owners, and add them up. Collective.
 
-        Args:
-            sums: int64 [R, C], sums of the splats that arrived here.
-
-        Returns:
-            int64 [P, C], sums of this rank's own splats; zero for splats that touch no tile. Integers add up
-            exactly, so the result does not depend on the number of ranks.
+        `sums`: int64 [R, C], sums of the splats that arrived here. Returns int64 [P, C], sums of this rank's
+        own splats; zero for splats that touch no tile. Integers add up exactly, so the result does not depend
+        on the number of ranks.
         """
 
 
@@ -197,17 +162,13 @@ class Transport(Protocol):
         """Estimate of a frame's sizes, the same on ranks that need equal sizes; None: each frame waits."""
 
     def project_and_send(
-        self,
-        inputs: ProjectionInputs,
-        assignment: TileAssignment | None,
-        capacity: Sizes | None,
+        self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
     ) -> Exchange:
         """Project this rank's Gaussians and send the splats to the ranks that composite them. Collective.
 
-        Args:
-            inputs: inputs of the projection, with the Gaussians' ids.
-            assignment: the tiles of each rank; None: this rank composites all tiles.
-            capacity: the sizes to allocate; None: the host first waits for the numbers.
+        `inputs`: inputs of the projection, with the Gaussians' ids. `assignment`: the tiles of each rank;
+        None: this rank composites all tiles. `capacity`: the sizes to allocate; None: the host first waits
+        for the numbers.
         """
 
 
@@ -217,13 +178,11 @@ class CapacityEstimate:
     If the host waited for the sizes, the device would be idle meanwhile. Instead, the host queues all the
     work with the estimate, and reads the true sizes while the device works. If the estimate was too small,
     the host queues the work again (`blitzgs.frame.render`).
-
-    Attributes:
-        sizes: the present estimate; None before the first frame has ended.
     """
 
     def __init__(self, sizes: Sizes | None = None) -> None:
         """Begin with an estimate, or with none; without one the first attempt waits for its sizes."""
+        # The present estimate; None before the first frame has ended.
         self.sizes = None if sizes is None else Sizes._make(max(1, size) for size in sizes)
         self._lock = threading.Lock()
 
@@ -248,10 +207,7 @@ class LocalTransport:
         self.estimate = None if exact else estimate or CapacityEstimate()
 
     def project_and_send(
-        self,
-        inputs: ProjectionInputs,
-        assignment: TileAssignment | None,
-        capacity: Sizes | None,
+        self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
     ) -> LocalExchange:
         """See `Transport.project_and_send`."""
         if assignment is not None:

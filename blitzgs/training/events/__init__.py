@@ -35,9 +35,8 @@ def handle_all(state: TrainingState, events: Sequence[Event]) -> bool:
     checkpoint of the same step is due some images earlier: a run that is resumed from that checkpoint begins
     with the next step, and would never run them.
 
-    Returns:
-        Whether all events have run. If not, because a signal stops the run (or the Gaussians do not fit into
-        the pool: PoolError), `progress.events_left` holds the others, and a resumed run begins with them.
+    Returns whether all events have run. If not, because a signal stops the run (or the Gaussians do not fit
+    into the pool: PoolError), `progress.events_left` holds the others, and a resumed run begins with them.
     """
     state.progress = replace(state.progress, events_left=[])
     ordered = sorted(events, key=lambda event: event.kind in ("evaluate", "checkpoint"))

@@ -7,7 +7,6 @@ import dataclasses
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from blitzgs.config.fields import RESET_OPACITY
 from blitzgs.config.schedule import Event
@@ -55,23 +54,13 @@ def run_density_event(state: TrainingState, event: Event) -> None:
     _log(state, event, counts, limit)
 
 
-def _spread(state: TrainingState) -> Tensor:
-    """Return the spread of this rank's blocks in thousandths of the scene's extent, int64 []."""
-    extent = state.space.extent
-    return (spread(state.stepper.bounds, extent) * (1000 / extent)).long().to(state.ranks.device)
-
-
 def _keep_sorted(state: TrainingState, event: Event, spread_now: int, is_sorted: bool) -> bool:
     """Sort the table if its blocks have become too large; no result depends on it. Every rank calls this.
 
     After the last event the order stays for the rest of the run, so that sorting always pays.
 
-    Args:
-        spread_now: spread of the blocks of all ranks.
-        is_sorted: whether the event has sorted the table already.
-
-    Returns:
-        Whether this sorted the table.
+    `spread_now`: spread of the blocks of all ranks. `is_sorted`: whether the event has sorted the table
+    already. Returns whether this sorted the table.
     """
     sorts = not is_sorted
     if sorts:
@@ -101,7 +90,10 @@ def population_limit(state: TrainingState) -> GrowthLimit | None:
 def _over_all_ranks(state: TrainingState, counts: dict[str, int]) -> tuple[dict[str, int], int]:
     """Return the sums of named counts over all ranks, and that of the spread of their blocks."""
     own = torch.tensor(list(counts.values()), dtype=torch.int64, device=state.ranks.device)
-    *sums, spread_now = state.ranks.all_reduce(torch.cat((own, _spread(state)[None]))).tolist()
+    # The spread is in thousandths of the scene's extent.
+    extent = state.space.extent
+    wide = (spread(state.stepper.bounds, extent) * (1000 / extent)).long().to(own.device)
+    *sums, spread_now = state.ranks.all_reduce(torch.cat((own, wide[None]))).tolist()
     return dict(zip(counts, sums, strict=True)), spread_now
 
 

@@ -132,7 +132,6 @@ class Glances:
                 self._measure(count)
 
     def _measure(self, count: int) -> None:
-        """Measure the first views, as many as `count`."""
         state = self._state
         started, views = state.clock(), sorted(self._order[:count])
         try:

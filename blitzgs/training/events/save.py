@@ -50,7 +50,6 @@ def finish_checkpoint(state: TrainingState) -> None:
 
 @contextlib.contextmanager
 def _reported(state: TrainingState) -> Iterator[None]:
-    """Report a checkpoint that cannot be written, and try again later."""
     try:
         yield
     except CheckpointError as error:
@@ -120,7 +119,6 @@ def _write(state: TrainingState, in_background: bool = False) -> Saving:
 
 
 def _save(state: TrainingState, folder: Path, in_background: bool = False) -> Saving:
-    """Begin to write a checkpoint into the folder of a run."""
     state.progress = replace(state.progress, curve=asdict(state.curve))
     # The division of tiles decides the order of sums, and therefore their last bits.
     shared = state.owners.columns() if state.ranks.world_size > 1 else {}
