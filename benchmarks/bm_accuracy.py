@@ -31,6 +31,7 @@ from pathlib import Path
 import torch
 from gradients import parameter_gradients
 from harness import make_parser, median_ms, write_json
+from report_tables import accuracy_lines
 from scenes import BenchmarkScene, aerial
 from torch import Tensor
 
@@ -281,18 +282,6 @@ def measure_library(folder: Path, arguments: list[str]) -> Figures:
     return replace(Figures(**row), name="exact exponential")
 
 
-HEAD = """\
-| option | forward + backward, ms a view | image error | gradient error | cut pixels |
-|---|---|---|---|---|"""
-
-
-def line(figures: Figures) -> str:
-    """Return an option's line of the table."""
-    f = figures
-    errors = f"{f.image_error:.1e} | {f.gradient_error:.1e}"
-    return f"| {f.name} | {f.milliseconds:.2f} | {errors} | {f.cut_pixels:.2%} |"
-
-
 def require_bounds(default: Figures) -> None:
     if default.image_error > IMAGE_BOUND or default.gradient_error > GRADIENT_BOUND:
         raise SystemExit(
@@ -314,12 +303,13 @@ def main() -> None:
     batch = aerial(gaussians, args.device, views=4, width=width, height=width * 2 // 3)
     scenes = {1: batch.first_views(1), 4: batch}
     title = f"{args.device}, {gaussians:,} Gaussians, {batch.width} x {batch.height}"
-    print(f"{title}\n\n{HEAD}", flush=True)
+    print(f"{title}\n", flush=True)
     rows: list[Figures] = []
 
     def add(figures: Figures) -> None:
         rows.append(figures)
-        print(line(figures), flush=True)
+        lines = accuracy_lines({"rows": [asdict(figures)]})
+        print("\n".join(lines[0 if len(rows) == 1 else -1 :]), flush=True)
         if args.json:
             write_json(args.json, args.device, title=title, rows=[asdict(row) for row in rows])
 

@@ -34,6 +34,7 @@ from typing import Any, NamedTuple
 
 import torch
 from harness import Clock, make_parser, write_json
+from report_tables import exchange_lines
 from scenes import aerial
 
 from blitzgs.capture.capture import load_capture
@@ -218,28 +219,6 @@ def measure(args: argparse.Namespace) -> None:
             print("REPORT " + json.dumps(report), flush=True)
 
 
-def show(report: dict[str, Any]) -> None:
-    """Print one number of ranks."""
-    print(f"\n{report['ranks']} rank(s), {report['device']}, {report['gaussians']:,} Gaussians")
-    print("  " + "  ".join(f"{stage} {ms:.2f}" for stage, ms in report["ms"].items()) + "  (ms)")
-    exchange = report["ms"]["exchange"] + report["ms"]["exchange back"]
-    if report["ranks"] > 1:
-        parts = "  ".join(f"{name} {size / 1e6:.2f}" for name, size in report["bytes per step"].items())
-        print(
-            f"  MB between ranks per step: {parts}; "
-            f"{report['bytes per visible gaussian']:.1f} bytes per visible Gaussian"
-        )
-        print(
-            f"  {report['visible per step']:,.0f} visible Gaussians, "
-            f"{report['splats per step']:,.0f} splats, "
-            f"{report['splats sent to other ranks']:,.0f} of them sent to another rank; "
-            f"exchange {100 * exchange / report['ms']['alone']:.1f} % of the step"
-        )
-        print(
-            "  largest cost over the mean: " + "  ".join(f"{k} {v:.3f}" for k, v in report["balance"].items())
-        )
-
-
 def main() -> None:
     parser = make_parser(__doc__, device="cpu")
     parser.add_argument("--data", help="a capture; its points become the Gaussians")
@@ -273,7 +252,7 @@ def main() -> None:
         )
         line = next(text for text in done.stdout.splitlines() if text.startswith("REPORT "))
         reports.append(json.loads(line.removeprefix("REPORT ")))
-        show(reports[-1])
+        print("\n".join(exchange_lines({"results": reports})), flush=True)
     if args.json:
         write_json(args.json, args.device, results=reports)
 

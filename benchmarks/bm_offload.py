@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 import torch
 from bm_step import LOSS, OPTIONS, RATE, make_table
-from harness import make_parser, markdown_table, write_json
+from harness import make_parser, write_json
+from report_tables import offload_lines
 from scenes import BenchmarkScene, aerial, look_at
 
 from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
@@ -230,10 +231,7 @@ def main() -> None:
             if args.json:
                 write_json(args.json, args.device, **found)
     print(f"{found['scene']}, B = {args.batch_size}, table {found['table_gb']:.2f} GB")
-    columns = (
-        "arm", "order", "step_ms", "cost", "resident_hits", "moved_mb_per_step", "in_gb_per_s", "sweep_s",
-    )  # fmt: skip
-    print(markdown_table([{name: row.get(name, "") for name in columns} for row in found["results"]]))
+    print("\n".join(offload_lines(found)))
     for row in found["results"]:
         if "failed" in row:
             print(f"{row['arm']}, {row['order']}: {row['failed']}")

@@ -20,9 +20,9 @@ writes stress.md.
 Every run is a process. By default, each GPU has one run at a time. With more (--per-gpu) the models are as
 good, but times no longer compare, and the table says so. When a run ends, it writes a JSON file into
 RESULTS/runs. The same command then skips the runs that are finished and repeats those that failed.
-quality.json has all runs, quality.csv one line per evaluation, quality.md the tables. --collect adds the
-runs of other folders, or of their quality.json, for example if several machines share the runs. In a copy
-without a repository, BLITZGS_COMMIT names the commit.
+quality.json has all runs, quality.md the tables. --collect adds the runs of other folders, or of their
+quality.json, for example if several machines share the runs. In a copy without a repository, BLITZGS_COMMIT
+names the commit.
 """
 
 from __future__ import annotations
@@ -43,14 +43,7 @@ from typing import Any, TextIO
 import quality_report
 import torch
 from harness import commit
-from quality_plan import (
-    STRESS_SEEDS,
-    RunSpec,
-    parse_named,
-    runs_of,
-    stress_markdown,
-    stress_recipes,
-)
+from quality_plan import STRESS_SEEDS, RunSpec, parse_named, runs_of, stress_markdown, stress_recipes
 from quality_run import describe, write
 
 EVALUATE_AT = (1_000, 2_000, 4_000, 7_000, 10_000, 15_000, 20_000)

@@ -69,25 +69,6 @@ def compared(file: Json) -> list[tuple[Json, Json]]:
     return [(run, ones[key]) for run, key in zip(runs, keys, strict=True) if key in several and key in ones]
 
 
-def city_rows(file: Json) -> Rows:
-    """Tabulate what was generated."""
-    city, first = file["city"], next((run for run in file["results"] if "views" in run), None)
-    rows = {
-        "extent of the city": f"{city['extent']:,.0f} m" if "extent" in city else NONE,
-        "views": f"{city['images']:,}",
-        "size in pixels": f"{city['width']} × {city['height']}" if "width" in city else NONE,
-        "photographs on disk": f"{city['image_bytes'] / 1e9:.2f} GB",
-        "generated in": f"{city['seconds']:.0f} s" if city.get("seconds") else "not noted",
-    }
-    if first is not None:
-        rows |= {
-            "views trained on, held out": f"{first['views']['train']:,}, {first['views']['test']:,}",
-            "points": f"{first['points']:,}",
-            "octree levels": str(first["levels"]),
-        }
-    return [{"city": name, "": value} for name, value in rows.items()]
-
-
 def arm_rows(file: Json) -> Rows:
     """Tabulate the runs."""
     return [
@@ -135,24 +116,6 @@ def cost_rows(file: Json) -> Rows:
     return rows
 
 
-def phase_rows(file: Json) -> Rows:
-    """Tabulate the phases of the schedule of every run."""
-    return [
-        {
-            "view level": title_of(run),
-            "images": f"{phase['from']:,.0f} to {phase['to']:,.0f}",
-            "on": phase["on"],
-            "images/s": f"{phase['images_per_second']:,.0f}",
-            "median": text(phase["median_images_per_second"], ",.0f"),
-            "active": text(phase["active"], ".2%"),
-            "visible": text(phase["visible"], ".2%"),
-            "M Gaussians": text(phase["gaussians"] and phase["gaussians"] / 1e6, ".2f"),
-        }
-        for run in trained(file)
-        for phase in run["phases"]
-    ]
-
-
 def popping_rows(file: Json) -> Rows:
     """Tabulate popping along a descending flight."""
     return [
@@ -196,33 +159,6 @@ def rank_rows(file: Json) -> Rows:
     return rows
 
 
-def memory_rows(file: Json) -> Rows:
-    """Tabulate host memory and time outside the training."""
-    rows = []
-    for run in trained(file):
-        images, wall = run["image_memory"], run["wall"]
-        evaluation = wall["evaluated"] - wall["trained"] if "evaluated" in wall else None
-        rows.append(
-            {
-                "view level": title_of(run),
-                "peak GB of a process": gb(run["host_peak_bytes"]),
-                "photographs of rank 0, GB (budget)": _budget(images, "compressed"),
-                "decoded, GB (budget)": _budget(images, "decoded"),
-                "times decoded": f"{images['decoded']:,}",
-                "set-up, s": f"{wall['set_up']:.1f}",
-                "training, s": f"{run['seconds']:.1f}",
-                "evaluation, s": text(evaluation, ".1f"),
-            }
-        )
-    return rows
-
-
-def _budget(images: Json, kind: str) -> str:
-    return f"{images[f'{kind}_bytes'] / 1e9:.2f} ({images[f'{kind}_budget'] / 1e9:.1f})"
-
-
 TABLES: dict[str, Callable[[Json], Rows]] = {
-    "city": city_rows, "city_arms": arm_rows, "city_costs": cost_rows, "city_phases": phase_rows,
-    "city_popping": popping_rows, "city_ranks": rank_rows,
-    "city_memory": memory_rows,
+    "city_arms": arm_rows, "city_costs": cost_rows, "city_popping": popping_rows, "city_ranks": rank_rows,
 }  # fmt: skip

@@ -8,10 +8,8 @@ outside has stopped the training, and else "running" or "failed".
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
-import resource
 import signal
 import statistics
 import sys
@@ -171,8 +169,6 @@ def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float)
         trainer = CityTrainer(config, capture, images, folder, ranks, laps=laps)
         state = trainer.state
         result["views"] = {"train": len(capture.train), "test": len(capture.test)}
-        result["points"] = len(capture.points)
-        result["levels"] = state.progress.level_count
         result["environment"] = environment(ranks.device)
         note("set_up")
         deadline = threading.Event()
@@ -192,14 +188,11 @@ def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float)
         is_done = result["finished"] or deadline.is_set()
         synchronize(ranks.device)
         images_seen, seconds = state.images_seen, state.progress.seconds
-        host_peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
         result |= {
             "images": images_seen, "planned_images": state.schedule.iterations,
             "batch_size": config.schedule.batch_size, "seconds": seconds,
             "images_per_second": images_seen / max(seconds, 1e-9), "gaussians": state.population(),
             "population": population_report(state, trainer.memory),
-            "image_memory": dataclasses.asdict(images.memory()),
-            "host_peak_bytes": ranks.all_gather_object(host_peak),
         }  # fmt: skip
         if ranks.rank == 0:
             records = [json.loads(line) for line in (folder / LOG).read_text().splitlines()]

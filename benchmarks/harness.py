@@ -16,7 +16,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -115,11 +115,16 @@ def format_value(value: Any) -> str:
     return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
 
 
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    """Return the lines of a Markdown table."""
+    names = list(head)
+    first, *others = [f"| {' | '.join(line)} |" for line in (names, *rows)]
+    return [first, f"|{'---|' * len(names)}", *others]
+
+
 def markdown_table(rows: Sequence[dict[str, Any]]) -> str:
     """Return rows of equal keys as a Markdown table, the keys as its head."""
-    head = list(rows[0])
-    lines = [head, ["---"] * len(head), *([format_value(row[key]) for key in head] for row in rows)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return "\n".join(table(rows[0], (map(format_value, row.values()) for row in rows)))
 
 
 def make_parser(

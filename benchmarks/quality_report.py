@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of `bm_quality.py`: JSON, CSV and Markdown tables of all runs of a folder."""
+"""Results of `bm_quality.py`: JSON and Markdown tables of all runs of a folder."""
 
 from __future__ import annotations
 
-import csv
 import json
 import statistics
 from collections import defaultdict
@@ -13,8 +12,6 @@ from typing import Any
 
 from harness import markdown_table
 from quality_run import write
-
-from blitzgs.runs.evaluation import METRICS
 
 RUNS = "runs"
 Run = dict[str, Any]
@@ -58,17 +55,15 @@ def is_done(out: Path, name: str) -> bool:
 
 
 def report(out: Path) -> str:
-    """Write quality.json, quality.csv and quality.md into `out`.
+    """Write quality.json and quality.md into `out`.
 
     Returns:
         The Markdown.
     """
     runs = read_runs(out / RUNS)
-    done = [run for run in runs if run["status"] == "done"]
     text = markdown(runs)
     (out / "quality.json").write_text(json.dumps({"runs": runs}))
     (out / "quality.md").write_text(text)
-    write_csv(out / "quality.csv", done)
     return text
 
 
@@ -172,24 +167,3 @@ def spread(values: Sequence[float], form: str, worst: Callable[[Iterable[float]]
         return ""
     median = form.format(statistics.median(values))
     return median if len(values) == 1 else f"{median} ({form.format(worst(values))})"
-
-
-def write_csv(path: Path, runs: Sequence[Run]) -> None:
-    """Write a line for each evaluation of each run."""
-    about = ("capture", "recipe", "settings", "seed", "commit", "per_gpu")
-    splits = [f"{split}_{metric}" for split in ("test", "train") for metric in METRICS]
-    head = [
-        *about, "images", "seconds", "gaussians", *splits, "is_end", "peak_gaussians", "peak_memory_bytes",
-    ]  # fmt: skip
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, head, restval="")
-        writer.writeheader()
-        for run in runs:
-            for evaluation in run["evaluations"]:
-                row = {key: run.get(key, "") for key in about}
-                row |= {key: evaluation[key] for key in ("images", "seconds", "gaussians")}
-                for split in ("test", "train"):
-                    row |= {f"{split}_{key}": value for key, value in evaluation.get(split, {}).items()}
-                if evaluation["images"] == run["images"]:
-                    row |= {"is_end": 1, **{key: run[key] for key in ("peak_gaussians", "peak_memory_bytes")}}
-                writer.writerow(row)

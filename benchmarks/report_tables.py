@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import city_report
+from harness import table
 
 Json = dict[str, Any]
 
@@ -35,13 +36,6 @@ OFFLOAD_COLUMNS = {
     "cost": "relative", "resident_hits": "blocks already there", "moved_mb_per_step": "MB moved a step",
     "sweep_s": "s for a sweep",
 }  # fmt: skip
-
-
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
-    """Return the lines of a Markdown table."""
-    names = list(head)
-    first, *others = [f"| {' | '.join(line)} |" for line in (names, *rows)]
-    return [first, f"|{'---|' * len(names)}", *others]
 
 
 def ms(value: float) -> str:

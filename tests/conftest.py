@@ -40,6 +40,17 @@ def one_thread(request):
     torch.set_num_threads(before)
 
 
+@pytest.fixture
+def failure(capsys):
+    """Call a command that ends with status 1; return what it printed as its error."""
+
+    def call(*arguments):
+        assert main([str(argument) for argument in arguments]) == 1
+        return capsys.readouterr().err
+
+    return call
+
+
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     """The folder of the tiny capture."""

@@ -6,7 +6,9 @@ from __future__ import annotations
 import json
 import math
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -144,6 +146,31 @@ def reference_images(scene: Scene, backgrounds: Tensor | None = None, **options)
         )
         for c in range(len(scene.viewmats))
     ]
+
+
+def ssim_map(x: Tensor, y: Tensor, padding: int = 5) -> Tensor:
+    """SSIM of images [B, H, W, 3] by its formula and torch's convolution in float64; a map of their size.
+
+    Args:
+        x: differentiable.
+        y: of the same shape.
+        padding: zeros around the images; without, the map is smaller by 5 pixels at each side.
+    """
+    x, y = (t.double().permute(0, 3, 1, 2) for t in (x, y))
+    line = torch.exp(-((torch.arange(11, dtype=torch.float64, device=x.device) - 5) ** 2) / 4.5)
+    window = torch.outer(line, line)
+    window = (window / window.sum()).expand(3, 1, 11, 11)
+    blur = partial(torch.nn.functional.conv2d, weight=window, padding=padding, groups=3)
+    mx, my = blur(x), blur(y)
+    vx, vy, cov = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
+    top = (2 * mx * my + 0.01**2) * (2 * cov + 0.03**2)
+    return (top / ((mx * mx + my * my + 0.01**2) * (vx + vy + 0.03**2))).permute(0, 2, 3, 1)
+
+
+def refused(error: type[Exception], text: str, call: Callable, /, *given: Any, **named: Any) -> None:
+    """Check that a call raises an error of this kind, whose message the regular expression matches."""
+    with pytest.raises(error, match=text):
+        call(*given, **named)
 
 
 def relative_error(actual: Tensor, expected: Tensor) -> float:

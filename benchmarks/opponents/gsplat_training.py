@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from blitzgs import rasterization, relocate
+from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.images import ImageStore
 from blitzgs.frame.render import RenderOptions
@@ -178,7 +179,7 @@ def unit_of(capture: Capture) -> float:
     world's origin. (gsplat turns the world upright before, which changes such a median a little.)
     """
     poses = np.stack([camera.world_to_camera for camera in capture.cameras])
-    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3]) + capture.offset
+    centres = camera_centres(poses) + capture.offset
     axes = poses[:, 2, :3]
     nearest = centres - (axes * centres).sum(axis=1, keepdims=True) * axes
     return float(np.median(np.linalg.norm(centres - np.median(nearest, axis=0), axis=1)))
@@ -186,8 +187,7 @@ def unit_of(capture: Capture) -> float:
 
 def space_of(capture: Capture) -> Space:
     """Return gsplat's unit, and as extent its scene scale: 1.1 x the farthest camera from their mean."""
-    poses = np.stack([camera.world_to_camera for camera in capture.cameras])
-    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    centres = camera_centres(np.stack([camera.world_to_camera for camera in capture.cameras]))
     farthest = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
     unit = unit_of(capture)
     return Space((0.0, 0.0, 0.0), unit, 1.1 * float(farthest) / unit)

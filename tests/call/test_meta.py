@@ -11,7 +11,7 @@ from torch.utils._pytree import tree_map
 
 from blitzgs.call import bad_values
 from blitzgs.call.meta import LATER, LateMapping, LazyDict
-from tests.helpers import DEVICES, random_scene, rasterize_scene, reference_images, relative_error
+from tests.helpers import DEVICES, random_scene, rasterize_scene, reference_images, refused, relative_error
 
 
 @pytest.fixture(autouse=True)
@@ -307,8 +307,7 @@ def test_reading_all_of_meta_reads_no_parameter(monkeypatch):
     monkeypatch.setattr("blitzgs.call.meta.non_finite", fail)
     _, _, meta = rasterize_scene(random_scene(n=30))
     assert len(list(meta.values())) == len(meta)
-    with pytest.raises(AssertionError, match="looked into"):
-        len(meta["non_finite"])
+    refused(AssertionError, "looked into", len, meta["non_finite"])
 
 
 PLAIN = {"image": 1, "ids": [2, 3], "mask": None}
@@ -371,8 +370,7 @@ def test_equality_compares_values():
     empty, plain = {}, dict(PLAIN)
     assert lazy()[0] == plain and plain == lazy()[0] and lazy()[0] == lazy()[0]
     assert lazy()[0] != empty and empty != lazy()[0]
-    with pytest.raises(TypeError, match="unhashable"):
-        hash(lazy()[0])
+    refused(TypeError, "unhashable", hash, lazy()[0])
 
 
 def test_values_may_be_replaced_and_deleted():

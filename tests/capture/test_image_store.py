@@ -13,6 +13,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.capture.image_files import decode_rgb, described, read_whole
 from blitzgs.capture.images import BoundedCache, ImageStore
 from tests.capture.helpers import smooth_image, write_capture, write_image
+from tests.helpers import refused
 
 pytestmark = pytest.mark.filterwarnings("ignore:all training cameras are in one place")
 NAMES = [f"v{i:02d}.jpg" for i in range(12)]
@@ -24,20 +25,14 @@ def capture(tmp_path):
     return load_capture(write_capture(tmp_path, NAMES))
 
 
-def test_images_are_rgb(tmp_path):
-    write_capture(tmp_path, ["a.png", "b.png"])
-    image = ImageStore(load_capture(tmp_path)).get(1)
-    assert image.dtype == torch.uint8 and not image.is_cuda
-    np.testing.assert_array_equal(image.numpy(), smooth_image(48, 64, seed=1))
-
-
-def test_grey_images_become_rgb(tmp_path):
+def test_images_are_rgb_grey_ones_too(tmp_path):
     write_capture(tmp_path, ["a.png", "b.png"])
     grey = smooth_image(48, 64)[..., :1]
     write_image(tmp_path / "images" / "a.png", grey)
-    np.testing.assert_array_equal(
-        ImageStore(load_capture(tmp_path)).get(0).numpy(), np.repeat(grey, 3, axis=2)
-    )
+    shown = [ImageStore(load_capture(tmp_path)).get(index) for index in (0, 1)]
+    assert all(image.dtype == torch.uint8 and not image.is_cuda for image in shown)
+    np.testing.assert_array_equal(shown[0].numpy(), np.repeat(grey, 3, axis=2))
+    np.testing.assert_array_equal(shown[1].numpy(), smooth_image(48, 64, seed=1))
 
 
 def test_the_same_bits_for_every_budget_thread_count_and_order(capture):
@@ -58,8 +53,7 @@ def test_files_are_read_once_within_the_budget(capture):
     for camera in capture.cameras:
         camera.image_path.unlink()
     assert all(torch.equal(store.get(i), before[i]) for i in range(12))
-    with pytest.raises(FileNotFoundError, match=NAMES[4]):
-        ImageStore(capture).get(4)
+    refused(FileNotFoundError, NAMES[4], ImageStore(capture).get, 4)
 
 
 def test_prepared_images_are_made_once_and_kept_without_loss(tmp_path):
@@ -185,10 +179,8 @@ def test_truncated_jpegs_are_named_and_never_shown_in_part(capture, kept):
     store = ImageStore(capture)
     store.prefetch(range(4))
     reason = r"(at byte \d+: truncated|cannot be decoded)" if kept else "the file is empty; copy it again"
-    with pytest.raises(ValueError, match=f"{NAMES[2]}: {reason}"):
-        store.get(2)
-    with pytest.raises(ValueError, match=NAMES[2]):
-        store.get(2)
+    refused(ValueError, f"{NAMES[2]}: {reason}", store.get, 2)
+    refused(ValueError, NAMES[2], store.get, 2)
     assert store.get(3).shape == (48, 64, 3)
 
 
@@ -212,8 +204,7 @@ def test_jpegs_with_lost_or_overwritten_blocks_are_refused(tmp_path, harm, begin
     path = capture.cameras[0].image_path
     data = path.read_bytes()
     path.write_bytes(harm(data, int(begin * len(data)), int(end * len(data))))
-    with pytest.raises(ValueError, match=rf"{NAMES[0]}: at byte \d+: .*(truncated|damaged)"):
-        ImageStore(capture).get(0)
+    refused(ValueError, rf"{NAMES[0]}: at byte \d+: .*(truncated|damaged)", ImageStore(capture).get, 0)
 
 
 @pytest.mark.parametrize("option", [None, "PROGRESSIVE", "OPTIMIZE", "RST_INTERVAL", "444", "411", "440"])
@@ -231,8 +222,7 @@ def test_every_kind_of_whole_jpeg_passes(tmp_path, option, size):
         path.write_bytes(data.tobytes() + b"trailing bytes")
         assert decode_rgb(read_whole(path)).shape == (*size, 3)
         path.write_bytes(data.tobytes()[:-2])
-        with pytest.raises(ValueError, match="end marker is missing"):
-            read_whole(path)
+        refused(ValueError, "end marker is missing", read_whole, path)
 
 
 def test_a_frame_of_motion_jpeg_has_no_huffman_tables(tmp_path):
@@ -245,8 +235,7 @@ def test_a_frame_of_motion_jpeg_has_no_huffman_tables(tmp_path):
     path.write_bytes(data)
     np.testing.assert_array_equal(decode_rgb(read_whole(path)), expected)
     path.write_bytes(data[:-100] + data[-2:])
-    with pytest.raises(ValueError, match="image data end before the last block"):
-        read_whole(path)
+    refused(ValueError, "image data end before the last block", read_whole, path)
 
 
 def test_floating_point_pixels_with_alpha_are_refused_by_name(tmp_path):
@@ -258,8 +247,7 @@ def test_floating_point_pixels_with_alpha_are_refused_by_name(tmp_path):
 
 def test_a_file_that_changed_its_size_is_refused(capture):
     write_image(capture.cameras[0].image_path, smooth_image(20, 30))
-    with pytest.raises(ValueError, match="is 30 x 20 now but was 64 x 48"):
-        ImageStore(capture).get(0)
+    refused(ValueError, "is 30 x 20 now but was 64 x 48", ImageStore(capture).get, 0)
 
 
 def test_bounded_cache_drops_the_least_recently_used():

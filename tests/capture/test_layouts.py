@@ -11,9 +11,9 @@ import pytest
 
 from blitzgs.capture.capture import MissingImagesError, load_capture
 from blitzgs.capture.images import ImageStore
-from blitzgs.capture.transforms import read_transforms
 from blitzgs.capture.usable import read_cameras
 from tests.capture.helpers import edit_model, smooth_image, write_capture, write_image
+from tests.helpers import refused
 from tests.training.tiny import tiny_scene, write_tiny_capture
 
 pytestmark = [
@@ -25,19 +25,15 @@ NAMES = [f"v{i:02d}.png" for i in range(9)]
 
 
 def test_nothing_to_load_is_said_clearly(tmp_path):
-    with pytest.raises(FileNotFoundError, match="holds no capture: expected a COLMAP model"):
-        load_capture(tmp_path)
-    with pytest.raises(FileNotFoundError, match="is not a folder"):
-        load_capture(tmp_path / "nowhere")
+    refused(FileNotFoundError, "holds no capture: expected a COLMAP model", load_capture, tmp_path)
+    refused(FileNotFoundError, "is not a folder", load_capture, tmp_path / "nowhere")
     (tmp_path / "photographs").mkdir()
     (tmp_path / "photographs" / "DJI_0001.DNG").touch()
     (tmp_path / "photographs" / "DJI_0002.MP4").touch()
-    with pytest.raises(FileNotFoundError, match=r"\.dng, \.mp4 cannot be read: convert"):
-        load_capture(tmp_path)
+    refused(FileNotFoundError, r"\.dng, \.mp4 cannot be read: convert", load_capture, tmp_path)
     (tmp_path / "photographs" / "DJI_0001.JPG").touch()
     (tmp_path / "photographs" / "cameras.json").touch()  # a run has such a file, and it is no model
-    with pytest.raises(FileNotFoundError, match="has images but not their cameras: blitzgs sfm"):
-        load_capture(tmp_path)
+    refused(FileNotFoundError, "has images but not their cameras: blitzgs sfm", load_capture, tmp_path)
     (tmp_path / "sparse" / "1").mkdir(parents=True)
     (tmp_path / "sparse" / "1" / "cameras.bin").touch()
     with pytest.raises(FileNotFoundError, match="there is a COLMAP model in .*sparse/1: .* to .*sparse/0"):
@@ -53,20 +49,17 @@ def test_nothing_to_load_is_said_clearly(tmp_path):
         load_capture(tmp_path)
     (tmp_path / "transforms.json").unlink()
     write_capture(tmp_path, NAMES[:2])
-    with pytest.raises(ValueError, match="downscale must be at least 1, got 0.5"):
-        load_capture(tmp_path, downscale=0.5)
+    refused(ValueError, "downscale must be at least 1, got 0.5", load_capture, tmp_path, downscale=0.5)
     with pytest.raises(ValueError, match="undistort must be one of crop, mask, got 'none'"):
         load_capture(tmp_path, undistort="none")
     with pytest.raises(FileNotFoundError, match="2 of 2 images .* with --data.images=FOLDER") as caught:
         load_capture(tmp_path, images="elsewhere", allow_missing=True)
     assert not isinstance(caught.value, MissingImagesError)  # leaving out all views is no remedy
     edit_model(tmp_path, lambda m: m.images.camera_ids.fill(7))
-    with pytest.raises(ValueError, match=f"the cameras of 2 images .first: {NAMES[0]}. are not there"):
-        load_capture(tmp_path)
+    refused(ValueError, f"the cameras of 2 images .first: {NAMES[0]}. are not there", load_capture, tmp_path)
     points = next((tmp_path / "sparse" / "0").glob("points3D.*"))
     points.unlink()
-    with pytest.raises(FileNotFoundError, match=f"{points.name} is missing: .* not a complete COLMAP"):
-        load_capture(tmp_path)
+    refused(FileNotFoundError, f"{points.name} is missing: .* not a complete COLMAP", load_capture, tmp_path)
 
 
 def test_mega_nerf_layout_with_mappings_and_with_two_models(tmp_path):
@@ -126,21 +119,13 @@ def test_blender_transforms(tmp_path):
         ({"w": math.inf, "h": 48}, "frame 0: w must be a finite number, got inf"),
         ({"w": 0, "h": 0}, "frame 0: the image's size must be at least 1 x 1 in whole pixels, got w = 0"),
         ({"fl_x": 10**400}, "frame 0: fl_x must be a finite number, got 10000"),
-        ({"fl_x": None}, "frame 0: fl_x must be a finite number, got null"),
         ({"file_path": ""}, "frame 0: file_path must name an image, got ''"),
         ({"file_path": None}, "frame 0: file_path must name an image, got None"),
-        ({"transform_matrix": np.diag([-1.0, 1, 1, 1]).tolist()}, "frame 0: .* mirrors the scene"),
-        ({"test_filenames": "a.png"}, "test_filenames must be a list"),
-        ({"val_filenames": ["a.png", 3]}, "val_filenames must be a list"),
-        ({"val_filenames": ["./a.png", "b.png"]}, r"name 1 images that are no frames \(first: b.png\)"),
         ({"ply_file_path": None}, "ply_file_path must name a file, got None"),
         ({"ply_file_path": ""}, "ply_file_path must name a file, got ''"),
         ({"mask_path": 3}, "frame 0: mask_path must name an image or be null, got 3"),
         ({"mask_path": ""}, "frame 0: mask_path must name an image or be null, got ''"),
-        ({"k4": 0.01}, "frame 0: k4 is 0.01, without k5 and k6: .* undistort the images"),
-        ({"is_fisheye": True, "p1": 0.1}, "frame 0: p1 = 0.1: a fisheye lens has only k1 to k4"),
         ({"is_fisheye": True, "camera_model": "OPENCV"}, "frame 0: is_fisheye is true but camera_model is"),
-        ({"is_fisheye": "yes"}, "frame 0: is_fisheye must be true or false, got 'yes'"),
         ({"k1": 1e300}, "the camera of .*a.png: the lens does not see along its own axis"),
     ],
 )
@@ -152,24 +137,6 @@ def test_transforms_that_make_no_sense_are_named(tmp_path, fields, message):
     with pytest.raises(ValueError, match=message) as caught:
         load_capture(tmp_path)
     assert str(tmp_path) in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("fields", "model", "distortion"),
-    [
-        ({"k1": 0.1, "k4": 0.0}, "FULL_OPENCV", (0.1, 0, 0, 0, 0, 0, 0, 0)),
-        ({"k4": 0.01, "k5": 0.0}, "FULL_OPENCV", (0, 0, 0, 0, 0, 0.01, 0, 0)),
-        ({"is_fisheye": False, "k1": 0.1}, "FULL_OPENCV", (0.1, 0, 0, 0, 0, 0, 0, 0)),
-        ({"is_fisheye": True, "k1": 0.1, "k4": 0.01, "p1": 0}, "OPENCV_FISHEYE", (0.1, 0, 0, 0.01)),
-        ({"camera_model": "OPENCV_FISHEYE", "k4": 0.01}, "OPENCV_FISHEYE", (0, 0, 0, 0.01)),
-    ],
-)
-def test_the_coefficients_of_transforms_are_those_of_their_lens(tmp_path, fields, model, distortion):
-    write_image(tmp_path / "a.png", smooth_image(48, 64))
-    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 60.0}
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]} | fields))
-    lens = read_transforms(tmp_path).frames[0].lens
-    assert (lens.model, lens.distortion) == (model, distortion)
 
 
 @pytest.mark.parametrize("again", ["a.png", "./a.png", "a"])
@@ -200,13 +167,6 @@ def test_missing_images_of_transforms_are_named_by_their_paths(tmp_path):
         load_capture(tmp_path, split=0)
 
 
-@pytest.mark.parametrize("text", ['{"frames": ' + "[" * 100_000, "[]"])
-def test_transforms_that_are_damaged_are_named(tmp_path, text):
-    (tmp_path / "transforms.json").write_text(text)
-    with pytest.raises(ValueError, match=f"{tmp_path}/transforms.json: not a transforms file"):
-        load_capture(tmp_path)
-
-
 def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
     frames = []
     (tmp_path / "own").mkdir()
@@ -227,8 +187,7 @@ def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
         **{"k1": -0.1, "k2": 0.01, "p1": 0.001, "p2": 0.0, "frames": frames, "ply_file_path": "p.ply"},
         **{"train_filenames": [f"images/f{i}.png" for i in (0, 1, 3)], "test_filenames": ["./images/f2.png"]},
     }
-    path = tmp_path / "transforms.json"
-    path.write_text(json.dumps(content))
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
     assert all(camera.mask_path is None for camera in load_capture(tmp_path, masks=False).cameras)
     capture = load_capture(tmp_path)
     assert capture.test == [2] and not capture.has_alpha
@@ -238,14 +197,6 @@ def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
     assert lens.model == "FULL_OPENCV" and lens.distortion[:4] == (-0.1, 0.01, 0.001, 0.0)
     store = ImageStore(capture)
     assert store.mask(0) is None and not store.mask(1).any()
-
-    content["frames"] = [{"file_path": "images/f0.png"}]
-    path.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match="frame 0: the field 'transform_matrix' is missing"):
-        load_capture(tmp_path)
-    path.write_text('{"frames": 3}')
-    with pytest.raises(ValueError, match="not a transforms file with a list of frames"):
-        load_capture(tmp_path)
 
 
 def test_a_transforms_file_of_any_name_needs_no_photographs(tmp_path):
@@ -274,10 +225,8 @@ def test_a_colmap_model_needs_no_photographs(tmp_path):
 
 
 def test_errors_name_the_file(tmp_path):
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        read_cameras(tmp_path / "nowhere", np.zeros(3))
-    with pytest.raises(FileNotFoundError, match="holds no capture"):
-        read_cameras(tmp_path, np.zeros(3))
+    refused(FileNotFoundError, "nowhere", read_cameras, tmp_path / "nowhere", np.zeros(3))
+    refused(FileNotFoundError, "holds no capture", read_cameras, tmp_path, np.zeros(3))
     file = tmp_path / "c.json"
     for text, reason in (
         ("{", "no JSON"),

@@ -16,6 +16,7 @@ from blitzgs.capture.points import file_points
 from blitzgs.formats.ply import read_point_cloud
 from tests.capture import helpers as files
 from tests.capture.helpers import as_text, smooth_image, write_capture, write_image
+from tests.helpers import refused
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 COUNT = 50
@@ -175,8 +176,7 @@ def test_points_without_colours_are_said(tmp_path):
 
 def test_a_file_of_points_that_is_missing_is_named(tmp_path):
     transforms_capture(tmp_path, ply_file_path="lost.ply")
-    with pytest.raises(FileNotFoundError, match="lost.ply is missing"):
-        load_capture(tmp_path)
+    refused(FileNotFoundError, "lost.ply is missing", load_capture, tmp_path)
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
@@ -284,8 +284,7 @@ def test_a_colmap_model_takes_points_and_an_offset_from_files_beside_it(tmp_path
     assert loaded.about.source.frame.crs == "EPSG:32633"
     np.testing.assert_array_equal(loaded.about.source.frame.to_world(np.zeros(3)), [412345.5, 5654321.25, 0])
     (tmp_path / "offset.xyz").write_text("412345.5 nan 0\n")
-    with pytest.raises(ValueError, match="translation finite"):
-        load_capture(tmp_path)
+    refused(ValueError, "translation finite", load_capture, tmp_path)
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz", ".e57"])
@@ -298,6 +297,5 @@ def test_damaged_files_are_refused_by_name(tmp_path, suffix):
         write_las(path, np.ones((1000, 3)))
         whole = path.read_bytes()
         path.write_bytes(whole[: len(whole) * 2 // 3])
-    with pytest.raises(ValueError, match=rf"p{suffix} cannot be read"):
-        file_points(path)
+    refused(ValueError, rf"p{suffix} cannot be read", file_points, path)
     shutil.rmtree(tmp_path)

@@ -19,6 +19,7 @@ from blitzgs.capture.shared_images import SharedImages, size_of
 from blitzgs.training import inputs
 from tests.capture.helpers import write_capture
 from tests.distributed.rank_harness import run_ranks
+from tests.helpers import refused
 from tests.training.tiny import tiny_config
 
 pytestmark = pytest.mark.filterwarnings("ignore:all training cameras are in one place")
@@ -45,12 +46,9 @@ def test_what_one_puts_there_the_other_finds():
 
 def test_other_memory_is_refused():
     _one, offer = SharedImages.create(SHAPES)
-    with pytest.raises(OSError, match="memory of another process"):
-        SharedImages.join(offer._replace(token=bytes(16)), SHAPES)
-    with pytest.raises(OSError, match="not the memory of the same images"):
-        SharedImages.join(offer, SHAPES | {"d": (9, 9)})
-    with pytest.raises(OSError, match=r"fd/12345"):
-        SharedImages.join(offer._replace(path="/proc/self/fd/12345"), SHAPES)
+    refused(OSError, "memory of another process", SharedImages.join, offer._replace(token=bytes(16)), SHAPES)
+    refused(OSError, "not the memory of the same images", SharedImages.join, offer, SHAPES | {"d": (9, 9)})
+    refused(OSError, r"fd/12345", SharedImages.join, offer._replace(path="/proc/self/fd/12345"), SHAPES)
 
 
 def test_the_memory_ends_with_its_users():
@@ -212,8 +210,7 @@ def test_saved_pictures_are_rgb_rounded_and_clamped(tmp_path):
     ],
 )
 def test_what_is_no_picture_is_refused(tmp_path, image, error, message):
-    with pytest.raises(error, match=message):
-        save_image(tmp_path / "a.png", image)
+    refused(error, message, save_image, tmp_path / "a.png", image)
     assert not (tmp_path / "a.png").exists()
 
 
@@ -253,8 +250,7 @@ def test_comparison_strip_holds_all_three(tmp_path):
     np.testing.assert_array_equal(found[24:, 68:], error_map(render, target))
     assert (found[:24, :30] < 128).any(), "the label is drawn"
     assert all((found[:24, right - 4 : right] > 200).all() for right in (30, 64, 98)), "no label is cut off"
-    with pytest.raises(ValueError, match="images of one height"):
-        strip([render, render[:5]], ["a", "b"])
+    refused(ValueError, "images of one height", strip, [render, render[:5]], ["a", "b"])
 
 
 def test_code_that_imports_the_former_name_gets_the_same_modules():

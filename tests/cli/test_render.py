@@ -18,6 +18,7 @@ from blitzgs.runs.folder import open_run
 from blitzgs.viewer.film import check_film, new_film
 from blitzgs.viewer.paths import CameraPath, Keyframe, to_json
 from tests.distributed.rank_harness import run_ranks
+from tests.helpers import refused
 
 
 def test_a_film_has_its_frames(tmp_path):
@@ -67,11 +68,9 @@ def test_a_full_disk_is_named_and_leaves_no_file(tmp_path):
 def test_what_is_no_film_is_kept(tmp_path):
     file = tmp_path / "a.mp4"
     check_film(file, 64, 48)
-    with pytest.raises(ValueError, match="even sides, got 63x48"):
-        check_film(file, 63, 48)
+    refused(ValueError, "even sides, got 63x48", check_film, file, 63, 48)
     file.write_text("notes on the film")
-    with pytest.raises(FileExistsError, match="is no film"):
-        check_film(file, 64, 48)
+    refused(FileExistsError, "is no film", check_film, file, 64, 48)
 
 
 def test_without_the_package_the_message_says_what_to_install(tmp_path, monkeypatch):
@@ -83,8 +82,7 @@ def test_without_the_package_the_message_says_what_to_install(tmp_path, monkeypa
         return imported(name, *rest, **options)
 
     monkeypatch.setattr(builtins, "__import__", without_av)
-    with pytest.raises(ImportError, match=r'pip install "blitzgs\[film\]"'):
-        check_film(tmp_path / "a.mp4", 64, 48)
+    refused(ImportError, r'pip install "blitzgs\[film\]"', check_film, tmp_path / "a.mp4", 64, 48)
 
 
 def test_a_film_of_a_path_shows_its_views(trained, tmp_path, capsys):
@@ -157,11 +155,10 @@ def test_cameras_of_a_file_are_rendered(trained, tmp_path):
     np.testing.assert_allclose(found, run.model().render(3).numpy(), atol=1e-5)
 
 
-def test_a_ply_file_has_no_cameras_of_its_own(trained, tmp_path, capsys):
+def test_a_ply_file_has_no_cameras_of_its_own(trained, tmp_path, failure):
     ply, out = tmp_path / "m.ply", str(tmp_path / "out")
     assert main(["export", str(trained[1]), "--ply", str(ply)]) == 0
-    assert main(["render", str(ply), "--out", out]) == 1
-    assert "has no cameras: use --path, --cameras" in capsys.readouterr().err
+    assert "has no cameras: use --path, --cameras" in failure("render", ply, "--out", out)
     flags = ["--path", "orbit", "--size", "48x32", "--seconds", "1", "--fps", "2"]
     assert main(["render", str(ply), *flags, "--out", out]) == 0
     pictures = [cv2.imread(str(path)) for path in sorted((tmp_path / "out").glob("*.png"))]
@@ -183,10 +180,9 @@ def test_a_ply_file_has_no_cameras_of_its_own(trained, tmp_path, capsys):
         (["--cameras", "x", "--exposure", "--out", "d"], "not for --cameras"),
     ],
 )
-def test_wrong_flags_are_named(trained, tmp_path, monkeypatch, capsys, flags, reason):
+def test_wrong_flags_are_named(trained, tmp_path, monkeypatch, failure, flags, reason):
     monkeypatch.chdir(tmp_path)
-    assert main(["render", str(trained[1]), *flags]) == 1
-    assert reason in capsys.readouterr().err
+    assert reason in failure("render", trained[1], *flags)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -30,6 +30,7 @@ from blitzgs.config.files import (
 from blitzgs.config.ranges import CHOICES, RANGES, _entries, describe, describe_all, flat_fields, problems
 from blitzgs.config.schedule import Schedule
 from blitzgs.optim.table_adam import BETA1, BETA2, EPS
+from tests.helpers import refused
 
 FOLDER = Path(__file__).parents[2] / "configs"
 AERIAL = FOLDER / "aerial.yaml"
@@ -92,8 +93,7 @@ def test_saved_configuration_reads_back_to_the_same(tmp_path):
     ],
 )
 def test_errors_name_the_field(override, message):
-    with pytest.raises(ConfigError, match=message):
-        load_config(None, [override])
+    refused(ConfigError, message, load_config, None, [override])
 
 
 def test_an_error_of_a_file_names_the_file(tmp_path):
@@ -103,19 +103,15 @@ def test_an_error_of_a_file_names_the_file(tmp_path):
         ("loss: 5", "loss: must be a section"),
     ):
         file.write_text(text)
-        with pytest.raises(ConfigError, match=f"^{file}: {message}"):
-            load_config(file)
+        refused(ConfigError, f"^{file}: {message}", load_config, file)
 
 
 def test_unreadable_files(tmp_path):
-    with pytest.raises(ConfigError, match="cannot read the configuration"):
-        load_config(tmp_path / "missing.yaml")
+    refused(ConfigError, "cannot read the configuration", load_config, tmp_path / "missing.yaml")
     (tmp_path / "broken.yaml").write_text("a: [")
-    with pytest.raises(ConfigError, match="not valid YAML"):
-        load_config(tmp_path / "broken.yaml")
+    refused(ConfigError, "not valid YAML", load_config, tmp_path / "broken.yaml")
     (tmp_path / "loop.yaml").write_text("base: loop.yaml")
-    with pytest.raises(ConfigError, match="leads back"):
-        load_config(tmp_path / "loop.yaml")
+    refused(ConfigError, "leads back", load_config, tmp_path / "loop.yaml")
 
 
 NUMBERS = [
@@ -176,8 +172,7 @@ def test_senseless_numbers_are_refused_by_name(name, default, value):
         assert name.startswith(("population.grad", "seed")) and number >= 0
         return
     text = f"[{value}, 0, 0]" if isinstance(default, tuple) else value
-    with pytest.raises(ConfigError, match=rf"{name}.*: must be .*got"):
-        load_config(None, [f"--{name}={text}"])
+    refused(ConfigError, rf"{name}.*: must be .*got", load_config, None, [f"--{name}={text}"])
 
 
 def test_a_position_rate_of_zero_keeps_the_means_in_place():
@@ -209,8 +204,7 @@ def test_masks_may_be_switched_off():
 def test_a_section_that_is_there_twice_is_refused_and_a_bom_is_not_read(tmp_path):
     file = tmp_path / "config.yaml"
     file.write_text("seed: 1\nloss:\n  ssim: 0.5\nloss:\n  scale: 1\n")
-    with pytest.raises(ConfigError, match="config.yaml: not valid YAML: the key 'loss' is given twice"):
-        load_config(file)
+    refused(ConfigError, "config.yaml: not valid YAML: the key 'loss' is given twice", load_config, file)
     file.write_bytes(b"\xef\xbb\xbfseed: 7\n")
     assert load_config(file).seed == 7
 
@@ -333,13 +327,11 @@ def test_no_field_that_is_gone_is_explained(kind):
 )
 def test_an_unknown_field_is_named(wanted, message):
     if wanted:
-        with pytest.raises(ConfigError, match=message):
-            describe(wanted)
+        refused(ConfigError, message, describe, wanted)
 
 
 def test_the_page_of_the_configuration_is_up_to_date(capsys):
-    with pytest.raises(SystemExit, match="0"):
-        main(["train", "--help-fields=markdown"])
+    refused(SystemExit, "0", main, ["train", "--help-fields=markdown"])
     made = capsys.readouterr().out
     assert PAGE.read_text() == made, "blitzgs train --help-fields=markdown > docs/configuration.md"
     rows = [line.split("|") for line in made.splitlines() if line.count("|") == 2]

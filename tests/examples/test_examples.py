@@ -35,10 +35,7 @@ def build(tmp_path_factory):
     if shutil.which("cmake") is None:
         pytest.skip("needs cmake")
     build = tmp_path_factory.mktemp("cpp") / "build"
-    options = [
-        f"-DBLITZGS_TORCH_DIR={Path(torch.__file__).parent}",
-        f"-DBLITZGS_LIBRARY_DIR={LIBRARY_DIR}",
-    ]
+    options = [f"-DBLITZGS_TORCH_DIR={Path(torch.__file__).parent}", f"-DBLITZGS_LIBRARY_DIR={LIBRARY_DIR}"]
     subprocess.run(["cmake", "-S", str(ROOT / "examples" / "cpp"), "-B", str(build), *options], check=True)
     subprocess.run(["cmake", "--build", str(build), "-j2"], check=True)
     return build

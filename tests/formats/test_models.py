@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from blitzgs.formats import packed
 from blitzgs.formats.gaussians import MIP, Gaussians
 from blitzgs.formats.models import FORMATS, check_replaces, read_gaussians, with_degree
-from tests.helpers import some_gaussians
+from tests.helpers import refused, some_gaussians
 
 gaussforge = pytest.importorskip("gaussforge")
 gsply = pytest.importorskip("gsply")
@@ -227,8 +227,7 @@ def test_lower_degrees_and_single_gaussians(tmp_path, name, degree):
     found = read_gaussians(written(tmp_path, name, model))
     assert len(found) == len(model) and found.degree == (0 if name == "splat" else degree)
     np.testing.assert_allclose(found.means[:1].norm(), found.means[:1].norm())
-    with pytest.raises(ValueError, match="no Gaussian"):
-        written(tmp_path, name, some_gaussians(0, degree))
+    refused(ValueError, "no Gaussian", written, tmp_path, name, some_gaussians(0, degree))
 
 
 @pytest.mark.parametrize("name", ["compressed-ply", "spz", "sog", "splat"])
@@ -297,12 +296,10 @@ def test_no_file_of_another_format_is_replaced(tmp_path):
     for name, format_ in FORMATS.items():
         path = tmp_path / f"{name}{format_.suffix}"
         check_replaces(path, format_)
-        with pytest.raises(ValueError, match="choose a name that ends in"):
-            check_replaces(tmp_path / "a.txt", format_)
+        refused(ValueError, "choose a name that ends in", check_replaces, tmp_path / "a.txt", format_)
         if format_.starts:
             path.write_bytes(b"mine")
-            with pytest.raises(FileExistsError, match="choose another name"):
-                check_replaces(path, format_)
+            refused(FileExistsError, "choose another name", check_replaces, path, format_)
 
 
 def gz(*parts):
@@ -435,11 +432,9 @@ def test_other_files_are_refused(tmp_path):
     path = tmp_path / "a.bin"
     for content in (b"", b"glTF", b"hello"):
         path.write_bytes(content)
-        with pytest.raises(ValueError, match="is no model"):
-            read_gaussians(path)
+        refused(ValueError, "is no model", read_gaussians, path)
     path.write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
-    with pytest.raises(ValueError, match="a.bin"):
-        read_gaussians(path)
+    refused(ValueError, "a.bin", read_gaussians, path)
 
 
 def test_compressed_ply_has_the_layout_of_supersplat(tmp_path, model):

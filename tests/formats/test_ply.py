@@ -13,7 +13,7 @@ import torch
 from blitzgs.formats import gaussians as blocks
 from blitzgs.formats.ply import PlySource, read_ply, read_points, save_ply, write_ply
 from blitzgs.formats.selection import Selected, Selection, read_polygon
-from tests.helpers import some_gaussians
+from tests.helpers import refused, some_gaussians
 
 
 def gaussians(n: int, degree: int, seed: int = 0) -> dict[str, torch.Tensor]:
@@ -162,8 +162,7 @@ def test_damaged_files_are_named_with_the_reason(tmp_path, change, message):
     inria_file(tmp_path / "in.ply", gaussians(3, 0))
     bad = tmp_path / "bad.ply"
     bad.write_bytes(change((tmp_path / "in.ply").read_bytes()))
-    with pytest.raises(ValueError, match=f"bad.ply.*{message}"):
-        read_ply(bad)
+    refused(ValueError, f"bad.ply.*{message}", read_ply, bad)
 
 
 def test_shapes_are_checked_and_no_file_appears(tmp_path):
@@ -208,8 +207,7 @@ def test_colours_that_are_no_bytes_or_fractions_are_refused(tmp_path, kind, red)
     types = [(n, "f8") for n in "xyz"] + [(c, kind) for c in ("red", "green", "blue")]
     rows = np.array([(1, 2, 3, red, 0, 0)], dtype=types)
     plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(tmp_path / "a.ply")
-    with pytest.raises(ValueError, match="a.ply: a point has the colour"):
-        read_points(tmp_path / "a.ply")
+    refused(ValueError, "a.ply: a point has the colour", read_points, tmp_path / "a.ply")
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
@@ -220,13 +218,11 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
     try:
-        with pytest.raises(OSError, match="model.ply cannot be written: File too large"):
-            write_ply(path, **gaussians(5000, 3))
+        refused(OSError, "model.ply cannot be written: File too large", write_ply, path, **gaussians(5000, 3))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["model.ply"]
-    with pytest.raises(OSError, match="/proc"):
-        write_ply("/proc/model.ply", **gaussians(1, 0))
+    refused(OSError, "/proc", write_ply, "/proc/model.ply", **gaussians(1, 0))
 
 
 def test_blocks_of_a_file_are_its_rows(tmp_path, monkeypatch):
@@ -248,11 +244,9 @@ def test_blocks_of_a_file_are_its_rows(tmp_path, monkeypatch):
     width = 4 * (17 + 24 + 1)
     content[-100 * width : 4 - 100 * width] = np.float32("nan").tobytes()
     (tmp_path / "m.ply").write_bytes(content)
-    with pytest.raises(ValueError, match=r"m\.ply, from Gaussian 100 on: means .* first is number 50"):
-        list(source.blocks())
+    refused(ValueError, r"m\.ply, from Gaussian 100 on: means .* first is number 50", list, source.blocks())
     (tmp_path / "m.ply").write_bytes(content[:-10])
-    with pytest.raises(ValueError, match=r"m\.ply"):
-        PlySource(tmp_path / "m.ply")
+    refused(ValueError, r"m\.ply", PlySource, tmp_path / "m.ply")
 
 
 ORIGIN = (500_000.0, 4_600_000.0, 100.0)
@@ -309,8 +303,7 @@ def test_the_degree_is_cut_and_never_raised(model):
 def test_an_empty_choice_is_refused(model):
     with pytest.raises(ValueError, match="no Gaussian meets"):
         Selected(model, Selection(box=np.array([[90.0] * 3, [91.0] * 3])))
-    with pytest.raises(ValueError, match="no octree levels"):
-        Selected(some_gaussians(3, 0), Selection(levels=(0, 1)))
+    refused(ValueError, "no octree levels", Selected, some_gaussians(3, 0), Selection(levels=(0, 1)))
 
 
 def test_polygons_of_files(tmp_path):
@@ -332,5 +325,4 @@ def test_polygons_of_files(tmp_path):
         "0 0 0\n" * 4,
     ):
         path.write_text(text)
-        with pytest.raises(ValueError, match="region cannot be read as a polygon"):
-            read_polygon(path)
+        refused(ValueError, "region cannot be read as a polygon", read_polygon, path)

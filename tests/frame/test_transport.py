@@ -16,13 +16,7 @@ from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.frame.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport, peer
 from blitzgs.frame.transport.collective import CollectiveWayBack
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT
-from blitzgs.frame.transport.protocol import (
-    CapacityEstimate,
-    Exchange,
-    ExchangeResult,
-    Traffic,
-    Transport,
-)
+from blitzgs.frame.transport.protocol import CapacityEstimate, Exchange, ExchangeResult, Traffic, Transport
 from blitzgs.ops.exchange import scatter_splats
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project_splats
@@ -30,7 +24,7 @@ from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Si
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.distributed.rank_harness import run_ranks
 from tests.frame.test_sharded_rendering import OPTIONS, cameras
-from tests.helpers import parameter_gradients, sum_of_ranks
+from tests.helpers import parameter_gradients, refused, sum_of_ranks
 from tests.training.tiny import random_gaussians
 
 
@@ -50,10 +44,7 @@ class RecordingTransport:
         self.calls: list[tuple[str, Sizes | None]] = []
 
     def project_and_send(
-        self,
-        inputs: ProjectionInputs,
-        assignment: TileAssignment | None,
-        capacity: Sizes | None,
+        self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
     ) -> RecordingExchange:
         """See `Transport.project_and_send`."""
         self.calls.append(("start", capacity))
@@ -288,8 +279,7 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
     assert torch.equal(sums[masks == 1], table) and not sums[masks == 0].any()
     later, _ = finished()
     later.way_back.check_still_valid()
-    with pytest.raises(RuntimeError, match="a later exchange has overwritten"):
-        result.way_back.check_still_valid()
+    refused(RuntimeError, "a later exchange has overwritten", result.way_back.check_still_valid)
     # One entry more than the capacity: the frame is repeated with a larger capacity.
     short = CapacityEstimate(Sizes(1, 1, needed[2] - 1))
     again = PeerTransport(alone, short)
@@ -324,12 +314,10 @@ def test_traffic_of_uneven_ranks():
 
 def test_a_transport_that_does_not_serve_the_job_says_so():
     assignment = TileAssignment(Ranks(), ranges_for(1))
-    with pytest.raises(ValueError, match="serves one rank"):
-        LocalTransport().project_and_send(scene(), assignment, None)
+    refused(ValueError, "serves one rank", LocalTransport().project_and_send, scene(), assignment, None)
     with pytest.raises(ValueError, match="need an assignment"):
         CollectiveTransport(Ranks()).project_and_send(scene(), None, None)
-    with pytest.raises(ValueError, match="share no memory"):
-        PeerTransport(Ranks())
+    refused(ValueError, "share no memory", PeerTransport, Ranks())
 
 
 def test_one_rank_needs_no_way_back():

@@ -13,9 +13,10 @@ from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.reference.render import contributions as by_definition
+from blitzgs.reference.render import top_mass
 from blitzgs.spawn.candidates import FEATURES, spawn_features
 from blitzgs.table.table import GaussianTable
-from tests.helpers import BACKENDS, DEVICES, random_scene
+from tests.helpers import BACKENDS, DEVICES, random_scene, refused
 from tests.population.test_density import LEVELS, random_table
 
 
@@ -162,8 +163,7 @@ def test_bad_arguments_of_contributions_are_named(change, error, message):
     given = {
         name: getattr(scene, name) for name in ("means", "quats", "scales", "opacities", "viewmats", "Ks")
     }
-    with pytest.raises(error, match=message):
-        blitzgs.contributions(**{**given, "width": 40, "height": 32, **change})
+    refused(error, message, blitzgs.contributions, **{**given, "width": 40, "height": 32, **change})
 
 
 SHARE = 99, 100
@@ -174,13 +174,9 @@ def by_sorting(weights, segments, ids, share):
     chosen = [False] * len(weights)
     for segment in set(segments):
         mine = [i for i, s in enumerate(segments) if s == segment]
-        mine.sort(key=lambda i: (-weights[i], ids[i]))
-        missing = sum(weights[i] for i in mine) * Fraction(*share)
-        for i in mine:
-            if missing <= 0:
-                break
-            chosen[i] = True
-            missing -= weights[i]
+        picked = top_mass([weights[i] for i in mine], [ids[i] for i in mine], Fraction(*share))
+        for i, is_chosen in zip(mine, picked, strict=True):
+            chosen[i] = is_chosen
     return chosen
 
 
@@ -333,8 +329,7 @@ def test_wrong_arguments():
         spawn_features(table, rows.int(), is_split, TIME, EXTENT, LEVELS)
     with pytest.raises(RuntimeError, match=r"is_split must have shape \[6\], got \[5\]"):
         spawn_features(table, rows, is_split[:5], TIME, EXTENT, LEVELS)
-    with pytest.raises(RuntimeError, match="extent must be positive"):
-        spawn_features(table, rows, is_split, TIME, 0.0, LEVELS)
+    refused(RuntimeError, "extent must be positive", spawn_features, table, rows, is_split, TIME, 0.0, LEVELS)
     with pytest.raises(RuntimeError, match="level_count must be positive"):
         spawn_features(table, rows, is_split, TIME, EXTENT, 0)
 

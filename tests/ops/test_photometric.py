@@ -10,25 +10,12 @@ from blitzgs.ops.photometric import (
     pixel_counts,
     ssim,
 )
-from tests.helpers import DEVICES, sum_parts
-
-
-def reference_ssim_map(x, y):
-    """Textbook SSIM in float64 with conv2d, [B, H, W, 3]."""
-    x, y = (t.double().permute(0, 3, 1, 2) for t in (x, y))
-    line = torch.exp(-((torch.arange(11, dtype=torch.float64, device=x.device) - 5) ** 2) / 4.5)
-    window = torch.outer(line, line)
-    window = (window / window.sum()).expand(3, 1, 11, 11)
-    blur = lambda t: F.conv2d(t, window, padding=5, groups=3)  # noqa: E731
-    mx, my = blur(x), blur(y)
-    vx, vy, cov = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
-    top = (2 * mx * my + 0.01**2) * (2 * cov + 0.03**2)
-    return (top / ((mx * mx + my * my + 0.01**2) * (vx + vy + 0.03**2))).permute(0, 2, 3, 1)
+from tests.helpers import DEVICES, ssim_map, sum_parts
 
 
 def reference_sums(x, y, masks=None):
     keep = 1 if masks is None else (masks != 0).double()[..., None]
-    parts = (x.double() - y.double()).abs(), reference_ssim_map(x, y)
+    parts = (x.double() - y.double()).abs(), ssim_map(x, y)
     return tuple((part * keep).sum((1, 2, 3)) for part in parts)
 
 
@@ -48,8 +35,8 @@ def images(shape=(2, 53, 70), dtype=torch.float32, device="cpu", seed=0):
 
 def test_reference_is_one_for_equal_images_and_low_for_noise():
     x, _, _ = images(dtype=torch.float64)
-    torch.testing.assert_close(reference_ssim_map(x, x), torch.ones_like(x))
-    assert reference_ssim_map(x, torch.rand_like(x)).mean() < 0.3
+    torch.testing.assert_close(ssim_map(x, x), torch.ones_like(x))
+    assert ssim_map(x, torch.rand_like(x)).mean() < 0.3
 
 
 def sums_and_gradient(*arguments):

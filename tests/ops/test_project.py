@@ -181,28 +181,6 @@ def test_dense_gradients_equal_scattered_compact_ones(backend, degree, coefficie
     torch.library.opcheck(torch.ops.blitzgs.project_bwd, arguments, {"dense": True})
 
 
-def test_regularisers_add_the_slopes_of_smallest_axis_and_opacity():
-    scene = before_activation(random_scene(n=50, cameras=2, dtype=torch.float64))
-    splats = project_scene(scene, raw=True)
-    P = len(splats.depths)
-    zeros = torch.zeros(P, 3, dtype=torch.float64)
-    weights, others = torch.tensor([[0.5, 2.0], [-0.3, 0.7]], dtype=torch.float64)
-    options = ProjectionOptions(scene.width, scene.height)
-    _, _, v_scales, v_opacities, _, _ = torch.ops.blitzgs.project_bwd(
-        [scene.means, scene.quats, scene.scales, scene.opacities],
-        *WeightedViews(scene.viewmats, scene.Ks, weights, others),
-        splats.camera_ids, splats.visible_ids, splats.splat_offsets, None, *options,
-        [zeros[:, :2], zeros, zeros[:, 0]], None, False,
-    )  # fmt: skip
-    log_scales, logits = scene.scales.requires_grad_(), scene.opacities.requires_grad_()
-    ids, views = splats.gaussian_ids.long(), splats.camera_ids.long()
-    terms = log_scales.exp().amin(dim=1)[ids] * weights[views] + logits.sigmoid()[ids] * others[views]
-    terms.sum().backward()
-    visible = splats.visible_ids.long()
-    assert relative_error(v_scales, log_scales.grad[visible]) < 1e-14
-    assert relative_error(v_opacities, logits.grad[visible]) < 1e-14
-
-
 def test_non_finite_gaussians_are_dropped_and_others_are_unchanged():
     scene = random_scene(n=40, cameras=2)
     clean = project_scene(scene)

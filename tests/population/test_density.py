@@ -11,12 +11,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.counter_random import hash_keys, normal
 from blitzgs.population import growth
-from blitzgs.population.density import (
-    DensityRules,
-    cap_opacities,
-    densify,
-    rotations,
-)
+from blitzgs.population.density import DensityRules, cap_opacities, densify, rotations
 from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit, rows_that_fit
 from blitzgs.runs.clean import floaters, views_counting
 from blitzgs.table.placement import place

@@ -148,9 +148,9 @@ RULES = DensityRules(grad_threshold=1.0, clone_scale=0.05, min_opacity=0.05, max
 CALL = {"time": TIME, "step": STEP, "seed": SEED, "level_count": LEVELS}
 
 
-def by_the_double_sum(opacity: float, copies: int) -> tuple[float, float]:
+def by_the_double_sum(opacity: float, copies: int, least: float = 0.0) -> tuple[float, float]:
     """Return opacity and factor of the scales as eq. 9 of the paper has them, in rational numbers."""
-    new = 1.0 - (1.0 - opacity) ** (1.0 / copies)
+    new = max(1.0 - (1.0 - opacity) ** (1.0 / copies), least)
     total = Fraction(0)
     for i in range(1, copies + 1):
         for k in range(i):

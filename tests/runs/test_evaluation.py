@@ -11,7 +11,6 @@ import sys
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
@@ -28,24 +27,7 @@ from blitzgs.runs.evaluation import correct_colours, image_metrics, load_lpips
 from blitzgs.runs.export import export, open_source, source_of
 from blitzgs.runs.folder import open_run
 from blitzgs.runs.world import in_world, load_world_frame, rotated_harmonics, save_world_frame
-from tests.helpers import export_ply, save_checkpoint
-
-
-def plain_ssim(x, y):
-    """SSIM map [H, W, 3] by direct convolution in float64."""
-    taps = torch.exp(-0.5 * (torch.arange(11, dtype=torch.float64) - 5) ** 2 / 1.5**2)
-    taps /= taps.sum()
-    window = (taps[:, None] * taps[None, :])[None, None].repeat(3, 1, 1, 1)
-
-    def blur(image):
-        return F.conv2d(image, window, padding=5, groups=3)
-
-    x, y = (image.permute(2, 0, 1)[None].double() for image in (x, y))
-    mx, my = blur(x), blur(y)
-    vx, vy, cxy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
-    c1, c2 = 0.01**2, 0.03**2
-    ssim = (2 * mx * my + c1) * (2 * cxy + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
-    return ssim[0].permute(1, 2, 0)
+from tests.helpers import export_ply, save_checkpoint, ssim_map
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -59,7 +41,7 @@ def test_metrics_match_plain_formulas(masked):
     mse = ((clamped.double() - target.double() / 255) ** 2)[counted].mean().item()
     metrics = image_metrics(render, target, mask)
     assert metrics["psnr"] == pytest.approx(-10 * math.log10(mse), abs=1e-4)
-    expected = plain_ssim(clamped, target.double() / 255)[counted].mean().item()
+    expected = ssim_map(clamped[None], target[None].double() / 255)[0][counted].mean().item()
     assert metrics["ssim"] == pytest.approx(expected, abs=1e-5)
 
 
@@ -122,7 +104,7 @@ def test_a_checkpoint_is_streamed_with_its_pending_steps(trained, tmp_path, monk
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-def test_a_damaged_checkpoint_is_passed_over(trained, tmp_path, capsys):
+def test_a_damaged_checkpoint_is_passed_over(trained, tmp_path, failure):
     run = tmp_path / "run"
     shutil.copytree(trained[1], run)
     newest = max((run / "checkpoints").glob("checkpoint_*"))
@@ -132,8 +114,7 @@ def test_a_damaged_checkpoint_is_passed_over(trained, tmp_path, capsys):
     (broken / "manifest.json").write_text("{}")
     with pytest.warns(UserWarning, match=f"checkpoint_999999 is damaged: .*; using {newest.name}"):
         assert len(open_source(run)) == before
-    assert main(["export", str(broken), "--ply", str(tmp_path / "a.ply")]) == 1
-    assert "damaged" in capsys.readouterr().err
+    assert "damaged" in failure("export", broken, "--ply", tmp_path / "a.ply")
     assert main(["export", str(newest), "--ply", str(tmp_path / "a.ply")]) == 0
     assert len(read_ply(tmp_path / "a.ply")) == before
 

@@ -21,7 +21,7 @@ from blitzgs.formats.ply import read_ply
 from blitzgs.runs import checkpoint, run_files
 from blitzgs.runs.export import without_antialiasing
 from blitzgs.training.trainer import Trainer
-from tests.helpers import export_ply, save_checkpoint
+from tests.helpers import export_ply, refused, save_checkpoint
 from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene
 
 
@@ -75,8 +75,7 @@ def test_what_a_run_folder_holds(trained, tmp_path):
     moved[:3, 3] -= moved[:3, :3] @ np.array(model.space.offset)
     again = model.camera(stored.cameras[3].K, moved, 48, 32)
     torch.testing.assert_close(model.render(again), model.render(stored.cameras[3]), rtol=0, atol=1e-4)
-    with pytest.raises(FileNotFoundError, match="is not a run"):
-        blitzgs.open_run(tmp_path)
+    refused(FileNotFoundError, "is not a run", blitzgs.open_run, tmp_path)
 
 
 def test_a_model_renders_depth_and_alpha_too(trained):
@@ -97,8 +96,7 @@ def test_a_model_renders_depth_and_alpha_too(trained):
     torch.testing.assert_close(other.render(camera, "RGB+ED", True), plain.render(camera, "RGB+ED", True))
     covered = both[..., 4] > 0.9
     assert covered.any() and both[..., 3][covered].median() > 0
-    with pytest.raises(ValueError, match="render_mode must be one of .*, got 'depth'"):
-        model.render(camera, "depth")
+    refused(ValueError, "render_mode must be one of .*, got 'depth'", model.render, camera, "depth")
 
 
 def test_a_run_and_its_model_print_in_a_line(trained, copy):
@@ -129,8 +127,7 @@ def test_a_camera_that_cannot_be_rendered_is_refused(trained, change, message):
     model = blitzgs.open_run(trained[1]).model()
     fields = {"K": np.eye(3), "world_to_camera": np.eye(4), "width": 48, "height": 32}
     assert model.camera(**fields).width == 48
-    with pytest.raises(ValueError, match=message):
-        model.camera(**fields | change)
+    refused(ValueError, message, model.camera, **fields | change)
 
 
 @pytest.mark.parametrize(
@@ -155,13 +152,10 @@ def test_a_model_renders_the_cameras_of_its_run_by_index(trained):
     assert repr(cameras) == "RunCameras(8 cameras: 7 train, 1 test)"
     for index in (cameras.test[0], np.int64(0), 7):
         assert torch.equal(model.render(index), model.render(cameras.cameras[index]))
-    with pytest.raises(IndexError, match="camera 8: the run has the cameras 0 to 7"):
-        model.render(8)
+    refused(IndexError, "camera 8: the run has the cameras 0 to 7", model.render, 8)
     for wrong in ("a", None, True, 1.5):
-        with pytest.raises(TypeError, match="camera must be a camera, such as run.cameras"):
-            model.render(wrong)
-    with pytest.raises(TypeError, match=r"got 0 \(int\)"):
-        dataclasses.replace(model, run=None).render(0)
+        refused(TypeError, "camera must be a camera, such as run.cameras", model.render, wrong)
+    refused(TypeError, r"got 0 \(int\)", dataclasses.replace(model, run=None).render, 0)
 
 
 def test_too_large_an_image_is_said_to_lack_memory(trained):
@@ -170,8 +164,7 @@ def test_too_large_an_image_is_said_to_lack_memory(trained):
     match = (
         "not enough memory to render 1 view of 1,000,000 x 60,000 pixels with .* Gaussians: the pixels alone"
     )
-    with pytest.raises(MemoryError, match=match):
-        run.model().render(camera)
+    refused(MemoryError, match, run.model().render, camera)
 
 
 def test_render_and_export_need_no_photographs(copy, tmp_path):
@@ -186,14 +179,13 @@ def test_render_and_export_need_no_photographs(copy, tmp_path):
 
 
 @pytest.mark.parametrize("command", ["eval", "render"])
-def test_a_run_is_shown_with_another_pool_than_it_was_trained_with(copy, tmp_path, capsys, command):
+def test_a_run_is_shown_with_another_pool_than_it_was_trained_with(copy, tmp_path, capsys, failure, command):
     data, folder = copy
     config = (folder / "config.yaml").read_text()
     (folder / "config.yaml").write_text(config.replace("resident_gb: 0.0", "resident_gb: 1.0e-06"))
     arguments = [command, str(folder), "--out", str(tmp_path / "out")]
     arguments += ["--data", str(data)] if command == "eval" else []
-    assert main(arguments) == 1
-    assert "--resident-gb" in capsys.readouterr().err
+    assert "--resident-gb" in failure(*arguments)
     for gigabytes in ("0", "1"):
         assert main([*arguments, "--resident-gb", gigabytes]) == 0
     for wrong in ("nan", "all"):
@@ -210,21 +202,19 @@ def test_a_split_without_views_is_named(copy, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_lost_photograph_costs_its_view_alone(copy, capsys):
+def test_a_lost_photograph_costs_its_view_alone(copy, capsys, failure):
     data, folder = copy
     whole = json.loads((folder / "evaluation" / "000040" / "metrics.json").read_text())
     for name in ("01.png", "05.png"):  # photographs of training views are lost; split and world do not change
         (data / "images" / name).unlink()
     flags = ["--data", str(data)]
-    assert main(["eval", str(folder), *flags]) == 1
-    assert "05.png" in (message := capsys.readouterr().err) and "(--allow-missing)" in message
+    assert "05.png" in (message := failure("eval", folder, *flags)) and "(--allow-missing)" in message
     assert main(["eval", str(folder), *flags, "--allow-missing", "--split", "train"]) == 0
     capsys.readouterr()
     assert main(["eval", str(folder), *flags, "--allow-missing"]) == 0
     assert json.loads(capsys.readouterr().out)["psnr"] == whole["psnr"]
     resume = ["train", "--out", str(folder), "--resume", *flags]
-    assert main(resume) == 1
-    assert "--data.allow_missing=true" in capsys.readouterr().err
+    assert "--data.allow_missing=true" in failure(*resume)
     assert main([*resume, "--data.allow_missing=true"]) == 0
 
 
@@ -286,12 +276,11 @@ def test_what_a_resume_may_change(trained):
 @pytest.mark.parametrize(
     "state", [{}, {"progress": {"steps": 1}}, {"progress": [], "space": {"offset": 3}, "config": {}}]
 )
-def test_a_checkpoint_of_another_version_is_named(trained, tmp_path, capsys, state):
+def test_a_checkpoint_of_another_version_is_named(trained, tmp_path, failure, state):
     shutil.copy(trained[1] / "config.yaml", tmp_path)
     table = run_files.restore(trained[1], Ranks()).table
     save_checkpoint(tmp_path / "checkpoints", {name: table[name] for name in table}, state, Ranks())
-    assert main(["eval", str(tmp_path)]) == 1
-    assert "checkpoint_000000 belongs to another version of BlitzGS" in capsys.readouterr().err
+    assert "checkpoint_000000 belongs to another version of BlitzGS" in failure("eval", tmp_path)
 
 
 def test_no_flipped_bit_of_a_manifest_passes(tmp_path):

@@ -269,7 +269,7 @@ def test_a_capture_that_cannot_be_read_leaves_no_folder(tmp_path):
     assert main(command) == 0
 
 
-def test_one_run_at_a_time(tmp_path, monkeypatch, capsys):
+def test_one_run_at_a_time(tmp_path, monkeypatch, failure):
     from blitzgs.runs import folder_checks
 
     monkeypatch.setattr(folder_checks, "LOCK_SECONDS", 0.1)
@@ -285,8 +285,7 @@ def test_one_run_at_a_time(tmp_path, monkeypatch, capsys):
         assert holder.stdout.readline() == "in\n"
         flags = as_flags("config=defaults", *OVERRIDES, "schedule.iterations=2")
         command = ["train", "--data", str(tmp_path / "data"), "--out", str(out), *flags]
-        assert main(command) == 1
-        assert f"in use by another run (process {holder.pid} on " in capsys.readouterr().err
+        assert f"in use by another run (process {holder.pid} on " in failure(*command)
         assert not (out / "log.jsonl").exists() and not (out / "config.yaml").exists()
     finally:
         holder.kill()

@@ -25,7 +25,7 @@ from blitzgs.spawn.gate import (
     veto_lowest,
 )
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import DEVICES
+from tests.helpers import DEVICES, refused
 
 xgboost = pytest.importorskip("xgboost")
 SCHEDULE = {"schedule.iterations": 100}
@@ -215,8 +215,7 @@ def test_fitting_one_scene_holds_out_parents(tmp_path):
 def test_runs_of_different_schedules_are_refused_by_the_fields_that_differ(tmp_path):
     other = SCHEDULE | {"schedule.scale": 0.5}
     message = r"^a and b were .* different schedules, .* each: schedule.scale \(None and 0.5\)$"
-    with pytest.raises(ValueError, match=message):
-        fit([spawns("a"), spawns("b", schedule=other)], tmp_path / "h.json")
+    refused(ValueError, message, fit, [spawns("a"), spawns("b", schedule=other)], tmp_path / "h.json")
 
 
 def test_scenes_of_the_same_name_are_told_apart(tmp_path):
@@ -318,8 +317,7 @@ def test_bad_files_are_named(gate, tmp_path, break_it, message):
     info_path(path).write_text(info_path(gate[0]).read_text())
     SpawnGate(path)
     break_it(path)
-    with pytest.raises(GateError, match=message):
-        SpawnGate(path)
+    refused(GateError, message, SpawnGate, path)
 
 
 def test_a_gate_in_ubjson_is_refused_with_how_to_convert_it(gate, tmp_path):
@@ -329,5 +327,4 @@ def test_a_gate_in_ubjson_is_refused_with_how_to_convert_it(gate, tmp_path):
         GateError, match=r"gate\.ubj: only XGBoost's JSON is read: .*save_model\('gate.json'\)"
     ):
         SpawnGate(path)
-    with pytest.raises(GateError, match=r"^\.: no such gate"):
-        SpawnGate(gate_file(""))
+    refused(GateError, r"^\.: no such gate", SpawnGate, gate_file(""))

@@ -296,10 +296,7 @@ def start_trainer(folder, device, steps):
 
 @pytest.mark.parametrize(
     ("device", "steps"),
-    [
-        ("cpu", 1000),
-        pytest.param("cuda", 100_000, marks=[pytest.mark.slow, pytest.mark.cuda, needs_cuda]),
-    ],
+    [("cpu", 1000), pytest.param("cuda", 100_000, marks=[pytest.mark.slow, pytest.mark.cuda, needs_cuda])],
 )
 @torch.no_grad()
 def test_a_long_run_stays_with_dense_adam_and_needs_no_more_memory(tmp_path, device, steps):

@@ -35,11 +35,7 @@ def facing_scene(n: int, width: int, height: int, seed: int = 0, focal: float = 
     z = uniform(n, seed=seed + 1, low=2.0, high=4.0)
     pixels = uniform(n, 2, seed=seed + 2) * torch.tensor([width, height])
     scene.means = torch.stack(
-        [
-            (pixels[:, 0] - scene.Ks[0, 0, 2]) / focal * z,
-            (pixels[:, 1] - scene.Ks[0, 1, 2]) / focal * z,
-            z,
-        ],
+        [(pixels[:, 0] - scene.Ks[0, 0, 2]) / focal * z, (pixels[:, 1] - scene.Ks[0, 1, 2]) / focal * z, z],
         dim=1,
     )
     return scene

@@ -16,7 +16,7 @@ from blitzgs.table.blocks import BlockIndex, BlockVisibility, Cameras, culled_bl
 from blitzgs.table.host_table import HostMemoryError, HostTable
 from blitzgs.table.pool import Moved, Pool, PoolError
 from blitzgs.table.table import GaussianTable
-from tests.helpers import DEVICES
+from tests.helpers import DEVICES, refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
 
 LIMITS = (NEAR, FAR, 0.3)
@@ -225,8 +225,7 @@ def test_large_batches_do_without_a_look_ahead():
 
 
 def test_a_budget_below_two_blocks_is_refused():
-    with pytest.raises(PoolError, match="less than two blocks"):
-        make_pool(slots=0)
+    refused(PoolError, "less than two blocks", make_pool, slots=0)
 
 
 def test_a_table_that_fits_is_loaded_once():
@@ -296,8 +295,12 @@ def assert_same_bits(table, other):
 def test_a_host_without_room_is_named(monkeypatch, tmp_path):
     (tmp_path / "meminfo").write_text("MemTotal: 100 kB\nMemAvailable:       40 kB\n")
     monkeypatch.setattr(host_table, "MEMORY_INFO", tmp_path / "meminfo")
-    with pytest.raises(HostMemoryError, match=r"10,000 Gaussians needs [0-9.]+ [kM]B .*max_gaussians"):
-        host_copy(make_table(10_000))
+    refused(
+        HostMemoryError,
+        r"10,000 Gaussians needs [0-9.]+ [kM]B .*max_gaussians",
+        host_copy,
+        make_table(10_000),
+    )
     monkeypatch.setattr(host_table, "MEMORY_INFO", tmp_path / "nothing")
     assert host_table.available_bytes() is None
     assert len(host_copy(make_table(1000))) == 1000

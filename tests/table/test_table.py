@@ -9,7 +9,7 @@ from blitzgs.table.blocks import BlockIndex, morton_order, spread
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.placement import place
 from blitzgs.table.table import NO_PARENT, PARAMETERS, REQUIRED, ZERO_AT_BIRTH, GaussianTable, schema
-from tests.helpers import DEVICES
+from tests.helpers import DEVICES, refused
 
 
 def filled_table(count: int, seed: int = 0) -> GaussianTable:
@@ -118,11 +118,9 @@ def test_a_table_of_parameters_alone_holds_first_gaussians():
 def test_new_rows_without_a_column_that_was_added_later_are_refused():
     table, new = filled_table(5), filled_table(2, seed=2).columns
     table["phi"] = torch.arange(5.0)
-    with pytest.raises(ValueError, match=r"new rows lack the columns \['phi'\]"):
-        table.append(new)
+    refused(ValueError, r"new rows lack the columns \['phi'\]", table.append, new)
     placement = place(5, torch.tensor([2]), torch.tensor([0, 1]), new["means"])
-    with pytest.raises(ValueError, match=r"new rows lack the columns \['phi'\]"):
-        table.replace(placement, new)
+    refused(ValueError, r"new rows lack the columns \['phi'\]", table.replace, placement, new)
     table.append(new | table.inherited(torch.tensor([3, 1])))
     assert table["phi"].tolist() == [0, 1, 2, 3, 4, 3, 1]
 
@@ -174,10 +172,8 @@ def test_errors_name_the_column():
         filled_table(4).append({k: v for k, v in columns.items() if k != "id"})
     with pytest.raises(ValueError, match=r"no columns \['colour'\]"):
         filled_table(4).append({**columns, "colour": torch.zeros(4)})
-    with pytest.raises(ValueError, match=r"mask must be bool \[4\]"):
-        filled_table(4).keep(torch.ones(3, dtype=torch.bool))
-    with pytest.raises(ValueError, match=r"order must be int64 \[4\]"):
-        filled_table(4).permute(torch.arange(3))
+    refused(ValueError, r"mask must be bool \[4\]", filled_table(4).keep, torch.ones(3, dtype=torch.bool))
+    refused(ValueError, r"order must be int64 \[4\]", filled_table(4).permute, torch.arange(3))
 
 
 def in_place(gone, beside):

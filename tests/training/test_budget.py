@@ -24,6 +24,7 @@ from blitzgs.training.budget import Budget, extended
 from blitzgs.training.replay import replay
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
+from tests.helpers import refused
 from tests.training.tiny import (
     OVERRIDES,
     as_flags,
@@ -225,8 +226,7 @@ def test_a_new_run_measures_anew_whatever_its_configuration_has_noted(tmp_path):
 def test_a_gate_is_not_replayed_on_a_run_by_the_clock(tmp_path):
     config = tiny_config("schedule.minutes=2", "population.lineage=true")
     arms = replay(config, *tiny_scene(), tmp_path / "run", tmp_path / "out", None, 0.5, Ranks())
-    with pytest.raises(ValueError, match=r"was trained with schedule.minutes \(2\): its arms would differ"):
-        next(arms)
+    refused(ValueError, r"was trained with schedule.minutes \(2\): its arms would differ", next, arms)
 
 
 def _train_on_ranks(ranks, folder):
@@ -280,8 +280,7 @@ def test_the_new_length(overrides, by, images):
 def test_a_run_that_is_not_finished_is_not_extended():
     with pytest.raises(ConfigError, match=r"not finished \(50 of 100 images\): continue it with --resume"):
         extended(tiny_config(), 50, 2)
-    with pytest.raises(ConfigError, match="schedule"):
-        extended(tiny_config(), 100, 1e9)
+    refused(ConfigError, "schedule", extended, tiny_config(), 100, 1e9)
 
 
 def extend(folder, by, *overrides):
@@ -299,8 +298,7 @@ def test_an_interrupted_extension_ends_as_an_uninterrupted_one(tmp_path, monkeyp
             with monkeypatch.context() as patch:
                 stop_at(patch, 120)
                 assert extend(tmp_path / name, 1.4).train() is None
-            with pytest.raises(ConfigError, match=r"not finished \(120 of 140 images\)"):
-                extend(tmp_path / name, 2)
+            refused(ConfigError, r"not finished \(120 of 140 images\)", extend, tmp_path / name, 2)
             config = load_config(tmp_path / name / run_files.CONFIG)
             running = Trainer(config, *tiny_scene(), tmp_path / name, Ranks(), resume=True)
         assert running.train()["images"] == 140

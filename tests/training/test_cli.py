@@ -165,12 +165,7 @@ def test_mistakes_get_a_message(arguments, status, message, capsys, tmp_path, mo
     assert message in printed and "Traceback" not in printed
 
 
-def fails(capsys, *arguments):
-    assert main([str(argument) for argument in arguments]) == 1
-    return capsys.readouterr().err
-
-
-def test_another_capture_is_refused(trained, tmp_path, capsys):
+def test_another_capture_is_refused(trained, tmp_path, failure):
     shutil.copytree(trained[0], tmp_path / "other: one")
     for name in ("eval", "render"):
         flags = ["--out", tmp_path / name, "--data", tmp_path / "other: one"]
@@ -180,7 +175,7 @@ def test_another_capture_is_refused(trained, tmp_path, capsys):
     struct.pack_into("<d", content, 8 + 4 + 4 * 8, 9.0)  # the first camera's translation along x
     poses.write_bytes(content)
     for name in ("eval", "render"):
-        message = fails(capsys, name, trained[1], *flags[2:], "--out", tmp_path / "no")
+        message = failure(name, trained[1], *flags[2:], "--out", tmp_path / "no")
         assert "is not the capture of the run" in message and not (tmp_path / "no").exists()
 
 
@@ -199,29 +194,24 @@ def test_photographs_that_were_changed_meanwhile_are_named(trained, tmp_path):
             assert main(command) == 0
 
 
-def test_mistakes_with_files_name_them(trained, tmp_path, capsys):
+def test_mistakes_with_files_name_them(trained, tmp_path, failure):
     file = tmp_path / "binary"
     file.write_bytes(b"\xff\xfe")
     data = ["--data", trained[0], "--out", tmp_path / "x"]
-    assert f"{file}: not valid YAML" in fails(capsys, "train", "--config", file, *data)
+    assert f"{file}: not valid YAML" in failure("train", "--config", file, *data)
     for out in (file, file / "inside"):
-        assert f"{file} is a file where a folder is needed" in fails(
-            capsys, "render", trained[1], "--out", out
-        )
-    assert f"{file} is a file where a folder is needed" in fails(capsys, "synth", file / "inside")
-    limited = fails(capsys, "train", "--resume", "--out", trained[1], "--minutes=3")
+        assert f"{file} is a file where a folder is needed" in failure("render", trained[1], "--out", out)
+    assert f"{file} is a file where a folder is needed" in failure("synth", file / "inside")
+    limited = failure("train", "--resume", "--out", trained[1], "--minutes=3")
     assert "--minutes: the run in" in limited and "leave out --minutes" in limited and "--extend" in limited
-    small = fails(capsys, "train", *data, "--data.downscale=100")
+    small = failure("train", *data, "--data.downscale=100")
     assert "downscale 100 leaves 1 x 1 pixels" in small
 
 
-def test_eval_without_held_out_views_says_so(trained, tmp_path, capsys):
-    flags = as_flags("config=defaults", *OVERRIDES) + [
-        "--schedule.scale=0.02",
-        "--data.split=0",
-    ]
+def test_eval_without_held_out_views_says_so(trained, tmp_path, failure):
+    flags = as_flags("config=defaults", *OVERRIDES) + ["--schedule.scale=0.02", "--data.split=0"]
     assert main(["train", "--data", str(trained[0]), "--out", str(tmp_path / "run"), *flags]) == 0
-    assert "no test views: choose another --split" in fails(capsys, "eval", tmp_path / "run")
+    assert "no test views: choose another --split" in failure("eval", tmp_path / "run")
 
 
 def test_show_config_and_help(capsys):

@@ -24,10 +24,10 @@ from tests.training.tiny import (
     assert_same_table,
     events_of,
     steps_of,
-    stop_at,
     tiny_config,
     tiny_scene,
     train,
+    trained_in_parts,
 )
 
 STATISTICS = ("grad_sum", "grad_count", "max_radii")
@@ -199,12 +199,9 @@ def test_a_step_renders_the_camera_of_the_reduced_photograph(tmp_path):
     assert torch.equal(frame.renders, expected) and expected.std() > 0.05
 
 
-def test_a_run_resumes_exactly_while_its_resolution_is_lower(whole_run, tmp_path, monkeypatch):
+def test_a_run_resumes_exactly_while_its_resolution_is_lower(whole_run, tmp_path):
     _, whole, _ = whole_run
-    stop_at(monkeypatch, 30)
-    assert train(tmp_path, *RISING)[1] is None
-    monkeypatch.undo()
-    resumed, _ = train(tmp_path, *RISING, resume=True)
+    resumed = trained_in_parts(train, tmp_path, 30, *RISING)
     assert_same_table(resumed.state.table, whole.state.table)
     assert [event["t"] for event in events_of(tmp_path, "resolution")] == [0, 40]
 

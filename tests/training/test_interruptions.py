@@ -26,8 +26,8 @@ from blitzgs.training.agreement import MAX_STEPS, Agreement, SaveClock, StopRequ
 from blitzgs.training.events import save
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import save_checkpoint
-from tests.training.tiny import at_step, read_log, steps_of, tiny_config, tiny_scene
+from tests.helpers import refused, save_checkpoint
+from tests.training.tiny import assert_same_table, at_step, read_log, steps_of, tiny_config, tiny_scene
 
 ROOT = Path(__file__).parents[2]
 
@@ -53,8 +53,7 @@ def test_what_is_not_finite_is_not_saved(tmp_path, monkeypatch, column):
     at_step(monkeypatch, 40, spoil)
     running = trainer(tmp_path, "schedule.checkpoint_every=13", "log.every=1000")
     message = rf"step 40: rank 0: column '{column}' is not finite in 1 Gaussians \(ids \d+\).*earlier ones"
-    with pytest.raises(NonFiniteError, match=message):
-        running.train()
+    refused(NonFiniteError, message, running.train)
     assert checkpoints(tmp_path) == ["checkpoint_000000", "checkpoint_000001"]
     assert run_files.restore(tmp_path, Ranks()).progress.step == 27
 
@@ -257,16 +256,14 @@ def test_a_photograph_that_vanishes_costs_nothing(tmp_path, monkeypatch):
 
     at_step(monkeypatch, 40, lambda self: setattr(images, "get", gone))
     running = trainer(tmp_path / "cut", images=images)
-    with pytest.raises(PhotographError, match=r"/photos/0\d.png'.*put the photograph back.*--resume"):
-        running.train()
+    refused(PhotographError, r"/photos/0\d.png'.*put the photograph back.*--resume", running.train)
     saved = run_files.restore(tmp_path / "cut", Ranks()).progress.step
     assert 40 <= saved <= 44  # some batches were loaded ahead
     images.get = get
     monkeypatch.undo()
     resumed = trainer(tmp_path / "cut", resume=True)
     resumed.train()
-    for name in whole.state.table:
-        assert torch.equal(resumed.state.table[name], whole.state.table[name]), name
+    assert_same_table(resumed.state.table, whole.state.table)
 
 
 def test_a_held_out_photograph_that_vanishes_costs_nothing(tmp_path):
@@ -280,8 +277,7 @@ def test_a_held_out_photograph_that_vanishes_costs_nothing(tmp_path):
 
     images.get = held_out_is_gone
     running = trainer(tmp_path, "schedule.evaluate_every=30", images=images)
-    with pytest.raises(PhotographError, match=r"/photos/03.png.*put the photograph back.*--resume"):
-        running.train()
+    refused(PhotographError, r"/photos/03.png.*put the photograph back.*--resume", running.train)
     assert run_files.restore(tmp_path, Ranks()).progress.step == 31
     images.get = get
     assert trainer(tmp_path, "schedule.evaluate_every=30", resume=True).train() is not None
@@ -324,8 +320,7 @@ def test_the_last_checkpoint_waits_for_room(tmp_path, monkeypatch, capsys):
 def test_waiting_for_room_ends_when_asked(tmp_path, monkeypatch):
     fail_saves(monkeypatch, 9, lambda: os.kill(os.getpid(), signal.SIGTERM))
     monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
-    with pytest.raises(checkpoint.CheckpointError, match="the disk is full"):
-        trainer(tmp_path).train()
+    refused(checkpoint.CheckpointError, "the disk is full", trainer(tmp_path).train)
 
 
 @pytest.mark.parametrize(
@@ -361,8 +356,7 @@ def test_a_file_in_the_place_of_the_checkpoints_ends_the_run_with_the_model_save
         (tmp_path / "checkpoints").touch()
 
     at_step(monkeypatch, 50, replace_folder)
-    with pytest.raises(checkpoint.CheckpointError, match="The model is saved in .*rescued_"):
-        trainer(tmp_path).train()
+    refused(checkpoint.CheckpointError, "The model is saved in .*rescued_", trainer(tmp_path).train)
 
 
 def test_a_lineage_that_cannot_be_written_waits_as_well(tmp_path, monkeypatch):
@@ -457,8 +451,7 @@ def test_a_terminal_that_is_gone_ends_nothing(tmp_path, monkeypatch):
 
 def test_a_resume_repeats_no_record_and_says_where_it_begins(tmp_path, monkeypatch):
     at_step(monkeypatch, 70, lambda self: (_ for _ in ()).throw(RuntimeError("killed")))
-    with pytest.raises(RuntimeError, match="killed"):
-        trainer(tmp_path, "schedule.checkpoint_every=50").train()
+    refused(RuntimeError, "killed", trainer(tmp_path, "schedule.checkpoint_every=50").train)
     assert [r["t"] for r in steps_of(tmp_path)] == [20, 40, 60]
     with (tmp_path / "log.jsonl").open("a") as file:
         file.write('{"t": 61, "lo')  # torn

@@ -35,9 +35,9 @@ from tests.training.tiny import (
     assert_same_table,
     look_at_origin,
     random_gaussians,
-    stop_at,
     tiny_config,
     tiny_scene,
+    trained_in_parts,
 )
 
 
@@ -263,14 +263,11 @@ def train_on_unequal_photographs(folder, resume=False):
     return trainer, trainer.train()
 
 
-def test_a_resumed_run_repeats_every_bit_and_a_render_shows_the_exposures(tmp_path, monkeypatch):
+def test_a_resumed_run_repeats_every_bit_and_a_render_shows_the_exposures(tmp_path):
     whole, summary = train_on_unequal_photographs(tmp_path / "whole")
     assert summary["exposure"]["least"] < 0.95 < 1.05 < summary["exposure"]["most"]
     assert summary["warnings"] == [] and summary["largest_fall"] == 0
-    stop_at(monkeypatch, 50)
-    train_on_unequal_photographs(tmp_path / "parts")
-    monkeypatch.undo()
-    resumed, _ = train_on_unequal_photographs(tmp_path / "parts", resume=True)
+    resumed = trained_in_parts(train_on_unequal_photographs, tmp_path / "parts", 50)
     assert_same_table(resumed.state.table, whole.state.table)
     assert torch.equal(resumed.state.stepper.exposures.measured, whole.state.stepper.exposures.measured)
     content = json.loads((tmp_path / "whole" / "exposures.json").read_text())

@@ -13,7 +13,7 @@ from blitzgs.runs.guard import NonFiniteError
 from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import small_batch_hint
-from tests.helpers import DEVICES, needs_cuda
+from tests.helpers import DEVICES, needs_cuda, refused
 from tests.training.tiny import (
     assert_same_table,
     events_of,
@@ -94,38 +94,32 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
     assert second.state.progress.peak_gaussians == whole.state.progress.peak_gaussians
 
 
-def test_a_run_that_views_made_longer_is_resumed_with_either_configuration(tmp_path, monkeypatch):
-    asked = ["schedule.iterations=40", "schedule.images_per_view=20"]
+@pytest.mark.parametrize(
+    ("asked", "other", "field"),
+    [
+        # A schedule that the views made longer, and an opacity term that follows the views.
+        (("schedule.images_per_view=20", "schedule.iterations=40"), "19", "schedule.scale"),
+        (("loss.opacity_total=0.2",), "0.3", "loss.opacity"),
+    ],
+)
+def test_a_run_is_resumed_with_either_configuration(tmp_path, monkeypatch, asked, other, field):
     stop_at(monkeypatch, 50)
     first, summary = train(tmp_path, *asked)
     views = len(first.state.capture.train)
-    assert summary is None and first.state.schedule.iterations == 20 * views > 50
+    assert summary is None
     monkeypatch.undo()
     own = run_files.load_config(tmp_path / "config.yaml")
-    assert own.schedule.images_per_view == 0 and own.schedule.scale == views / 2
-    with pytest.raises(ConfigError, match="schedule.scale: the checkpoint was trained with"):
-        train(tmp_path, asked[0], "schedule.images_per_view=19", resume=True)
+    if field == "schedule.scale":
+        assert first.state.schedule.iterations == 20 * views > 50
+        assert own.schedule.images_per_view == 0 and own.schedule.scale == views / 2
+    else:
+        assert first.state.config.loss.opacity == 0.2 / views
+        assert own.loss.opacity_total == 0 and own.loss.opacity == 0.2 / views
+    with pytest.raises(ConfigError, match=f"{field}: the checkpoint was trained with"):
+        train(tmp_path, asked[0].partition("=")[0] + "=" + other, *asked[1:], resume=True)
     Trainer(own, *tiny_scene(), tmp_path, Ranks(), resume=True).close()
     second, summary = train(tmp_path, *asked, resume=True)
-    assert summary is not None and second.state.schedule.iterations == 20 * views
-
-
-def test_a_run_whose_opacity_term_follows_the_views_is_resumed_with_either_configuration(
-    tmp_path, monkeypatch
-):
-    asked = ["loss.opacity_total=0.2"]
-    stop_at(monkeypatch, 50)
-    first, summary = train(tmp_path, *asked)
-    weight = 0.2 / len(first.state.capture.train)
-    assert summary is None and first.state.config.loss.opacity == weight
-    monkeypatch.undo()
-    own = run_files.load_config(tmp_path / "config.yaml")
-    assert own.loss.opacity_total == 0 and own.loss.opacity == weight
-    with pytest.raises(ConfigError, match="loss.opacity: the checkpoint was trained with"):
-        train(tmp_path, "loss.opacity_total=0.3", resume=True)
-    Trainer(own, *tiny_scene(), tmp_path, Ranks(), resume=True).close()
-    _, summary = train(tmp_path, *asked, resume=True)
-    assert summary is not None
+    assert summary is not None and second.state.schedule.iterations == first.state.schedule.iterations
 
 
 def test_a_checkpoint_has_all_events_of_its_step(tmp_path):
@@ -236,10 +230,7 @@ def test_views_that_see_nothing(tmp_path):
 def test_non_finite_values_stop_the_run_by_name(tmp_path, device):
     trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks(device=torch.device(device)))
     trainer.state.table["scales"][trainer.state.table["id"] == 7, 1] = float("nan")
-    with pytest.raises(
-        NonFiniteError, match=r"step 20: column 'scales' is not finite in 1 Gaussians \(ids 7\)"
-    ):
-        trainer.train()
+    refused(NonFiniteError, r"step 20: column 'scales' is not finite in 1 Gaussians \(ids 7\)", trainer.train)
 
 
 def test_a_non_finite_loss_names_step_and_view(tmp_path, monkeypatch):
@@ -262,8 +253,7 @@ def test_a_non_finite_loss_names_step_and_view(tmp_path, monkeypatch):
 def test_a_run_is_not_overwritten_nor_resumed_with_another_configuration(whole_run):
     folder, *_ = whole_run
     written = (folder / "config.yaml").read_bytes()
-    with pytest.raises(FileExistsError, match="add --resume"):
-        train(folder)
+    refused(FileExistsError, "add --resume", train, folder)
     with pytest.raises(
         ConfigError, match=r"loss.ssim: the checkpoint was trained with 0.2, now 0.3; leave out --config"
     ):

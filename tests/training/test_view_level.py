@@ -37,6 +37,7 @@ from tests.training.tiny import (
     stop_at,
     tiny_config,
     tiny_scene,
+    trained_in_parts,
     write_tiny_capture,
 )
 
@@ -145,13 +146,10 @@ def test_evaluation_has_the_gate_and_no_mask(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("last", [50, 65, 80])
-def test_resume_is_exact(whole_run, tmp_path, monkeypatch, last):
+def test_resume_is_exact(whole_run, tmp_path, last):
     """The run stops with the mask alone, with gate and first mask, and with gate and second mask."""
     _, whole, _, _ = whole_run
-    stop_at(monkeypatch, last)
-    assert train(tmp_path)[1] is None
-    monkeypatch.undo()
-    second, _ = train(tmp_path, resume=True)
+    second = trained_in_parts(train, tmp_path, last)
     assert_same_table(second.state.table, whole.state.table)
     assert second.state.progress.gated_views == whole.state.progress.gated_views
 
@@ -183,10 +181,7 @@ def test_levels_that_follow_footprints_leave_out_what_is_small_in_the_view(tmp_p
     assert followed == [(60, True), (80, True)] and summary is not None
     progress = whole.state.progress
     assert "1" in progress.gated_views and blitzgs.open_run(tmp_path / "whole").model().lod is not None
-    stop_at(monkeypatch, 75)
-    assert train(tmp_path / "stopped", *flags)[1] is None
-    monkeypatch.undo()
-    resumed, _ = train(tmp_path / "stopped", *flags, resume=True)
+    resumed = trained_in_parts(train, tmp_path / "stopped", 75, *flags)
     assert_same_table(resumed.state.table, whole.state.table)
 
 
@@ -295,11 +290,8 @@ def test_a_photograph_that_is_lost_changes_neither_length_nor_opacity_term_of_a_
     assert fewer.state.config.loss == before.state.config.loss
 
 
-def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path, monkeypatch):
-    stop_at(monkeypatch, 65)
-    assert train(tmp_path / "stopped", "view.lod=smooth")[1] is None
-    monkeypatch.undo()
-    resumed, _ = train(tmp_path / "stopped", "view.lod=smooth", resume=True)
+def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path):
+    resumed = trained_in_parts(train, tmp_path / "stopped", 65, "view.lod=smooth")
     trainer, _ = train(tmp_path / "whole", "view.lod=smooth")
     state = trainer.state
     assert_same_table(resumed.state.table, state.table)

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
@@ -238,6 +239,14 @@ def at_step(monkeypatch, number: int, action: Callable[[Trainer], object]) -> No
 def stop_at(monkeypatch, number: int) -> None:
     """Ask the process to stop after step `number`."""
     at_step(monkeypatch, number, lambda trainer: os.kill(os.getpid(), signal.SIGTERM))
+
+
+def trained_in_parts(train: Callable, folder: Path, number: int, *overrides: str) -> Trainer:
+    """Stop the training after step `number`, go on, and return the second trainer."""
+    with pytest.MonkeyPatch.context() as patch:
+        stop_at(patch, number)
+        assert train(folder, *overrides)[1] is None
+    return train(folder, *overrides, resume=True)[0]
 
 
 def read_log(folder: Path) -> list[dict[str, Any]]:

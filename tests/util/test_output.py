@@ -17,6 +17,7 @@ from blitzgs.util.charts import line_chart
 from blitzgs.util.output import OutputFolder, new_file, write_file
 from blitzgs.util.progress import Laps, image_progress
 from blitzgs.util.terminal import amount, printable
+from tests.helpers import refused
 
 PARTS = st.sampled_from(
     ["..", ".", "a", "A", "a.png", "a.jpg", "a.png.jpg", "b", "ä🏙", "x" * 300, "\udcff.png", ""]
@@ -83,8 +84,7 @@ def test_files_of_others_are_kept_and_own_files_are_replaced(tmp_path):
     (tmp_path / "a.png").write_bytes(b"a copy of a photograph")
     with pytest.raises(FileExistsError, match="a.png exists, and no earlier call .* choose another --out"):
         OutputFolder(tmp_path).paths(["a.jpg", "b.jpg"], ".png")
-    with pytest.raises(FileExistsError, match="a.png exists"):
-        OutputFolder(tmp_path).write(tmp_path / "a.png", b"render")
+    refused(FileExistsError, "a.png exists", OutputFolder(tmp_path).write, tmp_path / "a.png", b"render")
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
     for content in (b"render", b"render again"):
         output = OutputFolder(tmp_path / "out")
@@ -99,8 +99,7 @@ def test_a_link_that_appears_later_is_not_followed(tmp_path):
     (path,) = output.paths(["sub/a.png"], ".png")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "sub").symlink_to(tmp_path / "other")
-    with pytest.raises(OSError, match="leads out of"):
-        output.write(path, b"x")
+    refused(OSError, "leads out of", output.write, path, b"x")
     assert not list((tmp_path / "other").iterdir())
 
 
@@ -119,8 +118,7 @@ def test_only_regular_files_are_replaced(tmp_path, kind):
     else:
         path = Path("/dev/null")
     before = path.lstat()
-    with pytest.raises(OSError, match="which is not overwritten"):
-        write_file(path, b"new")
+    refused(OSError, "which is not overwritten", write_file, path, b"new")
     assert path.lstat().st_ino == before.st_ino and path.lstat().st_mode == before.st_mode
 
 

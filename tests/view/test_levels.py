@@ -15,7 +15,7 @@ from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Vi
 from blitzgs.reference.render import render as reference_render
 from blitzgs.view.gate import LodGate, ModelGate, centres_of
 from blitzgs.view.levels import FOOTPRINT_LEVELS, Levels, footprint_levels, footprint_sizes, measure_levels
-from tests.helpers import DEVICES
+from tests.helpers import DEVICES, refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_views
 from tests.view.test_gate import GATE, OPTIONS, make_scene
 
@@ -70,8 +70,7 @@ def test_farthest_is_where_eq_1_still_rounds_up_to_the_level():
 
 def test_degenerate_input_is_refused():
     points, centres = cloud(10)
-    with pytest.raises(ValueError, match="got 0 points and 30 cameras"):
-        measure_levels(points[:0], centres, 2.0, 0.001)
+    refused(ValueError, "got 0 points and 30 cameras", measure_levels, points[:0], centres, 2.0, 0.001)
     with pytest.raises(ValueError, match="spread out, .* measures 0, .* Check the points of the capture"):
         measure_levels(points[:1].repeat(5, 1), centres, 2.0, 0.001)
 
@@ -256,12 +255,9 @@ def test_errors_name_the_value():
         options = ProjectionOptions(WIDTH, HEIGHT, fade=fade)
         ProjectionInputs(gaussians, (viewmats, Ks), options, level=level).project(None)
 
-    with pytest.raises(RuntimeError, match="project_fwd: levels need a fade_slope of at least 1"):
-        call(table["level"], ())
-    with pytest.raises(RuntimeError, match=r"level must have shape \[10\], got \[9\]"):
-        call(table["level"][1:], SMOOTH.fade())
-    with pytest.raises(RuntimeError, match="level must be Byte, got Int"):
-        call(table["level"].int(), SMOOTH.fade())
+    refused(RuntimeError, "project_fwd: levels need a fade_slope of at least 1", call, table["level"], ())
+    refused(RuntimeError, r"level must have shape \[10\], got \[9\]", call, table["level"][1:], SMOOTH.fade())
+    refused(RuntimeError, "level must be Byte, got Int", call, table["level"].int(), SMOOTH.fade())
 
 
 @pytest.mark.parametrize("device", DEVICES)

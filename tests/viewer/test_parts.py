@@ -23,6 +23,7 @@ from blitzgs.viewer.live import Curves
 from blitzgs.viewer.panel import round_length
 from blitzgs.viewer.settings import Pace
 from blitzgs.viewer.world import World, looking, up_direction
+from tests.helpers import refused
 
 
 @dataclass
@@ -99,8 +100,7 @@ def test_frames_pass_through_the_keyframes():
     "text", ["", "[]", '{"keyframes": [{"matrix": [1, 2], "fov": 3}]}', '{"camera_path": 3}']
 )
 def test_files_that_are_no_paths_are_refused(text):
-    with pytest.raises(ValueError, match="no camera path"):
-        paths.from_json(text)
+    refused(ValueError, "no camera path", paths.from_json, text)
 
 
 def test_an_old_path_of_nerfstudio_is_read():
@@ -230,8 +230,7 @@ def test_the_door_with_a_token(behind):
 
 
 def test_a_port_in_use_is_an_error(behind):
-    with pytest.raises(OSError, match=f"cannot listen on 127.0.0.1:{behind}"):
-        Door("127.0.0.1", behind, behind, "")
+    refused(OSError, f"cannot listen on 127.0.0.1:{behind}", Door, "127.0.0.1", behind, behind, "")
 
 
 def test_addresses_of_this_machine():
@@ -390,7 +389,5 @@ def test_damaged_transforms_of_nerfstudio_are_named(tmp_path):
     path.write_text(json.dumps({"keyframes": [KEY]}))
     for content, reason in (("{}", "'transform' is missing"), ('{"transform": [[1]], "scale": 1}', "3 x 4")):
         file.write_text(content)
-        with pytest.raises(ValueError, match=f"{file}.*{reason}"):
-            read_film(str(path), None, None, None, file)
-    with pytest.raises(FileNotFoundError, match="orbit, flight, spline need none"):
-        read_film("Orbit", None, None, None, None)
+        refused(ValueError, f"{file}.*{reason}", read_film, str(path), None, None, None, file)
+    refused(FileNotFoundError, "orbit, flight, spline need none", read_film, "Orbit", None, None, None, None)
