@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -74,10 +75,15 @@ class Photographs:
         of them.
         """
         names = find_photographs(folder) if folder.is_dir() else []
+        files = list(files_below(folder)) if folder.is_dir() else [folder.name]
+        # Many cameras write a photograph as JPEG and as raw data beside it.
+        known = {PurePosixPath(name).with_suffix("") for name in names}
+        others = to_convert(name for name in files if PurePosixPath(name).with_suffix("") not in known)
         if not names:
-            others = to_convert(files_below(folder) if folder.is_dir() else [folder.name])
             what = "has no photographs" if folder.is_dir() else "is no folder of photographs"
             raise FileNotFoundError(f"{folder} {what} ({', '.join(IMAGE_SUFFIXES)}){others}")
+        if others:
+            warnings.warn(f"{folder}: only its {len(names)} photographs are used{others}", stacklevel=2)
         root = folder if (folder / "masks").is_dir() else folder.parent
         masks = find_masks(root, None, names, [None] * len(names))
         problems = damaged([(folder / name, mask) for name, mask in zip(names, masks, strict=True)])

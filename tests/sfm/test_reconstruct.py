@@ -302,6 +302,15 @@ def config_of(folder):
     return load_config(None, [f"data.path={folder}"])
 
 
+def test_photographs_in_other_formats_are_named(tmp_path):
+    write_photographs(tmp_path, 3)
+    (tmp_path / "view_0.DNG").write_bytes(b"")  # the raw data of a photograph
+    Photographs.of(tmp_path)
+    (tmp_path / "view_9.heic").write_bytes(b"")
+    with pytest.warns(UserWarning, match=r"only its 3 photographs are used; \.heic cannot be read: convert"):
+        Photographs.of(tmp_path)
+
+
 def test_photographs_alone_are_recognised(tmp_path, capsys):
     write_photographs(tmp_path / "data/images", 3)
     data = ["train", "--data", str(tmp_path / "data")]
