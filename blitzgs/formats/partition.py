@@ -55,7 +55,7 @@ class Partition:
 
         Args:
             source: at least one Gaussian.
-            folder: an existing folder with space for three copies of the model.
+            folder: an existing folder with space for two and a half copies of the model.
 
         Raises:
             ValueError: there is no Gaussian, or a value is NaN or infinite.
@@ -67,10 +67,10 @@ class Partition:
         self._width = 12 + 3 * (source.degree + 1) ** 2
         needed = len(source) * (12 + 4 * self._width)
         free = shutil.disk_usage(folder).free
-        if free < 3 * needed:
+        if free < 2.5 * needed:
             raise OSError(
                 errno.ENOSPC,
-                f"{3 * needed / 1e9:.1f} GB are needed for the files and a temporary copy, and "
+                f"{2.5 * needed / 1e9:.1f} GB are needed for the files and a temporary copy, and "
                 f"{free / 1e9:.1f} GB are free",
                 str(folder),
             )

@@ -24,7 +24,7 @@ from blitzgs.formats.gaussians import GaussianSource, is_antialiased
 from blitzgs.formats.partition import BITS, Counts, Partition, Parts, extents, interleaved
 from blitzgs.formats.proxies import merged, moments, shown
 from blitzgs.formats.sog import write_sog
-from blitzgs.formats.tiles import FEWER, TILE, Written, new_folder, workers
+from blitzgs.formats.tiles import TILE, Written, new_folder, workers
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import Report
 
@@ -34,8 +34,8 @@ Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
-# LODs of a leaf.
-_LODS = 4
+# LODs of a leaf, and the Gaussians of one for each of the next.
+_LODS, _FEWER = 4, 4
 
 
 @dataclass
@@ -127,7 +127,7 @@ def _encode(
     leaf, lod = job
     gaussians = parts.read(leaf.part)
     if lod > 0:
-        rows, _ = merged(moments(gaussians), max(1, leaf.count // FEWER**lod), box, antialiased)
+        rows, _ = merged(moments(gaussians), max(1, leaf.count // _FEWER**lod), box, antialiased)
         gaussians = shown(rows, parts.comments)
     means = gaussians.means.double().numpy()
     sides = np.maximum(np.ptp(means, axis=0), 1e-30)

@@ -2,8 +2,8 @@
 """A model as 3D Tiles 1.1: `tileset.json`, a GLB file with KHR_gaussian_splatting for each tile, and a page.
 
 The leaves of the tree hold the Gaussians by region, each in one. A tile above stands for its children
-(refine REPLACE): it has a quarter as many, merged from theirs (`blitzgs.formats.proxies`), so all tiles
-have at most a third more than the model. Bounding volumes are boxes of what a view can show, in the model's
+(refine REPLACE): it has an eighth as many, merged from theirs (`blitzgs.formats.proxies`), so all tiles
+have at most a seventh more than the model. Bounding volumes are boxes of what a view can show, in the model's
 coordinates. `root.transform` maps these to EPSG:4978 where the model is georeferenced, else it turns the
 model's up to +Z.
 """
@@ -42,7 +42,7 @@ TILESET, PAGE = "tileset.json", "index.html"
 TILE = 32_768
 _EXTENSION = "KHR_gaussian_splatting"
 # A tile has at most one Gaussian for so many of its children.
-FEWER = 4
+_FEWER = 8
 # Pixels of the error of a tile in which a cell of its merged Gaussians is one pixel wide.
 _PIXELS = 16
 
@@ -238,7 +238,7 @@ def tree(counts: Counts, most: int) -> tuple[Tile, npt.NDArray[np.int64]]:
             children.append(leaf(together))
         if len(children) == 1:
             return children[0]
-        return Tile(min(most, max(1, sum(child.count for child in children) // FEWER)), None, children)
+        return Tile(min(most, max(1, sum(child.count for child in children) // _FEWER)), None, children)
 
     root = tile(np.arange(len(counts.cells)), 0)
     for index, one in enumerate(root.every()):
@@ -309,7 +309,7 @@ class _Writer:
         else:
             rows = np.concatenate([self._moments(child) for child in tile.children])
             least = max(child.edge for child in tile.children)
-            most = min(tile.count, max(1, len(rows) // FEWER))
+            most = min(tile.count, max(1, len(rows) // _FEWER))
             rows, edge = merged(rows, most, self.box, self.antialiased, least)
             with open(os.open(self.proxies, os.O_WRONLY | os.O_CREAT, 0o666), "wb") as file:
                 file.seek(tile.first * rows.itemsize * rows.shape[1])
