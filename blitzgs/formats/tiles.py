@@ -238,6 +238,9 @@ def tree(counts: Counts, most: int) -> tuple[Tile, npt.NDArray[np.int64]]:
             children.append(leaf(together))
         if len(children) == 1:
             return children[0]
+        # A tile much smaller than others is not worth a request: its children are the parent's.
+        small = most // _FEWER
+        children = [one for child in children for one in (child.count < small and child.children or [child])]
         return Tile(min(most, max(1, sum(child.count for child in children) // _FEWER)), None, children)
 
     root = tile(np.arange(len(counts.cells)), 0)
