@@ -2,9 +2,9 @@
 """A model as streamed SOG, version 1, which SuperSplat and the PlayCanvas engine load piece by piece.
 
 Format: developer.playcanvas.com, "The Streamed SOG Format". `lod-meta.json` has a binary tree over the
-region. A viewer shows one LOD of each leaf: LOD 0 has all its Gaussians, and each further one a quarter as
-many, merged (`blitzgs.formats.proxies`). Each LOD of a leaf is an SOG of its own (`meta.json` and WebP
-files), in Morton order.
+region. A viewer shows one LOD of each leaf, by distance: LOD 0 has all its Gaussians, and each further one
+about a quarter as many, merged in cells (`blitzgs.formats.proxies`) of the same size in all leaves. Each LOD
+of a leaf is an SOG of its own (`meta.json` and WebP files), in Morton order.
 """
 
 from __future__ import annotations
@@ -72,12 +72,17 @@ def write_streamed_sog(
         leaves: list[_Leaf] = []
         tree = _split(counts, np.arange(len(counts.cells)), 0, most, parts_of_cells, leaves)
         parts = partition.place(parts_of_cells, counts.counts)
-        jobs = [(leaf, lod) for leaf in leaves for lod in range(_LODS)]
-        work = partial(_encode, parts, folder, partition.box, is_antialiased(source))
+        chosen = (parts, folder, partition.box, is_antialiased(source))
         boxes: dict[int, Array] = {}
         numbers, size = [], 0
         with workers(processes) as run:
-            for (leaf, lod), (box, number, written) in zip(jobs, run(work, jobs), strict=True):
+            edges = _medians(
+                np.stack(list(run(partial(_edges, *chosen), leaves))), [leaf.count for leaf in leaves]
+            )
+            jobs = [(leaf, lod, edge) for leaf in leaves for lod, edge in enumerate([0.0, *edges])]
+            for (leaf, lod, _), (box, number, written) in zip(
+                jobs, run(partial(_encode, *chosen), jobs), strict=True
+            ):
                 numbers.append(number)
                 size += written
                 if lod == 0:
@@ -91,7 +96,7 @@ def write_streamed_sog(
             "count": sum(numbers),
             "counts": [sum(numbers[lod::_LODS]) for lod in range(_LODS)],
             "lodLevels": _LODS,
-            "filenames": [f"{_name(leaf, lod)}/meta.json" for leaf, lod in jobs],
+            "filenames": [f"{_name(leaf, lod)}/meta.json" for leaf, lod, _ in jobs],
             "tree": node,
         }
         write_file(folder / META, json.dumps(meta, allow_nan=False))
@@ -120,14 +125,30 @@ def _name(leaf: _Leaf, lod: int) -> str:
     return f"{lod}_{leaf.part}"
 
 
+def _edges(parts: Parts, _: Path, box: Array, antialiased: bool, leaf: _Leaf) -> Array:
+    """Return the edges of the cells in which a leaf would have a quarter, a 16th and a 64th, [_LODS - 1]."""
+    rows, edges = moments(parts.read(leaf.part)), []
+    for lod in range(1, _LODS):
+        edges.append(merged(rows, max(1, leaf.count // _FEWER**lod), box, antialiased)[1])
+    return np.array(edges)
+
+
+def _medians(values: Array, weights: list[int]) -> list[float]:
+    """Return the weighted median of each column of values [N, C]."""
+    order = values.argsort(axis=0)
+    middle = (np.cumsum(np.array(weights)[order], axis=0) >= sum(weights) / 2).argmax(axis=0)
+    sorted_values = np.take_along_axis(values, order, axis=0)
+    return [float(sorted_values[row, column]) for column, row in enumerate(middle)]
+
+
 def _encode(
-    parts: Parts, folder: Path, box: Array, antialiased: bool, job: tuple[_Leaf, int]
+    parts: Parts, folder: Path, box: Array, antialiased: bool, job: tuple[_Leaf, int, float]
 ) -> tuple[Array, int, int]:
-    """Write one LOD of a leaf; return the box of its Gaussians, their number and the size of its files."""
-    leaf, lod = job
+    """Write one LOD of a leaf, merged in cells of an edge; return its box, number of Gaussians and size."""
+    leaf, lod, edge = job
     gaussians = parts.read(leaf.part)
     if lod > 0:
-        rows, _ = merged(moments(gaussians), max(1, leaf.count // _FEWER**lod), box, antialiased)
+        rows, _ = merged(moments(gaussians), leaf.count, box, antialiased, edge)
         gaussians = shown(rows, parts.comments)
     means = gaussians.means.double().numpy()
     sides = np.maximum(np.ptp(means, axis=0), 1e-30)

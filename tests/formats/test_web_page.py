@@ -235,6 +235,7 @@ def test_lods_stand_for_each_other(tmp_path):
     meta = json.loads((tmp_path / "city" / "lod-meta.json").read_text())
     assert meta["version"] == 1 and meta["lodLevels"] == len(meta["counts"]) == 4
     assert meta["counts"][0] == 1200 and meta["count"] == sum(meta["counts"])
+    assert 1200 / 8 < meta["counts"][1] < 1200 / 2 and meta["counts"][3] < 1200 / 16
     found, used = list(leaves(meta["tree"])), []
     seen = {lod: [] for lod in range(4)}
     for leaf in found:
@@ -244,7 +245,7 @@ def test_lods_stand_for_each_other(tmp_path):
             used.append(place["file"])
             data = gsply.sogread(str(tmp_path / "city" / meta["filenames"][place["file"]]))
             assert place["offset"] == 0 and len(data.means) == place["count"] <= 600
-            assert place["count"] <= max(1, leaf["lods"]["0"]["count"] / 4 ** int(lod))
+            assert place["count"] <= leaf["lods"][str(max(0, int(lod) - 1))]["count"]
             assert (data.means >= low - 1e-3).all() and (data.means <= high + 1e-3).all()
             seen[int(lod)].append(data.means)
     assert sorted(used) == list(range(len(meta["filenames"]))) and len(used) == done.tiles
