@@ -6,7 +6,8 @@
 
 The flight comes from above towards the middle of the scene, by the same ratio of distances from frame to
 frame. For each frame and error in pixels, the tiles are chosen as the page chooses them (without a budget),
-read from the GLB files, rendered, and compared with the picture of all tiles.
+read from the GLB files, rendered, and compared with the picture of the model, which is in the leaves. A view
+loads more than it shows: the tiles above those that it shows.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ class City:
         tileset = json.loads((folder / "tileset.json").read_text())
         self.view, self.degree = tileset["extras"]["view"], tileset["extras"]["degree"]
         self._folder, self._parts, self._count = folder, [], 0
+        self.leaves: list[slice] = []  # rows of the model
         self.root = self._tile(tileset["root"])
         names = ["POSITION", "ROTATION", "SCALE", "OPACITY"]
         names += [f"SH_DEGREE_{d}_COEF_{k}" for d in range(self.degree + 1) for k in range(2 * d + 1)]
@@ -69,15 +71,14 @@ class City:
 
     def _tile(self, node: dict[str, Any]) -> Tile:
         box = np.array(node["boundingVolume"]["box"])
-        start, size = self._count, 0
-        if "content" in node:
-            path = self._folder / node["content"]["uri"]
-            attributes = read_glb(path)[1].items()
-            self._parts.append({name.rpartition(":")[2]: values for name, values in attributes})
-            self._count += len(self._parts[-1]["POSITION"])
-            size = path.stat().st_size
-        rows = slice(start, self._count)
+        start, path = self._count, self._folder / node["content"]["uri"]
+        attributes = read_glb(path)[1].items()
+        self._parts.append({name.rpartition(":")[2]: values for name, values in attributes})
+        self._count += len(self._parts[-1]["POSITION"])
+        rows, size = slice(start, self._count), path.stat().st_size
         children = [self._tile(child) for child in node.get("children", [])]
+        if not children:
+            self.leaves.append(rows)
         return Tile(box[:3], np.diag(box[3:].reshape(3, 3)), node["geometricError"], children, rows, size)
 
     def chosen(
@@ -86,8 +87,8 @@ class City:
         K: np.ndarray,
         size: tuple[int, int],
         pixels: float,  # noqa: N803
-    ) -> list[Tile]:
-        """Return the tiles with contents that a view loads, as `tiles.js` chooses them."""
+    ) -> tuple[list[Tile], list[Tile]]:
+        """Return the tiles that a view loads, as `tiles.js` chooses them; it shows those not refined."""
         axes, centre = pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
         (fx, _, cx), (_, fy, cy) = K[:2]
         sides = np.stack(
@@ -99,17 +100,18 @@ class City:
                 -fy * axes[1] + (size[1] - cy) * axes[2],
             ]
         )
-        found, waiting = [], [self.root]
+        loaded, shown, waiting = [], [], [self.root]
         while waiting:
             tile = waiting.pop()
             if not (sides @ (tile.centre - centre) + np.abs(sides) @ tile.half > 0).all():
                 continue
-            if tile.bytes:
-                found.append(tile)
+            loaded.append(tile)
             away = np.linalg.norm(np.maximum(0, np.abs(centre - tile.centre) - tile.half))
-            if tile.error * fy / max(float(away), self.view["near"]) > pixels:
+            if tile.children and tile.error * fy / max(float(away), self.view["near"]) > pixels:
                 waiting += tile.children
-        return found
+            else:
+                shown.append(tile)
+        return loaded, shown
 
     def render(self, rows: Tensor, pose: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> Tensor:  # noqa: N803
         """Render some of the Gaussians; float32 [H, W, 3] in [0, 1]."""
@@ -135,8 +137,9 @@ def measure(
     """Fly through a tileset.
 
     Returns:
-        Number of Gaussians and bytes of all tiles, and for each error and frame: distance, tiles, Gaussians,
-        bytes of the view, bytes loaded since the begin of the flight, and PSNR in dB.
+        Numbers of Gaussians of the model and of all tiles, their bytes, and for each error and frame:
+        distance, tiles and Gaussians of the picture, those that it needs loaded, their bytes, those of the
+        flight so far, and PSNR in dB.
     """
     city = City(folder, torch.device(device))
     view, size = city.view, (width, width * 9 // 16)
@@ -144,6 +147,7 @@ def measure(
     focal = size[1] / 2 / math.tan(view["fov"] / 2)
     K = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])  # noqa: N806
     everything = torch.arange(len(city), device=city.means.device)
+    model = torch.cat([everything[rows] for rows in city.leaves])
     loaded: dict[float, dict[int, int]] = {error: {} for error in errors}
     rows = []
     for factor in np.geomspace(FARTHEST, NEAREST, frames):
@@ -151,10 +155,10 @@ def measure(
         pose = np.eye(4)
         pose[:3, :3] = stance.rotation.T
         pose[:3, 3] = -stance.rotation.T @ stance.position
-        full = city.render(everything, pose, K, size)
+        full = city.render(model, pose, K, size)
         for error in errors:
-            tiles = city.chosen(pose, K, size, error)
-            loaded[error] |= {tile.rows.start: tile.bytes for tile in tiles}
+            needed, tiles = city.chosen(pose, K, size, error)
+            loaded[error] |= {tile.rows.start: tile.bytes for tile in needed}
             some = torch.cat([everything[tile.rows] for tile in tiles]) if tiles else everything[:0]
             difference = float((city.render(some, pose, K, size) - full).double().square().mean())
             rows.append(
@@ -163,13 +167,15 @@ def measure(
                     "distance": float(factor * np.linalg.norm(eye - target)),
                     "tiles": len(tiles),
                     "gaussians": len(some),
-                    "bytes": sum(tile.bytes for tile in tiles),
+                    "loaded_gaussians": sum(tile.rows.stop - tile.rows.start for tile in needed),
+                    "bytes": sum(tile.bytes for tile in needed),
                     "loaded_bytes": sum(loaded[error].values()),
                     "psnr": -10 * math.log10(difference) if difference > 0 else None,  # None: equal
                 }
             )
     total = sum(file.stat().st_size for file in (folder / "tiles").iterdir())
-    return {"gaussians": len(city), "bytes": total, "width": size[0], "height": size[1], "frames": rows}
+    numbers = {"gaussians": len(model), "of_tiles": len(city)}
+    return {**numbers, "bytes": total, "width": size[0], "height": size[1], "frames": rows}
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs
+from blitzgs.util.rotations import quaternions
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ def decompose(covars: Tensor) -> Decomposed:
         matrices = torch.where(finite[:, None, None], matrices, torch.eye(3, device=covars.device).double())
         axes, variances = _principal_axes(matrices)
         scales = variances.clamp(min=0).sqrt().masked_fill_(~finite[:, None], torch.nan)
-        return Decomposed(upper, _quaternions(axes).to(covars.dtype), scales.to(covars.dtype))
+        return Decomposed(upper, quaternions(axes).to(covars.dtype), scales.to(covars.dtype))
 
 
 def _principal_axes(matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -68,26 +69,6 @@ def _principal_axes(matrices: Tensor) -> tuple[Tensor, Tensor]:
     u, v = frame[:, :, 1], frame[:, :, 2]
     axes = torch.stack([axis, cos * u + sin * v, cos * v - sin * u], dim=2)
     return axes, (axes * (matrices @ axes)).sum(dim=1) * size[:, :, 0]
-
-
-def _quaternions(rotations: Tensor) -> Tensor:
-    """Return (w, x, y, z) [N, 4] of rotations [N, 3, 3], over the largest of the four (Shepperd 1978)."""
-    r = rotations
-    xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
-    wx, wy, wz = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
-    xy, xz, yz = r[:, 0, 1] + r[:, 1, 0], r[:, 0, 2] + r[:, 2, 0], r[:, 1, 2] + r[:, 2, 1]
-    # Row i is 4 q_i q; the one with the largest q_i has the least rounding.
-    products = torch.stack(
-        [
-            torch.stack([1 + xx + yy + zz, wx, wy, wz], dim=1),
-            torch.stack([wx, 1 + xx - yy - zz, xy, xz], dim=1),
-            torch.stack([wy, xy, 1 - xx + yy - zz, yz], dim=1),
-            torch.stack([wz, xz, yz, 1 - xx - yy + zz], dim=1),
-        ],
-        dim=1,
-    )
-    best = products.diagonal(dim1=1, dim2=2).argmax(dim=1)
-    return torch.nn.functional.normalize(products[torch.arange(len(r), device=r.device), best], dim=1)
 
 
 def shaped_by(splats: ProjectedSplats, inputs: ProjectionInputs, decomposed: Decomposed) -> ProjectedSplats:

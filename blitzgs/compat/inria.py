@@ -19,7 +19,7 @@ from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.project import differentiable_splats, gaussian_tensors
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
 from blitzgs.ops.rasterize import rasterize
-from blitzgs.population.density import quaternion_matrices
+from blitzgs.util.rotations import quaternion_matrices
 
 NEAR = 0.2  # world units; INRIA's code has it as a constant
 # Float32 matrices of a camera agree with each other to about 1e-6.

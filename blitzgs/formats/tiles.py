@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A model as 3D Tiles 1.1: `tileset.json`, a GLB file with KHR_gaussian_splatting for each tile, and a page.
 
-The tree is an octree over the region. A tile holds the coarsest levels of its region that its ancestors do
-not hold, as many as fit, and its children add the next ones (refine ADD), so every Gaussian is in one tile.
-Bounding volumes are boxes of what a view can show, in the model's coordinates. `root.transform` maps these to
-EPSG:4978 where the model is georeferenced, else it turns the model's up to +Z.
+The leaves of the tree hold the Gaussians by region, each in one. A tile above stands for its children
+(refine REPLACE): it has an eighth as many, merged from theirs (`blitzgs.formats.proxies`), so all tiles
+have at most a seventh more than the model. Bounding volumes are boxes of what a view can show, in the model's
+coordinates. `root.transform` maps these to EPSG:4978 where the model is georeferenced, else it turns the
+model's up to +Z.
 """
 
 from __future__ import annotations
@@ -17,11 +18,10 @@ import multiprocessing
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +29,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from blitzgs.formats.gaussians import GaussianSource
+from blitzgs.formats.gaussians import GaussianSource, is_antialiased
 from blitzgs.formats.glb import write_glb
 from blitzgs.formats.partition import BITS, Counts, Partition, Parts, extents
+from blitzgs.formats.proxies import Rows, merged, moments, shown
 from blitzgs.formats.web_page import WebScene, tiles_page
 from blitzgs.util.output import sync_to_disk, write_file
 from blitzgs.util.progress import Report, follow_parent
@@ -40,6 +41,10 @@ TILESET, PAGE = "tileset.json", "index.html"
 # Gaussians of a tile: 8 MB at SH degree 3.
 TILE = 32_768
 _EXTENSION = "KHR_gaussian_splatting"
+# A tile has at most one Gaussian for so many of its children.
+_FEWER = 8
+# Pixels of the error of a tile in which a cell of its merged Gaussians is one pixel wide.
+_PIXELS = 16
 
 Array = npt.NDArray[np.float64]
 
@@ -49,16 +54,34 @@ class Tile:
     """A node of the tree.
 
     Attributes:
-        error: size in the model's unit of what is missing where the children are not shown; 0 for leaves.
-        entries: entries of `Counts` that the tile holds.
+        count: number of Gaussians; before a tile with children is written, the largest number.
+        part: number of the leaf's part; None: the tile has children.
         children: tiles of its eighths.
-        part: number of the tile's part; None: the tile holds nothing.
+        number: of its file.
+        first: row of its Gaussians among those of all tiles with children.
+        box: that of what a view can show of its Gaussians, [2, 3], once it is written; so are the rest.
+        bytes: size of its file.
+        edge: of the cells in which its Gaussians were merged; 0 for leaves.
     """
 
-    error: float
-    entries: list[npt.NDArray[np.int64]]
-    children: list[Tile] = field(default_factory=list)
+    count: int
     part: int | None = None
+    children: list[Tile] = field(default_factory=list)
+    number: int = 0
+    first: int = 0
+    box: Array = field(default_factory=lambda: np.zeros((2, 3)))
+    bytes: int = 0
+    edge: float = 0.0
+
+    def every(self) -> Iterator[Tile]:
+        """Yield the tile and those below."""
+        yield self
+        for child in self.children:
+            yield from child.every()
+
+    def height(self) -> int:
+        """Return the number of tiles from here to the lowest leaf."""
+        return 1 + max((child.height() for child in self.children), default=0)
 
 
 @dataclass(frozen=True)
@@ -94,8 +117,8 @@ def write_tiles(
         transform: [4, 4], from the model's coordinates to those of the tileset.
         scene: how the page beside the tileset shows it, in the model's coordinates.
         title: heading of the page.
-        most: Gaussians of a tile; a tile that would be smaller than a 256th of the region may have more.
-        processes: that encode tiles.
+        most: Gaussians of a tile; a leaf that would be smaller than a 256th of the region may have more.
+        processes: that merge and encode.
         report: called with the number of tiles written, and of all.
 
     Raises:
@@ -106,17 +129,20 @@ def write_tiles(
     with new_folder(path) as folder:
         partition = Partition(source, folder)
         counts = partition.count()
-        root, parts_of_entries = tree(counts, most)
-        parts = partition.place(parts_of_entries, counts.counts)
+        root, parts_of_cells = tree(counts, most)
+        parts = partition.place(parts_of_cells, counts.counts)
         (folder / "tiles").mkdir()
-        encoded = list(each_part(_encode, parts, folder / "tiles", processes, report=report))
+        writer = _Writer(folder, parts, partition.box, is_antialiased(source))
+        _encode_all(writer, root, processes, report)
         parts.file.unlink()
-        content, _ = _node(root, [(box, count) for box, count, _ in encoded])
+        writer.proxies.unlink(missing_ok=True)
+        content, _ = _node(root)
         content["transform"] = transform.T.ravel().tolist()
         used = {"extensionsUsed": [_EXTENSION], "extensionsRequired": [_EXTENSION]}
         tileset = {
             "asset": {"version": "1.1", "generator": "BlitzGS"},
-            "geometricError": counts.whole_error,
+            # As long as the scene is larger than that, something is shown.
+            "geometricError": max(partition.side, 2 * content["geometricError"]),
             "root": content,
             # 3D Tiles 1.1 has GLB contents of its own; by this, viewers learn before the first content which
             # glTF extensions they need.
@@ -129,7 +155,8 @@ def write_tiles(
         }  # fmt: skip
         write_file(folder / PAGE, tiles_page(title))
         write_file(folder / TILESET, json.dumps(tileset, allow_nan=False))
-    return Written(len(encoded), sum(size for *_, size in encoded), len(source))
+    tiles = list(root.every())
+    return Written(len(tiles), sum(tile.bytes for tile in tiles), len(source))
 
 
 @contextmanager
@@ -180,72 +207,61 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def tree(counts: Counts, most: int) -> tuple[Tile, npt.NDArray[np.int64]]:
-    """Make the tree; return its root, and the part of each entry."""
+    """Make the tree; return its root, and the part of each cell."""
     parts = np.full(len(counts.cells), -1, np.int64)
-    number = 0
+    number = first = 0
 
-    def numbered(tile: Tile) -> None:
+    def leaf(cells: npt.NDArray[np.int64]) -> Tile:
         nonlocal number
-        if tile.entries:
-            tile.part, number = number, number + 1
-            parts[np.concatenate(tile.entries)] = tile.part
-        for child in tile.children:
-            numbered(child)
+        parts[cells] = number
+        number += 1
+        return Tile(int(counts.counts[cells].sum()), number - 1)
 
-    root = _tile(counts, np.arange(len(counts.cells)), 0, -1, most)
-    numbered(root)
+    def tile(cells: npt.NDArray[np.int64], depth: int) -> Tile:
+        sizes = counts.counts[cells]
+        if sizes.sum() <= most or depth == BITS:
+            return leaf(cells)
+        octants = counts.cells[cells] >> 3 * (BITS - 1 - depth) & 7
+        totals = np.bincount(octants, sizes, minlength=8)
+        # Small eighths beside each other are one leaf.
+        children, together = [], np.zeros(0, np.int64)
+        for octant in np.flatnonzero(totals):
+            inside = cells[octants == octant]
+            if len(together) and counts.counts[together].sum() + totals[octant] > most:
+                children.append(leaf(together))
+                together = np.zeros(0, np.int64)
+            if totals[octant] > most:
+                children.append(tile(inside, depth + 1))
+            else:
+                together = np.concatenate([together, inside])
+        if len(together):
+            children.append(leaf(together))
+        if len(children) == 1:
+            return children[0]
+        # A tile much smaller than others is not worth a request: its children are the parent's.
+        small = most // _FEWER
+        children = [one for child in children for one in (child.count < small and child.children or [child])]
+        return Tile(min(most, max(1, sum(child.count for child in children) // _FEWER)), None, children)
+
+    root = tile(np.arange(len(counts.cells)), 0)
+    for index, one in enumerate(root.every()):
+        one.number = index
+        if one.children:
+            one.first, first = first, first + one.count
     return root, parts
 
 
-def _tile(counts: Counts, entries: npt.NDArray[np.int64], depth: int, above: int, most: int) -> Tile:
-    """Make the tile of a cell of the octree.
-
-    Args:
-        counts: of the model.
-        entries: those in the cell that no ancestor holds.
-        depth: of the cell.
-        above: finest level that its ancestors hold.
-        most: Gaussians of a tile.
-    """
-    levels = counts.levels[entries]
-    by_level = np.bincount(levels, weights=counts.counts[entries])
-    fitting = int((np.cumsum(by_level) <= most).sum())
-    if fitting == len(by_level) or depth == BITS:
-        return Tile(0.0, [entries])
-    # All levels below `fitting`; where not even the coarsest fits, the children share it.
-    held = max(above, fitting - 1)
-    own, rest = entries[levels <= held], entries[levels > held]
-    octants = counts.cells[rest] >> 3 * (BITS - 1 - depth) & 7
-    children = [
-        _tile(counts, rest[octants == octant], depth + 1, held, most) for octant in np.unique(octants)
-    ]
-    if len(own) == 0 and len(children) == 1:
-        return children[0]
-    error = counts.errors[held] if held >= 0 else counts.whole_error
-    return Tile(error, [own] if len(own) else [], children)
-
-
-def each_part(
-    work: Any,
-    parts: Parts,
-    folder: Path,
-    processes: int,
-    numbers: list[Any] | None = None,
-    report: Report = lambda done, total: None,
-) -> Iterator[Any]:
-    """Yield `work(parts, folder, number)` for all parts in order, computed by several processes."""
-    chosen = list(range(len(parts.starts) - 1)) if numbers is None else numbers
-    with ExitStack() as stack:
-        if processes == 1:
-            found: Iterator[Any] = map(partial(work, parts, folder), chosen)
-        else:
-            context = multiprocessing.get_context("spawn")
-            pool = ProcessPoolExecutor(processes, context, _prepare)
-            stack.callback(pool.shutdown, cancel_futures=True)
-            found = pool.map(partial(work, parts, folder), chosen)
-        for done, one in enumerate(found, 1):
-            report(done, len(chosen))
-            yield one
+@contextmanager
+def workers(processes: int) -> Iterator[Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]]:
+    """Yield a `map` whose function is computed by several processes; its results come in order."""
+    if processes == 1:
+        yield map
+        return
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _prepare)
+    try:
+        yield pool.map
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _prepare() -> None:
@@ -253,35 +269,91 @@ def _prepare() -> None:
     torch.set_num_threads(1)
 
 
-def _encode(parts: Parts, folder: Path, part: int) -> tuple[Array, int, int]:
-    """Write the file of a part; return the box of its Gaussians, their number, and the file's size."""
-    gaussians = parts.read(part)
-    file = folder / f"{part:06d}.glb"
-    # glTF's up is +Y and that of 3D Tiles +Z; viewers turn contents between the two.
-    write_glb(file, gaussians, up=(0.0, 0.0, 1.0))
-    return extents(gaussians), len(gaussians), file.stat().st_size
+def _encode_all(writer: _Writer, root: Tile, processes: int, report: Report) -> None:
+    """Write all tiles, children before their parents."""
+    by_height: dict[int, list[Tile]] = {}
+    for tile in root.every():
+        by_height.setdefault(tile.height(), []).append(tile)
+    done, total = 0, sum(len(tiles) for tiles in by_height.values())
+    with workers(processes) as run:
+        for _, tiles in sorted(by_height.items()):
+            for tile, found in zip(tiles, run(writer.encode, tiles), strict=True):
+                tile.box, tile.count, tile.bytes, tile.edge = found
+                done += 1
+                report(done, total)
 
 
-def _node(tile: Tile, boxes: list[tuple[Array, int]]) -> tuple[dict[str, Any], Array]:
+@dataclass(frozen=True)
+class _Writer:
+    """Writes files of tiles; may be sent to another process.
+
+    Attributes:
+        folder: of the tileset.
+        parts: the model's rows.
+        box: where most of the model is, [2, 3].
+        antialiased: whether viewers compensate the screen-space blur.
+    """
+
+    folder: Path
+    parts: Parts
+    box: Array
+    antialiased: bool
+
+    @property
+    def proxies(self) -> Path:
+        """The temporary file with the moments of tiles that have children, each from its `first` row on."""
+        return self.folder / "proxies.tmp"
+
+    def encode(self, tile: Tile) -> tuple[Array, int, int, float]:
+        """Write the file of a tile; return its box, number of Gaussians, size, and edge of the cells."""
+        edge = 0.0
+        if tile.part is not None:
+            gaussians = self.parts.read(tile.part)
+        else:
+            rows = np.concatenate([self._moments(child) for child in tile.children])
+            least = max(child.edge for child in tile.children)
+            most = min(tile.count, max(1, len(rows) // _FEWER))
+            rows, edge = merged(rows, most, self.box, self.antialiased, least)
+            with open(os.open(self.proxies, os.O_WRONLY | os.O_CREAT, 0o666), "wb") as file:
+                file.seek(tile.first * rows.itemsize * rows.shape[1])
+                file.write(rows.data)
+            gaussians = shown(rows, self.parts.comments)
+        path = self.folder / _uri(tile)
+        # glTF's up is +Y and that of 3D Tiles +Z; viewers turn contents between the two.
+        write_glb(path, gaussians, up=(0.0, 0.0, 1.0))
+        return extents(gaussians), len(gaussians), path.stat().st_size, edge
+
+    def _moments(self, tile: Tile) -> Rows:
+        if tile.part is not None:
+            return moments(self.parts.read(tile.part))
+        width = self.parts.width - 2  # no level; a covariance has one number less than quaternion and scales
+        values = np.fromfile(self.proxies, "<f4", tile.count * width, offset=4 * tile.first * width)
+        return values.reshape(-1, width)
+
+
+def _uri(tile: Tile) -> str:
+    return f"tiles/{tile.number:06d}.glb"
+
+
+def _node(tile: Tile) -> tuple[dict[str, Any], Array]:
     """Return the JSON of a tile and the box of its contents and those of its descendants."""
-    content: dict[str, Any] = {"boundingVolume": {}, "geometricError": tile.error, "refine": "ADD"}
-    inside = []
-    if tile.part is not None:
-        box, count = boxes[tile.part]
-        inside.append(box)
-        content["content"] = {
-            "uri": f"tiles/{tile.part:06d}.glb",
-            "boundingVolume": {"box": _box(box)},
-            "extras": {"gaussians": count},
-        }
-    if tile.children:
-        nodes = [_node(child, boxes) for child in tile.children]
-        content["children"] = [node for node, _ in nodes]
-        inside += [box for _, box in nodes]
-    every = np.stack(inside)
+    node: dict[str, Any] = {
+        "boundingVolume": {},
+        "geometricError": _PIXELS * tile.edge,
+        "refine": "REPLACE",
+        "content": {
+            "uri": _uri(tile),
+            "boundingVolume": {"box": _box(tile.box)},
+            "extras": {"gaussians": tile.count},
+        },
+    }
+    nodes = [_node(child) for child in tile.children]
+    if nodes:
+        node["children"] = [child for child, _ in nodes]
+    every = np.stack([tile.box, *(box for _, box in nodes)])
     box = np.stack([every[:, 0].min(axis=0), every[:, 1].max(axis=0)])
-    content["boundingVolume"] = {"box": _box(box)}
-    return content, box
+    node["boundingVolume"] = {"box": _box(box)}
+    return node, box
 
 
 def _box(box: Array) -> list[float]:

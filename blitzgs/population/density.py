@@ -17,6 +17,7 @@ from blitzgs.spawn.candidates import Candidates, Veto, spawn_features
 from blitzgs.spawn.lineage import Births, Cause, Lineage
 from blitzgs.table.placement import place
 from blitzgs.table.table import PARAMETERS, GaussianTable, opacity_logit
+from blitzgs.util.rotations import quaternion_matrices
 
 SPLIT_SHRINK = 1.6
 CHILDREN_OF_A_SPLIT = 2
@@ -210,17 +211,6 @@ def _shrink(children: dict[str, Tensor], seed: int, time: int) -> None:
 def rotations(quats: Tensor) -> Tensor:
     """Normalise quaternions (w, x, y, z) [M, 4] and return their rotation matrices [M, 3, 3]."""
     return quaternion_matrices(quats / quats.norm(dim=1, keepdim=True).clamp(min=1e-30))
-
-
-def quaternion_matrices(quats: Tensor) -> Tensor:
-    """Return the matrices [M, 3, 3] of quaternions [M, 4], rotations if the quaternions have length 1."""
-    w, x, y, z = quats.unbind(1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
 
 
 def death_causes(

@@ -64,12 +64,12 @@ def test_the_loop_learns_with_each_arm(tmp_path, capsys):
 
 def test_nearer_frames_load_more_and_small_errors_show_everything(tmp_path, capsys):
     write_tiles(tmp_path / "city", city(3000), np.eye(4), SCENE, "city", most=200)
-    arguments = [str(tmp_path / "city"), "--frames", "3", "--width", "96", "--errors", "1e-9", "8", "32"]
+    arguments = [str(tmp_path / "city"), "--frames", "3", "--width", "96", "--errors", "1e-9", "48", "192"]
     bm_tiles.main([*arguments, "--device", "cpu", "--json", str(tmp_path / "found.json")])
     assert "3,000 Gaussians" in capsys.readouterr().out
     rows = json.loads((tmp_path / "found.json").read_text())["rows"]
     assert len(rows) == 9
-    exact, coarse, coarser = ([row for row in rows if row["pixel_error"] == e] for e in (1e-9, 8, 32))
+    exact, coarse, coarser = ([row for row in rows if row["pixel_error"] == e] for e in (1e-9, 48, 192))
     # Everything that the camera can see is everything that the picture shows.
     assert all(row["psnr"] is None or row["psnr"] > 80 for row in exact)
     for fine, less, least in zip(exact, coarse, coarser, strict=True):

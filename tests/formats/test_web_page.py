@@ -221,35 +221,32 @@ def leaves(node):
         yield from leaves(child)
 
 
-def test_lods_have_the_trained_levels(tmp_path):
+def test_lods_stand_for_each_other(tmp_path):
     gsply = pytest.importorskip("gsply", reason="the extra formats is not installed")
     pytest.importorskip("imagecodecs", reason="gsply reads SOG with imagecodecs")
     model = city(1200)
     done = write_streamed_sog(tmp_path / "city", model, most=600)
     meta = json.loads((tmp_path / "city" / "lod-meta.json").read_text())
     assert meta["version"] == 1 and meta["lodLevels"] == len(meta["counts"]) == 4
-    # LOD n lacks the n finest levels.
-    expected = [int((model.levels <= 3 - lod).sum()) for lod in range(4)]
-    assert meta["counts"] == expected and meta["count"] == sum(expected)
+    assert meta["counts"][0] == 1200 and meta["count"] == sum(meta["counts"])
+    assert 1200 / 8 < meta["counts"][1] < 1200 / 2 and meta["counts"][3] < 1200 / 16
     found, used = list(leaves(meta["tree"])), []
     seen = {lod: [] for lod in range(4)}
     for leaf in found:
         low, high = (np.array(leaf["bound"][name]) for name in ("min", "max"))
+        assert list(leaf["lods"]) == ["0", "1", "2", "3"]
         for lod, place in leaf["lods"].items():
             used.append(place["file"])
             data = gsply.sogread(str(tmp_path / "city" / meta["filenames"][place["file"]]))
             assert place["offset"] == 0 and len(data.means) == place["count"] <= 600
+            assert place["count"] <= leaf["lods"][str(max(0, int(lod) - 1))]["count"]
             assert (data.means >= low - 1e-3).all() and (data.means <= high + 1e-3).all()
             seen[int(lod)].append(data.means)
     assert sorted(used) == list(range(len(meta["filenames"]))) and len(used) == done.tiles
     assert len(found) >= 2
-    for lod, parts in seen.items():
-        means = np.concatenate(parts)
-        wanted = model.means[model.levels <= 3 - lod].numpy()
-        assert len(means) == len(wanted)
-        # 16 bits of the logarithm of each coordinate.
-        for axis in range(3):
-            error = np.abs(np.sort(means[:, axis]) - np.sort(wanted[:, axis]))
-            assert (error <= 1e-3 * (1 + np.abs(np.sort(wanted[:, axis])))).all()
+    assert [sum(map(len, parts)) for parts in seen.values()] == meta["counts"]
+    # 16 bits of the logarithm of each coordinate.
+    means, wanted = np.sort(np.concatenate(seen[0]), axis=0), np.sort(model.means.numpy(), axis=0)
+    assert (np.abs(means - wanted) <= 1e-3 * (1 + np.abs(wanted))).all()
     assert done.gaussians == 1200
     assert not [path for path in (tmp_path / "city").rglob("*") if path.suffix in (".tmp", ".sog")]

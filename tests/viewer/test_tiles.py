@@ -62,15 +62,15 @@ def pixels(browser):
 def test_nearer_views_load_more_tiles_and_farther_ones_show_fewer(shown):
     _, browser, url = shown
     browser.go(url)
-    far = settle(browser, pose((20, -300, 150)))
+    far = settle(browser, pose((20, -1500, 900)))
     near = settle(browser, pose((20, 4, 5)))
     assert 0 < far["shown"] < near["shown"] and far["gaussians"] < near["gaussians"]
-    assert set(far["uris"]) & set(near["uris"])  # coarse tiles stay
+    assert not set(far["uris"]) & set(near["uris"])  # fine tiles replace coarse ones
     assert near["bytes"] > far["bytes"] > 0
     assert pixels(browser).std() > 15
-    again = settle(browser, pose((20, -300, 150)))
+    again = settle(browser, pose((20, -1500, 900)))
     assert sorted(again["uris"]) == sorted(far["uris"]) and again["bytes"] == near["bytes"]
-    away = settle(browser, pose((20, -300, 150), (20, -600, 150)))
+    away = settle(browser, pose((20, -1500, 900), (20, -3000, 900)))
     assert away["shown"] < far["shown"]  # behind the camera
     assert browser.errors() == []
 
@@ -96,9 +96,9 @@ def test_a_budget_is_kept_and_missing_tiles_are_said(shown):
     folder, browser, url = shown
     browser.go(url + "?budget=28000&error=0.01")
     first = settle(browser, pose((8, 8, 4), (2, 2, 1)))
-    assert first["shown"] == first["wanted"] == 7  # pages of 4,096 Gaussians
+    assert first["shown"] < first["wanted"] <= 7  # pages of 4,096 Gaussians
     other = settle(browser, pose((32, 22, 4), (38, 28, 1)))
-    assert other["shown"] == other["wanted"] == 7 and set(other["uris"]) != set(first["uris"])
+    assert other["shown"] < other["wanted"] <= 7 and set(other["uris"]) != set(first["uris"])
     assert pixels(browser).std() > 5
     assert browser.errors() == []
     tileset = folder / "city" / "tileset.json"
@@ -130,7 +130,7 @@ def test_damaged_folders_are_refused(tmp_path):
 
 def contents(folder):
     tileset = json.loads((folder / "tileset.json").read_text())
-    found = [node["content"]["uri"] for node, _ in nodes(tileset["root"]) if "content" in node]
+    found = [node["content"]["uri"] for node, _ in nodes(tileset["root"]) if "children" not in node]
     return tileset, np.concatenate([read_glb(folder / uri)[1]["POSITION"] for uri in found])
 
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Shows the tileset beside this page: loads the tiles whose absence would be seen, nearest and coarsest first.
+// Shows the tileset beside this page: a tile until all its visible children are loaded, whose detail would be seen.
 (() => {
   const HARMONIC = 1 / 64, REQUESTS = 6;
   const given = new URLSearchParams(location.search);
@@ -85,34 +85,47 @@
     return Math.hypot(...[0, 1, 2].map((i) => Math.max(0, Math.abs(centre[i] - box[i]) - box[3 + 4 * i])));
   }
 
-  // Chooses tiles for a view, those first whose absence would be seen most, until the budget is spent.
+  // Chooses tiles for a view: the root, then the children of those tiles first whose coarseness is seen most,
+  // until the budget is spent. Tiles above those that are shown stay loaded, to be shown until all below are there.
   function look(view) {
     if (!root) return;
     const canvas = document.getElementById("view"), sides = planes(view, canvas.width, canvas.height);
-    const focal = view.intrinsics[1], open = visible(root, view.centre, sides) ? [[Infinity, root]] : [];
+    const focal = view.intrinsics[1], open = [];
     let room = capacity;
     wanted = [];
     clock++;
+    const want = (tile) => {
+      tile.used = clock;
+      tile.finer = null;
+      room -= tile.needs;
+      wanted.push(tile);
+      const seen = (tile.error * focal) / Math.max(distance(tile, view.centre), scene.near);
+      if (seen > pixelError) open.push([seen, tile]);
+    };
+    if (visible(root, view.centre, sides)) want(root);
     while (open.length) {
       let best = 0;
       for (let i = 1; i < open.length; i++) if (open[i][0] > open[best][0]) best = i;
       const [, tile] = open.splice(best, 1)[0];
-      if (tile.uri) {
-        room -= tile.needs;
-        if (room < 0) break;
-        tile.used = clock;
-        wanted.push(tile);
-      }
-      const seen = (tile.error * focal) / Math.max(distance(tile, view.centre), scene.near);
-      if (seen > pixelError) for (const child of tile.children) if (visible(child, view.centre, sides)) open.push([seen, child]);
+      const finer = tile.children.filter((child) => visible(child, view.centre, sides));
+      if (finer.reduce((sum, child) => sum + child.needs, 0) > room) continue;
+      tile.finer = finer;
+      finer.forEach(want);
     }
     for (const tile of tiles) if (tile.used !== clock) tile.data = null;
     for (const tile of wanted) if (!tile.pages && !tile.loading && !tile.failed && requests < REQUESTS) load(tile);
     show();
   }
 
+  // Returns the finest loaded tiles that stand for a wanted one; null: some of it would be missing.
+  function standing(tile) {
+    const below = tile.finer?.map(standing);
+    if (below?.every(Boolean)) return below.flat();
+    return tile.pages ? [tile] : null;
+  }
+
   function show() {
-    const now = new Set(wanted.filter((tile) => tile.pages));
+    const now = new Set(wanted.length ? standing(root) : []);
     if (now.size === shown.size && [...now].every((tile) => shown.has(tile))) return;
     const pages = [...now].flatMap((tile) => tile.pages).sort((a, b) => a.page - b.page), ranges = [];
     for (const { page, size } of pages) {
@@ -173,8 +186,8 @@
   // --- Opening ---------------------------------------------------------------------------------------------------
 
   function node(json) {
-    const tile = { box: json.boundingVolume.box, error: json.geometricError, uri: json.content?.uri, used: -1, pages: null, data: null };
-    tile.needs = Math.ceil((json.content?.extras.gaussians ?? 0) / WIDTH);
+    const tile = { box: json.boundingVolume.box, error: json.geometricError, uri: json.content.uri, used: -1, finer: null, pages: null, data: null };
+    tile.needs = Math.ceil(json.content.extras.gaussians / WIDTH);
     tile.children = (json.children ?? []).map(node);
     tiles.push(tile);
     return tile;
@@ -189,7 +202,7 @@
     viewer = makeViewer(scene, look);
     Object.assign(window.blitzgs, viewer, { scene });
     root = node(tileset.root);
-    capacity = Math.min(Math.ceil(budget / WIDTH), tiles.reduce((sum, tile) => sum + tile.needs, 0));
+    capacity = Math.max(root.needs, Math.min(Math.ceil(budget / WIDTH), tiles.reduce((sum, tile) => sum + tile.needs, 0)));
     for (let page = capacity - 1; page >= 0; page--) free.push(page);
     const shades = new Uint32Array(4 * WIDTH * Math.max(1, texels * capacity));
     await viewer.open({ positions: new Float32Array(3 * WIDTH * capacity), levels: null, geometry: new Uint32Array(8 * WIDTH * capacity), texels, shades });
