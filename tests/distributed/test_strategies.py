@@ -24,21 +24,14 @@ SETTINGS = (
     "population.min_opacity=0.06", "model.antialiased=true", "optimiser.opacity=0.1",
     "optimiser.position_noise=1e6", "log.every=2", "log.keep_checkpoints=9",
 )  # fmt: skip
-RELOCATION = (
-    "population.strategy=relocation",
-    "loss.opacity=0.01",
-    "population.max_gaussians=450",
-)
+RELOCATION = ("population.strategy=relocation", "loss.opacity=0.01", "population.max_gaussians=450")
 # The second importance pass at the end of density control keeps half. Then rates fall.
 PRUNED = (
     "population.importance=true", "population.score=weight", "population.pass2_mass=1",
     "population.pass2_keep=0.5", "schedule.t1=0", "schedule.densify_until=54", "schedule.t2=54",
     "schedule.position_decay=60", "optimiser.final=0.1",
 )  # fmt: skip
-OPTIONS = {
-    "relocation": RELOCATION,
-    "relocation, pruned": (*RELOCATION, *PRUNED),
-}
+OPTIONS = {"relocation": RELOCATION, "relocation, pruned": (*RELOCATION, *PRUNED)}
 FIRST = Path("checkpoints") / "checkpoint_000000"
 
 

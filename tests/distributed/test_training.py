@@ -20,15 +20,7 @@ from blitzgs.runs import run_files
 from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import EIGHT, RankError, on_each_device, run_ranks
-from tests.training.tiny import (
-    OVERRIDES,
-    as_flags,
-    events_of,
-    read_log,
-    steps_of,
-    tiny_config,
-    tiny_scene,
-)
+from tests.training.tiny import OVERRIDES, as_flags, events_of, read_log, steps_of, tiny_config, tiny_scene
 
 ROOT = Path(__file__).parents[2]
 # 10 + 20 steps of 2 images; density events (after 28, 36, 44 and 52 images) fall into the 20 steps.
