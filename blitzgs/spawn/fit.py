@@ -81,15 +81,12 @@ def read_spawns(folder: Path, gaussians: int | None = None) -> Spawns:
     survived = alive[spawned]
     check_outcomes(survived, folder)
     return Spawns(
-        name=about["name"],
-        scene=about["scene"],
-        schedule=about["schedule"],
+        name=about["name"], scene=about["scene"], schedule=about["schedule"],
         features=feature_columns({name: births[name][spawned] for name in births}, len(survived)),
-        survived=survived,
-        parents=births["parent"][spawned],
+        survived=survived, parents=births["parent"][spawned],
         positions=np.stack([births[axis][spawned] for axis in "xyz"], 1),
         initial_survival=float(alive[~spawned].mean()),
-    )
+    )  # fmt: skip
 
 
 def read_about(text: bytes | str, file: Path) -> dict[str, Any]:

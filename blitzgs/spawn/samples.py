@@ -84,12 +84,8 @@ def read_sample(path: Path) -> Spawns:
     survived = columns["survived"].astype(bool)
     check_outcomes(survived, path)
     return Spawns(
-        name=about["name"],
-        scene=about["scene"],
-        schedule=about["schedule"],
-        features=feature_columns(columns, len(table)),
-        survived=survived,
-        parents=columns["parent"],
+        name=about["name"], scene=about["scene"], schedule=about["schedule"],
+        features=feature_columns(columns, len(table)), survived=survived, parents=columns["parent"],
         positions=np.stack([columns[axis] for axis in _AXES], 1),
         initial_survival=about.get("initial_survival", math.nan),
-    )
+    )  # fmt: skip

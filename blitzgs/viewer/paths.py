@@ -115,13 +115,10 @@ def from_json(text: str) -> CameraPath:
     if not keys:
         raise ValueError(f"{_NO_PATH}: it has neither keyframes nor camera_path")
     return CameraPath(
-        keys,
-        round(_number(content, "render_width", 1920, 1)),
-        round(_number(content, "render_height", 1080, 1)),
-        _number(content, "fps", 24.0, 0.01),
-        _number(content, "seconds", 4.0, 0.0),
-        bool(content.get("is_cycle", False)),
-    )
+        keys, round(_number(content, "render_width", 1920, 1)),
+        round(_number(content, "render_height", 1080, 1)), _number(content, "fps", 24.0, 0.01),
+        _number(content, "seconds", 4.0, 0.0), bool(content.get("is_cycle", False)),
+    )  # fmt: skip
 
 
 def frames_from_json(text: str) -> list[Keyframe]:

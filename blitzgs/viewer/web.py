@@ -142,17 +142,11 @@ def web_scene(world: World, options: RenderOptions, unit: float, lod: WebLevels 
         return x, y, z
 
     return WebScene(
-        near=options.near_plane * unit,
-        far=options.far_plane * unit,
-        blur=options.eps2d,
-        antialiased=options.antialiased,
-        background=options.background,
-        up=point(world.up),
-        eye=point(start.position * (unit / SCALE)),
-        target=point(world.middle * (unit / SCALE)),
-        fov=start.fov,
-        lod=lod,
-    )
+        near=options.near_plane * unit, far=options.far_plane * unit, blur=options.eps2d,
+        antialiased=options.antialiased, background=options.background, up=point(world.up),
+        eye=point(start.position * (unit / SCALE)), target=point(world.middle * (unit / SCALE)),
+        fov=start.fov, lod=lod,
+    )  # fmt: skip
 
 
 def _levels(lod: ModelGate) -> WebLevels:
