@@ -195,7 +195,7 @@ def run(args: argparse.Namespace) -> int:
             args.share_gpus,
             tables_on_host=config.memory.resident_gb > 0,
             lap=laps.lap,
-        ) as ranks,
+        ) as ranks,  # fmt: skip
     ):
         # A capture that cannot be read leaves no empty folder behind.
         capture, images = open_capture(config, ranks, reading=reading)

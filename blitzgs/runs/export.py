@@ -338,13 +338,10 @@ class _Shards:
                 with torch.no_grad():
                     optimiser.catch_up(table, None, self.step)
                 yield Gaussians(
-                    means=table["means"],
-                    quats=table["quats"],
-                    scales=table["scales"],
-                    opacities=table["opacities"],
-                    sh=table["sh"],
+                    means=table["means"], quats=table["quats"], scales=table["scales"],
+                    opacities=table["opacities"], sh=table["sh"],
                     levels=table["level"].float() if self.has_levels else None,
-                )
+                )  # fmt: skip
 
 
 def _comments(config: Config, space: Space, gate: LodGate | None, exposed: bool) -> list[str]:

@@ -195,13 +195,9 @@ def judge(run: Spawns, scores: NDArray[Any], gate_from: float = 0.0) -> dict[str
     """
     name, single = best_feature(run)
     found = {
-        "run": run.name,
-        "auc": auc(scores, run.survived),
-        "best_feature": name,
-        "best_feature_auc": single,
-        "spawns": len(run.survived),
-        "survived": float(run.survived.mean()),
-    }
+        "run": run.name, "auc": auc(scores, run.survived), "best_feature": name, "best_feature_auc": single,
+        "spawns": len(run.survived), "survived": float(run.survived.mean()),
+    }  # fmt: skip
     late = run.times >= gate_from
     if not late.all() and 0 < run.survived[late].sum() < late.sum():
         found["judged"] = judge(run.only(late), scores[late])

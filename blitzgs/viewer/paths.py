@@ -89,19 +89,12 @@ def to_json(path: CameraPath) -> str:
     ]
     keyframes = [{"matrix": _rows(key), "fov": key.fov, "aspect": key.aspect} for key in path.keyframes]
     content = {
-        "camera_type": "perspective",
-        "render_width": path.width,
-        "render_height": path.height,
-        "fps": path.fps,
-        "seconds": path.seconds,
-        "is_cycle": path.is_cycle,
-        "smoothness_value": 0.0,
+        "camera_type": "perspective", "render_width": path.width, "render_height": path.height,
+        "fps": path.fps, "seconds": path.seconds, "is_cycle": path.is_cycle, "smoothness_value": 0.0,
         "default_fov": path.keyframes[0].fov if path.keyframes else 50.0,
         "default_transition_sec": path.seconds / max(1, len(path.keyframes) - (not path.is_cycle)),
-        "keyframes": keyframes,
-        "camera_path": frames,
-        "crop": None,
-    }
+        "keyframes": keyframes, "camera_path": frames, "crop": None,
+    }  # fmt: skip
     return json.dumps(content, indent=1) + "\n"
 
 

@@ -118,13 +118,10 @@ def _splats(table: GaussianTable, rows: Tensor, degree: int, levels: bool) -> We
         return table[name][rows].cpu().numpy()
 
     return WebSplats(
-        means=column("means"),
-        quats=column("quats"),
-        scales=column("scales"),
-        opacities=table["opacities"][rows].sigmoid().cpu().numpy(),
-        sh=column("sh")[:, : (degree + 1) ** 2],
+        means=column("means"), quats=column("quats"), scales=column("scales"),
+        opacities=table["opacities"][rows].sigmoid().cpu().numpy(), sh=column("sh")[:, : (degree + 1) ** 2],
         levels=column("level") if levels else None,
-    )
+    )  # fmt: skip
 
 
 def _scene(opened: Opened) -> WebScene:
