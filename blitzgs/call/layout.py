@@ -115,18 +115,16 @@ def _gradients_of_arranged(
 
 
 class Layout:
-    """The arrangement of P splats in `meta`.
-
-    Attributes:
-        splats: the splats; camera_ids number all images of the call, gaussian_ids the Gaussians of a scene.
-        packed: whether `meta` has only the visible splats, or else an entry for every Gaussian and view.
-        places: where each splat is in `meta`; None: the order is unchanged.
-    """
+    """The arrangement of P splats in `meta`: the visible ones if `packed`, or else all of all views."""
 
     def __init__(self, splats: ProjectedSplats, shape: tuple[int, ...], packed: bool) -> None:
-        """Compute the arrangement. `shape`: batch dimensions, C, and the Gaussians N of a scene."""
+        """Compute the arrangement.
+
+        `splats`: their camera_ids number all images of the call, their gaussian_ids the Gaussians of a scene.
+        `shape`: batch dimensions, C, and the Gaussians N of a scene.
+        """
         self.splats, self.packed = splats, packed
-        self.places: Places | None = None
+        self.places: Places | None = None  # of each splat in `meta`; None: the order is unchanged
         if not packed:
             self.places = Places((splats.camera_ids, splats.gaussian_ids), shape)
         elif math.prod(shape[:-1]) > 1:

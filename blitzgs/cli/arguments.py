@@ -37,12 +37,9 @@ def add_command(
     Without `add_help`, the caller adds the flag --help.
     """
     parser = commands.add_parser(
-        name,
-        help=summary,
-        description=description or summary[0].upper() + summary[1:] + ".",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        add_help=add_help,
-    )
+        name, help=summary, description=description or summary[0].upper() + summary[1:] + ".",
+        formatter_class=argparse.RawDescriptionHelpFormatter, add_help=add_help,
+    )  # fmt: skip
     parser.set_defaults(run=function, parser=parser)
     return parser
 

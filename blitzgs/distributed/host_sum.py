@@ -34,11 +34,7 @@ class _Queued:
 
     Torch assumes that the tensors of the step are used on the step's stream alone, and gives their memory to
     new tensors as soon as no variable refers to them. They are kept here until the second stream has read
-    them.
-
-    Attributes:
-        memory: float32 [words], pinned.
-        written: event that is recorded after the copy to `memory`.
+    them. `memory`, float32 [words], is pinned; the event `written` is recorded after the copy to it.
     """
 
     def __init__(self, side: _Side, words: int, tensors: tuple[Tensor | None, ...]) -> None:

@@ -86,21 +86,13 @@ class TileRanges:
 
 
 class TileAssignment:
-    """The division of tiles among the ranks in one rendering.
-
-    Attributes:
-        ranks: the job; all its ranks render together.
-        ranges: the tiles of each rank.
-        own_tiles: this rank's own [first, one past last) tile.
-        composited_tiles: the [first, one past last) tile that this rank composites: its own and the halo
-            around them.
-        composited_by_rank: `composited_tiles` of every rank.
-    """
+    """The division of tiles among the ranks in one rendering; all ranks of the job render together."""
 
     def __init__(self, ranks: Ranks, ranges: TileRanges) -> None:
         """Compute which tiles each rank composites."""
         self.ranks, self.ranges = ranks, ranges
-        self.own_tiles = ranges.of(ranks.rank)
+        self.own_tiles = ranges.of(ranks.rank)  # [first, one past last)
+        # What a rank composites: its own tiles and the halo around them, [first, one past last).
         self.composited_by_rank = [ranges.composited(rank) for rank in range(ranks.world_size)]
         self.composited_tiles = self.composited_by_rank[ranks.rank]
 

@@ -37,20 +37,15 @@ class GateRules(NamedTuple):
     A view with an LOD gate leaves out each row of octree level l that is farther than `reach[l]` from the
     camera centre. A view with a column of the cull matrix leaves out the rows whose bit in that column is
     set.
-
-    Attributes:
-        level: uint8 [N]; a level beyond the last of `reach` counts as the last.
-        reach: one distance for each of 1 to 32 levels, in the unit of the means: up to it the level is kept.
-            Distances must not increase towards finer levels; a negative one removes the level everywhere.
-        lod_views: bit v is set when view v has an LOD gate.
-        cull: int32 [ceil(N / 256), columns, 8], of `blitzgs.ops.blocks`; None: there is none.
-        columns: of `cull`, one for each view; negative: the view has no mask. Empty: no view has one.
     """
 
-    level: Tensor
+    level: Tensor  # uint8 [N]; a level beyond the last of `reach` counts as the last
+    # One distance for each of 1 to 32 levels, in the unit of the means: up to it the level is kept. Distances
+    # must not increase towards finer levels; a negative one removes the level everywhere.
     reach: list[float]
-    lod_views: int
-    cull: Tensor | None = None
+    lod_views: int  # bit v is set when view v has an LOD gate
+    cull: Tensor | None = None  # int32 [ceil(N / 256), columns, 8], of `blitzgs.ops.blocks`
+    # Columns of `cull`, one for each view; negative: the view has no mask. Empty: no view has one.
     columns: list[int] = []  # noqa: RUF012  (never changed)
 
 

@@ -106,12 +106,8 @@ class GrowingSchedule(AdamTables):
 
     Its methods take the parameter's state: the parameter, its first and second moments, `last_step` and
     `moment_step` (see `AdamState`). The tables have a fixed length. Their rows, and the columns of steps,
-    count from `begin`.
-
-    Attributes:
-        begin: number of steps taken before the tables begin, with which all rows must be up to date.
-        last: number of the last step in the tables.
-        current: the step with which the parameters of all rows are known to be up to date.
+    count from `begin`, the number of steps taken before, with which all rows must be up to date. `last` is
+    the last step in the tables; the parameters of all rows are known to be up to date with step `current`.
     """
 
     LENGTH = 4096  # steps in the tables
@@ -312,16 +308,7 @@ def project_bwd_step_(
     """
     with below_autograd():
         torch.ops.blitzgs.project_bwd_step_(
-            state.tensors,
-            [schedule.table, schedule.lr_table],
-            *schedule.constants(step),
-            *views,
-            splats.camera_ids,
-            splats.visible_ids,
-            splats.splat_offsets,
-            level,
-            *options,
-            gradients.parts,
-            gradients.places,
-            means2d_sums,
-        )
+            state.tensors, [schedule.table, schedule.lr_table], *schedule.constants(step), *views,
+            splats.camera_ids, splats.visible_ids, splats.splat_offsets, level, *options, gradients.parts,
+            gradients.places, means2d_sums,
+        )  # fmt: skip

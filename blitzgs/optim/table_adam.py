@@ -30,11 +30,6 @@ class TableAdam:
     update; the columns `last_step` and `moment_step` note how far each row is current. `catch_up` must be
     called before the parameters of such rows are read. Use this class for a `GaussianTable` and a `Schedule`
     that is known in advance, as the trainer does, and `blitzgs.optim.LazyAdam` in a loop of your own.
-
-    Attributes:
-        lr_table: float32 [S + 1, 6], the learning rates of every step; see `Schedule.learning_rates`.
-        schedule: the tables of the lazy optimiser.
-        pending_table: table that bounds the movement by pending steps (`AdamSchedule.table`).
     """
 
     def __init__(self, config: OptimiserConfig, schedule: Schedule, extent: float, device: object) -> None:
@@ -52,9 +47,10 @@ class TableAdam:
         """
         rates = schedule.learning_rates(self._config, self._extent)
         self._position_rates = rates[:, 0].tolist()
+        # [S + 1, 6], the rates of every step; see `Schedule.learning_rates`.
         self.lr_table: Tensor = rates.to(self._device)  # type: ignore[call-overload]
         self.schedule = AdamSchedule(self.lr_table, *self._betas, self._eps)
-        self.pending_table = self.schedule.table
+        self.pending_table = self.schedule.table  # bounds the movement by pending steps
         self._alone: dict[str, AdamSchedule] = {}
 
     def position_rate(self, step: int) -> float:

@@ -55,13 +55,9 @@ def _count(value: float) -> str:
 
 
 class RunLog:
-    """Writes the records of a run; without a folder (on ranks other than 0) it does nothing.
+    """Writes the records of a run; without a folder (on ranks other than 0) it does nothing."""
 
-    Attributes:
-        total: images of the whole run, from which the remaining time is estimated.
-        listener: called with the time and the values of every record, or None.
-    """
-
+    # Called with the time and the values of every record.
     listener: Callable[[int, Mapping[str, Any]], object] | None = None
 
     def __init__(
@@ -82,7 +78,7 @@ class RunLog:
         self._held_out: float | None = None
         self._run_id = run_id
         self._marks = deque([(done, time.monotonic())], maxlen=_RATE_RECORDS)
-        self.total = total
+        self.total = total  # images of the whole run, from which the remaining time is estimated
         self.console = Console(quiet=folder is None, highlight=False)
         if folder is None:
             return

@@ -93,11 +93,6 @@ class ModelGate:
     Gaussians is rendered without the gate, because the gate would save little. So is a view that would keep
     less than `least_kept`, which no training view does: there, coarse levels that have not been trained to
     stand alone would show holes.
-
-    Attributes:
-        gate: the distances.
-        most_kept: share of all Gaussians from which on a view has no gate.
-        least_kept: share of all Gaussians below which a view has no gate.
     """
 
     def __init__(

@@ -27,19 +27,12 @@ FOOTPRINT_LEVELS, FOOTPRINT_STEPS = 32, 4
 
 @dataclass(frozen=True)
 class Levels:
-    """The octree levels of a scene: level l is meant for distances around `reference_distance` / `fork`^l.
+    """The octree levels of a scene: level l is meant for distances around `reference_distance` / `fork`^l."""
 
-    Attributes:
-        count: number of levels K.
-        fork: ratio f of neighbouring levels.
-        reference_distance: d_0, the distance that level 0 is meant for, in the scene's unit.
-        voxel_size: edge of a level-0 voxel, in the scene's unit.
-    """
-
-    count: int
-    fork: float
-    reference_distance: float
-    voxel_size: float
+    count: int  # number of levels K
+    fork: float  # ratio f of neighbouring levels
+    reference_distance: float  # d_0, the distance that level 0 is meant for, in the scene's unit
+    voxel_size: float  # edge of a level-0 voxel, in the scene's unit
 
     def voxel_size_of(self, level: int) -> float:
         """Return the edge of a voxel of `level`."""
@@ -186,18 +179,12 @@ class PointBlocks:
 
     A city has millions of points and thousands of cameras. The bounds decide nearly every question about
     their distances, so that only few of the distances themselves need to be computed.
-
-    Attributes:
-        order: int64 [M], the given points by block: `BLOCK_POINTS` in each, and the rest in the last one.
-        points: float64 [B, `BLOCK_POINTS`, 3]; the last block is filled up with its last point.
-        low: float64 [B, 3], lower corners of the boxes.
-        high: float64 [B, 3], upper corners.
     """
 
-    order: Tensor
-    points: Tensor
-    low: Tensor
-    high: Tensor
+    order: Tensor  # int64 [M], the points by block: `BLOCK_POINTS` in each, and the rest in the last one
+    points: Tensor  # float64 [B, `BLOCK_POINTS`, 3]; the last block is filled up with its last point
+    low: Tensor  # float64 [B, 3], lower corners of the boxes
+    high: Tensor  # float64 [B, 3], upper corners
 
     @classmethod
     def of(cls, points: Tensor) -> PointBlocks:

@@ -21,11 +21,7 @@ _CHUNK = 1 << 18
 
 
 class Door:
-    """Listens on an address, and forwards to a port of 127.0.0.1.
-
-    Attributes:
-        port: the port that it listens on.
-    """
+    """Listens on an address, on its `port`, and forwards to a port of 127.0.0.1."""
 
     def __init__(self, host: str, port: int, behind: int, token: str) -> None:
         """Listen (OSError: the address is not this machine's, or the port is in use).

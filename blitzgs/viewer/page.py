@@ -43,15 +43,7 @@ def require_viser() -> None:
 
 
 class Page:
-    """Serves the page; the caller draws what `next_ask` returns and gives it to `deliver`.
-
-    Attributes:
-        url: address to open.
-        visitors: those who look at present, by viser's numbers.
-        woken: set when a picture may be needed.
-        send_seconds: seconds of a processor that packing pictures has taken so far.
-        folders: called for each new visitor with viser's handle, to add folders of the caller's own.
-    """
+    """Serves the page at `url`; the caller draws what `next_ask` returns and gives it to `deliver`."""
 
     def __init__(
         self,
@@ -67,6 +59,7 @@ class Page:
         Args:
             host: address to listen on. If others than this machine reach it, a random token is part of `url`.
             port: 0: any free one.
+            folders: called for each new visitor with viser's handle, to add folders of the caller's own.
             memory: returns the memory of the model as text.
             moving_ms: milliseconds that a picture may take while the camera moves.
 
@@ -78,10 +71,10 @@ class Page:
         import viser
 
         self.exhibit, self.folders, self.memory = exhibit, folders, memory
-        self.woken = threading.Event()
-        self.visitors: dict[int, Visitor] = {}
+        self.woken = threading.Event()  # set when a picture may be needed
+        self.visitors: dict[int, Visitor] = {}  # those who look at present, by viser's numbers
         self.panels: dict[int, Panel] = {}
-        self.send_seconds = 0.0
+        self.send_seconds = 0.0  # of a processor, that packing pictures has taken so far
         self._moving_ms = moving_ms
         self._figured: dict[int, float] = {}
         self._turn = 0

@@ -59,14 +59,7 @@ class Shown:
 
 
 class Visitor:
-    """The state of one browser; any thread may call any method.
-
-    Attributes:
-        client: viser's handle.
-        settings: the visitor's choices; replaced as a whole when one changes.
-        shown: the newest picture, or None.
-        motion: "orbit", "fly" or "walk".
-    """
+    """The state of one browser; any thread may call any method."""
 
     def __init__(
         self,
@@ -82,9 +75,9 @@ class Visitor:
         the camera moves.
         """
         self.client, self.world, self.exhibit, self._wake = client, world, exhibit, wake
-        self.settings = Settings()
-        self.shown: Shown | None = None
-        self.motion = "orbit"
+        self.settings = Settings()  # the visitor's choices; replaced as a whole when one changes
+        self.shown: Shown | None = None  # the newest picture
+        self.motion = "orbit"  # "orbit", "fly" or "walk"
         self.standing: int | None = None
         self._place: Stance | None = None  # of the camera at which the visitor stands
         self._arrived = 0.0

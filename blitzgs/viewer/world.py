@@ -136,8 +136,6 @@ class Exhibit:
     title: str  # shown on the page
     space: Space  # maps the trained world to the capture's
     sh_degree: int  # highest spherical-harmonics degree
-    near: float  # near plane, trained units
-    far: float  # far plane, trained units
     background: tuple[float, float, float]  # RGB in [0, 1]
     levels: bool  # whether the Gaussians have octree levels
     lod: bool  # whether the model has an LOD gate

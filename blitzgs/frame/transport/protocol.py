@@ -76,16 +76,11 @@ class Traffic(NamedTuple):
         isects = [sum(column) for column in columns[first + 1 :: 2]]
         splats = [numbers[first::2] for numbers in totals]
         return cls(
-            own=Sizes(*totals[rank][:VIEW_TOTALS]),
-            splats=splats,
-            sent=splats[rank],
-            received=list(received[rank]),
-            starts=[sum(column[:rank]) for column in received],
-            most=max(*owned, *map(sum, splats), *map(sum, received)),
-            n_isects=isects[rank],
-            most_isects=max(isects),
-            most_blocks=max(blocks),
-        )
+            own=Sizes(*totals[rank][:VIEW_TOTALS]), splats=splats, sent=splats[rank],
+            received=list(received[rank]), starts=[sum(column[:rank]) for column in received],
+            most=max(*owned, *map(sum, splats), *map(sum, received)), n_isects=isects[rank],
+            most_isects=max(isects), most_blocks=max(blocks),
+        )  # fmt: skip
 
     @property
     def needed(self) -> Sizes:
@@ -216,22 +211,18 @@ class LocalTransport:
 
 
 class LocalExchange:
-    """See `Exchange`.
-
-    Attributes:
-        projected: the projection, of which `arrived` has the columns that compositing reads.
-        totals: `ProjectionOutputs.totals`; None until the host has waited for them.
-    """
+    """See `Exchange`."""
 
     def __init__(self, inputs: ProjectionInputs, capacity: Sizes | None) -> None:
         """Project."""
         # On the CPU the sizes are known at once, so no estimate is needed.
         self._capacity = capacity if inputs.gaussians[0].is_cuda else None
+        # `arrived` has the columns of the projection that compositing reads.
         self.projected = projected = inputs.project(self._capacity)
         self.gradient_table: Tensor | None = None
         splats, host = projected.for_compositing, projected.totals
         self._copy = HostCopy(host) if host.is_cuda else None
-        self.totals: list[int] | None = None
+        self.totals: list[int] | None = None  # of `projected`; None until the host has waited for them
         stage_ended("project")
         if self._capacity is None:
             self._host = host if self._copy is None else self._copy.read()
