@@ -75,11 +75,15 @@ def _cull_blocks(a: Arguments) -> tuple[Tensor, ...]:
 def _project_fwd(a: Arguments) -> tuple[Tensor, ...]:
     means, U, P = a.gaussians[0], _unknown(), _unknown()
     return (
-        *(_ints(means, n) for n in (P, P, U, U + 1)), *_columns(means, P, ((2,), (3,), (), ())),
-        means.new_empty(P if len(a.gaussians) > 4 else 0, 3), _ints(means, P, 2), _ints(means, P),
-        _longs(means, P if a.rank_tiles else 0), _longs(means, 0 if a.ids is None else P),
+        *(_ints(means, n) for n in (P, P, U, U + 1)),
+        *_columns(means, P, ((2,), (3,), (), ())),
+        means.new_empty(P if len(a.gaussians) > 4 else 0, 3),
+        _ints(means, P, 2),
+        _ints(means, P),
+        _longs(means, P if a.rank_tiles else 0),
+        _longs(means, 0 if a.ids is None else P),
         _longs(means, 4 + a.viewmats.shape[0] + len(a.rank_tiles)),
-    )  # fmt: skip
+    )
 
 
 def _project_bwd(a: Arguments) -> tuple[Tensor, ...]:

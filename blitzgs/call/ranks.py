@@ -110,9 +110,12 @@ def send_splats(splats: ProjectedSplats, channels: Tensor, job: CallRanks) -> tu
     means2d, conics, opacities, depths, own_channels = arrived.split(widths, dim=1)
     own_views = _all_to_all((images % job.views).index_select(0, order), *sizes).int()
     return splats._replace(
-        camera_ids=own_views, means2d=means2d.contiguous(), conics=conics.contiguous(),
-        opacities=opacities[:, 0].contiguous(), depths=depths[:, 0].contiguous(),
-    ), own_channels.contiguous()  # fmt: skip
+        camera_ids=own_views,
+        means2d=means2d.contiguous(),
+        conics=conics.contiguous(),
+        opacities=opacities[:, 0].contiguous(),
+        depths=depths[:, 0].contiguous(),
+    ), own_channels.contiguous()
 
 
 def _all_to_all(table: Tensor, sent: list[int], received: list[int]) -> Tensor:

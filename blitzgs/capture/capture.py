@@ -343,10 +343,16 @@ def _camera(
     pose = view.world_to_camera.copy()
     pose[:3, 3] += pose[:3, :3] @ offset
     return Camera(
-        name=view.name, width=size[0], height=size[1],
-        K=scaled_matrix(plan.K, (plan.width, plan.height), size), world_to_camera=pose, image_path=view.path,
-        mask_path=view.mask_path, orientation=orientation, rectification=plan,
-    )  # fmt: skip
+        name=view.name,
+        width=size[0],
+        height=size[1],
+        K=scaled_matrix(plan.K, (plan.width, plan.height), size),
+        world_to_camera=pose,
+        image_path=view.path,
+        mask_path=view.mask_path,
+        orientation=orientation,
+        rectification=plan,
+    )
 
 
 def _orientation(view: SourceView, header: ImageHeader, exif: str) -> int:

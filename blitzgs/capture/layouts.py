@@ -152,10 +152,13 @@ def _joined(
     tracks = [p.track_lengths for p in points if p.track_lengths is not None]
     errors = [p.errors for p in points if p.errors is not None]
     joined = SourcePoints(
-        np.concatenate([p.positions for p in points]), np.concatenate([p.colors for p in points]),
+        np.concatenate([p.positions for p in points]),
+        np.concatenate([p.colors for p in points]),
         np.concatenate(tracks) if len(tracks) == len(points) else None,
-        np.concatenate(errors) if len(errors) == len(points) else None, points[0].path, points[0].colors_from,
-    )  # fmt: skip
+        np.concatenate(errors) if len(errors) == len(points) else None,
+        points[0].path,
+        points[0].colors_from,
+    )
     return list(views.values()), joined
 
 

@@ -215,10 +215,13 @@ def _read_frame(
         raise ValueError(f"mask_path must name an image or be null, got {mask!r}")
     name = _name(relative)
     return SourceView(
-        name=name, path=path, mask_path=None if mask is None else paths[mask],
-        lens=read_lens(content, entry, path, notes), world_to_camera=_read_pose(entry["transform_matrix"]),
+        name=name,
+        path=path,
+        mask_path=None if mask is None else paths[mask],
+        lens=read_lens(content, entry, path, notes),
+        world_to_camera=_read_pose(entry["transform_matrix"]),
         part=_part(file, lists, name),
-    )  # fmt: skip
+    )
 
 
 def _read_pose(matrix: object) -> Float64:

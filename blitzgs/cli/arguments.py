@@ -37,9 +37,12 @@ def add_command(
     Without `add_help`, the caller adds the flag --help.
     """
     parser = commands.add_parser(
-        name, help=summary, description=description or summary[0].upper() + summary[1:] + ".",
-        formatter_class=argparse.RawDescriptionHelpFormatter, add_help=add_help,
-    )  # fmt: skip
+        name,
+        help=summary,
+        description=description or summary[0].upper() + summary[1:] + ".",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        add_help=add_help,
+    )
     parser.set_defaults(run=function, parser=parser)
     return parser
 

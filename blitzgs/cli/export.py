@@ -342,10 +342,14 @@ def _selection(args: argparse.Namespace) -> Selection | None:
     if args.min_opacity is not None and not 0 <= args.min_opacity < 1:
         raise ValueError(f"--min-opacity must be from 0 to below 1, got {args.min_opacity}")
     return Selection(
-        box=box, polygon=None if args.crop_polygon is None else read_polygon(args.crop_polygon),
+        box=box,
+        polygon=None if args.crop_polygon is None else read_polygon(args.crop_polygon),
         axes=("xyz".index((args.crop_axes or "xy")[0]), "xyz".index((args.crop_axes or "xy")[1])),
-        min_opacity=args.min_opacity or 0.0, levels=args.levels, sh_degree=args.sh_degree, most=args.most,
-    )  # fmt: skip
+        min_opacity=args.min_opacity or 0.0,
+        levels=args.levels,
+        sh_degree=args.sh_degree,
+        most=args.most,
+    )
 
 
 def _levels(text: str) -> tuple[int, int]:

@@ -208,7 +208,7 @@ def run(args: argparse.Namespace) -> int:
             args.share_gpus,
             tables_on_host=config.memory.resident_gb > 0,
             lap=laps.lap,
-        ) as ranks,  # fmt: skip
+        ) as ranks,
     ):
         # A capture that cannot be read leaves no empty folder behind.
         capture, images = open_capture(config, ranks, reading=reading)
@@ -357,13 +357,20 @@ def live_page(state: TrainingState, port: int, host: str) -> Live | None:
 
     capture, images, options = state.capture, state.images, state.render_options
     exhibit = Exhibit(
-        title=f"{state.folder.resolve().name} (training)", space=state.space,
-        sh_degree=state.config.model.sh_degree, background=options.background,
-        levels=state.progress.level_count > 1, lod=state.progress.level_count > 1,
-        smooth=state.config.view.lod == "smooth", box=box_of(state.table["means"]), cameras=capture.cameras,
-        test=capture.test, photograph=lambda index: np.asarray(images.get(index).numpy()),
-        paths=state.folder / "paths", frame=capture.about.source.frame,
-    )  # fmt: skip
+        title=f"{state.folder.resolve().name} (training)",
+        space=state.space,
+        sh_degree=state.config.model.sh_degree,
+        background=options.background,
+        levels=state.progress.level_count > 1,
+        lod=state.progress.level_count > 1,
+        smooth=state.config.view.lod == "smooth",
+        box=box_of(state.table["means"]),
+        cameras=capture.cameras,
+        test=capture.test,
+        photograph=lambda index: np.asarray(images.get(index).numpy()),
+        paths=state.folder / "paths",
+        frame=capture.about.source.frame,
+    )
     try:
         page = Live(exhibit, state.schedule.iterations, host, port)
     except OSError as error:

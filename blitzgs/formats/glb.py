@@ -130,10 +130,13 @@ def _values(block: Gaussians, path: Path) -> list[Array]:
             raise ValueError(f"{path}: {name} are not finite in float32, which glTF requires")
     colors = np.concatenate([0.5 + _SH_C0 * sh[:, 0], opacities[:, None]], axis=1)
     columns: list[Array] = [
-        block.means.numpy(), unit_quats(block.quats)[:, [1, 2, 3, 0]].float().numpy(), scales,
-        opacities.astype(np.float32), np.rint(colors.clip(0, 1) * 255).astype(np.uint8),
+        block.means.numpy(),
+        unit_quats(block.quats)[:, [1, 2, 3, 0]].float().numpy(),
+        scales,
+        opacities.astype(np.float32),
+        np.rint(colors.clip(0, 1) * 255).astype(np.uint8),
         *(sh[:, k] for k in range(sh.shape[1])),
-    ]  # fmt: skip
+    ]
     if block.levels is not None:
         columns.append(block.levels.float().numpy())
     return columns

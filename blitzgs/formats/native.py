@@ -148,10 +148,15 @@ def read_images(path: Path, with_points2d: bool) -> dict[str, Any]:
         "read_images", path, _array([with_points2d], "u8")
     )
     return {
-        "ids": ids, "quats": quats.reshape(-1, 4), "translations": translations.reshape(-1, 3),
-        "camera_ids": camera_ids, "names": _texts(names, ends), "point2d_offsets": offsets,
-        "points2d": points2d.reshape(-1, 2), "point3d_ids": point3d_ids,
-    }  # fmt: skip
+        "ids": ids,
+        "quats": quats.reshape(-1, 4),
+        "translations": translations.reshape(-1, 3),
+        "camera_ids": camera_ids,
+        "names": _texts(names, ends),
+        "point2d_offsets": offsets,
+        "points2d": points2d.reshape(-1, 2),
+        "point3d_ids": point3d_ids,
+    }
 
 
 def read_points(path: Path, with_tracks: bool) -> dict[str, Array]:
@@ -160,9 +165,14 @@ def read_points(path: Path, with_tracks: bool) -> dict[str, Array]:
         "read_points", path, _array([with_tracks], "u8")
     )
     return {
-        "ids": ids, "positions": positions.reshape(-1, 3), "colors": colors.reshape(-1, 3), "errors": errors,
-        "track_offsets": offsets, "track_image_ids": image_ids, "track_point2d_ids": point2d_ids,
-    }  # fmt: skip
+        "ids": ids,
+        "positions": positions.reshape(-1, 3),
+        "colors": colors.reshape(-1, 3),
+        "errors": errors,
+        "track_offsets": offsets,
+        "track_image_ids": image_ids,
+        "track_point2d_ids": point2d_ids,
+    }
 
 
 def read_ply(

@@ -184,9 +184,13 @@ def read_compressed_ply(path: Path) -> Gaussians:
     words = np.fromfile(path, "<u4", 4 * count, offset=begin + bounds.nbytes).reshape(count, 4)
     codes = np.fromfile(path, "u1", rest * count, offset=begin + bounds.nbytes + words.nbytes)
     model = Gaussians(
-        means=torch.empty(count, 3), quats=torch.empty(count, 4), scales=torch.empty(count, 3),
-        opacities=torch.empty(count), sh=torch.empty(count, _COEFFICIENTS[degree], 3), comments=comments,
-    )  # fmt: skip
+        means=torch.empty(count, 3),
+        quats=torch.empty(count, 4),
+        scales=torch.empty(count, 3),
+        opacities=torch.empty(count),
+        sh=torch.empty(count, _COEFFICIENTS[degree], 3),
+        comments=comments,
+    )
     for first in range(0, count, BLOCK):
         rows = slice(first, min(first + BLOCK, count))
         _unpack(model.rows(rows), bounds[first // _CHUNK :], words[rows], codes.reshape(count, -1)[rows])

@@ -104,11 +104,15 @@ def _gaussians(path: Path, comments: list[str], table: npt.NDArray[np.void]) -> 
     for channel in range(3):
         sh[:, 1:, channel] = columns(*(f"f_rest_{channel * (k - 1) + i}" for i in range(k - 1)))
     return Gaussians(
-        means=columns("x", "y", "z"), quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        scales=columns("scale_0", "scale_1", "scale_2"), opacities=columns("opacity")[:, 0], sh=sh,
-        normals=columns("nx", "ny", "nz"), comments=comments,
+        means=columns("x", "y", "z"),
+        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        scales=columns("scale_0", "scale_1", "scale_2"),
+        opacities=columns("opacity")[:, 0],
+        sh=sh,
+        normals=columns("nx", "ny", "nz"),
+        comments=comments,
         levels=columns(LEVEL)[:, 0] if LEVEL in names else None,
-    )  # fmt: skip
+    )
 
 
 def write_ply(

@@ -67,11 +67,15 @@ def write_sog(path: Path, source: GaussianSource) -> None:
             named = palette.nearest(block.sh[:, 1:].flatten(1)).numpy()
             codes["shN_labels"][rows] = np.stack([named & 255, named >> 8], axis=1)
     meta: dict[str, Any] = {
-        "version": 2, "asset": {"generator": "BlitzGS"}, "count": count, "antialias": is_antialiased(source),
+        "version": 2,
+        "asset": {"generator": "BlitzGS"},
+        "count": count,
+        "antialias": is_antialiased(source),
         "means": {"mins": survey.least.tolist(), "maxs": survey.most.tolist(), "files": []},
-        "scales": {"codebook": scales_book.tolist(), "files": []}, "quats": {"files": []},
+        "scales": {"codebook": scales_book.tolist(), "files": []},
+        "quats": {"files": []},
         "sh0": {"codebook": colors_book.tolist(), "files": []},
-    }  # fmt: skip
+    }
     width = -(-int(np.ceil(count**0.5)) // 4) * 4
     sizes = dict.fromkeys(codes, (-(-count // (4 * width)) * 4, width))
     if palette is not None:

@@ -308,7 +308,16 @@ def project_bwd_step_(
     """
     with below_autograd():
         torch.ops.blitzgs.project_bwd_step_(
-            state.tensors, [schedule.table, schedule.lr_table], *schedule.constants(step), *views,
-            splats.camera_ids, splats.visible_ids, splats.splat_offsets, level, *options, gradients.parts,
-            gradients.places, means2d_sums,
-        )  # fmt: skip
+            state.tensors,
+            [schedule.table, schedule.lr_table],
+            *schedule.constants(step),
+            *views,
+            splats.camera_ids,
+            splats.visible_ids,
+            splats.splat_offsets,
+            level,
+            *options,
+            gradients.parts,
+            gradients.places,
+            means2d_sums,
+        )

@@ -128,9 +128,13 @@ def save_cameras(folder: Path, capture: Capture, run_id: str = "") -> None:
         for camera in capture.cameras
     ]
     content = {
-        "version": _VERSION, "run": run_id, "train": list(capture.train), "test": list(capture.test),
-        "inputs": [str(path.absolute()) for path in input_files(capture)], "cameras": views,
-    }  # fmt: skip
+        "version": _VERSION,
+        "run": run_id,
+        "train": list(capture.train),
+        "test": list(capture.test),
+        "inputs": [str(path.absolute()) for path in input_files(capture)],
+        "cameras": views,
+    }
     write_file(folder / CAMERAS, json.dumps(content))
 
 

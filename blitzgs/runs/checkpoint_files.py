@@ -102,9 +102,12 @@ def finish(
     if missing:
         raise OSError(f"{', '.join(missing)} not in {unfinished}: every rank must see the same file system")
     content = {
-        "format": FORMAT, "world_size": world_size, "shards": [asdict(shard) for shard in shards],
-        "shared": None if shared is None else asdict(shared), "state": dict(state),
-    }  # fmt: skip
+        "format": FORMAT,
+        "world_size": world_size,
+        "shards": [asdict(shard) for shard in shards],
+        "shared": None if shared is None else asdict(shared),
+        "state": dict(state),
+    }
     content = json.loads(json.dumps(content))  # tuples become lists: what is read back has the same digest
     with open(unfinished / MANIFEST, "w") as file:
         json.dump(content | {"sha256": _digest(content)}, file, indent=1)

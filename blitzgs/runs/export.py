@@ -252,10 +252,13 @@ class RunSource(Changed):
 def source_of(model: Model) -> RunSource:
     """Return the source of a model in memory."""
     found = Gaussians(
-        means=model.means.cpu(), quats=model.quats.cpu(), scales=model.scales.cpu(),
-        opacities=model.opacities.cpu(), sh=model.sh.cpu(),
+        means=model.means.cpu(),
+        quats=model.quats.cpu(),
+        scales=model.scales.cpu(),
+        opacities=model.opacities.cpu(),
+        sh=model.sh.cpu(),
         levels=None if model.lod is None else model.level.cpu().float(),
-    )  # fmt: skip
+    )
     gate = None if model.lod is None else model.lod.gate
     lines = _comments(model.config, model.space, gate, model.exposures is not None)
     return RunSource(found, model.space, lines, model.config)
@@ -274,10 +277,14 @@ def largest_of_run(source: RunSource, most: int, device: torch.device) -> Model:
     table = GaussianTable.of_parameters({name: column.to(device) for name, column in columns.items()})
     return Model(
         **{name: table[name] for name in (*PARAMETERS, "level")},
-        lod=model_gate(source.config, source.progress, table, Ranks()), space=source.space, sh_degree=0,
-        config=source.config, images_seen=source.progress.step * source.config.schedule.batch_size,
-        exposures=None, run=None,
-    )  # fmt: skip
+        lod=model_gate(source.config, source.progress, table, Ranks()),
+        space=source.space,
+        sh_degree=0,
+        config=source.config,
+        images_seen=source.progress.step * source.config.schedule.batch_size,
+        exposures=None,
+        run=None,
+    )
 
 
 def open_source(folder: Path, only: str | None = None) -> RunSource:
@@ -338,10 +345,13 @@ class _Shards:
                 with torch.no_grad():
                     optimiser.catch_up(table, None, self.step)
                 yield Gaussians(
-                    means=table["means"], quats=table["quats"], scales=table["scales"],
-                    opacities=table["opacities"], sh=table["sh"],
+                    means=table["means"],
+                    quats=table["quats"],
+                    scales=table["scales"],
+                    opacities=table["opacities"],
+                    sh=table["sh"],
                     levels=table["level"].float() if self.has_levels else None,
-                )  # fmt: skip
+                )
 
 
 def _comments(config: Config, space: Space, gate: LodGate | None, exposed: bool) -> list[str]:

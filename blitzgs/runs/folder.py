@@ -234,11 +234,15 @@ class RunFolder:
         found = run_files.open_model(self.path, Ranks(), only=checkpoint)
         columns = {name: found.table[name].to(chosen) for name in (*PARAMETERS, "level")}
         return Model(
-            **columns, lod=model_gate(found.config, found.progress, found.table, Ranks()), space=found.space,
-            sh_degree=found.progress.sh_degree, config=found.config,
-            images_seen=found.progress.step * found.config.schedule.batch_size, exposures=found.exposures,
+            **columns,
+            lod=model_gate(found.config, found.progress, found.table, Ranks()),
+            space=found.space,
+            sh_degree=found.progress.sh_degree,
+            config=found.config,
+            images_seen=found.progress.step * found.config.schedule.batch_size,
+            exposures=found.exposures,
             run=self,
-        )  # fmt: skip
+        )
 
     @staticmethod
     def _json(path: Path) -> dict[str, Any]:

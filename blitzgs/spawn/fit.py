@@ -89,12 +89,15 @@ def read_spawns(folder: Path, gaussians: int | None = None) -> Spawns:
     survived = alive[spawned]
     check_outcomes(survived, folder)
     return Spawns(
-        name=about["name"], scene=about["scene"], schedule=about["schedule"],
+        name=about["name"],
+        scene=about["scene"],
+        schedule=about["schedule"],
         features=feature_columns({name: births[name][spawned] for name in births}, len(survived)),
-        survived=survived, parents=births["parent"][spawned],
+        survived=survived,
+        parents=births["parent"][spawned],
         positions=np.stack([births[axis][spawned] for axis in "xyz"], 1),
         initial_survival=float(alive[~spawned].mean()),
-    )  # fmt: skip
+    )
 
 
 def read_about(text: bytes | str, file: Path) -> dict[str, Any]:
@@ -203,9 +206,13 @@ def judge(run: Spawns, scores: NDArray[Any], gate_from: float = 0.0) -> dict[str
     """
     name, single = best_feature(run)
     found = {
-        "run": run.name, "auc": auc(scores, run.survived), "best_feature": name, "best_feature_auc": single,
-        "spawns": len(run.survived), "survived": float(run.survived.mean()),
-    }  # fmt: skip
+        "run": run.name,
+        "auc": auc(scores, run.survived),
+        "best_feature": name,
+        "best_feature_auc": single,
+        "spawns": len(run.survived),
+        "survived": float(run.survived.mean()),
+    }
     late = run.times >= gate_from
     if not late.all() and 0 < run.survived[late].sum() < late.sum():
         found["judged"] = judge(run.only(late), scores[late])

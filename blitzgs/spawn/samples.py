@@ -40,9 +40,13 @@ def write_sample(run: Spawns, path: Path, most: int = MAX_ROWS) -> float:
     columns |= dict(zip(_AXES, some.positions.T, strict=True))
     columns |= dict(zip(FEATURES, some.features.T, strict=True))
     about = {
-        "name": run.name, "scene": run.scene, "schedule": run.schedule,
-        "initial_survival": run.initial_survival, "spawns": len(run.survived), "rate": rate,
-    }  # fmt: skip
+        "name": run.name,
+        "scene": run.scene,
+        "schedule": run.schedule,
+        "initial_survival": run.initial_survival,
+        "spawns": len(run.survived),
+        "rate": rate,
+    }
     table = arrow.table({name: np.ascontiguousarray(column) for name, column in columns.items()})
     table = table.replace_schema_metadata({_ABOUT: json.dumps(about)})
     # pyarrow takes no path that is not UTF-8, so it gets the open file.
@@ -80,8 +84,12 @@ def read_sample(path: Path) -> Spawns:
     survived = columns["survived"].astype(bool)
     check_outcomes(survived, path)
     return Spawns(
-        name=about["name"], scene=about["scene"], schedule=about["schedule"],
-        features=feature_columns(columns, len(table)), survived=survived, parents=columns["parent"],
+        name=about["name"],
+        scene=about["scene"],
+        schedule=about["schedule"],
+        features=feature_columns(columns, len(table)),
+        survived=survived,
+        parents=columns["parent"],
         positions=np.stack([columns[axis] for axis in _AXES], 1),
         initial_survival=about.get("initial_survival", math.nan),
-    )  # fmt: skip
+    )

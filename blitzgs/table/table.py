@@ -74,11 +74,16 @@ def schema(sh_degree: int) -> dict[str, Column]:
     for prefix in ("exp_avg", "exp_avg_sq"):
         columns |= {f"{prefix}.{name}": Column(f, shape) for name, shape in rows.items()}
     columns |= {
-        "last_step": Column(torch.int32, ()), "moment_step": Column(torch.int32, ()),
-        "id": Column(torch.int64, ()), "parent": Column(torch.int64, ()), "birth": Column(torch.int32, ()),
-        "level": Column(torch.uint8, ()), "grad_sum": Column(f, ()), "grad_count": Column(torch.int32, ()),
+        "last_step": Column(torch.int32, ()),
+        "moment_step": Column(torch.int32, ()),
+        "id": Column(torch.int64, ()),
+        "parent": Column(torch.int64, ()),
+        "birth": Column(torch.int32, ()),
+        "level": Column(torch.uint8, ()),
+        "grad_sum": Column(f, ()),
+        "grad_count": Column(torch.int32, ()),
         "max_radii": Column(f, ()),
-    }  # fmt: skip
+    }
     return columns
 
 

@@ -316,10 +316,14 @@ def first_gaussians(
         count, degree, found = len(first), 0, first.found
     sort_rows(table)
     return table, Progress(
-        step=0, sh_degree=degree, level_count=levels.count, peak_gaussians=count, seconds=0.0,
+        step=0,
+        sh_degree=degree,
+        level_count=levels.count,
+        peak_gaussians=count,
+        seconds=0.0,
         milestones={"initial": count} | ({"found": found} if found > count else {}),
         reference_distance=levels.reference_distance,
-    )  # fmt: skip
+    )
 
 
 def _of_file(

@@ -46,9 +46,12 @@ def image_progress(what: str, shown: bool = True, unit: str = "images") -> Itera
         yield lines(lambda text: print(f"{what}: {text} {unit}", file=sys.stderr, flush=True))
         return
     columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn(unit),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn(unit),
         TimeRemainingColumn(),
-    )  # fmt: skip
+    )
     with Progress(*columns, console=console, disable=not shown, transient=True) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -152,10 +152,14 @@ def render_options(config: Config, space: Space, sh_degree: int, lod: LodGate | 
     """Return the render options of a run at a spherical-harmonics degree, with the fading of its LOD gate."""
     model = config.model
     return RenderOptions(
-        sh_degree=sh_degree, near_plane=(model.near or _NEAR) * space.extent, far_plane=FAR * space.extent,
-        antialiased=model.antialiased, background=model.background, deterministic=model.deterministic,
+        sh_degree=sh_degree,
+        near_plane=(model.near or _NEAR) * space.extent,
+        far_plane=FAR * space.extent,
+        antialiased=model.antialiased,
+        background=model.background,
+        deterministic=model.deterministic,
         fade=() if lod is None else lod.fade(),
-    )  # fmt: skip
+    )
 
 
 def trained_centres(cameras: list[CameraLike], space: Space) -> Tensor:

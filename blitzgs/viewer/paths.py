@@ -89,12 +89,19 @@ def to_json(path: CameraPath) -> str:
     ]
     keyframes = [{"matrix": _rows(key), "fov": key.fov, "aspect": key.aspect} for key in path.keyframes]
     content = {
-        "camera_type": "perspective", "render_width": path.width, "render_height": path.height,
-        "fps": path.fps, "seconds": path.seconds, "is_cycle": path.is_cycle, "smoothness_value": 0.0,
+        "camera_type": "perspective",
+        "render_width": path.width,
+        "render_height": path.height,
+        "fps": path.fps,
+        "seconds": path.seconds,
+        "is_cycle": path.is_cycle,
+        "smoothness_value": 0.0,
         "default_fov": path.keyframes[0].fov if path.keyframes else 50.0,
         "default_transition_sec": path.seconds / max(1, len(path.keyframes) - (not path.is_cycle)),
-        "keyframes": keyframes, "camera_path": frames, "crop": None,
-    }  # fmt: skip
+        "keyframes": keyframes,
+        "camera_path": frames,
+        "crop": None,
+    }
     return json.dumps(content, indent=1) + "\n"
 
 
@@ -108,10 +115,13 @@ def from_json(text: str) -> CameraPath:
     if not keys:
         raise ValueError(f"{_NO_PATH}: it has neither keyframes nor camera_path")
     return CameraPath(
-        keys, round(_number(content, "render_width", 1920, 1)),
-        round(_number(content, "render_height", 1080, 1)), _number(content, "fps", 24.0, 0.01),
-        _number(content, "seconds", 4.0, 0.0), bool(content.get("is_cycle", False)),
-    )  # fmt: skip
+        keys,
+        round(_number(content, "render_width", 1920, 1)),
+        round(_number(content, "render_height", 1080, 1)),
+        _number(content, "fps", 24.0, 0.01),
+        _number(content, "seconds", 4.0, 0.0),
+        bool(content.get("is_cycle", False)),
+    )
 
 
 def frames_from_json(text: str) -> list[Keyframe]:

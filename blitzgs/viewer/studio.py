@@ -89,14 +89,21 @@ def open_model(
     subject = Subject(table, options, model.space.unit, model.lod)
     stored = load_cameras(path) if (path / CAMERAS).exists() else None
     exhibit = Exhibit(
-        title=path.resolve().name + (f" {checkpoint}" if checkpoint else ""), space=model.space,
-        sh_degree=degree, background=options.background, levels=bool((model.level > 0).any()),
-        lod=model.lod is not None, smooth=model.lod is not None and model.lod.gate.smooth,
-        box=box_of(model.means), cameras=() if stored is None else stored.cameras,
-        test=() if stored is None else stored.test, photograph=photograph if stored is not None else None,
+        title=path.resolve().name + (f" {checkpoint}" if checkpoint else ""),
+        space=model.space,
+        sh_degree=degree,
+        background=options.background,
+        levels=bool((model.level > 0).any()),
+        lod=model.lod is not None,
+        smooth=model.lod is not None and model.lod.gate.smooth,
+        box=box_of(model.means),
+        cameras=() if stored is None else stored.cameras,
+        test=() if stored is None else stored.test,
+        photograph=photograph if stored is not None else None,
         exposures=_exposures(model.exposures, () if stored is None else stored.train),
-        paths=paths or path / "paths", frame=load_world_frame(path),
-    )  # fmt: skip
+        paths=paths or path / "paths",
+        frame=load_world_frame(path),
+    )
     return Opened(exhibit, subject, table, ranks, count - len(table))
 
 
@@ -129,10 +136,16 @@ def _open_file(path: Path, ranks: Ranks, paths: Path, most: int | None) -> Opene
     options = render_options(config, space, found.degree, gate)
     lod = None if gate is None else ModelGate(gate, math.inf if gate.smooth else 0.95, table, ranks)
     exhibit = Exhibit(
-        title=path.name, space=space, sh_degree=full_degree, background=options.background,
-        levels=found.levels is not None, lod=lod is not None, smooth=gate is not None and gate.smooth,
-        box=(box - middle) / space.unit, paths=paths,
-    )  # fmt: skip
+        title=path.name,
+        space=space,
+        sh_degree=full_degree,
+        background=options.background,
+        levels=found.levels is not None,
+        lod=lod is not None,
+        smooth=gate is not None and gate.smooth,
+        box=(box - middle) / space.unit,
+        paths=paths,
+    )
     return Opened(exhibit, Subject(table, options, space.unit, lod), table, ranks, count - len(table))
 
 

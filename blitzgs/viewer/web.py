@@ -118,10 +118,13 @@ def _splats(table: GaussianTable, rows: Tensor, degree: int, levels: bool) -> We
         return table[name][rows].cpu().numpy()
 
     return WebSplats(
-        means=column("means"), quats=column("quats"), scales=column("scales"),
-        opacities=table["opacities"][rows].sigmoid().cpu().numpy(), sh=column("sh")[:, : (degree + 1) ** 2],
+        means=column("means"),
+        quats=column("quats"),
+        scales=column("scales"),
+        opacities=table["opacities"][rows].sigmoid().cpu().numpy(),
+        sh=column("sh")[:, : (degree + 1) ** 2],
         levels=column("level") if levels else None,
-    )  # fmt: skip
+    )
 
 
 def _scene(opened: Opened) -> WebScene:
@@ -139,11 +142,17 @@ def web_scene(world: World, options: RenderOptions, unit: float, lod: WebLevels 
         return x, y, z
 
     return WebScene(
-        near=options.near_plane * unit, far=options.far_plane * unit, blur=options.eps2d,
-        antialiased=options.antialiased, background=options.background, up=point(world.up),
-        eye=point(start.position * (unit / SCALE)), target=point(world.middle * (unit / SCALE)),
-        fov=start.fov, lod=lod,
-    )  # fmt: skip
+        near=options.near_plane * unit,
+        far=options.far_plane * unit,
+        blur=options.eps2d,
+        antialiased=options.antialiased,
+        background=options.background,
+        up=point(world.up),
+        eye=point(start.position * (unit / SCALE)),
+        target=point(world.middle * (unit / SCALE)),
+        fov=start.fov,
+        lod=lod,
+    )
 
 
 def _levels(lod: ModelGate) -> WebLevels:

@@ -181,6 +181,9 @@ def _points(path: Path, lines: list[bytes], count: int) -> SourcePoints:
             f"{path}: a point has not three lines of numbers ({error}); export it again"
         ) from error
     return SourcePoints(
-        positions, np.clip(colors, 0, 255).astype(np.uint8), tracks, path=path,
+        positions,
+        np.clip(colors, 0, 255).astype(np.uint8),
+        tracks,
+        path=path,
         colors_from="the points' own colours",
-    )  # fmt: skip
+    )

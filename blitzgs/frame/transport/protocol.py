@@ -76,11 +76,16 @@ class Traffic(NamedTuple):
         isects = [sum(column) for column in columns[first + 1 :: 2]]
         splats = [numbers[first::2] for numbers in totals]
         return cls(
-            own=Sizes(*totals[rank][:VIEW_TOTALS]), splats=splats, sent=splats[rank],
-            received=list(received[rank]), starts=[sum(column[:rank]) for column in received],
-            most=max(*owned, *map(sum, splats), *map(sum, received)), n_isects=isects[rank],
-            most_isects=max(isects), most_blocks=max(blocks),
-        )  # fmt: skip
+            own=Sizes(*totals[rank][:VIEW_TOTALS]),
+            splats=splats,
+            sent=splats[rank],
+            received=list(received[rank]),
+            starts=[sum(column[:rank]) for column in received],
+            most=max(*owned, *map(sum, splats), *map(sum, received)),
+            n_isects=isects[rank],
+            most_isects=max(isects),
+            most_blocks=max(blocks),
+        )
 
     @property
     def needed(self) -> Sizes:

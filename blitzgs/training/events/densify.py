@@ -119,10 +119,15 @@ def change_population(state: TrainingState, time: int, rules: DensityRules) -> D
     """Run the strategy of `population.strategy`. Every rank calls this."""
     population, progress = state.config.population, state.progress
     call: dict[str, Any] = {
-        "time": time, "step": progress.step, "seed": state.config.seed, "level_count": progress.level_count,
-        "ranks": state.ranks, "extent": state.space.extent, "lineage": state.lineage,
+        "time": time,
+        "step": progress.step,
+        "seed": state.config.seed,
+        "level_count": progress.level_count,
+        "ranks": state.ranks,
+        "extent": state.space.extent,
+        "lineage": state.lineage,
         "pending": state.optimiser.pending(state.table, progress.step),
-    }  # fmt: skip
+    }
     if population.strategy == "relocation":
         report = relocate(state.table, rules, growth=population.growth, **call)
         for name in STATISTICS:
