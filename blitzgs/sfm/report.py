@@ -25,6 +25,7 @@ UInt8 = npt.NDArray[np.uint8]
 _FEW_POINTS, _FEW_FEATURES, _DOUBTFUL = 50, 100, 3.0
 # A warning is given if a smaller share has a pose, or the mean error is larger, in pixels.
 _MOST, _LARGE = 0.9, 2.0
+_APART = "that nothing connects with the others"
 _SIDE, _BAR, _LINE, _NAMED = 900, 420, 18, 40
 
 
@@ -68,7 +69,9 @@ class Reconstruction:
                 lines.append(f"{'':15}and {rest} others, all in {self.capture / 'sfm/report.json'}")
         if found < _MOST * count:
             pairs = "" if "exhaustive" in self.decisions["pairs"] else " or --pairs exhaustive (slow)"
-            remedy = f"another --camera-model{pairs} may find more"
+            apart = any(_APART in why for why in self.unregistered.values())
+            between = "photographs from in between would connect them; " if apart else ""
+            remedy = f"{between}another --camera-model{pairs} may find more"
             lines.append(f"warning: {count - found} of {count} photographs have no pose; {remedy}")
         if not self.error < _LARGE:
             lines.append(f"warning: {self.error:.1f} pixels are much: check lens, sharpness and masks")
@@ -157,7 +160,7 @@ def _reason(found: Found, part: int) -> str:
     if found.features < _FEW_FEATURES:
         return f"{found.features} features: blurred, dark, masked, or without texture"
     if part:
-        return f"belongs to {part} photographs that nothing connects with the others"
+        return f"belongs to {part} photographs {_APART}"
     if not found.neighbours:
         return f"none of its {found.features:,} features was found in another photograph: it has no overlap"
     return (

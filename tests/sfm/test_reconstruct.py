@@ -25,7 +25,7 @@ from blitzgs.sfm import engine, reconstruct
 from blitzgs.sfm.photographs import Photographs, judge_positions
 from blitzgs.sfm.pycolmap_stage import _centre_lenses, features
 from blitzgs.sfm.reconstruct import Settings
-from blitzgs.sfm.report import examine
+from blitzgs.sfm.report import Reconstruction, _reason, examine
 from tests.capture.helpers import Posed, opensfm, pix4d, realitycapture
 from tests.sfm.scene import FOCAL, aligned, with_gps, write_photographs
 from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
@@ -71,13 +71,23 @@ def test_poses_and_lens_are_found(made):
     assert camera.focal_length == pytest.approx(FOCAL, rel=0.01)
 
 
+@pytest.mark.parametrize(
+    ("part", "remedy"), [(4, "photographs from in between would connect"), (0, "; another")]
+)
+def test_the_remedy_for_photographs_without_a_pose(part, remedy):
+    why = _reason(engine.Found(900, 50, 3), part)
+    left = dict.fromkeys("abcd", why)
+    found = Reconstruction(Path("c"), {"e": 0.5}, {"e": 100}, left, {}, 100, {"pairs": "all"})
+    assert remedy in found.lines()[-1] and "--camera-model or --pairs exhaustive" in found.lines()[-1]
+
+
 def test_unused_photographs_are_named_with_the_reason(made):
     root, _ = made
-    report = json.loads((root / "capture/sfm/report.json").read_text())
-    assert set(report["no_pose"]) == {"cut.jpg", "wall.jpg"}
-    assert "cut.jpg" in report["no_pose"]["cut.jpg"] and "features" not in report["no_pose"]["cut.jpg"]
-    assert report["no_pose"]["wall.jpg"].startswith("0 features")
-    assert report["doubtful"] == {}
+    told = json.loads((root / "capture/sfm/report.json").read_text())
+    assert set(told["no_pose"]) == {"cut.jpg", "wall.jpg"}
+    assert "cut.jpg" in told["no_pose"]["cut.jpg"] and "features" not in told["no_pose"]["cut.jpg"]
+    assert told["no_pose"]["wall.jpg"].startswith("0 features")
+    assert told["doubtful"] == {}
     model = pycolmap.Reconstruction(root / "capture/sparse/0")
     away = [
         np.linalg.norm(image.project_point(model.points3D[seen.point3D_id].xyz) - seen.xy)
@@ -85,7 +95,7 @@ def test_unused_photographs_are_named_with_the_reason(made):
         for seen in image.points2D
         if seen.has_point3D()
     ]
-    assert report["error"] == pytest.approx(np.mean(away), rel=1e-6)
+    assert told["error"] == pytest.approx(np.mean(away), rel=1e-6)
     plan = cv2.imread(str(root / "capture/sfm/cameras.png"))
     assert (plan[:, :900] != 255).any(axis=2).sum() > 8 * 60  # eight cameras of ten pixels, and points
 
