@@ -220,7 +220,7 @@ def measure(args: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = make_parser(__doc__, device="cpu")
+    parser = make_parser(__doc__)
     parser.add_argument("--data", help="a capture; its points become the Gaussians")
     parser.add_argument("--downscale", type=int, default=2)
     parser.add_argument(

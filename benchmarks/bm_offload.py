@@ -217,7 +217,7 @@ def with_cost(results: list[dict[str, Any]], resident: dict[str, float]) -> list
 
 def main() -> None:
     """Measure, and print a table; the JSON file is written again after each pool."""
-    parser = make_parser(__doc__, device="cuda")
+    parser = make_parser(__doc__)
     parser.add_argument("--gaussians", type=int, default=16_000_000)
     parser.add_argument("--ratios", type=float, nargs="+", default=[1, 2, 4])
     orders = ["random", "tour", "flight"]
