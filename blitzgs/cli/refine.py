@@ -22,8 +22,8 @@ command lets COLMAP (pycolmap: pip install 'blitzgs[sfm]') find the axis and the
 pixels at which the photographs saw their points; it needs a COLMAP model that has these.
 
 NEW gets sparse/0, links to all else of CAPTURE, and sfm/refined.json. Its world stays that of CAPTURE. A lens
-is refined if 15 photographs or more have it. Where the median miss falls by less than a tenth, NEW has the
-model of CAPTURE.
+is refined if 15 photographs or more have it, and gets distortion if that takes another tenth of the error.
+Where the median miss falls by less than a tenth, NEW has the model of CAPTURE.
 """
 
 

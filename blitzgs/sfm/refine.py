@@ -57,8 +57,9 @@ class Refined:
 def refine(root: Path, capture: Path) -> Refined:
     """Write a capture with the lenses, poses and points of the COLMAP model of another one, refined.
 
-    All else of it is linked. A camera of 15 photographs or more gets its principal point and a lens of the
-    model OPENCV, if it has no distortion or a radial one; others keep their lens. World coordinates stay.
+    All else of it is linked. A camera of 15 photographs or more gets its principal point and, if the error
+    then falls by another tenth, the lens OPENCV in the place of a pinhole or radial one; others keep theirs.
+    World coordinates stay.
     FileNotFoundError: `root` has no model. FileExistsError: `capture` is not empty. ValueError: the model has
     no observations. ImportError: pycolmap is not installed.
     """

@@ -13,7 +13,7 @@ from blitzgs.sfm.refine import refine
 from blitzgs.sfm.report import misses
 
 pycolmap = pytest.importorskip("pycolmap")
-LENS = [600.0, 603.0, 340.0, 230.0, 0.02, -0.01, 0.001, 0.002]
+LENS = [600.0, 603.0, 340.0, 230.0, -0.08, 0.02, 0.001, 0.002]
 
 
 @pytest.fixture
@@ -99,6 +99,14 @@ def test_a_lens_that_fits_stays(scene, tmp_path):
         assert files[0].read_bytes() == files[1].read_bytes()
     assert not found.adopted
     assert "stay" in found.lines()[1]
+
+
+def test_photographs_are_undistorted_only_where_it_pays(scene, tmp_path):
+    """A pinhole with another axis stays a pinhole."""
+    capture, _ = scene(20, lens=[600.0, 603.0, 340.0, 230.0, 0, 0, 0, 0])
+    assert refine(capture, tmp_path / "new").adopted
+    (camera,) = read_model(tmp_path / "new/sparse/0").cameras
+    assert camera.model == "PINHOLE" and camera.params == pytest.approx([600, 603, 340, 230], abs=1)
 
 
 def test_a_few_photographs_do_not_determine_a_lens(scene, tmp_path):
