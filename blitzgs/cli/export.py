@@ -79,9 +79,8 @@ A city that no browser holds at once is written as a folder that viewers load pi
   blitzgs export RUN|CHECKPOINT|FILE --tiles CITY            # 3D Tiles 1.1; then blitzgs view CITY
   blitzgs export RUN|CHECKPOINT|FILE --streamed-sog CITY     # for SuperSplat
 
-Memory does not grow with a run or a PLY file; the disk needs two and a half times the size of the
-model. See
-docs/guide/formats.md.
+Memory does not grow with a run or a PLY file; the disk needs two and a half times the size of the model.
+See docs/guide/formats.md.
 """
 _TILES = "--tiles and --streamed-sog"
 _COUNT = arguments.number(int, lambda value: value >= 1, "a whole number from 1 on")

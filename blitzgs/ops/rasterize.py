@@ -26,10 +26,10 @@ class RasterizeSaved(NamedTuple):
 
     splats: list[Tensor]  # means2d [P, 2], conics [P, 3], splat_opacities [P], colors [P, D]
     backgrounds: Tensor | None  # [B, D]; None: black
-    # Isect_splats, int32 [I], the splats of each tile, front to back; tile_offsets, int64 [B * T + 1], where
+    # isect_splats, int32 [I], the splats of each tile, front to back; tile_offsets, int64 [B * T + 1], where
     # each tile's list begins.
     lists: list[Tensor]
-    # Transmittances [B, H, W], the weight of the background in each pixel; last_ids, int32 [B, H, W], where
+    # transmittances [B, H, W], the weight of the background in each pixel; last_ids, int32 [B, H, W], where
     # each pixel's list ended; packed_splats and tile_order, the splats and the order of the tiles in layouts
     # that only the kernels of the backend read.
     composited: list[Tensor]

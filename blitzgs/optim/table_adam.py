@@ -47,7 +47,7 @@ class TableAdam:
         """
         rates = schedule.learning_rates(self._config, self._extent)
         self._position_rates = rates[:, 0].tolist()
-        # [S + 1, 6], the rates of every step; see `Schedule.learning_rates`.
+        # float32 [S + 1, 6], the rates of every step; see `Schedule.learning_rates`.
         self.lr_table: Tensor = rates.to(self._device)  # type: ignore[call-overload]
         self.schedule = AdamSchedule(self.lr_table, *self._betas, self._eps)
         self.pending_table = self.schedule.table  # bounds the movement by pending steps

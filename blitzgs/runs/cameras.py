@@ -31,25 +31,39 @@ _PIECE, _NAMED, _THREADS = 4096, 4, 16
 
 @dataclass(frozen=True, eq=False)
 class RunCamera:
-    """A pinhole camera with the fields of `blitzgs.capture.cameras.Camera` that rendering reads."""
+    """A pinhole camera with the fields of `blitzgs.capture.cameras.Camera` that rendering reads.
 
-    name: str  # name of the image
-    width: int  # image width in pixels
-    height: int  # image height in pixels
-    # Intrinsics in pixels, float64 [3, 3]; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+    Attributes:
+        name: name of the image.
+        width: image width in pixels.
+        height: image height in pixels.
+        K: intrinsics in pixels, float64 [3, 3]; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+        world_to_camera: rigid pose, float64 [4, 4], in the re-centred world (capture position - the run's
+            offset).
+    """
+
+    name: str
+    width: int
+    height: int
     K: npt.NDArray[np.float64]
-    # Rigid pose, float64 [4, 4], in the re-centred world (capture position - the run's offset).
     world_to_camera: npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RunCameras:
-    """All cameras of a run."""
+    """All cameras of a run.
 
-    cameras: Sequence[CameraLike]  # all cameras in the order of the capture
-    train: list[int]  # indices of the training cameras
-    test: list[int]  # indices of the held-out cameras
-    inputs: list[Path]  # paths of the photographs and masks during training
+    Attributes:
+        cameras: all cameras in the order of the capture.
+        train: indices of the training cameras.
+        test: indices of the held-out cameras.
+        inputs: paths of the photographs and masks during training.
+    """
+
+    cameras: Sequence[CameraLike]
+    train: list[int]
+    test: list[int]
+    inputs: list[Path]
 
     def __repr__(self) -> str:
         return (

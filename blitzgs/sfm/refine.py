@@ -50,7 +50,8 @@ class Refined:
         ]
         if not self.adopted:
             return [*lines, f"{'result:':15}lenses and poses are as good as can be found: they stay"]
-        lines += [f"{'lens:':15}{old}\n{'':15}-> {new}" for old, new in self.lenses if old != new]
+        for old, new in self.lenses:
+            lines += [f"{'lens:':15}{old}", f"{'':15}-> {new}"] if old != new else []
         return [*lines, f"{'photographs:':15}moved by {self.moved:.3g} units (median)"]
 
 
@@ -61,7 +62,7 @@ def refine(root: Path, capture: Path) -> Refined:
     then falls by another tenth, the lens OPENCV in the place of a pinhole or radial one; others keep theirs.
     World coordinates stay.
     FileNotFoundError: `root` has no model. FileExistsError: `capture` is not empty. ValueError: the model has
-    no observations. ImportError: pycolmap is not installed.
+    no observations, or `capture` is in `root`. ImportError: pycolmap is not installed.
     """
     if not has_pycolmap():
         raise ImportError("poses are refined by COLMAP's pycolmap: pip install 'blitzgs[sfm]'")
@@ -96,11 +97,11 @@ def refine(root: Path, capture: Path) -> Refined:
     refined = _compare(model, read_model(found, points2d=True))
     source = found if refined.adopted else folder
     (sparse := capture / "sparse" / "0").mkdir(parents=True)
-    for name in FILES:
-        file = next(path for path in (source / f"{name}.bin", source / f"{name}.txt") if path.is_file())
+    kinds = [[source / (name + suffix) for name in FILES] for suffix in (".bin", ".txt")]
+    for file in next(files for files in kinds if all(file.is_file() for file in files)):  # as `read_model`
         shutil.copyfile(file, sparse / file.name)
     shutil.rmtree(found)
-    _link_others(root.resolve(), folder.resolve(), capture)
+    _link_others(root, folder, capture)
     (work / "refined.json").write_text(json.dumps(asdict(refined), indent=1))
     return refined
 
@@ -141,4 +142,4 @@ def _link_others(root: Path, model: Path, capture: Path) -> None:
     for path in root.iterdir():
         own = path.name in (*inside[:1], WORK) or (not inside and path.stem in (*FILES, "rigs", "frames"))
         if not own:
-            (capture / path.name).symlink_to(path, target_is_directory=path.is_dir())
+            (capture / path.name).symlink_to(path.resolve(), target_is_directory=path.is_dir())

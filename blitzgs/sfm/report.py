@@ -128,14 +128,18 @@ def examine(
 
 
 def misses(model: ColmapModel) -> Float64:
-    """Return the distance in pixels of each observation from its point's image [O]; NaN: it has no point."""
+    """Return the distance in pixels of each observation from its point's image [O].
+
+    NaN: it has no point, or the lens does not see the point.
+    """
     lenses = {c.id: Lens(c.model, c.width, c.height, tuple(c.params.tolist())) for c in model.cameras}
     order = np.argsort(model.points.ids)
     ids, positions = model.points.ids[order], model.points.positions[order]
     offsets, found = model.images.point2d_offsets.tolist(), np.full(len(model.images.points2d), np.nan)
+    has_point = np.isin(model.images.point3d_ids, ids)
     rows = zip(offsets, offsets[1:], model.images.camera_ids.tolist(), strict=False)
     for (begin, end, camera), pose in zip(rows, world_to_camera(model.images), strict=True):
-        at = begin + np.flatnonzero(model.images.point3d_ids[begin:end] >= 0)
+        at = begin + np.flatnonzero(has_point[begin:end])
         world = positions[np.searchsorted(ids, model.images.point3d_ids[at])]
         x, y, depth = pose[:3, :3] @ world.T + pose[:3, 3:]
         u, v = lenses[camera].project(x / depth, y / depth)

@@ -60,7 +60,7 @@ def test_lens_and_poses_are_found(scene, tmp_path, capsys):
     capture, truth = scene(20)
     assert main(["refine", str(capture), str(tmp_path / "new")]) == 0
     told = capsys.readouterr().out
-    assert "-> OPENCV " in told and f"blitzgs train --data {tmp_path / 'new'}" in told
+    assert "\n               -> OPENCV " in told and f"\n  blitzgs train --data {tmp_path / 'new'}" in told
     (camera,) = read_model(tmp_path / "new/sparse/0").cameras
     assert camera.params[:4] == pytest.approx(LENS[:4], abs=1)
     known, found = (Lens("OPENCV", 640, 480, tuple(values)) for values in (LENS, camera.params.tolist()))
@@ -111,6 +111,8 @@ def test_photographs_are_undistorted_only_where_it_pays(scene, tmp_path):
 
 def test_a_few_photographs_do_not_determine_a_lens(scene, tmp_path):
     capture, _ = scene(8)
+    (capture / "sparse").rename(tmp_path / "elsewhere")  # a link is as good as a folder
+    (capture / "sparse").symlink_to(tmp_path / "elsewhere")
     old, new = refine(capture, tmp_path / "new").lenses[0]
     assert old == new and old.startswith("PINHOLE")
 
@@ -140,6 +142,9 @@ def test_what_cannot_be_refined_is_refused(scene, tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match="none has no COLMAP model"):
         refine(tmp_path / "none", tmp_path / "new")
     model = pycolmap.Reconstruction(capture / "sparse/0")
+    (capture / "sparse/0/points3D.bin").rename(capture / "sparse/0/points3D.ply")
+    with pytest.raises(ValueError, match="does not say at which pixels photographs saw its points"):
+        refine(capture, tmp_path / "new")
     for number in list(model.points3D):
         model.delete_point3D(number)
     model.write(capture / "sparse/0")
