@@ -63,7 +63,11 @@ def encode_image(image: Tensor, suffix: str) -> bytes:
     except cv2.error:  # its message has paths of its sources
         written = False
     if not written:
-        raise ValueError(f"cannot write a picture as '{suffix}': use .png, .jpg or .webp")
+        height, width = image.shape[:2]
+        raise ValueError(
+            f"cannot write a picture as '{suffix}' of {width:,} x {height:,} pixels: use .png, or for smaller "
+            "ones .jpg or .webp"
+        )
     return bytes(data)
 
 

@@ -44,7 +44,7 @@ class GateRules(NamedTuple):
     # must not increase towards finer levels; a negative one removes the level everywhere.
     reach: list[float]
     lod_views: int  # bit v is set when view v has an LOD gate
-    cull: Tensor | None = None  # int32 [ceil(N / 256), columns, 8], of `blitzgs.ops.blocks`
+    cull: Tensor | None = None  # int32 [ceil(N / 256), columns, 8], of `blitzgs.ops.blocks`; None: none
     # Columns of `cull`, one for each view; negative: the view has no mask. Empty: no view has one.
     columns: list[int] = []  # noqa: RUF012  (never changed)
 
