@@ -65,8 +65,8 @@ def encode_image(image: Tensor, suffix: str) -> bytes:
     if not written:
         height, width = image.shape[:2]
         raise ValueError(
-            f"cannot write a picture as '{suffix}' of {width:,} x {height:,} pixels: use .png, or for smaller "
-            "ones .jpg or .webp"
+            f"cannot write a picture as '{suffix}' of {width:,} x {height:,} pixels: use .png, or for "
+            "smaller ones .jpg or .webp"
         )
     return bytes(data)
 
