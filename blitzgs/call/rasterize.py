@@ -30,12 +30,6 @@ from blitzgs.util.errors import explain_memory
 _HALF = (torch.float16, torch.bfloat16)
 
 
-def _like_means(values: Any, means: Any) -> Any:
-    """Return half-precision values in the dtype of the means, and everything else as it is."""
-    is_half = isinstance(values, Tensor) and values.dtype in _HALF and isinstance(means, Tensor)
-    return values.to(means.dtype) if is_half else values
-
-
 def rasterization(
     means: Tensor,
     quats: Tensor | None,
@@ -196,7 +190,10 @@ def rasterization(
         width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, render_mode,
         rasterize_mode, camera_model,
     )  # fmt: skip
-    colors, extra_signals = _like_means(colors, means), _like_means(extra_signals, means)
+    if isinstance(colors, Tensor) and colors.dtype in _HALF and isinstance(means, Tensor):
+        colors = colors.to(means.dtype)
+    if isinstance(extra_signals, Tensor) and extra_signals.dtype in _HALF and isinstance(means, Tensor):
+        extra_signals = extra_signals.to(means.dtype)
     required: dict[str, object] = {"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks}
     if covars is None:
         required |= {"quats": quats, "scales": scales}
@@ -242,10 +239,14 @@ def rasterization(
         antialiased=rasterize_mode == "antialiased",
         raw=False,
     )
-    background = background_rows(backgrounds, gaussians, render_mode, return_normals)
+    background = None
+    if backgrounds is not None:
+        background = background_rows(backgrounds, gaussians, render_mode, return_normals)
     if pixels is not None and (distributed or torch.compiler.is_compiling()):
         raise ValueError("pixels support neither distributed=True nor torch.compile; leave one out")
-    listed = checked_pixels(pixels, image_ids, gaussians.images, width, height)
+    listed = None
+    if pixels is not None or image_ids is not None:
+        listed = checked_pixels(pixels, image_ids, gaussians.images, width, height)
     image = ImageOptions(
         render_mode, background, packed, sparse_grad, absgrad, return_normals, return_median, listed
     )

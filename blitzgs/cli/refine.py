@@ -39,6 +39,5 @@ def run(args: argparse.Namespace) -> int:
     begin = time.monotonic()
     print("\n".join(map(printable, refine(args.capture, args.new).lines())))
     print(f"{'time:':15}{(time.monotonic() - begin) / 60:.1f} minutes")
-    name = shlex.quote(str(args.new))
-    print(f"next:\n  {printable(f'blitzgs train --data {name} --out RUN')}")
+    print(f"next:\n  {printable(f'blitzgs train --data {shlex.quote(str(args.new))} --out RUN')}")
     return 0

@@ -24,8 +24,9 @@ from blitzgs.sfm.engine import MANY, adopt, least_model, lens_model
 # The standard deviations of a position by GPS in metres, across and up; the second of an altitude that says
 # nothing. Drones state altitudes by barometer, which drift between flights.
 _ACROSS, _UP, _UNKNOWN = 3.0, 15.0, 1e4
-# A model is refined in rounds; after each, observations that miss by so many times the median are left out.
-_ROUNDS, _ITERATIONS, _WRONG = 2, 40, 6.0
+# A model is refined in rounds. The scale of Cauchy's loss is the median miss, in pixels, or at least this;
+# after each round, observations that miss by so many times the scale are left out.
+_ROUNDS, _ITERATIONS, _LEAST_SCALE, _WRONG = 2, 40, 0.5, 4.0
 _POORER = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # special cases of OPENCV
 
 
@@ -201,7 +202,8 @@ def refine(job: dict[str, Any]) -> None:
     before = np.stack([image.projection_center() for image in posed])
     counts = Counter(image.camera_id for image in posed)
     few = [number for number in model.cameras if counts[number] < MANY]
-    _adjust(model, few, job["miss"], 0)
+    scale = max(job["miss"], _LEAST_SCALE)
+    _adjust(model, few, scale, 0)
     richer = copy.deepcopy(model)
     for number, camera in richer.cameras.items():
         if number not in few and camera.model.name in (
@@ -215,7 +217,7 @@ def refine(job: dict[str, Any]) -> None:
             centre = camera.params[list(camera.principal_point_idxs())]
             camera.model = pycolmap.CameraModelId.OPENCV
             camera.params = [lengths[0], lengths[-1], *centre, *radial, 0.0, 0.0]
-    _adjust(richer, few, job["miss"], _ROUNDS)
+    _adjust(richer, few, scale, _ROUNDS)
     if richer.compute_mean_reprojection_error() < 0.9 * model.compute_mean_reprojection_error():
         model = richer
     now = np.stack([model.images[image.image_id].projection_center() for image in posed])
@@ -225,7 +227,7 @@ def refine(job: dict[str, Any]) -> None:
     model.write(job["refined"])
 
 
-def _adjust(model: Any, few: list[int], miss: float, done: int) -> None:
+def _adjust(model: Any, few: list[int], scale: float, done: int) -> None:
     """Adjust all but the lenses of the cameras `few`, and leave out what misses by far; tell the rounds."""
     wanted = pycolmap.BundleAdjustmentConfig()
     for image in model.images.values():
@@ -236,12 +238,12 @@ def _adjust(model: Any, few: list[int], miss: float, done: int) -> None:
         wanted.set_constant_cam_intrinsics(number)
     options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = miss
+    options.ceres.loss_function_scale = scale
     options.ceres.use_gpu = pycolmap.has_cuda
     options.ceres.solver_options.max_num_iterations = _ITERATIONS
     for number in range(done, done + _ROUNDS):
         pycolmap.create_default_bundle_adjuster(options, wanted, model).solve()
-        pycolmap.ObservationManager(model).filter_all_points3D(_WRONG * miss, 0.0)
+        pycolmap.ObservationManager(model).filter_all_points3D(_WRONG * scale, 0.0)
         print(f"[{number + 1}/{2 * _ROUNDS}]", flush=True)
 
 

@@ -51,7 +51,8 @@ class Refined:
         if not self.adopted:
             return [*lines, f"{'result:':15}lenses and poses are as good as can be found: they stay"]
         for old, new in self.lenses:
-            lines += [f"{'lens:':15}{old}", f"{'':15}-> {new}"] if old != new else []
+            if old != new:
+                lines += [f"{'lens:':15}{old}", f"{'':15}-> {new}"]
         return [*lines, f"{'photographs:':15}moved by {self.moved:.3g} units (median)"]
 
 

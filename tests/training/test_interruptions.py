@@ -450,7 +450,10 @@ def test_a_terminal_that_is_gone_ends_nothing(tmp_path, monkeypatch):
 
 
 def test_a_resume_repeats_no_record_and_says_where_it_begins(tmp_path, monkeypatch):
-    at_step(monkeypatch, 70, lambda self: (_ for _ in ()).throw(RuntimeError("killed")))
+    at_step(
+        monkeypatch, 52, lambda self: self.state.save_clock.saving and self.state.save_clock.saving.wait()
+    )
+    at_step(monkeypatch, 52 + MAX_STEPS + 2, lambda self: (_ for _ in ()).throw(RuntimeError("killed")))
     refused(RuntimeError, "killed", trainer(tmp_path, "schedule.checkpoint_every=50").train)
     assert [r["t"] for r in steps_of(tmp_path)] == [20, 40, 60]
     with (tmp_path / "log.jsonl").open("a") as file:
