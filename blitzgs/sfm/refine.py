@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -91,8 +92,8 @@ def refine(root: Path, capture: Path) -> Refined:
         job = {"model": str(folder.absolute()), "refined": str(found), "miss": float(np.nanmedian(missed))}
 
         def heard(line: str) -> None:
-            if line.startswith("[") and "/" in line:
-                report(*map(int, line[1 : line.index("]")].split("/")))
+            if round_of := re.match(r"\[(\d+)/(\d+)\]$", line):
+                report(int(round_of[1]), int(round_of[2]))
 
         run_pycolmap("refine", job, work / "colmap.log", lock, heard)
     refined = _compare(model, read_model(found, points2d=True))
