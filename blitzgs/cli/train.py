@@ -17,6 +17,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from blitzgs.capture.colmap import find_models
 from blitzgs.cli.arguments import Commands, add_command, add_device, add_path, number
 from blitzgs.cli.report import kept_warnings, write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
@@ -26,6 +27,7 @@ from blitzgs.config.ranges import describe, describe_all, describe_page
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files
 from blitzgs.runs.folder_checks import locked
+from blitzgs.sfm.refine import fit_of
 from blitzgs.training.budget import LEAST_IMAGES, estimate
 from blitzgs.training.inputs import open_capture, read_ahead
 from blitzgs.training.state import TrainingState
@@ -240,6 +242,9 @@ def _check(args: argparse.Namespace, config: Config) -> int:
     check_worlds(capture)
     lines = understood(config, capture, images)
     images.close()
+    used = [m for m, _ in find_models(capture.root) if m == capture.root / capture.about.source.cameras]
+    if used and (fit := fit_of(used[0])) is not None:
+        lines.append(f"{'poses:':15}{fit}")
     rough = estimate(config, capture, _on_gpu(args), torch.get_num_threads())
     lines.append(f"{'training:':15}{rough}")
     print("\n".join(lines), flush=True)

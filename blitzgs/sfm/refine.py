@@ -28,6 +28,9 @@ from blitzgs.util.progress import image_progress
 
 # A refined model replaces the old one if the median miss falls to this share of what it was.
 _BETTER = 0.9
+# Parts of a picture along an axis, and pixels by which a lens that is worth a try misses: of captures with
+# 0.19, 0.13 and 0.01 only the first gained.
+_PARTS, _LENS = 8, 0.15
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,7 @@ def refine(root: Path, capture: Path) -> Refined:
     if capture.resolve().is_relative_to(root.resolve()):
         raise ValueError(f"{capture} is in the capture itself: choose a folder outside {root}")
     model = read_model(folder, points2d=True)
-    missed = misses(model)
+    missed = np.linalg.norm(misses(model), axis=1)
     if not (~np.isnan(missed)).any():
         raise ValueError(
             f"{folder} does not say at which pixels photographs saw its points, which tell lens and poses: "
@@ -108,6 +111,29 @@ def refine(root: Path, capture: Path) -> Refined:
     return refined
 
 
+def fit_of(model: Path) -> str | None:
+    """Return how well lenses and poses of a COLMAP model fit its observations; None: it has none.
+
+    What photographs miss alike, at the same part of the picture, is the lens: the median in each of
+    64 parts says how much, and chance hardly adds to it.
+    """
+    read = read_model(model, points2d=True)
+    vectors = misses(read)
+    seen = ~np.isnan(vectors[:, 0])
+    if not seen.any():
+        return None
+    sizes = {camera.id: (camera.width, camera.height) for camera in read.cameras}
+    ends = read.images.point2d_offsets.astype(np.int64)
+    counts = ends[1:] - ends[:-1]
+    size = np.repeat(np.array([sizes[camera] for camera in read.images.camera_ids.tolist()]), counts, axis=0)
+    part = np.clip(read.images.points2d * _PARTS // size, 0, _PARTS - 1).astype(np.int64) @ [_PARTS, 1]
+    alike = [np.median(vectors[seen & (part == number)], axis=0) for number in np.unique(part[seen])]
+    median = float(np.median(np.linalg.norm(vectors[seen], axis=1)))
+    lens = float(np.sqrt((np.array(alike) ** 2).sum(axis=1).mean()))
+    advice = "; blitzgs refine may help" if lens > _LENS else ""
+    return f"miss their points by {median:.2f} pixels (median), by {lens:.2f} because of the lens{advice}"
+
+
 def _compare(old: ColmapModel, new: ColmapModel) -> Refined:
     was, now = _by_name(old), _by_name(new)
     both = {name: ~np.isnan(was[name][0]) & ~np.isnan(now[name][0]) for name in was}
@@ -129,7 +155,8 @@ def _compare(old: ColmapModel, new: ColmapModel) -> Refined:
 
 def _by_name(model: ColmapModel) -> dict[str, tuple[Float64, Float64]]:
     """Return the misses and the place of each photograph."""
-    parts = np.split(misses(model), model.images.point2d_offsets[1:-1].tolist())
+    distances = np.linalg.norm(misses(model), axis=1)
+    parts = np.split(distances, model.images.point2d_offsets[1:-1].tolist())
     centres = camera_centres(world_to_camera(model.images))
     return dict(zip(model.images.names, zip(parts, centres, strict=True), strict=True))
 

@@ -128,30 +128,31 @@ def examine(
 
 
 def misses(model: ColmapModel) -> Float64:
-    """Return the distance in pixels of each observation from its point's image [O].
+    """Return from each observation to its point's image, in pixels [O, 2].
 
     NaN: it has no point, or the lens does not see the point.
     """
     lenses = {c.id: Lens(c.model, c.width, c.height, tuple(c.params.tolist())) for c in model.cameras}
     order = np.argsort(model.points.ids)
     ids, positions = model.points.ids[order], model.points.positions[order]
-    offsets, found = model.images.point2d_offsets.tolist(), np.full(len(model.images.points2d), np.nan)
+    offsets, found = model.images.point2d_offsets.tolist(), np.full((len(model.images.points2d), 2), np.nan)
     has_point = np.isin(model.images.point3d_ids, ids)
     rows = zip(offsets, offsets[1:], model.images.camera_ids.tolist(), strict=False)
     for (begin, end, camera), pose in zip(rows, world_to_camera(model.images), strict=True):
         at = begin + np.flatnonzero(has_point[begin:end])
         world = positions[np.searchsorted(ids, model.images.point3d_ids[at])]
         x, y, depth = pose[:3, :3] @ world.T + pose[:3, 3:]
-        u, v = lenses[camera].project(x / depth, y / depth)
-        found[at] = np.hypot(u - model.images.points2d[at, 0], v - model.images.points2d[at, 1])
+        pixels = np.stack(lenses[camera].project(x / depth, y / depth), axis=1)
+        found[at] = pixels - model.images.points2d[at]
     return found
 
 
 def _errors(model: ColmapModel) -> tuple[dict[str, float], dict[str, int]]:
     """Return the mean of each photograph's misses, in pixels, and their number."""
     errors, counts = {}, {}
+    distances = np.linalg.norm(misses(model), axis=1)
     for name, missed in zip(
-        model.images.names, np.split(misses(model), model.images.point2d_offsets[1:-1].tolist()), strict=True
+        model.images.names, np.split(distances, model.images.point2d_offsets[1:-1].tolist()), strict=True
     ):
         seen = missed[~np.isnan(missed)]
         counts[name] = len(seen)

@@ -9,7 +9,7 @@ import pytest
 from blitzgs.capture.colmap import read_model
 from blitzgs.capture.lens import Lens
 from blitzgs.cli import main
-from blitzgs.sfm.refine import refine
+from blitzgs.sfm.refine import fit_of, refine
 from blitzgs.sfm.report import misses
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -53,7 +53,16 @@ def test_misses_are_those_of_pycolmap(scene):
             known = seen.has_point3D()
             pixel = image.project_point(model.points3D[seen.point3D_id].xyz) if known else [np.nan] * 2
             expected.append(np.linalg.norm(pixel - seen.xy))
-    assert misses(read) == pytest.approx(expected, abs=1e-9, nan_ok=True)
+    assert np.linalg.norm(misses(read), axis=1) == pytest.approx(expected, abs=1e-9, nan_ok=True)
+
+
+@pytest.mark.parametrize(("taken", "advised"), [("PINHOLE", True), ("OPENCV", False)])
+def test_a_check_says_how_well_the_lens_fits(scene, taken, advised):
+    capture, _ = scene(20, taken=taken)
+    told = fit_of(capture / "sparse/0")
+    assert told.endswith("blitzgs refine may help") == advised
+    by_chance, of_lens = (float(told.split(" by ")[part].split()[0]) for part in (1, 2))
+    assert by_chance == pytest.approx(0.12, abs=0.01) and of_lens < 0.03 if not advised else of_lens > 0.1
 
 
 def test_lens_and_poses_are_found(scene, tmp_path, capsys):
