@@ -206,12 +206,7 @@ def refine(job: dict[str, Any]) -> None:
     _adjust(model, few, scale, 0)
     richer = copy.deepcopy(model)
     for number, camera in richer.cameras.items():
-        if number not in few and camera.model.name in (
-            "SIMPLE_PINHOLE",
-            "PINHOLE",
-            "SIMPLE_RADIAL",
-            "RADIAL",
-        ):
+        if number not in few and camera.model.name in _POORER:
             radial = [*camera.params[list(camera.extra_params_idxs())], 0.0, 0.0][:2]
             lengths = camera.params[list(camera.focal_length_idxs())]
             centre = camera.params[list(camera.principal_point_idxs())]

@@ -80,7 +80,7 @@ def refine(root: Path, capture: Path) -> Refined:
     if capture.resolve().is_relative_to(root.resolve()):
         raise ValueError(f"{capture} is in the capture itself: choose a folder outside {root}")
     model = read_model(folder, points2d=True)
-    missed = np.linalg.norm(misses(model), axis=1)
+    missed = _distances(model)
     if not (~np.isnan(missed)).any():
         raise ValueError(
             f"{folder} does not say at which pixels photographs saw its points, which tell lens and poses: "
@@ -99,7 +99,7 @@ def refine(root: Path, capture: Path) -> Refined:
                 report(int(round_of[1]), int(round_of[2]))
 
         run_pycolmap("refine", job, work / "colmap.log", lock, heard)
-    refined = _compare(model, read_model(found, points2d=True))
+    refined = _compare(model, missed, read_model(found, points2d=True))
     source = found if refined.adopted else folder
     (sparse := capture / "sparse" / "0").mkdir(parents=True)
     kinds = [[source / (name + suffix) for name in FILES] for suffix in (".bin", ".txt")]
@@ -134,8 +134,13 @@ def fit_of(model: Path) -> str | None:
     return f"miss their points by {median:.2f} pixels (median), by {lens:.2f} because of the lens{advice}"
 
 
-def _compare(old: ColmapModel, new: ColmapModel) -> Refined:
-    was, now = _by_name(old), _by_name(new)
+def _distances(model: ColmapModel) -> Float64:
+    """Return the misses as distances [O]."""
+    return np.linalg.norm(misses(model), axis=1)
+
+
+def _compare(old: ColmapModel, missed: Float64, new: ColmapModel) -> Refined:
+    was, now = _by_name(old, missed), _by_name(new, _distances(new))
     both = {name: ~np.isnan(was[name][0]) & ~np.isnan(now[name][0]) for name in was}
     before, after = (
         float(np.median(np.concatenate([side[name][0][both[name]] for name in was]))) for side in (was, now)
@@ -146,16 +151,15 @@ def _compare(old: ColmapModel, new: ColmapModel) -> Refined:
         before=before,
         after=after,
         observations=kept,
-        left_out=int(sum((~np.isnan(missed)).sum() for missed, _ in was.values())) - kept,
+        left_out=int((~np.isnan(missed)).sum()) - kept,
         lenses=[(_lens(camera), lenses[camera.id]) for camera in old.cameras],
         moved=float(np.median([np.linalg.norm(was[name][1] - now[name][1]) for name in was])),
         adopted=after < _BETTER * before,
     )
 
 
-def _by_name(model: ColmapModel) -> dict[str, tuple[Float64, Float64]]:
+def _by_name(model: ColmapModel, distances: Float64) -> dict[str, tuple[Float64, Float64]]:
     """Return the misses and the place of each photograph."""
-    distances = np.linalg.norm(misses(model), axis=1)
     parts = np.split(distances, model.images.point2d_offsets[1:-1].tolist())
     centres = camera_centres(world_to_camera(model.images))
     return dict(zip(model.images.names, zip(parts, centres, strict=True), strict=True))

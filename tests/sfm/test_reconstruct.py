@@ -23,12 +23,12 @@ from blitzgs.cli import sfm as command
 from blitzgs.config.files import load_config
 from blitzgs.sfm import engine, reconstruct
 from blitzgs.sfm.photographs import Photographs, judge_positions
-from blitzgs.sfm.pycolmap_stage import _centre_lenses, features
+from blitzgs.sfm.pycolmap_stage import features
 from blitzgs.sfm.reconstruct import Settings
 from blitzgs.sfm.report import Reconstruction, _reason, examine
 from tests.capture.helpers import Posed, opensfm, pix4d, realitycapture
 from tests.sfm.scene import FOCAL, aligned, with_gps, write_photographs
-from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
+from tests.training.tiny import OVERRIDES, as_flags
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -177,29 +177,6 @@ def test_interrupted_work_goes_on_and_is_placed_by_gps(tmp_path, monkeypatch):
     )
     assert height == pytest.approx(metres[1][2] + 400, abs=0.01)
     assert not (tmp_path / "images").is_symlink()
-
-
-@pytest.mark.parametrize(("count", "away", "found"), [(20, 40, 40), (10, 40, 0), (20, 1, 0)])
-def test_many_photographs_determine_the_principal_point(tmp_path, count, away, found):
-    """A few do not, and it stays in the middle if the error is hardly less elsewhere."""
-    made = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=count, num_points3D=300)
-    made.camera_width, made.camera_height = 640, 480
-    made.camera_model_id, made.camera_params = pycolmap.CameraModelId.PINHOLE, [600, 600, 320 + away, 240]
-    with pycolmap.Database.open(tmp_path / "database.db") as database:
-        model = pycolmap.synthesize_dataset(made, database)
-        pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.3), model, database)
-    model.cameras[1].params = [600, 600, 320, 240]
-    pycolmap.bundle_adjustment(model)  # as the mappers leave it
-    model.update_point_3d_errors()
-    (tmp_path / "0").mkdir()
-    model.write(tmp_path / "0")
-    _centre_lenses(str(tmp_path / "database.db"), tmp_path / "0", pycolmap.IncrementalPipelineOptions())
-    params = pycolmap.Reconstruction(tmp_path / "0").cameras[1].params
-    if found:
-        assert params == pytest.approx([600, 600, 320 + found, 240], abs=1)
-    else:
-        assert params[2:].tolist() == [320, 240]
-    assert [path.name for path in tmp_path.glob("*") if path.is_dir()] == ["0"]
 
 
 def test_a_camera_of_exif_is_another_camera(tmp_path):
@@ -417,29 +394,6 @@ else:
     options = pycolmap.IncrementalPipelineOptions(min_model_size=int(flags["--Mapper.min_model_size"]))
     pycolmap.incremental_mapping(database, flags["--image_path"], flags["--output_path"], options)
 """
-
-
-def test_a_model_that_cannot_be_refined_is_kept(tmp_path, monkeypatch):
-    write_tiny_capture(tmp_path / "tiny")
-    program = tmp_path / "colmap"
-    found = f"cp -r {tmp_path}/tiny/sparse/0 {tmp_path}/models/0"
-    program.write_text(
-        f'#!/bin/sh\ncase $1 in mapper) {found} ;; help) ;; *) echo "no CUDA"; exit 3 ;; esac\n'
-    )
-    program.chmod(0o755)
-    monkeypatch.setattr(engine, "backend", lambda: str(program))
-    monkeypatch.setattr(engine, "MANY", 8)
-    names = [f"{i}.png" for i in range(8)]
-    job = engine.Job(
-        "d", "p", "", str(tmp_path / "models"), "", names, [(48, 32)] * 8, "auto", "exhaustive", "incremental"
-    )
-    with (tmp_path / "lock").open("w") as lock:
-        stage = (job, tmp_path / "colmap.log", lock.fileno(), lambda done, total: None)
-        with pytest.warns(UserWarning, match="principal point stays .* status 3: no CUDA"):
-            engine.run_stage("cameras", *stage)
-        assert [path.name for path in (tmp_path / "models").iterdir()] == ["0"]
-        with pytest.raises(engine.StageError, match="status 3: no CUDA"):
-            engine.run_stage("pairs", *stage)
 
 
 @pytest.mark.slow

@@ -9,8 +9,11 @@ import pytest
 from blitzgs.capture.colmap import read_model
 from blitzgs.capture.lens import Lens
 from blitzgs.cli import main
+from blitzgs.sfm import engine
+from blitzgs.sfm.pycolmap_stage import _centre_lenses
 from blitzgs.sfm.refine import fit_of, refine
 from blitzgs.sfm.report import misses
+from tests.training.tiny import write_tiny_capture
 
 pycolmap = pytest.importorskip("pycolmap")
 LENS = [600.0, 603.0, 340.0, 230.0, -0.08, 0.02, 0.001, 0.002]
@@ -20,13 +23,13 @@ LENS = [600.0, 603.0, 340.0, 230.0, -0.08, 0.02, 0.001, 0.002]
 def scene(tmp_path):
     """Return a function that writes a capture with a wrong lens, and returns the true centres by name."""
 
-    def make(count, lens=LENS, taken="PINHOLE", noise=0.1):
+    def make(count, lens=LENS, taken="PINHOLE"):
         pycolmap.set_random_seed(0)
         made = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=count, num_points3D=400)
         made.camera_width, made.camera_height = 640, 480
         made.camera_model_id, made.camera_params = pycolmap.CameraModelId.OPENCV, lens
         model = pycolmap.synthesize_dataset(made)
-        pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=noise), model)
+        pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.1), model)
         truth = {image.name: image.projection_center() for image in model.images.values()}
         if taken == "PINHOLE":
             model.cameras[1].model = pycolmap.CameraModelId.PINHOLE
@@ -163,3 +166,49 @@ def test_what_cannot_be_refined_is_refused(scene, tmp_path, monkeypatch):
     with pytest.raises(ImportError, match=r"pip install 'blitzgs\[sfm\]'"):
         refine(capture, tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(("count", "away", "found"), [(20, 40, 40), (10, 40, 0), (20, 1, 0)])
+def test_many_photographs_determine_the_principal_point(tmp_path, count, away, found):
+    """A few do not, and it stays in the middle if the error is hardly less elsewhere."""
+    made = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=count, num_points3D=300)
+    made.camera_width, made.camera_height = 640, 480
+    made.camera_model_id, made.camera_params = pycolmap.CameraModelId.PINHOLE, [600, 600, 320 + away, 240]
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        model = pycolmap.synthesize_dataset(made, database)
+        pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.3), model, database)
+    model.cameras[1].params = [600, 600, 320, 240]
+    pycolmap.bundle_adjustment(model)  # as the mappers leave it
+    model.update_point_3d_errors()
+    (tmp_path / "0").mkdir()
+    model.write(tmp_path / "0")
+    _centre_lenses(str(tmp_path / "database.db"), tmp_path / "0", pycolmap.IncrementalPipelineOptions())
+    params = pycolmap.Reconstruction(tmp_path / "0").cameras[1].params
+    if found:
+        assert params == pytest.approx([600, 600, 320 + found, 240], abs=1)
+    else:
+        assert params[2:].tolist() == [320, 240]
+    assert [path.name for path in tmp_path.glob("*") if path.is_dir()] == ["0"]
+
+
+def test_a_model_that_cannot_be_refined_is_kept(tmp_path, monkeypatch):
+    write_tiny_capture(tmp_path / "tiny")
+    program = tmp_path / "colmap"
+    found = f"cp -r {tmp_path}/tiny/sparse/0 {tmp_path}/models/0"
+    program.write_text(
+        f'#!/bin/sh\ncase $1 in mapper) {found} ;; help) ;; *) echo "no CUDA"; exit 3 ;; esac\n'
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr(engine, "backend", lambda: str(program))
+    monkeypatch.setattr(engine, "MANY", 8)
+    names = [f"{i}.png" for i in range(8)]
+    job = engine.Job(
+        "d", "p", "", str(tmp_path / "models"), "", names, [(48, 32)] * 8, "auto", "exhaustive", "incremental"
+    )
+    with (tmp_path / "lock").open("w") as lock:
+        stage = (job, tmp_path / "colmap.log", lock.fileno(), lambda done, total: None)
+        with pytest.warns(UserWarning, match="principal point stays .* status 3: no CUDA"):
+            engine.run_stage("cameras", *stage)
+        assert [path.name for path in (tmp_path / "models").iterdir()] == ["0"]
+        with pytest.raises(engine.StageError, match="status 3: no CUDA"):
+            engine.run_stage("pairs", *stage)
