@@ -9,7 +9,7 @@ namespace blitzgs {
 // The places [runs, n_ranks] that scatter_splats returned, checked and contiguous.
 inline Tensor checked_places(const char* op, const Tensor& places, std::int64_t splats,
                              std::int64_t n_ranks) {
-  return checked(op, "places", places, ScalarType::Long, {place_runs(splats), n_ranks});
+  return checked<std::int64_t>(op, "places", places, {place_runs(splats), n_ranks});
 }
 
 inline const SplatPlace* places_in(const Tensor& places) {
