@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
+#include <iterator>
 #include <limits>
 
 #include "io/byte_reader.h"
@@ -32,16 +32,15 @@ const std::vector<CameraModel>& camera_models() {
 }
 
 const CameraModel* find_camera_model(int id) {
-  const auto& models = camera_models();
-  const auto found = std::find_if(models.begin(), models.end(), [&](const auto& m) { return m.id == id; });
-  return found == models.end() ? nullptr : &*found;
+  const auto& models = camera_models();  // ordered by id
+  return id >= 0 && id < std::ssize(models) ? &models[static_cast<std::size_t>(id)] : nullptr;
 }
 
 const CameraModel* find_camera_model(std::string_view name) {
-  const auto& models = camera_models();
-  const auto found =
-      std::find_if(models.begin(), models.end(), [&](const auto& m) { return m.name == name; });
-  return found == models.end() ? nullptr : &*found;
+  for (const CameraModel& model : camera_models()) {
+    if (model.name == name) return &model;
+  }
+  return nullptr;
 }
 
 std::string camera_problem(const ColmapCamera& camera) {
