@@ -1,10 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "active/blocks.h"
 
-#include <algorithm>
-#include <optional>
 #include <tuple>
-#include <vector>
 
 #include "active/pool.h"
 #include "active/view_gate.h"
@@ -222,15 +219,13 @@ std::int64_t check_pair(const char* op, const Tensor& pool, const Tensor& table)
                 "columns must have rows, and as many axes in pool and table; got ", shape_of(pool), " and ",
                 shape_of(table));
   check_dtype(op, "a column of the pool", pool, table.scalar_type());
-  std::int64_t elements = 1;
   for (std::int64_t axis = 1; axis < pool.dim(); ++axis) {
     BLITZGS_CHECK(pool.size(axis) == table.size(axis), op, "rows of pool and table must be alike, got ",
                   shape_of(pool), " and ", shape_of(table));
-    elements *= pool.size(axis);
   }
   for (const Tensor* column : {&pool, &table}) check_contiguous(op, "columns", *column);
   BLITZGS_CHECK(table.is_cpu(), op, "the table must be in the memory of the host");
-  return kBlockRows * elements * static_cast<std::int64_t>(pool.element_size());
+  return kBlockRows * elements_behind(pool) * static_cast<std::int64_t>(pool.element_size());
 }
 
 void swap_blocks_(const std::vector<Tensor>& pool, const std::vector<Tensor>& table, std::int64_t n_written,

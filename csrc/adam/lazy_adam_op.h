@@ -2,9 +2,7 @@
 // The checked tensors of the optimiser's state and schedule, for all ops that move parameters.
 #pragma once
 #include <cmath>
-#include <optional>
 #include <utility>
-#include <vector>
 
 #include "adam/lazy_adam.h"
 #include "common/op.h"

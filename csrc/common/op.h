@@ -48,6 +48,13 @@ inline std::string shape_of(const Tensor& tensor) {
   return text.str();
 }
 
+// The number of elements of a row behind its first `axis` dimensions.
+inline std::int64_t elements_behind(const Tensor& column, std::int64_t axis = 1) {
+  std::int64_t elements = 1;
+  for (; axis < column.dim(); ++axis) elements *= column.size(axis);
+  return elements;
+}
+
 template <typename... Parts>
 [[noreturn]] void fail(const Parts&... parts) {
   std::ostringstream text;

@@ -1,13 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <limits>
 #include <tuple>
-#include <vector>
 
 #include "common/op.h"
-#include "exchange/places_op.h"
 #include "exchange/scatter.h"
 #include "exchange/tile_costs.h"
 #include "exchange/transport.h"
+#include "project/project_op.h"
 
 namespace blitzgs {
 namespace {
@@ -132,10 +130,7 @@ std::vector<Tensor> sum_splats(const Tensor& values, const Tensor& places,
   });
 }
 
-}  // namespace
-
 #ifdef BLITZGS_BACKEND_CUDA
-namespace {
 
 // Checks that there is one buffer for each rank and that all have the same length and dtype.
 void check_peers(const char* op, const std::vector<Tensor>& buffers, ScalarType dtype) {
@@ -241,12 +236,9 @@ std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const
   return {places, plan};
 }
 
-}  // namespace
-#endif
+#else
 
 // The costs are in the memory of the host for every device that renders.
-#ifndef BLITZGS_BACKEND_CUDA
-namespace {
 
 std::vector<Tensor> tile_costs(const Tensor& sums_in, std::int64_t first, std::int64_t views,
                                std::int64_t grain) {
@@ -301,8 +293,9 @@ std::vector<std::int64_t> divide_tiles(const std::vector<Tensor>& costs, const s
   return bounds;
 }
 
-}  // namespace
 #endif
+
+}  // namespace
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "importance/importance.h"
 
-#include <limits>
 #include <tuple>
 
 #include "common/rows.h"

@@ -2,7 +2,6 @@
 #include "intersect/intersect.h"
 
 #include <exception>
-#include <limits>
 #include <tuple>
 
 #include "rasterize/rasterize_op.h"

@@ -67,6 +67,18 @@ constexpr std::uint64_t kPoint2dBytes = 2 * 8 + 8;
 constexpr std::uint64_t kPointBytes = 8 + 3 * 8 + 3 + 8 + 8;  // with an empty track
 constexpr std::uint64_t kTrackBytes = 4 + 4;
 
+// Without the empty line of an image that has no observations, the next image stands here and would be lost.
+void skip_observations(TextReader& reader) {
+  std::uint64_t tokens = 0;
+  std::string_view last;
+  for (; reader.has_token(); ++tokens) last = reader.token("an observation");
+  std::int64_t id = 0;
+  if (tokens % 3 != 0 || (tokens > 0 && !parse_number(last, id))) {
+    reader.fail(
+        "expected the observations of an image (x, y and point id of each), which may be an empty line");
+  }
+}
+
 }  // namespace
 
 std::vector<ColmapCamera> read_cameras_binary(std::istream& in, const std::string& name) {
@@ -151,22 +163,6 @@ ColmapPoints read_points_binary(std::istream& in, const std::string& name, bool 
   reader.expect_end();
   return points;
 }
-
-namespace {
-
-// Without the empty line of an image that has no observations, the next image stands here and would be lost.
-void skip_observations(TextReader& reader) {
-  std::uint64_t tokens = 0;
-  std::string_view last;
-  for (; reader.has_token(); ++tokens) last = reader.token("an observation");
-  std::int64_t id = 0;
-  if (tokens % 3 != 0 || (tokens > 0 && !parse_number(last, id))) {
-    reader.fail(
-        "expected the observations of an image (x, y and point id of each), which may be an empty line");
-  }
-}
-
-}  // namespace
 
 std::vector<ColmapCamera> read_cameras_text(std::istream& in, const std::string& name) {
   TextReader reader(in, name);

@@ -2,9 +2,7 @@
 #include "loss/photometric.h"
 
 #include <cmath>
-#include <optional>
 #include <tuple>
-#include <vector>
 
 #include "common/op.h"
 

@@ -43,54 +43,44 @@ void density_stats_(const Tensor& grad_sum, const Tensor& grad_count, const Tens
   });
 }
 
-std::int64_t row_elements(const Tensor& column) {
-  std::int64_t elements = 1;
-  for (std::int64_t axis = 1; axis < column.dim(); ++axis) elements *= column.size(axis);
-  return elements;
-}
-
-// Copies rows of `column` (absent: zeros) to `out`; from and to (columns.h) are absent or int64 [n].
-void copy_rows(const char* op, Tensor& out, const std::optional<Tensor>& to, const Tensor* column,
-               const std::optional<Tensor>& from, std::int64_t n) {
-  const std::int64_t row_bytes = row_elements(out) * static_cast<std::int64_t>(out.element_size());
+// Copies n rows of `column` (null: zeros) to `out`; from and to: columns.h.
+void copy_rows(const char* op, const Tensor& out, const std::int64_t* to, const void* column,
+               const std::int64_t* from, std::int64_t n) {
+  const std::int64_t row_bytes = elements_behind(out) * static_cast<std::int64_t>(out.element_size());
   BLITZGS_CHECK(row_bytes < (1 << 16), op, "rows must be shorter than 64 KiB, got ", row_bytes, " bytes");
   DeviceScope scope(out);
-  backend::copy_rows({column ? static_cast<const std::byte*>(column->const_data_ptr()) : nullptr,
-                      data_or_null<std::int64_t>(from), static_cast<std::byte*>(out.mutable_data_ptr()),
-                      data_or_null<std::int64_t>(to), n, row_bytes},
+  backend::copy_rows({static_cast<const std::byte*>(column), from,
+                      static_cast<std::byte*>(out.mutable_data_ptr()), to, n, row_bytes},
                      scope.stream);
 }
 
-void check_rows_alike(const char* op, const char* name, const Tensor& rows, const Tensor& column) {
+// Checks that there are n rows like those of `column`.
+void check_rows(const char* op, const char* name, const Tensor& rows, std::int64_t n, const Tensor& column) {
+  BLITZGS_CHECK(column.dim() >= 1, op, "column must have rows, got ", shape_of(column));
   check_dtype(op, name, rows, column.scalar_type());
-  BLITZGS_CHECK(rows.dim() == column.dim() && row_elements(rows) == row_elements(column), op, "rows of ",
-                name, " must be like those of column, got ", shape_of(rows), " for ", shape_of(column));
+  BLITZGS_CHECK(rows.dim() == column.dim() && elements_behind(rows) == elements_behind(column), op,
+                "rows of ", name, " must be like those of column, got ", shape_of(rows), " for ",
+                shape_of(column));
+  BLITZGS_CHECK(rows.size(0) == n, op, name, " must have ", n, " rows, got ", shape_of(rows));
 }
 
-void take_rows_(Tensor out, const Tensor& column_in, const Tensor& rows_in) {
+void take_rows_(const Tensor& out, const Tensor& column_in, const Tensor& rows_in) {
   constexpr const char* kOp = "take_rows";
-  BLITZGS_CHECK(column_in.dim() >= 1, "take_rows", "column must have rows, got ", shape_of(column_in));
-  const std::optional<Tensor> rows = checked(kOp, "rows", rows_in, ScalarType::Long, {-1});
-  check_rows_alike(kOp, "out", out, column_in);
+  const auto rows = checked<std::int64_t>(kOp, "rows", rows_in, {-1});
+  check_rows(kOp, "out", out, rows.size(0), column_in);
   check_contiguous(kOp, "out", out);
-  const std::int64_t n = rows->size(0);
-  BLITZGS_CHECK(out.size(0) == n, "take_rows", "out must have ", n, " rows, got ", shape_of(out));
   const Tensor column = as_contiguous(column_in);
-  copy_rows(kOp, out, std::nullopt, &column, rows, n);
+  copy_rows(kOp, out, nullptr, column.const_data_ptr(), rows, rows.size(0));
 }
 
-void put_rows_(Tensor column, const Tensor& rows_in, const std::optional<Tensor>& fresh_in) {
+void put_rows_(const Tensor& column, const Tensor& rows_in, const std::optional<Tensor>& fresh_in) {
   constexpr const char* kOp = "put_rows_";
-  BLITZGS_CHECK(column.dim() >= 1, "put_rows_", "column must have rows, got ", shape_of(column));
+  BLITZGS_CHECK(column.dim() >= 1, kOp, "column must have rows, got ", shape_of(column));
   check_contiguous(kOp, "column", column);
-  const std::optional<Tensor> rows = checked(kOp, "rows", rows_in, ScalarType::Long, {-1});
-  const std::int64_t n = rows->size(0);
-  if (!fresh_in) return copy_rows(kOp, column, rows, nullptr, std::nullopt, n);
-  check_rows_alike(kOp, "fresh", *fresh_in, column);
-  BLITZGS_CHECK(fresh_in->size(0) == n, "put_rows_", "fresh must have ", n, " rows, got ",
-                shape_of(*fresh_in));
-  const Tensor fresh = as_contiguous(*fresh_in);
-  copy_rows(kOp, column, rows, &fresh, std::nullopt, n);
+  const auto rows = checked<std::int64_t>(kOp, "rows", rows_in, {-1});
+  const Tensor fresh = fresh_in ? as_contiguous(*fresh_in) : column;
+  if (fresh_in) check_rows(kOp, "fresh", fresh, rows.size(0), column);
+  copy_rows(kOp, column, rows, fresh_in ? fresh.const_data_ptr() : nullptr, nullptr, rows.size(0));
 }
 
 Tensor sampling_keys(const Tensor& weights_in, const Tensor& ids_in, std::int64_t seed, std::int64_t event) {

@@ -1,14 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "project/project.h"
 
-#include <algorithm>
-#include <optional>
 #include <tuple>
-#include <vector>
 
 #include "adam/lazy_adam_op.h"
 #include "common/op.h"
-#include "exchange/places_op.h"
 #include "project/project_op.h"
 
 namespace blitzgs {
@@ -118,17 +114,13 @@ using Projected = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Ten
 Projected project_fwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
                       const OptionalTensor& active_ids, const OptionalTensor& active_views,
                       const OptionalTensor& n_active, const OptionalTensor& n_blocks,
-                      const OptionalTensor& ids, const OptionalTensor& level, std::int64_t width,
-                      std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
-                      double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
+                      const OptionalTensor& ids, const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS,
                       const FloatList& fade, const IntList& rank_tiles,
                       std::optional<std::int64_t> visible_capacity,
                       std::optional<std::int64_t> splat_capacity) {
   constexpr const char* kOp = "project_fwd";
   const ProjectArguments p(kOp, gaussians, viewmats, Ks,
-                           checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
-                                           eps2d, radius_clip, antialiased, raw, fade),
-                           fade, level);
+                           checked_options(kOp, BLITZGS_PROJECT_OPTION_NAMES, fade), fade, level);
   const Candidates candidates(kOp, active_ids, active_views, n_active, n_blocks, p.count);
   const RankTiles ranks = checked_rank_tiles(kOp, rank_tiles);
   const std::optional<ProjectSizes> sizes = checked_capacity(kOp, visible_capacity, splat_capacity);
@@ -149,8 +141,6 @@ Projected project_fwd(const TensorList& gaussians, const Tensor& viewmats, const
   return {t.gaussian_ids, t.camera_ids, t.visible_ids, t.splat_offsets, t.means2d,    t.conics,    t.depths,
           t.opacities,    t.colors,     t.radii,       t.tiles_touched, t.rank_masks, t.splat_ids, totals};
 }
-
-}  // namespace
 
 class HeldSplatGradients {
  public:
@@ -224,8 +214,6 @@ class HeldSplatGradients {
   RankSplatGradients ranks_{};
 };
 
-namespace {
-
 // The outputs of the forward pass that both ops read, and the weights of the regularisers for each view. The
 // object holds the tensors, so that the raw pointers stay valid.
 struct BackwardSplats {
@@ -257,16 +245,12 @@ using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
 BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
                             const OptionalTensor& scale_reg, const OptionalTensor& opacity_reg,
                             const Tensor& camera_ids, const Tensor& visible_ids, const Tensor& splat_offsets,
-                            const OptionalTensor& level, std::int64_t width, std::int64_t height,
-                            std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
-                            double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
-                            const FloatList& fade, const TensorList& v_splats, const OptionalTensor& v_depths,
-                            bool need_viewmats, bool dense) {
+                            const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS, const FloatList& fade,
+                            const TensorList& v_splats, const OptionalTensor& v_depths, bool need_viewmats,
+                            bool dense) {
   constexpr const char* kOp = "project_bwd";
   const ProjectArguments p(kOp, gaussians, viewmats, Ks,
-                           checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
-                                           eps2d, radius_clip, antialiased, raw, fade),
-                           fade, level);
+                           checked_options(kOp, BLITZGS_PROJECT_OPTION_NAMES, fade), fade, level);
   const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
                              std::nullopt);
@@ -296,18 +280,14 @@ void project_bwd_step(const TensorList& state_in, const TensorList& tables, std:
                       std::int64_t explicit_steps, double beta1, double beta2, double eps,
                       const Tensor& viewmats, const Tensor& Ks, const OptionalTensor& scale_reg,
                       const OptionalTensor& opacity_reg, const Tensor& camera_ids, const Tensor& visible_ids,
-                      const Tensor& splat_offsets, const OptionalTensor& level, std::int64_t width,
-                      std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
-                      double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
+                      const Tensor& splat_offsets, const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS,
                       const FloatList& fade, const TensorList& v_splats, const OptionalTensor& places,
                       const OptionalTensor& means2d_sums) {
   constexpr const char* kOp = "project_bwd_step_";
   AdamTensors state(kOp, state_in, tables, {step, explicit_steps, beta1, beta2, eps});
   state.check_takes_step();
   const ProjectArguments p(kOp, state.params, viewmats, Ks,
-                           checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
-                                           eps2d, radius_clip, antialiased, raw, fade),
-                           fade, level);
+                           checked_options(kOp, BLITZGS_PROJECT_OPTION_NAMES, fade), fade, level);
   const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt, places,
                              means2d_sums);

@@ -2,7 +2,6 @@
 #include "project/unscented.h"
 
 #include <cmath>
-#include <optional>
 #include <tuple>
 
 #include "common/op.h"
@@ -52,12 +51,10 @@ struct UnscentedArguments {
 #define BLITZGS_UNSCENTED                                                                                \
   const TensorList &gaussians, const Tensor &viewmats, const Tensor &Ks, const Tensor &lenses,           \
       const OptionalTensor &viewmats_rs, bool fisheye, std::int64_t shutter, const FloatList &transform, \
-      std::int64_t width, std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree,           \
-      double near_plane, double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw
-#define BLITZGS_UNSCENTED_CHECKED(op)                                                                     \
-  op, gaussians, viewmats, Ks, lenses, viewmats_rs, fisheye, shutter, transform,                          \
-      checked_options(op, width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, \
-                      antialiased, raw, {})
+      BLITZGS_PROJECT_OPTIONS
+#define BLITZGS_UNSCENTED_CHECKED(op)                                            \
+  op, gaussians, viewmats, Ks, lenses, viewmats_rs, fisheye, shutter, transform, \
+      checked_options(op, BLITZGS_PROJECT_OPTION_NAMES, {})
 
 Tensor unscented_visible(BLITZGS_UNSCENTED) {
   const UnscentedArguments a(BLITZGS_UNSCENTED_CHECKED("unscented_visible"));

@@ -94,66 +94,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd
 
 namespace {
 
-// Makes a Splats of the groups of arguments of the backward ops: splats (means2d, conics, splat_opacities,
-// colors) and lists (isect_splats, tile_offsets).
-Splats backward_splats(const char* op, const std::vector<Tensor>& splats,
-                       const std::optional<Tensor>& backgrounds, const std::vector<Tensor>& lists,
-                       const TileGrid& grid) {
-  BLITZGS_CHECK(splats.size() == 4 && lists.size() == 2, op,
-                "splats must be (means2d, conics, splat_opacities, colors) and lists (isect_splats, "
-                "tile_offsets), got ",
-                splats.size(), " and ", lists.size(), " tensors");
-  return {op, splats[0], splats[1], splats[2], splats[3], backgrounds, lists[0], lists[1], grid};
-}
-
-// The outputs of the forward pass that the backward ops read, (transmittances, last_ids, packed_splats,
-// tile_order), and the gradients of the images, checked and contiguous.
-struct Composited {
-  Composited(const char* op, const Splats& splats, const std::vector<Tensor>& composited,
-             const Tensor& v_renders_in, const std::optional<Tensor>& v_alphas_in)
-      : grid_count(splats.grid.count()) {
-    BLITZGS_CHECK(composited.size() == 4, op,
-                  "composited must be (transmittances, last_ids, packed_splats, tile_order), got ",
-                  composited.size(), " tensors");
-    packed = composited[2];
-    order = composited[3];
-    const TileGrid& grid = splats.grid;
-    const std::int64_t B = grid.n_cameras, height = grid.height, width = grid.width;
-    const ScalarType dtype = splats.means2d.scalar_type();
-    v_renders = checked(op, "v_renders", v_renders_in, dtype, {B, height, width, splats.n_channels});
-    transmittances = checked(op, "transmittances", composited[0], dtype, {B, height, width});
-    last_ids = checked(op, "last_ids", composited[1], ScalarType::Int, {B, height, width});
-    v_alphas = checked(op, "v_alphas", v_alphas_in, dtype, {B, height, width});
-    check_in_place(op, "packed_splats", packed, ScalarType::Byte,
-                   {-1, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
-    check_in_place(op, "tile_order", order, ScalarType::Int, {-1, kTileOrderClasses});
-    BLITZGS_CHECK(packed.size(0) >= splats.n_splats && tiles() >= grid.tile_end - grid.tile_begin &&
-                      reinterpret_cast<std::uintptr_t>(packed.const_data_ptr()) % 64 == 0,
-                  op, "packed_splats and tile_order must be as rasterize_fwd returned them, ", "for ",
-                  splats.n_splats, " splats and ", grid.tile_end - grid.tile_begin, " tiles or more, got ",
-                  packed.size(0), " and ", tiles());
-  }
-
-  RasterizeAux aux() const {
-    return {const_cast<void*>(packed.const_data_ptr()), packed.size(0),
-            order.size(0) > 0 ? const_cast<std::int32_t*>(data<std::int32_t>(order)) : nullptr, tiles()};
-  }
-
-  template <class T>
-  RasterizeSaved<T> saved() const {
-    return {data<T>(transmittances), data<std::int32_t>(last_ids), data<T>(v_renders),
-            data_or_null<T>(v_alphas)};
-  }
-
-  Tensor transmittances, last_ids, v_renders, packed, order;
-  std::optional<Tensor> v_alphas;
-  std::int64_t grid_count;
-
- private:
-  // The number of tiles that the forward pass composited.
-  std::int64_t tiles() const { return order.size(0) > 0 ? order.size(0) - 1 : grid_count; }
-};
-
 // Checks a table of splat gradients that a caller gives (CUDA).
 void check_gradients(const char* op, const Splats& splats, const Tensor& gradients) {
   BLITZGS_CHECK(kPacked, op, "tables of gradients need CUDA");
@@ -165,34 +105,59 @@ void check_gradients(const char* op, const Splats& splats, const Tensor& gradien
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
     const std::vector<Tensor>& splats_in, const std::optional<Tensor>& backgrounds,
-    const std::vector<Tensor>& lists, const std::vector<Tensor>& composited_in, const Tensor& v_renders,
-    const std::optional<Tensor>& v_alphas, std::int64_t n_cameras, std::int64_t width, std::int64_t height,
+    const std::vector<Tensor>& lists, const std::vector<Tensor>& composited, const Tensor& v_renders_in,
+    const std::optional<Tensor>& v_alphas_in, std::int64_t n_cameras, std::int64_t width, std::int64_t height,
     std::int64_t tile_size, std::int64_t tile_begin, std::int64_t tile_end, bool absgrad, bool deterministic,
     const std::optional<Tensor>& gradients) {
   constexpr const char* kOp = "rasterize_bwd";
+  BLITZGS_CHECK(splats_in.size() == 4 && lists.size() == 2, kOp,
+                "splats must be (means2d, conics, splat_opacities, colors) and lists (isect_splats, "
+                "tile_offsets), got ",
+                splats_in.size(), " and ", lists.size(), " tensors");
+  BLITZGS_CHECK(composited.size() == 4, kOp,
+                "composited must be (transmittances, last_ids, packed_splats, tile_order), got ",
+                composited.size(), " tensors");
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
-  const Splats splats = backward_splats(kOp, splats_in, backgrounds, lists, grid);
+  const Splats splats(kOp, splats_in[0], splats_in[1], splats_in[2], splats_in[3], backgrounds, lists[0],
+                      lists[1], grid);
   if (gradients) check_gradients(kOp, splats, *gradients);
-  BLITZGS_CHECK(!gradients || !v_alphas, kOp, "v_alphas needs gradients in columns");
-  const Composited composited(kOp, splats, composited_in, v_renders, v_alphas);
+  BLITZGS_CHECK(!gradients || !v_alphas_in, kOp, "v_alphas needs gradients in columns");
+  const auto last_ids = checked<std::int32_t>(kOp, "last_ids", composited[1], {n_cameras, height, width});
+  const auto order =
+      checked_in_place<std::int32_t>(kOp, "tile_order", composited[3], {-1, kTileOrderClasses});
+  const auto packed = checked_in_place<std::uint8_t>(
+      kOp, "packed_splats", composited[2],
+      {-1, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
+  const bool ordered = order.size(0) > 0;
+  // The number of tiles that the forward pass composited.
+  const std::int64_t tiles = ordered ? order.size(0) - 1 : grid.count();
+  BLITZGS_CHECK(packed.size(0) >= splats.n_splats && tiles >= grid.tile_end - grid.tile_begin &&
+                    reinterpret_cast<std::uintptr_t>(packed.data()) % 64 == 0,
+                kOp, "packed_splats and tile_order must be as rasterize_fwd returned them, for ",
+                splats.n_splats, " splats and ", grid.tile_end - grid.tile_begin, " tiles or more, got ",
+                packed.size(0), " and ", tiles);
+  const RasterizeAux aux{packed, packed.size(0), order.data_if(ordered), tiles};
   const Tensor& like = splats.means2d;
   const std::int64_t n_splats = gradients ? 0 : splats.n_splats, n_isects = splats.isect_splats.size(0);
   DeviceScope scope(like);
   return dispatch_floating(like, [&]<class T>() -> std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> {
+    const auto transmittances = checked<T>(kOp, "transmittances", composited[0], {n_cameras, height, width}),
+               v_renders =
+                   checked<T>(kOp, "v_renders", v_renders_in, {n_cameras, height, width, splats.n_channels});
+    const auto v_alphas = checked<T>(kOp, "v_alphas", v_alphas_in, {n_cameras, height, width});
+    const RasterizeSaved<T> saved{transmittances, last_ids, v_renders, v_alphas};
     const auto v_means2d = make<T>(like, {n_splats, 2}), v_conics = make<T>(like, {n_splats, 3}),
                v_opacities = make<T>(like, {n_splats}),
                v_colors = make<T>(like, {n_splats, splats.n_channels}),
                v_means2d_abs = make<T>(like, {absgrad ? n_splats : 0, 2});
 #ifdef BLITZGS_BACKEND_CUDA
     if (gradients) {
-      cuda::rasterize_bwd_packed(splats.input<T>(), composited.saved<T>(), n_isects, composited.aux(),
-                                 deterministic, absgrad, mutable_data<T>(*gradients), scope.workspace,
-                                 scope.stream);
+      cuda::rasterize_bwd_packed(splats.input<T>(), saved, n_isects, aux, deterministic, absgrad,
+                                 mutable_data<T>(*gradients), scope.workspace, scope.stream);
       return {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs};
     }
 #endif
-    backend::rasterize_bwd<T>(splats.input<T>(), composited.saved<T>(), n_isects, composited.aux(),
-                              deterministic,
+    backend::rasterize_bwd<T>(splats.input<T>(), saved, n_isects, aux, deterministic,
                               {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs.data_if(absgrad)},
                               scope.workspace, scope.stream);
     return {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs};

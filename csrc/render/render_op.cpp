@@ -3,9 +3,7 @@
 
 #include <functional>
 #include <numeric>
-#include <optional>
 #include <tuple>
-#include <vector>
 
 #include "common/rows.h"
 #include "project/project_op.h"
@@ -31,9 +29,7 @@ Tensor rows_of(const Tensor& tensor, std::int64_t length) {
 
 // Words of 4 bytes in the elements of a row behind its first `axis` dimensions.
 std::int64_t words_behind(const Tensor& column, std::int64_t axis) {
-  std::int64_t words = static_cast<std::int64_t>(column.element_size()) / 4;
-  for (; axis < column.dim(); ++axis) words *= column.size(axis);
-  return words;
+  return static_cast<std::int64_t>(column.element_size()) / 4 * elements_behind(column, axis);
 }
 
 void check_column(const char* op, const Tensor& column) {
@@ -179,9 +175,7 @@ TensorList render(const Tensor& means2d, const Tensor& conics, const Tensor& spl
                   const Tensor& depths, const Tensor& camera_ids, const Tensor& visible_ids,
                   const Tensor& splat_offsets, const Tensor& radii, const Tensor& tiles_touched,
                   const OptionalTensor& channels_in, bool with_depth, const TensorList& gaussians,
-                  const TensorList& sh, const Tensor& viewmats, const Tensor& Ks, std::int64_t width,
-                  std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
-                  double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
+                  const TensorList& sh, const Tensor& viewmats, const Tensor& Ks, BLITZGS_PROJECT_OPTIONS,
                   const FloatList& fade, const OptionalTensor& backgrounds, std::int64_t n_isects,
                   bool backward_follows, const OptionalTensor& totals_in) {
   const std::int64_t* totals = checked_totals(totals_in);
@@ -189,8 +183,7 @@ TensorList render(const Tensor& means2d, const Tensor& conics, const Tensor& spl
   if (totals) n_splats = view_of(*totals_in, {1}, {1}, kTotalSplats);
   TensorList rows;
   if (!gaussians.empty()) {
-    const auto options = checked_options(kRender, width, height, tile_size, sh_degree, near_plane, far_plane,
-                                         eps2d, radius_clip, antialiased, raw, fade);
+    const auto options = checked_options(kRender, BLITZGS_PROJECT_OPTION_NAMES, fade);
     rows =
         color_rows(gaussians, sh, viewmats, Ks, options,
                    {visible_ids, splat_offsets, camera_ids, splat_opacities, radii, tiles_touched}, totals);
@@ -272,20 +265,19 @@ std::vector<Tensor> make_targets(const std::vector<Tensor>& columns, std::size_t
     // Rows of a splat's gradient lie in a longer table: a column of it is read as it is.
     const bool strided = from == 1 && rows_are_contiguous(column, 1);
     held.push_back(strided ? column : as_contiguous(column));
-    const auto element_words = static_cast<std::int64_t>(column.element_size()) / 4;
     BLITZGS_CHECK(column.element_size() % 4 == 0, kArrangeSplats,
                   "columns must have elements of 4 or 8 bytes, got ",
                   torch::headeronly::toString(column.scalar_type()));
     std::vector<std::int64_t> shape = to;
-    std::int64_t words = element_words;
     for (auto axis = static_cast<std::int64_t>(from); axis < column.dim(); ++axis) {
       shape.push_back(column.size(axis));
-      words *= column.size(axis);
     }
+    const std::int64_t words = words_behind(column, static_cast<std::int64_t>(from));
     targets.push_back(make_empty(column, shape));
-    moves.columns[moves.n_columns++] = {static_cast<const std::uint32_t*>(held.back().const_data_ptr()),
-                                        static_cast<std::uint32_t*>(targets.back().mutable_data_ptr()), words,
-                                        strided ? column.stride(0) * element_words : words};
+    moves.columns[moves.n_columns++] = {
+        static_cast<const std::uint32_t*>(held.back().const_data_ptr()),
+        static_cast<std::uint32_t*>(targets.back().mutable_data_ptr()), words,
+        strided ? column.stride(0) * words_behind(column, column.dim()) : words};
   }
   return targets;
 }
