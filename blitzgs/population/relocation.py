@@ -97,7 +97,7 @@ def relocate(
         features = spawn_features(table, parents, torch.zeros_like(parents).bool(), time, extent, level_count)
     # Sharing must not reduce the opacity below the limit, or the Gaussian would count as dead. With moments
     # of zero a row would move by several times its learning rate in its next steps, as Adam's bias correction
-    # is that of the run and not of the row. Each event copies the most opaque Gaussians, and such steps of all
+    # is that of the run, not of the row. Each event copies the most opaque Gaussians, and such steps of all
     # of them undo what a run has learnt (docs/decisions.md).
     least = opacity_logit(rules.min_opacity)
     moments = (*table.exp_avgs, *table.exp_avg_sqs)
