@@ -5,6 +5,7 @@
 #include "common/rows.h"
 #include "population/columns.h"
 #include "population/knn.h"
+#include "population/relocation.h"
 
 namespace blitzgs {
 namespace {
@@ -45,18 +46,16 @@ void density_stats_(const Tensor& grad_sum, const Tensor& grad_count, const Tens
 
 // Copies n rows of `column` (null: zeros) to `out`; from and to: columns.h.
 void copy_rows(const char* op, const Tensor& out, const std::int64_t* to, const void* column,
-               const std::int64_t* from, std::int64_t n) {
+               const std::int64_t* from, std::int64_t n, CudaStream stream) {
   const std::int64_t row_bytes = elements_behind(out) * static_cast<std::int64_t>(out.element_size());
   BLITZGS_CHECK(row_bytes < (1 << 16), op, "rows must be shorter than 64 KiB, got ", row_bytes, " bytes");
-  DeviceScope scope(out);
   backend::copy_rows({static_cast<const std::byte*>(column), from,
                       static_cast<std::byte*>(out.mutable_data_ptr()), to, n, row_bytes},
-                     scope.stream);
+                     stream);
 }
 
 // Checks that there are n rows like those of `column`.
 void check_rows(const char* op, const char* name, const Tensor& rows, std::int64_t n, const Tensor& column) {
-  BLITZGS_CHECK(column.dim() >= 1, op, "column must have rows, got ", shape_of(column));
   check_dtype(op, name, rows, column.scalar_type());
   BLITZGS_CHECK(rows.dim() == column.dim() && elements_behind(rows) == elements_behind(column), op,
                 "rows of ", name, " must be like those of column, got ", shape_of(rows), " for ",
@@ -64,23 +63,101 @@ void check_rows(const char* op, const char* name, const Tensor& rows, std::int64
   BLITZGS_CHECK(rows.size(0) == n, op, name, " must have ", n, " rows, got ", shape_of(rows));
 }
 
-void take_rows_(const Tensor& out, const Tensor& column_in, const Tensor& rows_in) {
-  constexpr const char* kOp = "take_rows";
-  const auto rows = checked<std::int64_t>(kOp, "rows", rows_in, {-1});
-  check_rows(kOp, "out", out, rows.size(0), column_in);
-  check_contiguous(kOp, "out", out);
-  const Tensor column = as_contiguous(column_in);
-  copy_rows(kOp, out, nullptr, column.const_data_ptr(), rows, rows.size(0));
+// Checks a column on the device of `rows`.
+void check_column(const char* op, const char* name, const Tensor& column, const Tensor& rows) {
+  BLITZGS_CHECK(column.dim() >= 1, op, name, " must have rows, got ", shape_of(column));
+  check_device(op, name, column, rows, "rows");
 }
 
-void put_rows_(const Tensor& column, const Tensor& rows_in, const std::optional<Tensor>& fresh_in) {
-  constexpr const char* kOp = "put_rows_";
-  BLITZGS_CHECK(column.dim() >= 1, kOp, "column must have rows, got ", shape_of(column));
-  check_contiguous(kOp, "column", column);
+// check_column() of a column that the op writes in its own memory.
+void check_written(const char* op, const char* name, const Tensor& written, const Tensor& rows) {
+  check_column(op, name, written, rows);
+  check_contiguous(op, name, written);
+}
+
+void take_rows_(const std::vector<Tensor>& out, const std::vector<Tensor>& columns, const Tensor& rows_in) {
+  constexpr const char* kOp = "take_rows";
+  BLITZGS_CHECK(out.size() == columns.size(), kOp, "there must be as many out as columns, got ", out.size(),
+                " for ", columns.size());
   const auto rows = checked<std::int64_t>(kOp, "rows", rows_in, {-1});
-  const Tensor fresh = fresh_in ? as_contiguous(*fresh_in) : column;
-  if (fresh_in) check_rows(kOp, "fresh", fresh, rows.size(0), column);
-  copy_rows(kOp, column, rows, fresh_in ? fresh.const_data_ptr() : nullptr, nullptr, rows.size(0));
+  DeviceScope scope(rows);
+  for (std::size_t c = 0; c < columns.size(); ++c) {
+    check_column(kOp, "column", columns[c], rows);
+    check_written(kOp, "out", out[c], rows);
+    check_rows(kOp, "out", out[c], rows.size(0), columns[c]);
+    const Tensor column = as_contiguous(columns[c]);
+    copy_rows(kOp, out[c], nullptr, column.const_data_ptr(), rows, rows.size(0), scope.stream);
+  }
+}
+
+void put_rows_(const std::vector<Tensor>& columns, const Tensor& rows_in, const std::vector<Tensor>& fresh) {
+  constexpr const char* kOp = "put_rows_";
+  BLITZGS_CHECK(fresh.empty() || fresh.size() == columns.size(), kOp,
+                "fresh must be empty or as many as columns, got ", fresh.size(), " for ", columns.size());
+  const auto rows = checked<std::int64_t>(kOp, "rows", rows_in, {-1});
+  const std::int64_t n = rows.size(0);
+  DeviceScope scope(rows);
+  for (std::size_t c = 0; c < columns.size(); ++c) {
+    check_written(kOp, "column", columns[c], rows);
+    if (fresh.empty()) {
+      copy_rows(kOp, columns[c], rows, nullptr, nullptr, n, scope.stream);
+      continue;
+    }
+    check_device(kOp, "fresh", fresh[c], rows, "rows");
+    check_rows(kOp, "fresh", fresh[c], n, columns[c]);
+    const Tensor values = as_contiguous(fresh[c]);
+    copy_rows(kOp, columns[c], rows, values.const_data_ptr(), nullptr, n, scope.stream);
+  }
+}
+
+Tensor hash_with_key(const Tensor& hashes_in, const std::optional<Tensor>& keys_in, std::int64_t number) {
+  constexpr const char* kOp = "hash_key";
+  const auto hashes = checked<std::int64_t>(kOp, "hashes", hashes_in, {-1});
+  const std::int64_t n = hashes.size(0);
+  const auto keys = checked<std::int64_t>(kOp, "keys", keys_in, {n});
+  const auto out = make<std::int64_t>(hashes, {n});
+  DeviceScope scope(hashes);
+  backend::for_each_row(HashKey{hashes, keys, number, n, out}, scope.stream);
+  return out;
+}
+
+Tensor overlap(const Tensor& opacities_in, const Tensor& copies_in) {
+  constexpr const char* kOp = "overlap";
+  const auto opacities = checked<double>(kOp, "opacities", opacities_in, {-1});
+  const std::int64_t n = opacities.size(0);
+  const auto copies = checked<std::int64_t>(kOp, "copies", copies_in, {n});
+  const auto overlaps = make<double>(opacities, {n});
+  DeviceScope scope(opacities);
+  backend::for_each_row(Overlap{opacities, copies, n, overlaps}, scope.stream);
+  return overlaps;
+}
+
+void share_rows_(const Tensor& opacities_in, const Tensor& scales, const std::vector<Tensor>& moments,
+                 const Tensor& rows_in, const Tensor& copies_in, double least) {
+  constexpr const char* kOp = "share_rows_";
+  const auto opacities = checked_in_place<float>(kOp, "opacities", opacities_in, {-1});
+  const std::int64_t count = opacities.size(0);
+  const auto rows = checked<std::int64_t>(kOp, "rows", rows_in, {-1});
+  const std::int64_t n = rows.size(0);
+  const auto copies = checked<std::int64_t>(kOp, "copies", copies_in, {n});
+  ShareRows args{opacities,
+                 checked_in_place<float>(kOp, "scales", scales, {count, 3}),
+                 {},
+                 rows,
+                 copies,
+                 n,
+                 static_cast<float>(least)};
+  BLITZGS_CHECK(moments.size() == ShareRows::kColumns, kOp, "there must be ", ShareRows::kColumns,
+                " moments, got ", moments.size());
+  for (int c = 0; c < ShareRows::kColumns; ++c) {
+    check_dtype(kOp, "a moment", moments[c], ScalarType::Float);
+    check_written(kOp, "a moment", moments[c], rows);
+    BLITZGS_CHECK(moments[c].size(0) == count, kOp, "a moment must have ", count, " rows, got ",
+                  shape_of(moments[c]));
+    args.moments[c] = {mutable_data<float>(moments[c]), static_cast<int>(elements_behind(moments[c]))};
+  }
+  DeviceScope scope(opacities);
+  backend::for_each_row(args, scope.stream);
 }
 
 Tensor sampling_keys(const Tensor& weights_in, const Tensor& ids_in, std::int64_t seed, std::int64_t event) {
@@ -209,6 +286,9 @@ BLITZGS_REGISTER(m) {
   m.impl("density_stats_", TORCH_BOX(&blitzgs::density_stats_));
   m.impl("take_rows_", TORCH_BOX(&blitzgs::take_rows_));
   m.impl("put_rows_", TORCH_BOX(&blitzgs::put_rows_));
+  m.impl("hash_key", TORCH_BOX(&blitzgs::hash_with_key));
+  m.impl("overlap", TORCH_BOX(&blitzgs::overlap));
+  m.impl("share_rows_", TORCH_BOX(&blitzgs::share_rows_));
   m.impl("sampling_keys", TORCH_BOX(&blitzgs::sampling_keys));
   m.impl("key_histogram", TORCH_BOX(&blitzgs::key_histogram));
   m.impl("find_non_finite", TORCH_BOX(&blitzgs::find_non_finite));
