@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -49,6 +48,7 @@ from blitzgs.capture.usable import (
     without_unused,
 )
 from blitzgs.util.errors import check_number
+from blitzgs.util.messages import warn
 
 # In pixels. SSIM compares windows of 11 pixels, and a much smaller image shows too little to train on.
 _LEAST_SIDE = 8
@@ -253,10 +253,9 @@ def _headers(views: list[SourceView]) -> list[ImageHeader]:
     check_masks([view.mask_path for view in views])
     extra_bands = [view.name for view, header in zip(views, headers, strict=True) if header.extra_bands]
     if extra_bands:
-        warnings.warn(
+        warn(
             f"{len(extra_bands)} of {len(views)} photographs have a further band that their file does not "
-            f"call alpha (first: {extra_bands[0]}), near infrared for example; it is not used",
-            stacklevel=3,
+            f"call alpha (first: {extra_bands[0]}), near infrared for example; it is not used"
         )
     return headers
 
@@ -287,10 +286,9 @@ def _with_files(
     files = [(view.path, mask) for view, mask in zip(some, found, strict=True)]
     damage = {} if find_damage is None else find_damage(files)
     if damage:
-        warnings.warn(
+        warn(
             f"{len(damage)} of {len(some)} images or their masks are damaged; dropped (first: "
-            f"{next(iter(damage.values()))})",
-            stacklevel=3,
+            f"{next(iter(damage.values()))})"
         )
     left = [place for place in range(len(kept)) if place not in damage]
     return [kept[place] for place in left], {kept[place]: found[place] for place in left}, damage

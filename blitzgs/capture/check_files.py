@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import threading
-import warnings
 from collections.abc import Callable, Container, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from blitzgs.capture.cameras import Camera
 from blitzgs.capture.image_files import check_photograph, decode_mask, read_whole
+from blitzgs.util.messages import warn
 
 _THREADS = 16
 # Returns what is wrong with photographs and their masks, as `damaged` does.
@@ -93,8 +93,7 @@ class FileCheck:
             if not has_pixels:
                 blank.append(camera.name)
         if blank:
-            warnings.warn(
+            warn(
                 f"{len(blank)} photographs have no pixel that counts, as they are transparent or masked "
-                f"everywhere (first: {blank[0]})",
-                stacklevel=1,
+                f"everywhere (first: {blank[0]})"
             )

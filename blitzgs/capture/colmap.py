@@ -94,19 +94,11 @@ def camera_models() -> dict[str, list[str]]:
     return {name: params.split(",") for _, name, params in native.camera_models()}
 
 
-def find_model(path: Path) -> Path | None:
-    """Return the folder of a sparse model below `path` (sparse/0, sparse, `path`, colmap/...), or None.
-
-    Of several numbered models, which COLMAP makes of parts that it could not join, it is the largest.
-    """
-    models = find_models(path)
-    return models[0][0] if models else None
-
-
 def find_models(path: Path) -> list[tuple[Path, int]]:
-    """Return the folders of the sparse models below `path` in one place, with their numbers of images.
+    """Return the sparse models below `path` in one place (sparse/0, sparse, `path`, colmap/...).
 
-    The largest comes first. The number is 0 if there is only one model, which nobody compares.
+    Each is a folder and its number of images. Of several numbered models, which COLMAP makes of parts that it
+    could not join, the largest comes first. The number is 0 if there is only one, which nobody compares.
     """
     for folder in ("sparse", ".", "colmap/sparse"):
         numbered = _numbered(path / folder) if folder != "." else []
@@ -119,7 +111,7 @@ def find_models(path: Path) -> list[tuple[Path, int]]:
 
 
 def find_incomplete_model(path: Path) -> Path | None:
-    """Return the folder that `find_model` would return if none of its files were missing, or None."""
+    """Return the folder of a model that lacks files, where `find_models` would look for it, or None."""
     folders = ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap/sparse")
     return next((path / folder for folder in folders if _has(path / folder, any)), None)
 
@@ -182,40 +174,17 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
 def write_model(folder: Path | str, model: ColmapModel) -> None:
     """Write a sparse model as .bin files, creating the folder.
 
-    ValueError: columns disagree in length, a camera's parameters do not fit its model, or a name cannot stand
-    in the file.
+    ValueError: a camera's parameters do not fit its model, or a name cannot stand in the file.
     """
-    _check(model)
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    for name, content in zip(FILES, _bytes_of(model), strict=True):
-        Path(folder, f"{name}.bin").write_bytes(content)
-
-
-def _check(model: ColmapModel) -> None:
-    """Refuse a model that its files could not hold."""
     for camera in model.cameras:
         if len(camera.params) != len(camera_models()[camera.model]):
             raise ValueError(f"camera {camera.id}: {len(camera.params)} parameters do not fit {camera.model}")
-    images, points = model.images, model.points
-    n, m = len(images.ids), len(points.ids)
-    for what, found, wanted in (
-        ("images: quats [N, 4]", images.quats.shape, (n, 4)),
-        ("images: translations [N, 3]", images.translations.shape, (n, 3)),
-        ("images: camera_ids [N]", images.camera_ids.shape, (n,)),
-        ("images: names [N]", (len(images.names),), (n,)),
-        ("images: points2d [O, 2]", images.points2d.shape, (int(images.point2d_offsets[-1]), 2)),
-        ("images: point3d_ids [O]", images.point3d_ids.shape, (int(images.point2d_offsets[-1]),)),
-        ("points: positions [M, 3]", points.positions.shape, (m, 3)),
-        ("points: colors [M, 3]", points.colors.shape, (m, 3)),
-        ("points: errors [M]", points.errors.shape, (m,)),
-        ("points: track_image_ids", points.track_image_ids.shape, (int(points.track_offsets[-1]),)),
-        ("points: track_point2d_ids", points.track_point2d_ids.shape, (int(points.track_offsets[-1]),)),
-    ):
-        if found != wanted:
-            raise ValueError(f"{what} must have the shape {wanted}, got {found}")
-    for name in images.names:
+    for name in model.images.names:
         if not name or "\0" in name or "\n" in name:
             raise ValueError(f"images: the name {name!r} is empty or has a NUL or line break in it")
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    for name, content in zip(FILES, _bytes_of(model), strict=True):
+        Path(folder, f"{name}.bin").write_bytes(content)
 
 
 def _bytes_of(model: ColmapModel) -> Iterator[bytes]:
@@ -248,42 +217,15 @@ def _joined(heads: list[bytes], offsets: npt.NDArray[np.uint64], rows: npt.NDArr
     return b"".join(parts)
 
 
-def quats_to_rotations(quats: Float64) -> Float64:
-    """Return the rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z) of any length; zero: NaN."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def rotation_to_quat(rotation: Float64) -> Float64:
-    """Return (w, x, y, z), w >= 0, of a rotation matrix [3, 3], through its largest component."""
-    r = rotation
-    squares = np.array(
-        [
-            1 + r[0, 0] + r[1, 1] + r[2, 2],
-            1 + r[0, 0] - r[1, 1] - r[2, 2],
-            1 - r[0, 0] + r[1, 1] - r[2, 2],
-            1 - r[0, 0] - r[1, 1] + r[2, 2],
-        ]
-    )
-    largest = int(squares.argmax())
-    a, b, c = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    d, e, f = r[1, 0] + r[0, 1], r[0, 2] + r[2, 0], r[2, 1] + r[1, 2]
-    rows = np.array(
-        [[squares[0], a, b, c], [a, squares[1], d, e], [b, d, squares[2], f], [c, e, f, squares[3]]]
-    )
-    quat: Float64 = rows[largest] / np.linalg.norm(rows[largest])
-    return quat if quat[0] >= 0 else -quat
-
-
 def world_to_camera(images: ColmapImages) -> Float64:
-    """Return the poses as matrices [N, 4, 4]."""
-    poses = np.tile(np.eye(4), (len(images.ids), 1, 1))
-    poses[:, :3, :3] = quats_to_rotations(images.quats)
+    """Return the poses as matrices [N, 4, 4]; a quaternion of zeros gives NaN."""
+    import torch
+
+    from blitzgs.util.rotations import quaternion_matrices
+
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unit = images.quats / np.linalg.norm(images.quats, axis=1, keepdims=True)
+    poses = np.tile(np.eye(4), (len(unit), 1, 1))
+    poses[:, :3, :3] = quaternion_matrices(torch.from_numpy(unit)).numpy()
     poses[:, :3, 3] = images.translations
     return poses

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import re
 import shlex
-import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,11 +14,12 @@ import numpy as np
 
 from blitzgs.capture import colmap, transforms
 from blitzgs.capture.cameras import SourceView
-from blitzgs.capture.lens import Lens
-from blitzgs.capture.names import ImageFinder, to_convert
+from blitzgs.capture.lens import lenses_of
+from blitzgs.capture.names import ImageFinder, relative_to, to_convert
 from blitzgs.capture.points import SourcePoints, file_points, transforms_points
 from blitzgs.capture.projects.find import FoundProject, find_project, read_project
 from blitzgs.capture.world import WorldFrame, frame_beside
+from blitzgs.util.messages import located, warn
 
 _PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 # What programs write beside the images of a synthetic capture.
@@ -54,7 +54,7 @@ def read_layout(
         return views, points, _with_photographs(root, source, views)
     models, notes = _models(root, sparse)
     folder = models[0] if models else None
-    parts = [part for part in ("train", "val") if colmap.find_model(root / part)]
+    parts = {part: found[0][0] for part in ("train", "val") if (found := colmap.find_models(root / part))}
     by_default = sparse in ("largest", "all")
     has_transforms = by_default and bool(transforms.find_transforms(root))
     if has_transforms and (folder is None or "colmap" in folder.relative_to(root).parts):
@@ -65,9 +65,9 @@ def read_layout(
         shown = " and ".join(str(model.relative_to(root)) for model in models if model != root)
         source = Source(shown or "cameras, images and points3D", "", tuple(notes))
     elif "train" in parts:
-        found = [_read_colmap(root / p, _model_in(root / p), images, downscale, part=p) for p in parts]
-        views, points = [view for views, _ in found for view in views], found[0][1]
-        source = Source(" and ".join(str(_model_in(root / p).relative_to(root)) for p in parts))
+        read = [_read_colmap(root / p, model, images, downscale, part=p) for p, model in parts.items()]
+        views, points = [view for views, _ in read for view in views], read[0][1]
+        source = Source(" and ".join(str(model.relative_to(root)) for model in parts.values()))
     elif (project := find_project(root)) is not None:
         views, points, source = _read_project(root, project, images, downscale)
     else:
@@ -86,13 +86,8 @@ def read_layout(
 def _read_project(
     root: Path, project: FoundProject, images: str, downscale: float
 ) -> tuple[list[SourceView], SourcePoints, Source]:
-    names, paths, lenses, content, points = read_project(root, project, images, downscale)
-    views = [
-        SourceView(name, path, None, lens, view.world_to_camera)
-        for name, path, lens, view in zip(names, paths, lenses, content.views, strict=True)
-    ]
-    file = project.file.relative_to(root) if project.file.is_relative_to(root) else project.file
-    cameras = f"{file} ({project.kind.program})"
+    views, points, content = read_project(root, project, images, downscale)
+    cameras = f"{relative_to(root, project.file)} ({project.kind.program})"
     return views, points, Source(cameras, notes=tuple(content.notes), frame=content.frame)
 
 
@@ -113,18 +108,13 @@ def _hint(root: Path) -> str:
     return to_convert(names)
 
 
-def _model_in(root: Path) -> Path:
-    folder = colmap.find_model(root)
-    assert folder is not None
-    return folder
-
-
 def _models(root: Path, sparse: str) -> tuple[list[Path], list[str]]:
     """Return the COLMAP models to read, the largest first, and a line if others are left out."""
     if sparse not in ("largest", "all"):
         named = root / sparse
-        if colmap.find_models(named) and (model := _model_in(named)).is_relative_to(root):
-            return [model], []
+        found = colmap.find_models(named)[:1]
+        if found and found[0][0].is_relative_to(root):
+            return [found[0][0]], []
         raise FileNotFoundError(
             f"data.sparse: {named} has no complete COLMAP model (cameras, images and points3D); name its "
             "folder relative to the capture, or use 'largest' or 'all'"
@@ -139,7 +129,7 @@ def _models(root: Path, sparse: str) -> tuple[list[Path], list[str]]:
         f"of {len(models)} COLMAP models, the largest is used: {counts} (others with --data.sparse=FOLDER; "
         "--data.sparse=all reads all, if they have the same world coordinates)"
     )
-    warnings.warn(note, stacklevel=4)
+    warn(note)
     return [models[0][0]], [note]
 
 
@@ -182,10 +172,9 @@ def _with_photographs(root: Path, source: Source, views: Sequence[SourceView]) -
         and not _BY_PRODUCT.search(file.stem)
     )
     if without:
-        warnings.warn(
+        warn(
             f"{len(without)} of {len(without) + len(used)} photographs have no camera in {source.cameras} "
-            f"and are not used (first: {without[0].name})",
-            stacklevel=4,
+            f"and are not used (first: {without[0].name})"
         )
     return replace(source, without_camera=len(without))
 
@@ -199,7 +188,7 @@ def _read_transforms(root: Path, model: Path | None) -> tuple[list[SourceView], 
             notes.append(f"transforms.json is read, and {', '.join(beside)} beside it not")
     for note in notes:
         if not note.startswith("fields without effect"):
-            warnings.warn(f"{content.files[0]}: {note}", stacklevel=4)
+            warn(f"{content.files[0]}: {note}")
     source = Source(" and ".join(path.name for path in content.files), content.split, tuple(notes))
     return content.frames, transforms_points(root, content, model), source
 
@@ -208,14 +197,8 @@ def _read_colmap(
     root: Path, folder: Path, images: str, downscale: float, part: str = ""
 ) -> tuple[list[SourceView], SourcePoints]:
     model = colmap.read_model(folder)
-    lenses: dict[int, Lens] = {}
-    for camera in model.cameras:
-        if camera.id in lenses:
-            raise ValueError(f"{folder}: there are two cameras {camera.id}")
-        try:
-            lenses[camera.id] = Lens(camera.model, camera.width, camera.height, tuple(camera.params.tolist()))
-        except ValueError as error:
-            raise ValueError(f"{folder}: camera {camera.id}: {error}") from error
+    with located(str(folder)):
+        lenses = lenses_of(model.cameras)
     names = model.images.names
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)
@@ -228,15 +211,10 @@ def _read_colmap(
     lens_of = [lenses[c] for c in model.images.camera_ids.tolist()]
     paths = ImageFinder(root, images).find_all(names, lens_of, downscale)
     poses = colmap.world_to_camera(model.images)
-    prefix = f"{part}/" if part else ""
     views = [
-        SourceView(prefix + name, path, None, lens, pose)
+        SourceView(f"{part}/{name}" if part else name, path, None, lens, pose)
         for name, path, lens, pose in zip(names, paths, lens_of, poses, strict=True)
     ]
     if model.points_path is not None and model.points_path.suffix in colmap.POINT_SUFFIXES:
         return views, file_points(model.points_path)
-    p = model.points
-    path = model.points_path
-    return views, SourcePoints(
-        p.positions, p.colors, p.track_lengths, p.errors, path, "the model's own colours"
-    )
+    return views, SourcePoints.of_model(model.points, model.points_path, "the model's own colours")

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,6 +12,7 @@ from pathlib import Path, PurePosixPath
 from blitzgs.capture.cameras import Camera, same_shape
 from blitzgs.capture.image_files import decode_mask, read_header, read_whole
 from blitzgs.capture.names import files_below, unified, what_is_at
+from blitzgs.util.messages import warn
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp", ".avif", ".jp2")
 # What programs call the mask of a.jpg, the names that are tried first first.
@@ -65,10 +65,7 @@ def find_masks(
             f"{PurePosixPath(unified(names[0])).name}.png, or use --data.masks=false"
         )
     if unused:
-        warnings.warn(
-            f"{len(unused)} of {len(files)} masks in {folder} belong to no image (first: {unused[0]})",
-            stacklevel=3,
-        )
+        warn(f"{len(unused)} of {len(files)} masks in {folder} belong to no image (first: {unused[0]})")
     return found
 
 
@@ -172,17 +169,15 @@ def check_masks(masks: Sequence[Path | None]) -> None:
     if not shares:
         return
     if max(shares) == 0:
-        warnings.warn(
+        warn(
             f"the masks exclude nothing ({len(shares)} of {len(paths)} were looked at; first: {sample[0]}): "
-            "black or transparent pixels are excluded, all others count",
-            stacklevel=3,
+            "black or transparent pixels are excluded, all others count"
         )
     elif min(shares) == 1:
-        warnings.warn(
+        warn(
             f"the masks exclude every pixel ({len(shares)} of {len(paths)} were looked at; first: "
             f"{sample[0]}): black or transparent pixels are excluded, and in lossy files (JPEG) dark ones "
-            "too; write masks as PNG with white where pixels count, or use --data.masks=false",
-            stacklevel=3,
+            "too; write masks as PNG with white where pixels count, or use --data.masks=false"
         )
 
 

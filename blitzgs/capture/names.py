@@ -11,13 +11,13 @@ import os
 import re
 import stat
 import unicodedata
-import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePath, PurePosixPath
 
 from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
+from blitzgs.util.messages import warn
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".avif", ".jp2", ".gif")
 # Of photographs that have to be converted; the cameras may have been found before that.
@@ -32,6 +32,11 @@ _DEEPEST = 8
 def unified(name: str) -> str:
     """Return a path with slashes, without `.` parts, and with composed letters."""
     return unicodedata.normalize("NFC", str(PurePosixPath(name.replace("\\", "/"))))
+
+
+def relative_to(root: Path, path: Path) -> Path:
+    """Return a path as one below `root`, where it is below it."""
+    return path.relative_to(root) if path.is_relative_to(root) else path
 
 
 def _any_case(name: str) -> str:
@@ -91,10 +96,9 @@ def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dic
         if not new:
             continue
         name, file = next(iter(new.items()))
-        warnings.warn(
+        warn(
             f"{len(new)} of {len(found) + len(wanted)} files have other names in {folder} than in the "
-            f"capture's file: {file} is used for {name} (names that differ only in {ignored})",
-            stacklevel=3,
+            f"capture's file: {file} is used for {name} (names that differ only in {ignored})"
         )
         matches |= {name: folder / file for name, file in new.items()}
         used = set(new.values())
@@ -173,10 +177,9 @@ def check_inside(paths: Iterable[Path], root: Path, allowed: Sequence[Path], ref
     outside = [path for path in paths if not _is_below(os.path.normpath(path.absolute()), bases)]
     if not refuse:
         if outside:
-            warnings.warn(
+            warn(
                 f"{len(outside)} names of the capture lead outside {root} (first: {outside[0]}); "
-                "--data.inside_only=true refuses them",
-                stacklevel=2,
+                "--data.inside_only=true refuses them"
             )
         return
     # A link inside the capture belongs to the capture, so it must not lead outside either.
@@ -222,7 +225,7 @@ class ImageFinder:
                 problem = _first_problem(folder, names, lenses, paths, downscale)
                 if problem is None:
                     return [path for path in paths if path is not None]
-                warnings.warn(f"{problem}; downscaling {self.images} instead", stacklevel=2)
+                warn(f"{problem}; downscaling {self.images} instead")
         files = [self._find(name) for name in names]
         there = [path.is_file() for path in files]
         lost = [name for name, found in zip(names, there, strict=True) if not found]
@@ -325,7 +328,7 @@ def existing(names: Sequence[str], paths: Sequence[Path], root: Path, images: st
         raise FileNotFoundError(f"{message}; {remedy}")
     if not allow:
         raise MissingImagesError(f"{message}; put them back, or leave those views out with allow_missing")
-    warnings.warn(f"{message}; dropped", stacklevel=3)
+    warn(f"{message}; dropped")
     return found
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath
@@ -18,6 +17,7 @@ from blitzgs.capture.lengths import StrayCamera, random_points
 from blitzgs.capture.lens import Lens, check_lens
 from blitzgs.capture.names import read_lines
 from blitzgs.capture.points import SourcePoints
+from blitzgs.util.messages import warn
 
 # Coordinates from here on are damage; the squares of smaller ones are finite.
 _FARTHEST = 1e100
@@ -36,10 +36,9 @@ def with_finite_poses(views: list[SourceView]) -> list[SourceView]:
         raise ValueError(f"none of the {len(views)} views has a pose (a finite rotation and translation)")
     if len(finite) < len(views):
         first = next(v.name for v in views if not _is_usable(v.world_to_camera).all())
-        warnings.warn(
+        warn(
             f"{len(views) - len(finite)} of {len(views)} views have no finite pose and were dropped "
-            f"(first: {first})",
-            stacklevel=3,
+            f"(first: {first})"
         )
     return finite
 
@@ -59,10 +58,7 @@ def check_lenses(views: list[SourceView]) -> None:
         if doubt:
             unusual[view.lens] = f"{view.name}: {doubt}"
     if unusual:
-        warnings.warn(
-            f"{len(unusual)} of {len(checked)} cameras are unusual (first: {next(iter(unusual.values()))})",
-            stacklevel=3,
-        )
+        warn(f"{len(unusual)} of {len(checked)} cameras are unusual (first: {next(iter(unusual.values()))})")
 
 
 def without_strays(
@@ -73,10 +69,9 @@ def without_strays(
         return kept
     shown = ", ".join(f"{s.name} at {s.distance:.6g}" for s in strays[:5]) + ", ..." * (len(strays) > 5)
     done = "kept" if keep else "left out; --data.stray_cameras=keep trains on them"
-    warnings.warn(
+    warn(
         f"{len(strays)} of {len(views)} cameras lie far from the others, which are within "
-        f"{strays[0].others:.6g} of their middle, and show hardly a point: {shown} ({done})",
-        stacklevel=3,
+        f"{strays[0].others:.6g} of their middle, and show hardly a point: {shown} ({done})"
     )
     names = {stray.name for stray in strays}
     return kept if keep else [index for index in kept if views[index].name not in names]
@@ -87,9 +82,7 @@ def finite_points(points: SourcePoints) -> SourcePoints:
     finite: npt.NDArray[np.bool_] = np.asarray(_is_usable(points.positions).all(axis=1))
     if finite.all():
         return points
-    warnings.warn(
-        f"{int((~finite).sum())} of {finite.size} points are not finite and were dropped", stacklevel=3
-    )
+    warn(f"{int((~finite).sum())} of {finite.size} points are not finite and were dropped")
     return replace(
         points,
         positions=points.positions[finite],
@@ -101,10 +94,9 @@ def finite_points(points: SourcePoints) -> SourcePoints:
 
 def points_at_random(root: Path, cameras: Sequence[Camera], offset: Float64) -> SourcePoints:
     """Return uniform points of random colours in the region that the cameras look at."""
-    warnings.warn(
+    warn(
         f"{root}: the capture has no points; {_RANDOM_POINTS:,} random ones take their place. Points of the "
-        "reconstruction give a better start",
-        stacklevel=3,
+        "reconstruction give a better start"
     )
     try:
         return SourcePoints(*random_points(cameras, offset, _RANDOM_POINTS))

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import warnings
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from blitzgs.config.files import load_config
 from blitzgs.runs import run_files
 from blitzgs.runs.world import load_world_frame, save_world_frame
 from blitzgs.training.inputs import load_configured
+from blitzgs.util.messages import warn
 from blitzgs.util.terminal import printable
 
 # -1 for photographs that look straight down, or level; -1.4 between the two.
@@ -112,10 +112,7 @@ def _warn_if_turned_over(frame: WorldFrame, capture: Capture) -> None:
     poses = np.stack([camera.world_to_camera for camera in capture.cameras])
     down, forward = (poses[:, 1:3, :3] @ frame.rotation[2]).mean(axis=0)  # by how much they point up
     if frame.crs != GEOCENTRIC and down + forward > _TURNED_OVER:
-        warnings.warn(
-            "the photographs are upside down in this world: are E and N exchanged, or are heights depths?",
-            stacklevel=2,
-        )
+        warn("the photographs are upside down in this world: are E and N exchanged, or are heights depths?")
 
 
 def _print_residuals(placed: list[Placed]) -> None:

@@ -13,6 +13,7 @@ from typing import TextIO
 
 from blitzgs.cli.arguments import Commands, add_command, add_path, add_run
 from blitzgs.runs.run_files import check_is_run
+from blitzgs.util.messages import warn
 from blitzgs.util.terminal import printable
 
 HELP = """\
@@ -82,10 +83,7 @@ def write_final_report(folder: Path, summary: Mapping[str, object] | None) -> No
         look = look_of(folder) if isinstance(count, int) and 0 < count <= _MAX_GAUSSIANS else None
         write_report(folder, look)
     except Exception as error:
-        warnings.warn(
-            f"the report was not written ({type(error).__name__}: {error}); blitzgs report RUN tries again",
-            stacklevel=2,
-        )
+        warn(f"the report was not written ({type(error).__name__}: {error}); blitzgs report RUN tries again")
 
 
 COMPARE_HELP = """\

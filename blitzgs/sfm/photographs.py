@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import re
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -21,6 +20,7 @@ from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, to_convert
 from blitzgs.capture.projects.find import find_project
 from blitzgs.capture.transforms import find_transforms
 from blitzgs.sfm.engine import MOST_IN_ALL_PAIRS
+from blitzgs.util.messages import warn
 from blitzgs.util.output import write_file
 
 # Files and folders of what programs write beside photographs.
@@ -83,7 +83,7 @@ class Photographs:
             what = "has no photographs" if folder.is_dir() else "is no folder of photographs"
             raise FileNotFoundError(f"{folder} {what} ({', '.join(IMAGE_SUFFIXES)}){others}")
         if others:
-            warnings.warn(f"{folder}: only its {len(names)} photographs are used{others}", stacklevel=2)
+            warn(f"{folder}: only its {len(names)} photographs are used{others}")
         root = folder if (folder / "masks").is_dir() else folder.parent
         masks = find_masks(root, None, names, [None] * len(names))
         problems = damaged([(folder / name, mask) for name, mask in zip(names, masks, strict=True)])

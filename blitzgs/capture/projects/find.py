@@ -3,15 +3,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-import numpy as np
-
-from blitzgs.capture.cameras import Float64
+from blitzgs.capture.cameras import Float64, SourceView
 from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.names import IMAGE_SUFFIXES, ImageFinder, files_below, unified
@@ -27,6 +24,7 @@ from blitzgs.capture.projects.realitycapture import (
     read_realitycapture,
 )
 from blitzgs.capture.world import WorldFrame, converted, frame_beside
+from blitzgs.util.messages import warn
 
 
 @dataclass(frozen=True)
@@ -96,8 +94,8 @@ def folder_of(file: Path, images: str) -> Path:
 
 def read_project(
     root: Path, found: FoundProject, images: str, downscale: float
-) -> tuple[list[str], list[Path], list[Lens], Project, SourcePoints]:
-    """Read a project: names, files, lenses, the project itself, and its points.
+) -> tuple[list[SourceView], SourcePoints, Project]:
+    """Read a project: its views, its points, and what else it says.
 
     FileNotFoundError: no photograph is there, so that the size of none is known. ValueError: the project is
     damaged.
@@ -118,8 +116,12 @@ def read_project(
     if project.lost:
         project.notes.append(f"{project.lost} photographs of the project have no pose and are left out")
     for note in project.notes:
-        warnings.warn(f"{found.file}: {note}", stacklevel=5)
-    return names, paths, lenses, project, _points(root, found, project, lenses)
+        warn(f"{found.file}: {note}")
+    views = [
+        SourceView(name, path, None, lens, view.world_to_camera)
+        for name, path, lens, view in zip(names, paths, lenses, project.views, strict=True)
+    ]
+    return views, _points(root, found, project, views), project
 
 
 def _relative(name: str) -> str:
@@ -167,13 +169,11 @@ def _lenses(found: FoundProject, project: Project, names: Sequence[str], finder:
     ]
 
 
-def _points(root: Path, found: FoundProject, project: Project, lenses: Sequence[Lens]) -> SourcePoints:
+def _points(root: Path, found: FoundProject, project: Project, views: Sequence[SourceView]) -> SourcePoints:
     if project.points is not None and len(project.points.positions):
         return project.points
-    poses = [view.world_to_camera for view in project.views]
     bundles = [file for file in sorted(root.glob("*.out")) if is_bundler(file) and file != found.file]
-    own = [read_bundler(file).points for file in bundles[:1]]
-    return points_beside(root, own[0] if own else None, project.frame, list(zip(lenses, poses, strict=True)))
+    return points_beside(root, read_bundler(bundles[0]).points if bundles else None, project.frame, views)
 
 
 # Points and views that are compared to find out in which coordinates points are.
@@ -181,12 +181,12 @@ _SAMPLE, _VIEWS = 2000, 100
 
 
 def points_beside(
-    root: Path, own: SourcePoints | None, frame: WorldFrame | None, cameras: Sequence[tuple[Lens, Float64]]
+    root: Path, own: SourcePoints | None, frame: WorldFrame | None, views: Sequence[SourceView]
 ) -> SourcePoints:
     """Return the project's own points, or those of a file beside it, in the world of its cameras.
 
     Programs export cameras in coordinates of their own and points in those of a reference system, or both in
-    one of the two: the coordinates in which the views (lenses and poses [4, 4]) see the points are taken.
+    one of the two: the coordinates in which the views see the points are taken.
     """
     points = own
     if points is None:
@@ -197,12 +197,11 @@ def points_beside(
         if len(named) != 1:
             if named:
                 shown = ", ".join(path.name for path in named[:5])
-                warnings.warn(
+                warn(
                     f"{root} has {len(named)} files of points ({shown}), and none is used: call one of them "
-                    f"points{named[0].suffix.lower()}",
-                    stacklevel=5,
+                    f"points{named[0].suffix.lower()}"
                 )
-            return SourcePoints(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
+            return SourcePoints.none()
         points = file_points(named[0])
     choices = {"the project's own coordinates": points.positions}
     if frame is not None:
@@ -210,24 +209,16 @@ def points_beside(
         if points.crs is not None and frame.crs:
             moved = converted(points.positions, points.crs, frame.crs)
             choices[f"coordinates of {points.crs.name}"] = frame.from_world(moved)
-    seen = {name: seen_share(positions, cameras) for name, positions in choices.items()}
+    seen = {name: seen_share(positions, views) for name, positions in choices.items()}
     best = max(seen, key=seen.__getitem__)
     if best != next(iter(choices)):
-        warnings.warn(f"{points.path}: the points are in {best}, and are moved to the cameras'", stacklevel=5)
+        warn(f"{points.path}: the points are in {best}, and are moved to the cameras'")
     points.positions = choices[best]
     return points
 
 
-def seen_share(positions: Float64, cameras: Sequence[tuple[Lens, Float64]]) -> float:
+def seen_share(positions: Float64, views: Sequence[SourceView]) -> float:
     """Return the share of views that see a point, of a sample of both."""
     sample = positions[:: max(1, len(positions) // _SAMPLE)]
-    some = cameras[:: max(1, len(cameras) // _VIEWS)]
-    return sum(_sees(lens, pose, sample) for lens, pose in some) / max(1, len(some))
-
-
-def _sees(lens: Lens, pose: Float64, positions: Float64) -> bool:
-    with np.errstate(all="ignore"):
-        x, y, depth = pose[:3, :3] @ positions.T + pose[:3, 3:]
-        front = depth > 0
-        u, v = lens.project(x[front] / depth[front], y[front] / depth[front])
-        return bool(((u >= 0) & (u < lens.width) & (v >= 0) & (v < lens.height)).any())
+    some = views[:: max(1, len(views) // _VIEWS)]
+    return sum(len(view.pixels_of(sample)) > 0 for view in some) / max(1, len(some))
