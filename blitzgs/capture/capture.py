@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,14 +28,13 @@ from blitzgs.capture.cameras import (
     same_shape,
     scaled_matrix,
 )
-from blitzgs.capture.check_files import FindDamage, damaged
 from blitzgs.capture.image_files import ImageHeader, read_header
 from blitzgs.capture.layouts import Source, read_layout
 from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_extent
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.masks import check_mask_sizes, check_masks, find_masks
+from blitzgs.capture.masks import FindDamage, check_mask_sizes, check_masks, damaged, find_masks
 from blitzgs.capture.names import MissingImagesError as MissingImagesError
-from blitzgs.capture.names import check_inside, existing, to_convert
+from blitzgs.capture.names import check_inside, existing, relative_to, to_convert
 from blitzgs.capture.projects.find import FoundProject, folder_of, project_at
 from blitzgs.capture.usable import (
     check_lenses,
@@ -47,8 +45,8 @@ from blitzgs.capture.usable import (
     without_strays,
     without_unused,
 )
-from blitzgs.util.errors import check_number
-from blitzgs.util.messages import warn
+from blitzgs.config.ranges import CHOICES
+from blitzgs.util.errors import check_number, located, warn
 
 # In pixels. SSIM compares windows of 11 pixels, and a much smaller image shows too little to train on.
 _LEAST_SIDE = 8
@@ -147,7 +145,7 @@ def load_capture(
             them; no length is measured by them either way.
         inside_only: refuse names that lead outside the capture, for captures that somebody else has made;
             otherwise they are read with a warning.
-        find_damage: see `check_files.damaged`; called with `allow_missing` only. The ranks of a job divide
+        find_damage: see `masks.damaged`; called with `allow_missing` only. The ranks of a job divide
             the files among them.
 
     Raises:
@@ -175,14 +173,13 @@ def load_capture(
     folders = [root / images, *([root / masks] if isinstance(masks, str) else [])]
     named = [path for view in views for path in (view.path, view.mask_path)] + [points.path]
     check_inside([path for path in named if path is not None], root, folders, inside_only)
-    kept = existing([v.name for v in views], [v.path for v in views], root, images, allow_missing)
-    missing = len(views) - len(kept)
-    kept, found, damage = _with_files(views, kept, root, masks, find_damage if allow_missing else None)
-    kept = without_strays(views, kept, strays, keep=stray_cameras == "keep")
-    place = {index: position for position, index in enumerate(kept)}
-    views = [replace(views[index], mask_path=found[index]) for index in kept]
-    train, test = ([place[index] for index in part if index in place] for part in (train, test))
-    apart_left = [place[index] for index in kept if apart[index]]
+    held_out, far = ({views[index].name for index in some} for some in (test, np.flatnonzero(apart)))
+    posed, views = len(views), existing(views, root, images, allow_missing)
+    missing = posed - len(views)
+    views, damage = _with_masks(views, root, masks, find_damage if allow_missing else None)
+    views = without_strays(views, strays, posed, keep=stray_cameras == "keep")
+    train, test = ([i for i, v in enumerate(views) if (v.name in held_out) is part] for part in (False, True))
+    apart_left = [index for index, view in enumerate(views) if view.name in far]
     if not train:
         raise MissingImagesError(f"{root}: no image of a training view is on disk and whole")
     headers = _headers(views)
@@ -208,12 +205,12 @@ def load_capture(
         unused,
         missing,
         blind,
-        not has_points,
-        _relative(points.path, root),
-        points.colors_from,
-        with_alpha,
-        sum(header.extra_bands > 0 for header in headers),
-        len(damage),
+        random_points=not has_points,
+        points_from="" if points.path is None else str(relative_to(root, points.path)),
+        colors_from=points.colors_from,
+        with_alpha=with_alpha,
+        extra_bands=sum(header.extra_bands > 0 for header in headers),
+        damaged=len(damage),
     )
     return Capture(
         root,
@@ -237,12 +234,8 @@ def _check_options(downscale: float, exif: str, undistort: str, stray_cameras: s
     check_number("downscale", downscale)
     if not downscale >= 1:  # NaN too
         raise ValueError(f"downscale must be at least 1, got {downscale}")
-    for option, value, allowed in (
-        ("exif", exif, ("auto", "apply", "ignore")),
-        ("undistort", undistort, ("crop", "mask")),
-        ("stray_cameras", stray_cameras, ("drop", "keep")),
-    ):
-        if value not in allowed:
+    for option, value in (("exif", exif), ("undistort", undistort), ("stray_cameras", stray_cameras)):
+        if value not in (allowed := CHOICES[f"data.{option}"]):
             raise ValueError(f"{option} must be one of {', '.join(allowed)}, got {value!r}")
 
 
@@ -273,31 +266,20 @@ def _root_of(path: Path, images: str) -> tuple[Path, FoundProject | None]:
     return folder_of(path, images), project
 
 
-def _with_files(
-    views: Sequence[SourceView],
-    kept: list[int],
-    root: Path,
-    masks: str | bool | None,
-    find_damage: FindDamage | None,
-) -> tuple[list[int], dict[int, Path | None], dict[int, str]]:
-    """Return the views that are left, the mask of each, and what is wrong with those that are left out."""
-    some = [views[index] for index in kept]
-    found = find_masks(root, masks, [view.name for view in some], [view.mask_path for view in some])
-    files = [(view.path, mask) for view, mask in zip(some, found, strict=True)]
-    damage = {} if find_damage is None else find_damage(files)
-    if damage:
+def _with_masks(
+    views: list[SourceView], root: Path, masks: str | bool | None, find_damage: FindDamage | None
+) -> tuple[list[SourceView], dict[int, str]]:
+    """Return the views that are whole, with their masks, and what is wrong with the others."""
+    found = find_masks(root, masks, [view.name for view in views], [view.mask_path for view in views])
+    views = [replace(view, mask_path=mask) for view, mask in zip(views, found, strict=True)]
+    if find_damage is None:
+        return views, {}
+    if damage := find_damage([(view.path, view.mask_path) for view in views]):
         warn(
-            f"{len(damage)} of {len(some)} images or their masks are damaged; dropped (first: "
+            f"{len(damage)} of {len(views)} images or their masks are damaged; dropped (first: "
             f"{next(iter(damage.values()))})"
         )
-    left = [place for place in range(len(kept)) if place not in damage]
-    return [kept[place] for place in left], {kept[place]: found[place] for place in left}, damage
-
-
-def _relative(path: Path | None, root: Path) -> str:
-    if path is None:
-        return ""
-    return str(path.relative_to(root) if path.is_relative_to(root) else path)
+    return [view for index, view in enumerate(views) if index not in damage], damage
 
 
 def _camera(
@@ -324,10 +306,8 @@ def _camera(
         )
     lens = view.lens.scaled(width, height)
     if lens not in plans:
-        try:
+        with located(f"the camera of {view.path}"):
             plans[lens] = rectify(lens, policy)
-        except ValueError as error:
-            raise ValueError(f"the camera of {view.path}: {error}") from error
     plan = plans[lens]
     # Images from images_N are downscaled already; only the rest of the factor is applied while decoding.
     already = max(1.0, view.lens.width / width) if downscale > 1 else 1.0

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -105,7 +105,7 @@ def find_models(path: Path) -> list[tuple[Path, int]]:
         if len(numbered) > 1:
             counted = [(model, count_images(model)) for model in numbered]
             return sorted(counted, key=lambda model: -model[1])  # stable: of equal ones, the first
-        if numbered or _has(path / folder, all):
+        if numbered or complete_files(path / folder):
             return [(numbered[0] if numbered else path / folder, 0)]
     return []
 
@@ -113,23 +113,26 @@ def find_models(path: Path) -> list[tuple[Path, int]]:
 def find_incomplete_model(path: Path) -> Path | None:
     """Return the folder of a model that lacks files, where `find_models` would look for it, or None."""
     folders = ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap/sparse")
-    return next((path / folder for folder in folders if _has(path / folder, any)), None)
+    kinds = [(name, suffix) for name in FILES for suffix in _SUFFIXES]
+    return next((path / f for f in folders if any(_file(path / f, *kind).is_file() for kind in kinds)), None)
 
 
 def _numbered(folder: Path) -> list[Path]:
     """Return the complete models in the folders 0, 1, ... of a folder, in the order of their numbers."""
-    found = [model for model in folder.glob("[0-9]*") if model.name.isdecimal() and _has(model, all)]
+    found = [model for model in folder.glob("[0-9]*") if model.name.isdecimal() and complete_files(model)]
     return sorted(found, key=lambda model: int(model.name))
 
 
-def _has(folder: Path, enough: Callable[[Iterable[bool]], bool]) -> bool:
-    return any(enough(_file(folder, name, suffix).is_file() for name in FILES) for suffix in _SUFFIXES)
+def complete_files(folder: Path) -> dict[str, Path] | None:
+    """Return the files of a model by their names in `FILES`, binary ones first; None: one is missing."""
+    kinds = ({name: _file(folder, name, suffix) for name in FILES} for suffix in _SUFFIXES)
+    return next((files for files in kinds if all(path.is_file() for path in files.values())), None)
 
 
 def _file(folder: Path, name: str, suffix: str) -> Path:
     """Return a file of a model; its points may be in points3D.ply alone, or in a file of another program."""
     path = folder / (name + suffix)
-    others = [folder / (name + other) for other in (".bin", ".txt")]
+    others = [folder / (name + other) for other in _SUFFIXES]
     if name == "points3D" and not any(other.is_file() for other in others):
         path = next((p for s in POINT_SUFFIXES if (p := path.with_suffix(s)).is_file()), path)
     return path
@@ -137,11 +140,9 @@ def _file(folder: Path, name: str, suffix: str) -> Path:
 
 def count_images(folder: Path) -> int:
     """Return the number of images of a model; 0 if its file is damaged, so that an undamaged one is used."""
-    path = folder / "images.bin"
-    if not all(_file(folder, name, ".bin").is_file() for name in FILES):
-        path = folder / "images.txt"
+    files = complete_files(folder)
     try:
-        return len(native.read_images(os.fsencode(path), False)["ids"])
+        return len(native.read_images(os.fsencode(files["images"]), False)["ids"]) if files else 0
     except ValueError:
         return 0
 
@@ -154,12 +155,11 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
     the byte offset or line, and the reason.
     """
     folder = Path(folder)
-    binary, text = ({name: _file(folder, name, suffix) for name in FILES} for suffix in _SUFFIXES)
-    complete = (kind for kind in (binary, text) if all(path.is_file() for path in kind.values()))
-    paths = next(complete, binary if binary["cameras"].is_file() else text)
-    for path in paths.values():
-        if not path.is_file():
-            raise FileNotFoundError(f"{path} is missing: {folder} is not a complete COLMAP sparse model")
+    paths = complete_files(folder)
+    if paths is None:
+        suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+        lost = next(path for name in FILES if not (path := _file(folder, name, suffix)).is_file())
+        raise FileNotFoundError(f"{lost} is missing: {folder} is not a complete COLMAP sparse model")
     elsewhere = paths["points3D"].suffix in POINT_SUFFIXES
     return ColmapModel(
         [ColmapCamera(*row) for row in native.read_cameras(os.fsencode(paths["cameras"]))],

@@ -9,17 +9,18 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
+from typing import Any
 
 import numpy as np
 
 from blitzgs.capture import colmap, transforms
 from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.lens import lenses_of
-from blitzgs.capture.names import ImageFinder, relative_to, to_convert
+from blitzgs.capture.names import find_images, relative_to, to_convert
 from blitzgs.capture.points import SourcePoints, file_points, transforms_points
 from blitzgs.capture.projects.find import FoundProject, find_project, read_project
 from blitzgs.capture.world import WorldFrame, frame_beside
-from blitzgs.util.messages import located, warn
+from blitzgs.util.errors import located, warn
 
 _PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 # What programs write beside the images of a synthetic capture.
@@ -138,18 +139,11 @@ def _joined(
 ) -> tuple[list[SourceView], SourcePoints]:
     """Return the views and points of several models; of an image in two of them, the first counts."""
     views = {view.name: view for found, _ in reversed(parts) for view in found}
-    points = [points for _, points in parts]
-    tracks = [p.track_lengths for p in points if p.track_lengths is not None]
-    errors = [p.errors for p in points if p.errors is not None]
-    joined = SourcePoints(
-        np.concatenate([p.positions for p in points]),
-        np.concatenate([p.colors for p in points]),
-        np.concatenate(tracks) if len(tracks) == len(points) else None,
-        np.concatenate(errors) if len(errors) == len(points) else None,
-        points[0].path,
-        points[0].colors_from,
-    )
-    return list(views.values()), joined
+    columns = [points.columns() for _, points in parts]
+    common = [name for name in columns[0] if all(name in others for others in columns)]
+    joined: dict[str, Any] = {name: np.concatenate([each[name] for each in columns]) for name in common}
+    first = parts[0][1]
+    return list(views.values()), SourcePoints(**joined, path=first.path, colors_from=first.colors_from)
 
 
 def _with_photographs(root: Path, source: Source, views: Sequence[SourceView]) -> Source:
@@ -209,7 +203,7 @@ def _read_colmap(
             f"{folder}: the cameras of {len(unknown)} images (first: {unknown[0]}) are not there"
         )
     lens_of = [lenses[c] for c in model.images.camera_ids.tolist()]
-    paths = ImageFinder(root, images).find_all(names, lens_of, downscale)
+    paths = find_images(root, images, names, lens_of, downscale)
     poses = colmap.world_to_camera(model.images)
     views = [
         SourceView(f"{part}/{name}" if part else name, path, None, lens, pose)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture.cameras import Camera, Float64, SourceView, camera_centres
-from blitzgs.util.messages import warn
+from blitzgs.util.errors import warn
 
 # Cameras whose distance is below this share of the points' distance count as being in one place: the parallax
 # between them is far below a pixel.
@@ -115,7 +115,6 @@ class Sight:
     # [V] depth of the nearest points that each view sees, without the nearest 2 % of them; infinite for a
     # view that sees none.
     nearest: Float64
-    names: list[str]
 
     @classmethod
     def of(cls, cameras: Sequence[Camera], points: Float64) -> Sight:
@@ -128,17 +127,17 @@ class Sight:
                 # At least one point is skipped where there are several.
                 rank = min(len(depths) - 1, max(1, int(_SKIPPED_POINTS * len(depths))))
                 nearest[index] = np.partition(depths, rank)[rank]
-        return cls(nearest, [camera.name for camera in cameras])
+        return cls(nearest)
 
     def blind(self, cameras: Sequence[Camera], points: Float64) -> int:
         """Return how many views see none of the points; warn if most do, and name the first."""
-        blind = [name for name, depth in zip(self.names, self.nearest, strict=True) if np.isinf(depth)]
-        if 2 * len(blind) > len(self.names):
+        blind = [c.name for c, depth in zip(cameras, self.nearest, strict=True) if np.isinf(depth)]
+        if 2 * len(blind) > len(cameras):
             warn(
-                f"{len(blind)} of {len(self.names)} views (first: {blind[0]}) see none of the points: do the "
+                f"{len(blind)} of {len(cameras)} views (first: {blind[0]}) see none of the points: do the "
                 "poses and the points belong together, and do the cameras look along +z?"
             )
-        if len(blind) == len(self.names):  # a view may see points that are not in the sample
+        if len(blind) == len(cameras):  # a view may see points that are not in the sample
             some = cameras[:: max(1, len(cameras) // 64)]
             return len(blind) - sum(len(depths_seen(camera, points)) > 0 for camera in some)
         return len(blind)

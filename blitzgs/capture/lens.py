@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture.colmap import ColmapCamera, camera_models
-from blitzgs.util.messages import located
+from blitzgs.util.errors import located
 
 Array = npt.NDArray[np.float64]
 _OWN_MODELS = {"BROWN": ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "skew"]}

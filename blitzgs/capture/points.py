@@ -15,7 +15,7 @@ from blitzgs.capture.cameras import Float64, camera_centres
 from blitzgs.capture.names import unified
 from blitzgs.capture.transforms import Transforms
 from blitzgs.formats.ply import read_point_cloud
-from blitzgs.util.messages import optional_package, warn
+from blitzgs.util.errors import optional_package, warn
 
 SUFFIXES = (".las", ".laz", ".e57")
 # A start needs no more: denser clouds are thinned evenly while they are read.
@@ -85,11 +85,9 @@ def _read_e57(path: Path) -> tuple[Float64, npt.NDArray[np.uint8] | None, None]:
             scan = file.read_scan(index, colors=with_color, ignore_missing_fields=True)
             xyz = np.stack([scan[f"cartesian{axis}"][::step] for axis in "XYZ"], axis=1).astype(np.float64)
             positions.append(xyz)
-            if with_color:
-                rgb = np.stack([scan[f"color{c}"][::step] for c in ("Red", "Green", "Blue")], axis=1)
-                colors.append(rgb.astype(np.float64))
-            else:
-                colors.append(np.full(xyz.shape, np.nan))
+            none = np.full(len(xyz), np.nan)
+            rgb = [scan[f"color{c}"][::step] if with_color else none for c in ("Red", "Green", "Blue")]
+            colors.append(np.stack(rgb, axis=1).astype(np.float64))
     finally:
         file.close()
     found = np.concatenate(colors)
@@ -119,6 +117,11 @@ class SourcePoints:
     colors_from: str = ""  # what in it gives the colours; empty: nothing
     crs: Any = None  # the reference system that the file names (pyproj's); None: it names none
 
+    def columns(self) -> dict[str, Any]:
+        """Return the columns that there are, by name."""
+        found = {name: getattr(self, name) for name in ("positions", "colors", "track_lengths", "errors")}
+        return {name: column for name, column in found.items() if column is not None}
+
     @classmethod
     def none(cls) -> SourcePoints:
         """Return no points."""
@@ -136,11 +139,10 @@ def file_points(path: Path) -> SourcePoints:
         raise FileNotFoundError(f"{path} is missing: put the file of points there, or correct its name")
     if path.suffix.lower() in SUFFIXES:
         positions, colors, crs = read_points(path)
-        if colors is None:
-            warn(f"{path}: the points have no colours and start grey")
-            colors = np.full(positions.shape, _GREY, dtype=np.uint8)
-            return SourcePoints(positions, colors, path=path, crs=crs)
-        return SourcePoints(positions, colors, path=path, colors_from="red, green, blue", crs=crs)
+        if colors is not None:
+            return SourcePoints(positions, colors, path=path, colors_from="red, green, blue", crs=crs)
+        warn(f"{path}: the points have no colours and start grey")
+        return SourcePoints(positions, np.full(positions.shape, _GREY, np.uint8), path=path, crs=crs)
     cloud = read_point_cloud(path)
     if not cloud.colors_from and len(cloud.positions):
         warn(

@@ -18,14 +18,14 @@ from blitzgs.capture.world import (
     fit_similarity,
     frame_in,
     gps_positions,
-    pyproj_module,
+    reference_system,
 )
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_path, add_run
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_flags, add_run
 from blitzgs.config.files import load_config
 from blitzgs.runs import run_files
 from blitzgs.runs.world import load_world_frame, save_world_frame
 from blitzgs.training.inputs import load_configured
-from blitzgs.util.messages import warn
+from blitzgs.util.errors import warn
 from blitzgs.util.terminal import printable
 
 # -1 for photographs that look straight down, or level; -1.4 between the two.
@@ -45,14 +45,19 @@ too.
 """
 
 
+GIVEN = """
+--gcp FILE  ground control points and their marks
+--gps  use the positions in the photographs' EXIF
+"""
+
+
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "align", run, summary, HELP)
     add_run(parser)
     how = parser.add_mutually_exclusive_group()
-    add_path(how, "--gcp", "FILE", "ground control points and their marks")
-    how.add_argument("--gps", action="store_true", help="use the positions in the photographs' EXIF")
-    parser.add_argument("--crs", metavar="EPSG:N", help="reference system of the points, or wanted")
+    add_flags(how, GIVEN)
+    add_flags(parser, "--crs EPSG:N  reference system of the points, or wanted")
     add_capture(parser)
 
 
@@ -96,14 +101,10 @@ def _by_points(args: argparse.Namespace, capture: Capture) -> WorldFrame:
 def _check_lengths(crs: str) -> None:
     """Refuse a reference system of angles, in which points make no similarity; unknown without pyproj."""
     try:
-        pyproj = pyproj_module()
+        system = reference_system(crs)
     except ImportError:
         return
-    try:
-        angles = pyproj.CRS.from_user_input(crs).is_geographic
-    except pyproj.exceptions.CRSError as error:
-        raise ValueError(f"{crs!r:.60} is no reference system: name one such as EPSG:32633") from error
-    if angles:
+    if system.is_geographic:
         raise ValueError(f"{crs} has angles: convert the points to a projected system, such as a UTM zone")
 
 
@@ -140,7 +141,7 @@ def _by_gps(args: argparse.Namespace, capture: Capture) -> WorldFrame:
     target = args.crs or GEOCENTRIC
     if args.crs:
         _check_lengths(args.crs)
-    system = pyproj_module().CRS.from_user_input(target).to_3d()
+    system = reference_system(target).to_3d()
     moved = converted(world, "EPSG:4979", system)
     frame = fit_similarity(centres, moved, target, f"EXIF GPS of {len(some)} photographs")
     apart = np.linalg.norm(frame.to_world(centres) - moved, axis=1)

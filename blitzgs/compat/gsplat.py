@@ -199,7 +199,7 @@ class DefaultStrategy(Strategy):
         lives = (~pruned).nonzero()[:, 0]
         _renew(
             params, optimizers, lambda name, _: grown[name][lives],
-            lambda moment: _where_rows(old, moment[rows])[lives],
+            lambda moment: (moment[rows] * old.view(-1, *[1] * (moment.dim() - 1)))[lives],
         )  # fmt: skip
         for name in ("grad2d", "count", "radii"):
             if name in state:
@@ -376,11 +376,6 @@ def _sample(weights: Tensor, count: int) -> Tensor:
     total = weights.double().cumsum(0)
     draws = torch.rand(count, dtype=torch.float64, device=weights.device) * total[-1]
     return torch.searchsorted(total, draws, right=True).clamp(max=len(weights) - 1)
-
-
-def _where_rows(chosen: Tensor, rows: Tensor) -> Tensor:
-    """Set rows [M, ...] to zero where `chosen`, bool [M], is false."""
-    return rows * chosen.view(-1, *[1] * (rows.dim() - 1))
 
 
 def _renew(

@@ -19,6 +19,7 @@ import yaml
 
 from blitzgs.config.fields import FORK, POSITION_LEFT, SH_SHARE, Config
 from blitzgs.config.fields import ConfigError as ConfigError
+from blitzgs.config.ranges import flat as flat
 from blitzgs.config.ranges import problems
 from blitzgs.util.output import write_file
 
@@ -121,15 +122,6 @@ def to_dict(config: Config) -> dict[str, Any]:
 def changed(config: Config, section: str, **fields: Any) -> Config:
     """Return a configuration with other values of some fields of a section."""
     return dataclasses.replace(config, **{section: dataclasses.replace(getattr(config, section), **fields)})
-
-
-def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the values of nested dictionaries by names such as "section.field"."""
-    found: dict[str, Any] = {}
-    for name, value in values.items():
-        nested = isinstance(value, Mapping)
-        found |= flat(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
-    return found
 
 
 def save_config(config: Config, path: Path) -> None:

@@ -78,18 +78,13 @@ class _Reply:
         self._free(self._handle)
 
 
-class _Memory:
-    """A column of a reply as numpy takes it; an array of it keeps the reply alive."""
-
-    def __init__(self, reply: _Reply, column: _Column, dtype: np.dtype[Any]) -> None:
-        self._reply = reply
-        data, shape = (column.data, False), (column.size,)
-        self.__array_interface__ = {"version": 3, "shape": shape, "typestr": dtype.str, "data": data}
-
-
 def _array_of(reply: _Reply, column: _Column) -> Array:
     dtype = _TYPES[column.type]
-    return np.asarray(_Memory(reply, column, dtype)) if column.size else np.empty(0, dtype)
+    if not column.size:
+        return np.empty(0, dtype)
+    memory: Any = (ctypes.c_byte * (column.size * dtype.itemsize)).from_address(column.data)
+    memory.reply = reply  # whose memory it is
+    return np.frombuffer(memory, dtype)
 
 
 def _call(name: str, *arguments: Path | Array, keeps_gil: bool = False) -> list[Array]:
@@ -144,9 +139,8 @@ def read_cameras(path: Path) -> list[tuple[int, str, int, int, Array]]:
 
 def read_images(path: Path, with_points2d: bool) -> dict[str, Any]:
     """Read images.bin or .txt, as the fields of `ColmapImages`."""
-    ids, quats, translations, camera_ids, names, ends, offsets, points2d, point3d_ids = _call(
-        "read_images", path, _array([with_points2d], "u8")
-    )
+    columns = _call("read_images", path, _array([with_points2d], "u8"))
+    ids, quats, translations, camera_ids, names, ends, offsets, points2d, point3d_ids = columns
     return {
         "ids": ids,
         "quats": quats.reshape(-1, 4),

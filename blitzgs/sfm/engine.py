@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.colmap import Float64, read_model
-from blitzgs.util.messages import warn
+from blitzgs.util.errors import warn
 
 _PAIR_IDS = 2147483647  # the id of a pair of images a < b is this number times a, plus b
 

@@ -12,15 +12,14 @@ from pathlib import Path, PurePosixPath
 import cv2
 import numpy as np
 
-from blitzgs.capture.check_files import damaged
 from blitzgs.capture.colmap import Float64, find_incomplete_model, find_models
 from blitzgs.capture.image_files import decode_mask, read_header, read_whole
-from blitzgs.capture.masks import find_masks
+from blitzgs.capture.masks import damaged, find_masks
 from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, to_convert
 from blitzgs.capture.projects.find import find_project
 from blitzgs.capture.transforms import find_transforms
 from blitzgs.sfm.engine import MOST_IN_ALL_PAIRS
-from blitzgs.util.messages import warn
+from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 
 # Files and folders of what programs write beside photographs.

@@ -11,12 +11,12 @@ from pathlib import Path, PurePosixPath
 from blitzgs.capture.cameras import Float64, SourceView
 from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.names import IMAGE_SUFFIXES, ImageFinder, files_below, unified
+from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, find_images, unified
 from blitzgs.capture.points import SUFFIXES, SourcePoints, file_points
+from blitzgs.capture.projects import Project
 from blitzgs.capture.projects.metashape import is_metashape, read_metashape
 from blitzgs.capture.projects.opensfm import NAME, read_opensfm
 from blitzgs.capture.projects.pix4d import SUFFIX, read_opf, read_pix4d
-from blitzgs.capture.projects.project import Project
 from blitzgs.capture.projects.realitycapture import (
     is_bundler,
     is_realitycapture,
@@ -24,7 +24,7 @@ from blitzgs.capture.projects.realitycapture import (
     read_realitycapture,
 )
 from blitzgs.capture.world import WorldFrame, converted, frame_beside
-from blitzgs.util.messages import warn
+from blitzgs.util.errors import warn
 
 
 @dataclass(frozen=True)
@@ -106,13 +106,12 @@ def read_project(
             f"{found.file} has no photograph with a pose: align the photographs, and export again"
         )
     project.frame = project.frame or frame_beside(root)
-    finder = ImageFinder(root, images)
     names = _with_suffixes(root / images, root, [_relative(view.name) for view in project.views])
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)
         raise ValueError(f"{found.file}: there are two photographs called {twice}")
-    lenses = _lenses(found, project, names, finder)
-    paths = finder.find_all(names, lenses, downscale)
+    lenses = _lenses(found, project, names, root, images)
+    paths = find_images(root, images, names, lenses, downscale)
     if project.lost:
         project.notes.append(f"{project.lost} photographs of the project have no pose and are left out")
     for note in project.notes:
@@ -149,17 +148,19 @@ def _with_suffixes(folder: Path, root: Path, names: Sequence[str]) -> list[str]:
     return [fits.get(name, name) for name in names]
 
 
-def _lenses(found: FoundProject, project: Project, names: Sequence[str], finder: ImageFinder) -> list[Lens]:
+def _lenses(
+    found: FoundProject, project: Project, names: Sequence[str], root: Path, images: str
+) -> list[Lens]:
     if all(isinstance(view.lens, Lens) for view in project.views):
         return [view.lens for view in project.views if isinstance(view.lens, Lens)]
     one = Lens("PINHOLE", 1, 1, (1.0, 1.0, 0.5, 0.5))
-    paths = finder.find_all(names, [one] * len(names), 1)
+    paths = find_images(root, images, names, [one] * len(names), 1)
     sizes = [(h.width, h.height) if p.is_file() and (h := read_header(p)) else None for p in paths]
     common = Counter(size for size in sizes if size is not None).most_common(1)
     if not common:
         raise FileNotFoundError(
             f"{found.file} gives lengths as shares of the image, and none of its {len(names)} photographs "
-            f"(first: {names[0]}) is in {finder.root / finder.images}: put them there, or name their folder "
+            f"(first: {names[0]}) is in {root / images}: put them there, or name their folder "
             "with --data.images=FOLDER"
         )
     # A photograph that is missing is refused or left out later.
