@@ -60,7 +60,7 @@ class HostTable(GaussianTable):
         return _allocate(like, rows, self._pinned)
 
     def _reorder(self, name: str, order: Tensor) -> None:
-        self._store(name, take_rows(self[name], order))
+        self._store(name, *take_rows([self[name]], order))
 
 
 def available_bytes() -> int | None:
