@@ -142,7 +142,7 @@ def count_images(folder: Path) -> int:
     """Return the number of images of a model; 0 if its file is damaged, so that an undamaged one is used."""
     files = complete_files(folder)
     try:
-        return len(native.read_images(os.fsencode(files["images"]), False)["ids"]) if files else 0
+        return len(native.read_images(os.fsencode(files["images"]), False)[0]) if files else 0
     except ValueError:
         return 0
 
@@ -160,15 +160,11 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
         suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
         lost = next(path for name in FILES if not (path := _file(folder, name, suffix)).is_file())
         raise FileNotFoundError(f"{lost} is missing: {folder} is not a complete COLMAP sparse model")
-    elsewhere = paths["points3D"].suffix in POINT_SUFFIXES
-    return ColmapModel(
-        [ColmapCamera(*row) for row in native.read_cameras(os.fsencode(paths["cameras"]))],
-        ColmapImages(**native.read_images(os.fsencode(paths["images"]), points2d)),
-        ColmapPoints()
-        if elsewhere
-        else ColmapPoints(**native.read_points(os.fsencode(paths["points3D"]), tracks)),
-        paths["points3D"],
-    )
+    cameras = [ColmapCamera(*row) for row in native.read_cameras(os.fsencode(paths["cameras"]))]
+    images, points = native.read_images(os.fsencode(paths["images"]), points2d), ColmapPoints()
+    if paths["points3D"].suffix not in POINT_SUFFIXES:
+        points = ColmapPoints(*native.read_points(os.fsencode(paths["points3D"]), tracks))
+    return ColmapModel(cameras, ColmapImages(*images), points, paths["points3D"])
 
 
 def write_model(folder: Path | str, model: ColmapModel) -> None:

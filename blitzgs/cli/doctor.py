@@ -56,6 +56,7 @@ TIMEOUT = 120.0  # seconds of each test
 _LITTLE_MEMORY = 4 << 30
 _NOT_FOR_USERS = ("test", "lint", "all")
 _LOCAL = "allow connections to 127.0.0.1; until then train with one process"
+_NCCL = "NCCL_DEBUG=WARN blitzgs doctor"
 _REPORT = "report this with `blitzgs doctor --json`"
 _REINSTALL = "pip install --force-reinstall --no-deps blitzgs (in a checkout: make build)"
 
@@ -116,8 +117,9 @@ def examine(folder: Path | None = None) -> list[Line]:
         checks += [(f"render {name}", _REINSTALL, True, partial(_render, name)) for name in backends]
         checks.append(("exchange Gloo", _LOCAL, False, partial(_exchange, "cpu")))
         if gpus:
-            nccl = partial(_exchange, "cuda") if len(gpus) > 1 else _nccl
-            checks.append(("exchange NCCL", "NCCL_DEBUG=WARN blitzgs doctor", False, nccl))
+            several = len(gpus) > 1
+            remedy, nccl = (_LOCAL, partial(_exchange, "cuda")) if several else (_NCCL, _nccl)
+            checks.append(("exchange NCCL", remedy, False, nccl))
     if folder is not None:
         checks.append(("disk", "choose a folder that can be written", False, partial(_disk, folder)))
     with ThreadPoolExecutor(2) as pool:

@@ -137,36 +137,19 @@ def read_cameras(path: Path) -> list[tuple[int, str, int, int, Array]]:
     return list(zip(ids.tolist(), names, widths.tolist(), heights.tolist(), each, strict=True))
 
 
-def read_images(path: Path, with_points2d: bool) -> dict[str, Any]:
-    """Read images.bin or .txt, as the fields of `ColmapImages`."""
+def read_images(path: Path, with_points2d: bool) -> list[Any]:
+    """Read images.bin or .txt: the columns of `ColmapImages`, in its order."""
     columns = _call("read_images", path, _array([with_points2d], "u8"))
     ids, quats, translations, camera_ids, names, ends, offsets, points2d, point3d_ids = columns
-    return {
-        "ids": ids,
-        "quats": quats.reshape(-1, 4),
-        "translations": translations.reshape(-1, 3),
-        "camera_ids": camera_ids,
-        "names": _texts(names, ends),
-        "point2d_offsets": offsets,
-        "points2d": points2d.reshape(-1, 2),
-        "point3d_ids": point3d_ids,
-    }
+    poses = [quats.reshape(-1, 4), translations.reshape(-1, 3)]
+    return [ids, camera_ids, *poses, _texts(names, ends), offsets, points2d.reshape(-1, 2), point3d_ids]
 
 
-def read_points(path: Path, with_tracks: bool) -> dict[str, Array]:
-    """Read points3D.bin or .txt, as the fields of `ColmapPoints`."""
-    ids, positions, colors, errors, offsets, image_ids, point2d_ids = _call(
-        "read_points", path, _array([with_tracks], "u8")
-    )
-    return {
-        "ids": ids,
-        "positions": positions.reshape(-1, 3),
-        "colors": colors.reshape(-1, 3),
-        "errors": errors,
-        "track_offsets": offsets,
-        "track_image_ids": image_ids,
-        "track_point2d_ids": point2d_ids,
-    }
+def read_points(path: Path, with_tracks: bool) -> list[Array]:
+    """Read points3D.bin or .txt: the columns of `ColmapPoints`, in its order."""
+    columns = _call("read_points", path, _array([with_tracks], "u8"))
+    ids, positions, colors, *others = columns
+    return [ids, positions.reshape(-1, 3), colors.reshape(-1, 3), *others]
 
 
 def read_ply(

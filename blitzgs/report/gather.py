@@ -51,6 +51,11 @@ class RunData:
     frame: WorldFrame | None = None  # where the capture lies in the world
 
     @property
+    def figures(self) -> dict[str, float]:
+        """The numbers of the summary."""
+        return {name: value for name, value in self.summary.items() if isinstance(value, (int, float))}
+
+    @property
     def is_test(self) -> bool:
         """Whether the measured views are held out."""
         return self.cameras is None or bool(self.cameras.test)
@@ -232,6 +237,12 @@ def layers(data: RunData, index: int) -> dict[str, str] | None:
             return None
         found[part] = "data:image/webp;base64," + base64.b64encode(content).decode()
     return found
+
+
+def stages(data: RunData) -> dict[str, float]:
+    """Return the seconds of the stages of the training."""
+    found = _mapping(data.summary.get("stages"))
+    return {str(name): round(value, 2) for name, value in found.items() if isinstance(value, (int, float))}
 
 
 def subtitle(data: RunData) -> str:
