@@ -88,7 +88,7 @@ def _read_project(
     root: Path, project: FoundProject, images: str, downscale: float
 ) -> tuple[list[SourceView], SourcePoints, Source]:
     views, points, content = read_project(root, project, images, downscale)
-    cameras = f"{relative_to(root, project.file)} ({project.kind.program})"
+    cameras = f"{relative_to(root, project.file)} ({project.program})"
     return views, points, Source(cameras, notes=tuple(content.notes), frame=content.frame)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from blitzgs.capture.cameras import Float64, camera_centres
 from blitzgs.capture.capture import Capture
-from blitzgs.capture.control_points import Placed, align, place, read_control_points
+from blitzgs.capture.control_points import ControlPoint, align, place, read_control_points
 from blitzgs.capture.world import (
     GEOCENTRIC,
     WorldFrame,
@@ -92,9 +92,9 @@ def _by_points(args: argparse.Namespace, capture: Capture) -> WorldFrame:
     crs = args.crs or crs
     if crs:
         _check_lengths(crs)
-    placed = place(points, capture.cameras, capture.offset)
-    frame = align(placed, capture.offset, crs, f"{len(placed)} ground control points of {args.gcp.name}")
-    _print_residuals(placed)
+    points = place(points, capture.cameras, capture.offset)
+    frame = align(points, capture.offset, crs, f"{len(points)} ground control points of {args.gcp.name}")
+    _print_residuals(points)
     return frame
 
 
@@ -116,17 +116,17 @@ def _warn_if_turned_over(frame: WorldFrame, capture: Capture) -> None:
         warn("the photographs are upside down in this world: are E and N exchanged, or are heights depths?")
 
 
-def _print_residuals(placed: list[Placed]) -> None:
-    width = max(5, *(len(p.point.name) for p in placed))
+def _print_residuals(points: list[ControlPoint]) -> None:
+    width = max(5, *(len(p.name) for p in points))
     print(f"{'point':{width}} marks {'dE':>10} {'dN':>10} {'dh':>10} {'3D':>10} {'px':>8}")
-    for p in placed:
+    for p in points:
         values = "".join(f" {value:10.4f}" for value in [*p.offset, float(np.linalg.norm(p.offset))])
         note = f"  {p.problem}" if p.problem else ""
-        print(printable(f"{p.point.name:{width}} {len(p.pixels):5}{values} {p.reprojection:8.2f}{note}"))
-    used = [p for p in placed if not p.problem]
+        print(printable(f"{p.name:{width}} {len(p.seen):5}{values} {p.reprojection:8.2f}{note}"))
+    used = [p for p in points if not p.problem]
     offsets = np.stack([p.offset for p in used])
     flat, up = (float(np.sqrt((part**2).sum(axis=1).mean())) for part in (offsets[:, :2], offsets[:, 2:]))
-    print(f"{len(used)} of {len(placed)} points used; RMS {flat:.4f} horizontal, {up:.4f} vertical")
+    print(f"{len(used)} of {len(points)} points used; RMS {flat:.4f} horizontal, {up:.4f} vertical")
     if len(used) == 3:
         print("three points leave no check of themselves: a fourth would show a mistake")
 

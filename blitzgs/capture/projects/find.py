@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 from blitzgs.capture.cameras import Float64, SourceView
 from blitzgs.capture.image_files import read_header
@@ -27,41 +27,33 @@ from blitzgs.capture.world import WorldFrame, converted, frame_beside
 from blitzgs.util.errors import warn
 
 
-@dataclass(frozen=True)
-class _Kind:
-    """How the file of a program is found and read."""
+class FoundProject(NamedTuple):
+    """The project of a program in a folder: its file, and what reads it."""
 
     program: str
-    patterns: tuple[str, ...]
+    file: Path
     read: Callable[[Path], Project]
-    is_one: Callable[[Path], bool] = lambda _: True
 
 
-_KINDS = (
-    _Kind("Metashape", ("*.xml",), read_metashape, is_metashape),
-    _Kind("OPF", ("*.opf", "*/*.opf"), read_opf),
-    _Kind("Pix4D", tuple(f"{at}*{SUFFIX}" for at in ("", "params/", "*/params/", "*/*/params/")), read_pix4d),
-    _Kind("RealityCapture", ("*.csv",), read_realitycapture, is_realitycapture),
-    _Kind("OpenSfM", (NAME, f"opensfm/{NAME}", "reconstruction.topocentric.json"), read_opensfm),
-    _Kind("Bundler", ("*.out",), read_bundler, is_bundler),
+_PARAMS = ("", "params/", "*/params/", "*/*/params/")
+# Each program, how its files are called, what reads them, and what tells whether a file is one.
+_KINDS: tuple[tuple[str, tuple[str, ...], Callable[[Path], Project], Callable[[Path], bool]], ...] = (
+    ("Metashape", ("*.xml",), read_metashape, is_metashape),
+    ("OPF", ("*.opf", "*/*.opf"), read_opf, Path.is_file),
+    ("Pix4D", tuple(f"{at}*{SUFFIX}" for at in _PARAMS), read_pix4d, Path.is_file),
+    ("RealityCapture", ("*.csv",), read_realitycapture, is_realitycapture),
+    ("OpenSfM", (NAME, f"opensfm/{NAME}", "reconstruction.topocentric.json"), read_opensfm, Path.is_file),
+    ("Bundler", ("*.out",), read_bundler, is_bundler),
 )
 # Folders above a project's file that may be the capture's: opensfm/, or 1_initial/params/.
 _FOLDERS_ABOVE = 3
 
 
-@dataclass(frozen=True)
-class FoundProject:
-    """A project: its program and its file."""
-
-    kind: _Kind
-    file: Path
-
-
 def project_at(path: Path) -> FoundProject | None:
     """Return the project of a file; None: it is none."""
-    for kind in _KINDS:
-        if any(PurePosixPath(path.name).match(Path(p).name) for p in kind.patterns) and kind.is_one(path):
-            return FoundProject(kind, path)
+    for program, patterns, read, is_one in _KINDS:
+        if any(PurePosixPath(path.name).match(Path(p).name) for p in patterns) and is_one(path):
+            return FoundProject(program, path, read)
     return None
 
 
@@ -72,14 +64,14 @@ def find_project(root: Path) -> FoundProject | None:
     ValueError: there are several.
     """
     found = [
-        FoundProject(kind, file)
-        for kind in _KINDS
-        for file in sorted({f for pattern in kind.patterns for f in root.glob(pattern)})
-        if file.is_file() and kind.is_one(file)
+        FoundProject(program, file, read)
+        for program, patterns, read, is_one in _KINDS
+        for file in sorted({f for pattern in patterns for f in root.glob(pattern)})
+        if file.is_file() and is_one(file)
     ]
     files = {project.file for project in found}
     found = [p for p in found if p.file.name == NAME or p.file.with_name(NAME) not in files]
-    main = [project for project in found if project.kind.read is not read_bundler] or found
+    main = [project for project in found if project.read is not read_bundler] or found
     if len(main) > 1:
         shown = ", ".join(str(project.file.relative_to(root)) for project in main[:5])
         raise ValueError(f"{root} has {len(main)} projects ({shown}): name one of these files with --data")
@@ -100,7 +92,7 @@ def read_project(
     FileNotFoundError: no photograph is there, so that the size of none is known. ValueError: the project is
     damaged.
     """
-    project = found.kind.read(found.file)
+    project = found.read(found.file)
     if not project.views:
         raise ValueError(
             f"{found.file} has no photograph with a pose: align the photographs, and export again"
