@@ -29,8 +29,8 @@ from blitzgs.capture.cameras import (
     scaled_matrix,
 )
 from blitzgs.capture.image_files import ImageHeader, read_header
-from blitzgs.capture.layouts import Source, read_layout
-from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_extent
+from blitzgs.capture.layouts import About, read_layout
+from blitzgs.capture.lengths import Sight, find_apart, measured_extent
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.masks import FindDamage, check_mask_sizes, check_masks, damaged, find_masks
 from blitzgs.capture.names import MissingImagesError as MissingImagesError
@@ -85,25 +85,6 @@ class Capture:
     """What was read and what was left out."""
 
 
-@dataclass(frozen=True)
-class About:
-    """What `load_capture` decided, for messages."""
-
-    source: Source
-    split: str  # what decided on the held-out views
-    # The cameras whose pose is wrong; they are left out unless `stray_cameras` keeps them.
-    strays: list[StrayCamera]
-    unused: int  # number of frames that are in no list of the file's own split
-    missing: int  # number of views whose image is not on disk
-    blind: int  # number of views that see none of the points
-    random_points: bool  # whether the capture has no points, so that training starts from random ones
-    points_from: str = ""  # the file of the points, relative to the capture
-    colors_from: str = ""  # what in it gives their colours; empty: nothing
-    with_alpha: int = 0  # number of photographs that have alpha
-    extra_bands: int = 0  # number of photographs with a band that is neither colour nor alpha; it is not used
-    damaged: int = 0  # number of views that `allow_missing` left out because their image or mask is damaged
-
-
 def load_capture(
     path: Path | str,
     *,
@@ -154,7 +135,7 @@ def load_capture(
     """
     root, project = _root_of(Path(path), images)
     _check_options(downscale, exif, undistort, stray_cameras)
-    views, points, source = read_layout(root, images, downscale, sparse, project)
+    views, points, about = read_layout(root, images, downscale, sparse, project)
     if not views:
         raise ValueError(f"{root}: its COLMAP model or transforms.json lists no images")
     listed = len(views)
@@ -198,13 +179,13 @@ def load_capture(
     blind = sight.blind(cameras, points.positions)
     near = sight.near([i for i in train if i not in apart_left] if has_points else [], extent)
     with_alpha = sum(header.has_alpha for header in headers)
-    about = About(
-        source,
-        why,
-        strays,
-        unused,
-        missing,
-        blind,
+    about = replace(
+        about,
+        split=why,
+        strays=strays,
+        unused=unused,
+        missing=missing,
+        blind=blind,
         random_points=not has_points,
         points_from="" if points.path is None else str(relative_to(root, points.path)),
         colors_from=points.colors_from,

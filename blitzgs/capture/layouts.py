@@ -15,6 +15,7 @@ import numpy as np
 
 from blitzgs.capture import colmap, transforms
 from blitzgs.capture.cameras import SourceView
+from blitzgs.capture.lengths import StrayCamera
 from blitzgs.capture.lens import lenses_of
 from blitzgs.capture.names import find_images, relative_to, to_convert
 from blitzgs.capture.points import SourcePoints, file_points, transforms_points
@@ -28,19 +29,31 @@ _BY_PRODUCT = re.compile(r"(?i)(depth|normal|disp|mask|alpha|segmentation)s?(_?\
 
 
 @dataclass(frozen=True)
-class Source:
-    """Which files were read, and what of them was not."""
+class About:
+    """What was read of a capture and what was decided, for messages; `load_capture` knows all of it."""
 
     cameras: str  # the model or files that the poses are from, relative to the capture
-    split: str = ""  # what in the files decides on the split
+    split_from: str = ""  # what in the files decides on the split
     notes: tuple[str, ...] = ()  # what the reader decided between fields or files, and what has no effect
     without_camera: int = 0  # photographs beside those of the views that have no camera
     frame: WorldFrame | None = None  # where the capture lies in the world; None: the files do not say
+    split: str = ""  # what decided on the held-out views
+    # The cameras whose pose is wrong; they are left out unless `stray_cameras` keeps them.
+    strays: Sequence[StrayCamera] = ()
+    unused: int = 0  # number of frames that are in no list of the file's own split
+    missing: int = 0  # number of views whose image is not on disk
+    blind: int = 0  # number of views that see none of the points
+    random_points: bool = False  # whether the capture has no points, so that training starts from random ones
+    points_from: str = ""  # the file of the points, relative to the capture
+    colors_from: str = ""  # what in it gives their colours; empty: nothing
+    with_alpha: int = 0  # number of photographs that have alpha
+    extra_bands: int = 0  # number of photographs with a band that is neither colour nor alpha; it is not used
+    damaged: int = 0  # number of views that `allow_missing` left out because their image or mask is damaged
 
 
 def read_layout(
     root: Path, images: str, downscale: float, sparse: str = "largest", project: FoundProject | None = None
-) -> tuple[list[SourceView], SourcePoints, Source]:
+) -> tuple[list[SourceView], SourcePoints, About]:
     """Read the views and points of a folder in any of the layouts of docs/captures.md, or of a `project`.
 
     `downscale` (which decides on the folder of images) and `sparse` are those of `load_capture`.
@@ -51,26 +64,26 @@ def read_layout(
             f"{root} is not a folder: name the folder of the capture (images and a COLMAP model) with --data"
         )
     if project is not None:
-        views, points, source = _read_project(root, project, images, downscale)
-        return views, points, _with_photographs(root, source, views)
+        views, points, about = _read_project(root, project, images, downscale)
+        return views, points, _with_photographs(root, about, views)
     models, notes = _models(root, sparse)
     folder = models[0] if models else None
     parts = {part: found[0][0] for part in ("train", "val") if (found := colmap.find_models(root / part))}
     by_default = sparse in ("largest", "all")
     has_transforms = by_default and bool(transforms.find_transforms(root))
     if has_transforms and (folder is None or "colmap" in folder.relative_to(root).parts):
-        views, points, source = _read_transforms(root, folder)
+        views, points, about = _read_transforms(root, folder)
     elif folder is not None:
         read = [_read_colmap(root, model, images, downscale) for model in models]
         views, points = read[0] if len(read) == 1 else _joined(root, read)
         shown = " and ".join(str(model.relative_to(root)) for model in models if model != root)
-        source = Source(shown or "cameras, images and points3D", "", tuple(notes))
+        about = About(shown or "cameras, images and points3D", "", tuple(notes))
     elif "train" in parts:
         read = [_read_colmap(root / p, model, images, downscale, part=p) for p, model in parts.items()]
         views, points = [view for views, _ in read for view in views], read[0][1]
-        source = Source(" and ".join(str(model.relative_to(root)) for model in parts.values()))
+        about = About(" and ".join(str(model.relative_to(root)) for model in parts.values()))
     elif (project := find_project(root)) is not None:
-        views, points, source = _read_project(root, project, images, downscale)
+        views, points, about = _read_project(root, project, images, downscale)
     else:
         incomplete = colmap.find_incomplete_model(root)
         if incomplete is not None:
@@ -79,17 +92,17 @@ def read_layout(
             f"{root} holds no capture: expected a COLMAP model (sparse/0 with cameras, images and points3D "
             f"as .bin or .txt), transforms.json, or a project of another program{_hint(root)}"
         )
-    if source.frame is None:
-        source = replace(source, frame=frame_beside(root))
-    return views, points, _with_photographs(root, source, views)
+    if about.frame is None:
+        about = replace(about, frame=frame_beside(root))
+    return views, points, _with_photographs(root, about, views)
 
 
 def _read_project(
     root: Path, project: FoundProject, images: str, downscale: float
-) -> tuple[list[SourceView], SourcePoints, Source]:
+) -> tuple[list[SourceView], SourcePoints, About]:
     views, points, content = read_project(root, project, images, downscale)
     cameras = f"{relative_to(root, project.file)} ({project.program})"
-    return views, points, Source(cameras, notes=tuple(content.notes), frame=content.frame)
+    return views, points, About(cameras, notes=tuple(content.notes), frame=content.frame)
 
 
 def _hint(root: Path) -> str:
@@ -146,7 +159,7 @@ def _joined(
     return list(views.values()), SourcePoints(**joined, path=first.path, colors_from=first.colors_from)
 
 
-def _with_photographs(root: Path, source: Source, views: Sequence[SourceView]) -> Source:
+def _with_photographs(root: Path, about: About, views: Sequence[SourceView]) -> About:
     """Add the number of photographs that have no camera, and say it.
 
     They are searched in the folders of those that have one, so that folders of masks or of smaller copies do
@@ -167,13 +180,13 @@ def _with_photographs(root: Path, source: Source, views: Sequence[SourceView]) -
     )
     if without:
         warn(
-            f"{len(without)} of {len(without) + len(used)} photographs have no camera in {source.cameras} "
+            f"{len(without)} of {len(without) + len(used)} photographs have no camera in {about.cameras} "
             f"and are not used (first: {without[0].name})"
         )
-    return replace(source, without_camera=len(without))
+    return replace(about, without_camera=len(without))
 
 
-def _read_transforms(root: Path, model: Path | None) -> tuple[list[SourceView], SourcePoints, Source]:
+def _read_transforms(root: Path, model: Path | None) -> tuple[list[SourceView], SourcePoints, About]:
     content = transforms.read_transforms(root)
     notes = list(content.notes)
     if content.files[0].name == "transforms.json":
@@ -183,8 +196,8 @@ def _read_transforms(root: Path, model: Path | None) -> tuple[list[SourceView], 
     for note in notes:
         if not note.startswith("fields without effect"):
             warn(f"{content.files[0]}: {note}")
-    source = Source(" and ".join(path.name for path in content.files), content.split, tuple(notes))
-    return content.frames, transforms_points(root, content, model), source
+    about = About(" and ".join(path.name for path in content.files), content.split, tuple(notes))
+    return content.frames, transforms_points(root, content, model), about
 
 
 def _read_colmap(

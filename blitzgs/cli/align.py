@@ -162,7 +162,7 @@ def _centres(capture: Capture) -> Float64:
 
 
 def _converted(args: argparse.Namespace, capture: Capture) -> WorldFrame:
-    known = load_world_frame(args.folder) or capture.about.source.frame
+    known = load_world_frame(args.folder) or capture.about.frame
     if known is None or not known.crs:
         _check_lengths(args.crs)
         frame = known or WorldFrame()

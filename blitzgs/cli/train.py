@@ -215,7 +215,7 @@ def _check(args: argparse.Namespace, config: Config) -> int:
     check_worlds(capture)
     lines = understood(config, capture, images)
     images.close()
-    used = [m for m, _ in find_models(capture.root) if m == capture.root / capture.about.source.cameras]
+    used = [m for m, _ in find_models(capture.root) if m == capture.root / capture.about.cameras]
     if used and (fit := fit_of(used[0])) is not None:
         lines.append(f"{'poses:':15}{fit}")
     rough = estimate(config, capture, _on_gpu(args), torch.get_num_threads())
@@ -343,7 +343,7 @@ def live_page(state: TrainingState, port: int, host: str) -> Live | None:
         test=capture.test,
         photograph=lambda index: np.asarray(images.get(index).numpy()),
         paths=state.folder / "paths",
-        frame=capture.about.source.frame,
+        frame=capture.about.frame,
     )
     try:
         page = Live(exhibit, state.schedule.iterations, host, port)
