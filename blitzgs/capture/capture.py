@@ -30,7 +30,7 @@ from blitzgs.capture.cameras import (
 )
 from blitzgs.capture.image_files import ImageHeader, read_header
 from blitzgs.capture.layouts import About, read_layout
-from blitzgs.capture.lengths import Sight, find_apart, measured_extent
+from blitzgs.capture.lengths import blind_views, find_apart, measured_extent, near_plane, nearest_depths
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.masks import FindDamage, check_mask_sizes, check_masks, damaged, find_masks
 from blitzgs.capture.names import MissingImagesError as MissingImagesError
@@ -78,7 +78,7 @@ class Capture:
     has_alpha: bool
     """Whether some image has an alpha channel; `ImageStore` composites it over its background."""
     near: float
-    """Near plane by the depths of the points that training views see (`Sight.near`), in world units."""
+    """Near plane (`lengths.near_plane`) by the depths of the points that training views see, world units."""
     apart: list[int]
     """Cameras that are so far from the others that no length is measured by them."""
     about: About
@@ -175,9 +175,9 @@ def load_capture(
         points = points_at_random(root, [c for i, c in enumerate(cameras) if i not in apart_left], offset)
     points.positions = points.positions - offset
     extent = measured_extent(train_centres, points.positions)
-    sight = Sight.of(cameras, points.positions)
-    blind = sight.blind(cameras, points.positions)
-    near = sight.near([i for i in train if i not in apart_left] if has_points else [], extent)
+    nearest = nearest_depths(cameras, points.positions)
+    blind = blind_views(nearest, cameras, points.positions)
+    near = near_plane(nearest[[i for i in train if has_points and i not in apart_left]], extent)
     with_alpha = sum(header.has_alpha for header in headers)
     about = replace(
         about,

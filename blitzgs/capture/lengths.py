@@ -108,56 +108,51 @@ def depths_seen(camera: Camera, points: Float64) -> Float64:
     return np.asarray(depth[(u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)])
 
 
-@dataclass(frozen=True)
-class Sight:
-    """What the views see of the points, by a sample of them."""
+def nearest_depths(cameras: Sequence[Camera], points: Float64) -> Float64:
+    """Return the depth [V] of the nearest re-centred points [M, 3] that each view sees, by a sample of them.
 
-    # [V] depth of the nearest points that each view sees, without the nearest 2 % of them; infinite for a
-    # view that sees none.
-    nearest: Float64
+    The nearest 2 % are skipped; infinite for a view that sees none.
+    """
+    sample = sampled(points, len(cameras))
+    nearest = np.full(len(cameras), np.inf)
+    for index, camera in enumerate(cameras):
+        depths = depths_seen(camera, sample)
+        if len(depths):
+            # At least one point is skipped where there are several.
+            rank = min(len(depths) - 1, max(1, int(_SKIPPED_POINTS * len(depths))))
+            nearest[index] = np.partition(depths, rank)[rank]
+    return nearest
 
-    @classmethod
-    def of(cls, cameras: Sequence[Camera], points: Float64) -> Sight:
-        """Measure the views of cameras; `points` [M, 3] are re-centred."""
-        sample = sampled(points, len(cameras))
-        nearest = np.full(len(cameras), np.inf)
-        for index, camera in enumerate(cameras):
-            depths = depths_seen(camera, sample)
-            if len(depths):
-                # At least one point is skipped where there are several.
-                rank = min(len(depths) - 1, max(1, int(_SKIPPED_POINTS * len(depths))))
-                nearest[index] = np.partition(depths, rank)[rank]
-        return cls(nearest)
 
-    def blind(self, cameras: Sequence[Camera], points: Float64) -> int:
-        """Return how many views see none of the points; warn if most do, and name the first."""
-        blind = [c.name for c, depth in zip(cameras, self.nearest, strict=True) if np.isinf(depth)]
-        if 2 * len(blind) > len(cameras):
-            warn(
-                f"{len(blind)} of {len(cameras)} views (first: {blind[0]}) see none of the points: do the "
-                "poses and the points belong together, and do the cameras look along +z?"
-            )
-        if len(blind) == len(cameras):  # a view may see points that are not in the sample
-            some = cameras[:: max(1, len(cameras) // 64)]
-            return len(blind) - sum(len(depths_seen(camera, points)) > 0 for camera in some)
-        return len(blind)
+def blind_views(nearest: Float64, cameras: Sequence[Camera], points: Float64) -> int:
+    """Return how many views see none of the points; warn if most do, and name the first."""
+    blind = [camera.name for camera, depth in zip(cameras, nearest, strict=True) if np.isinf(depth)]
+    if 2 * len(blind) > len(cameras):
+        warn(
+            f"{len(blind)} of {len(cameras)} views (first: {blind[0]}) see none of the points: do the poses "
+            "and the points belong together, and do the cameras look along +z?"
+        )
+    if len(blind) == len(cameras):  # a view may see points that are not in the sample
+        some = cameras[:: max(1, len(cameras) // 64)]
+        return len(blind) - sum(len(depths_seen(camera, points)) > 0 for camera in some)
+    return len(blind)
 
-    def near(self, views: Sequence[int], extent: float) -> float:
-        """Return the near plane: less than the depth of what views see, and at most 0.01 x the extent."""
-        most = NEAR_OF_EXTENT * extent
-        depths = np.sort(self.nearest[list(views)])
-        depths = depths[np.isfinite(depths)]
-        if len(depths) == 0:
-            return most
-        near = min(most, _NEAR_OF_DEPTH * float(depths[int(_SKIPPED_VIEWS * len(depths))]))
-        lost = int((depths <= most).sum())
-        if 2 * lost > len(depths):
-            # The cameras are spread over far more than they are away from what they show, as along a street.
-            warn(
-                f"{lost} of {len(depths)} views begin to see points at less than {NEAR_OF_EXTENT:g} x the "
-                f"extent ({most:.4g}), so the near plane is at {near:.4g}; model.near sets another"
-            )
-        return near
+
+def near_plane(nearest: Float64, extent: float) -> float:
+    """Return a near plane: less than the depths that views see, and at most 0.01 x the extent."""
+    most = NEAR_OF_EXTENT * extent
+    depths = np.sort(nearest[np.isfinite(nearest)])
+    if len(depths) == 0:
+        return most
+    near = min(most, _NEAR_OF_DEPTH * float(depths[int(_SKIPPED_VIEWS * len(depths))]))
+    lost = int((depths <= most).sum())
+    if 2 * lost > len(depths):
+        # The cameras are spread over far more than they are away from what they show, as along a street.
+        warn(
+            f"{lost} of {len(depths)} views begin to see points at less than {NEAR_OF_EXTENT:g} x the extent "
+            f"({most:.4g}), so the near plane is at {near:.4g}; model.near sets another"
+        )
+    return near
 
 
 def measured_extent(centres: Float64, points: Float64) -> float:

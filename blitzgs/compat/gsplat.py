@@ -32,8 +32,7 @@ class Strategy:
     def check_sanity(self, params: Params, optimizers: Optimizers) -> None:
         """Check the parameters, [N, ...] each, and their optimisers.
 
-        Raises:
-            ValueError: a required parameter or an optimiser is missing, or an optimiser has several groups.
+        ValueError: a required parameter or an optimiser is missing, or an optimiser has several groups.
         """
         missing = [name for name in _REQUIRED if name not in params]
         if missing:
@@ -211,10 +210,8 @@ class DefaultStrategy(Strategy):
             scene.on_split(split, torch.cat([(~splits).nonzero()[:, 0], beyond]))
             scene.on_remove(pruned)
         if self.verbose:
-            print(
-                f"Step {step}: {len(cloned)} cloned, {len(split)} split, {len(rows) - len(lives)} pruned, "
-                f"now {len(lives)} Gaussians"
-            )
+            counts = f"{len(cloned)} cloned, {len(split)} split, {len(rows) - len(lives)} pruned"
+            print(f"Step {step}: {counts}, now {len(lives)} Gaussians")
 
     def _children(self, params: Params, split: Tensor) -> dict[str, Tensor]:
         """Return what differs from the parents: the first children of the rows `split`, then the second."""
@@ -248,8 +245,7 @@ class MCMCStrategy(Strategy):
         noise_opacity_t: opacity at which the noise falls to a half.
         noise_opacity_k: steepness of this fall.
 
-    Raises:
-        ValueError: `refine_every` is no number of steps.
+    ValueError: `refine_every` is no number of steps.
     """
 
     cap_max: int = 1_000_000
@@ -344,10 +340,8 @@ class MCMCStrategy(Strategy):
             if scene is not None:
                 scene.on_sample_add(sources)
         if self.verbose:
-            print(
-                f"Step {step}: {len(dead)} relocated, {max(0, added)} added, now {len(params['means'])} "
-                "Gaussians"
-            )
+            now = f"now {len(params['means'])} Gaussians"
+            print(f"Step {step}: {len(dead)} relocated, {max(0, added)} added, {now}")
 
     def _shares(self, params: Params, sources: Tensor) -> dict[str, Tensor]:
         """Return the opacities and scales when each Gaussian is copied as often as it is in `sources`."""

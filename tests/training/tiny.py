@@ -19,7 +19,7 @@ from torch import Tensor
 
 from blitzgs.capture.image_files import reduced, reduced_mask
 from blitzgs.capture.images import ImageMemory
-from blitzgs.capture.lengths import Sight
+from blitzgs.capture.lengths import near_plane, nearest_depths
 from blitzgs.config.fields import Config
 from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks
@@ -68,7 +68,7 @@ class Capture:
 
     @property
     def near(self) -> float:
-        return Sight.of(self.cameras, self.points).near(self.train, self.extent)
+        return near_plane(nearest_depths(self.cameras, self.points)[self.train], self.extent)
 
 
 class Images:
