@@ -13,8 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from blitzgs.capture.cameras import Float64
-from blitzgs.capture.colmap import rotation_to_quat
 from blitzgs.capture.world import GEO, WorldFrame, read_world_frame
 from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
@@ -26,6 +24,7 @@ from blitzgs.runs.folder import Model
 from blitzgs.runs.run_files import Progress, TrainedModel
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.output import write_file
+from blitzgs.util.rotations import quaternions
 from blitzgs.view.gate import LodGate
 from blitzgs.view.views import Space
 
@@ -60,7 +59,7 @@ def in_world(model: Model, frame: WorldFrame) -> Model:
     return replace(
         model,
         means=(model.means.double() @ rotation.T).float(),
-        quats=_product(rotation_to_quat(frame.rotation), model.quats.double()).float(),
+        quats=_product(quaternions(rotation[None])[0], model.quats.double()).float(),
         sh=rotated_harmonics(model.sh, rotation),
         space=moved,
     )
@@ -85,7 +84,7 @@ def rotated_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
     return out
 
 
-def _product(left: Float64, right: Tensor) -> Tensor:
+def _product(left: Tensor, right: Tensor) -> Tensor:
     """Return the products of a quaternion [4] and quaternions [N, 4], w, x, y, z."""
     w, x, y, z = left.tolist()
     rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]

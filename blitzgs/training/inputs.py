@@ -14,8 +14,8 @@ from pathlib import Path
 
 import blitzgs
 from blitzgs.capture.capture import Capture, MissingImagesError, capture_fingerprint, load_capture
-from blitzgs.capture.check_files import FindDamage, damaged
 from blitzgs.capture.images import ImageStore, decoded_shapes
+from blitzgs.capture.masks import FindDamage, damaged
 from blitzgs.capture.shared_images import SharedImages, size_of
 from blitzgs.config.fields import Config, DataConfig
 from blitzgs.config.files import ConfigError, flat, to_dict

@@ -159,8 +159,8 @@ def _describe(folder: Path, config: Config, capture: Capture, run_id: str, is_ne
     save_config(config, folder / run_files.CONFIG)
     if is_new or not (folder / CAMERAS).exists():
         save_cameras(folder, capture, run_id)
-    if is_new and capture.about.source.frame is not None:
-        save_world_frame(folder, capture.about.source.frame)
+    if is_new and capture.about.frame is not None:
+        save_world_frame(folder, capture.about.frame)
 
 
 def _resolved(config: Config, capture: Capture, restored: run_files.Restored | None) -> Config:
