@@ -13,21 +13,19 @@ import os
 import re
 import shutil
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
 import torch
-from safetensors import safe_open
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.redistribution import global_positions
-from blitzgs.runs.checkpoint_files import DAMAGE, Shard, finish, header_of, verified, write_shard
+from blitzgs.runs.checkpoint_files import DAMAGE, Shard, finish, opened, verified, write_shard
 from blitzgs.util.output import check_space, explain, is_lack_of_space
 
 SHARED = "shared.safetensors"
@@ -245,7 +243,7 @@ def load(
         raise CheckpointError(f"checkpoint {path} is damaged: {'; '.join(sorted(set(problems)))}")
     shared = {}
     if manifest.shared is not None:
-        with _opened(path / manifest.shared.file) as file:
+        with opened(path / manifest.shared.file) as file:
             shared = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     return read_share(path, manifest.shards, ranks, torch.device(device)), manifest.state, shared
 
@@ -254,33 +252,23 @@ def read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.devi
     """Read this rank's share of the columns in a folder's shards, as `load` does, without verifying files."""
     sizes = [shard.rows for shard in shards]
     if len(shards) == ranks.world_size:
-        with _opened(path / shards[ranks.rank].file) as file:
+        with opened(path / shards[ranks.rank].file) as file:
             return {name: file.get_tensor(name).to(device) for name in file.keys()}  # noqa: SIM118
-    positions = [global_positions(sizes, index) for index in range(len(shards))]
-    count = len(range(ranks.rank, sum(sizes), ranks.world_size))
-    columns = {
-        name: torch.empty((count, *spec.shape[1:]), dtype=spec.dtype, device=device)
-        for name, spec in header_of(path / shards[0].file).items()
-    }
-    for shard, order in zip(shards, positions, strict=True):
-        chosen = (order % ranks.world_size == ranks.rank).nonzero().squeeze(1)
-        if len(chosen) == 0:
-            continue
-        target = (order[chosen] // ranks.world_size).to(device)
-        with _opened(path / shard.file) as file:
-            for name, column in columns.items():
-                column[target] = file.get_tensor(name)[chosen].to(device)
+    parts = []
+    for index, shard in enumerate(shards):
+        order = global_positions(sizes, index)
+        rows = (order % ranks.world_size == ranks.rank).nonzero().squeeze(1)
+        if len(rows):
+            parts.append((shard, rows, order[rows] // ranks.world_size))
+    count, none = sum(len(rows) for _, rows, _ in parts), torch.empty(0, dtype=torch.int64)
+    columns: dict[str, Tensor] = {}
+    for shard, rows, target in parts or [(shards[0], none, none)]:
+        with opened(path / shard.file) as file:
+            for name in file.keys():  # noqa: SIM118
+                part = file.get_tensor(name)[rows].to(device)
+                column = columns.setdefault(name, part.new_empty((count, *part.shape[1:])))
+                column[target.to(device)] = part
     return columns
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """Open a safetensors file, also if its path is not valid UTF-8."""
-    with open(path, "rb") as file:
-        is_text = os.fsencode(path).decode(errors="replace") == str(path)
-        # The package accepts only UTF-8 paths.
-        with safe_open(path if is_text else f"/proc/self/fd/{file.fileno()}", "pt") as shard:
-            yield shard
 
 
 def _delete_old(directory: Path, keep: int, reached: Callable[[str], None]) -> Thread:

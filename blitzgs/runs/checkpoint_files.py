@@ -11,13 +11,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import safe_open
 from torch import Tensor
 
 from blitzgs.util.output import sync_to_disk
@@ -134,17 +136,7 @@ _DTYPES = {
     torch.uint8: "U8",
     torch.bool: "BOOL",
 }
-_BY_NAME = {name: dtype for dtype, name in _DTYPES.items()}
 _CHUNK_BYTES = 64 << 20
-
-
-@dataclass
-class ColumnSpec:
-    """Dtype, shape and first byte of one column of a shard file."""
-
-    dtype: torch.dtype
-    shape: tuple[int, ...]
-    start: int
 
 
 def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[str], None]) -> tuple[int, str]:
@@ -198,31 +190,13 @@ def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[st
     return size, digest.hexdigest()
 
 
-def header_of(path: Path) -> dict[str, ColumnSpec]:
-    """Read the names, dtypes, shapes and places of the columns in a safetensors file."""
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """Open a safetensors file as its package does, also if the path is not valid UTF-8."""
     with open(path, "rb") as file:
-        head = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-        body = file.tell()
-    return {
-        name: ColumnSpec(_BY_NAME[entry["dtype"]], tuple(entry["shape"]), body + entry["data_offsets"][0])
-        for name, entry in head.items()
-        if name != "__metadata__"
-    }
-
-
-def read_rows(path: Path, first: int, last: int) -> dict[str, Tensor]:
-    """Read the rows from `first` to before `last` of all columns in a safetensors file."""
-    columns = {}
-    with open(path, "rb") as file:
-        for name, spec in header_of(path).items():
-            shape = (min(last, spec.shape[0]) - first, *spec.shape[1:])
-            column = torch.empty(shape, dtype=spec.dtype)
-            data = column.view(-1).view(torch.uint8).numpy()
-            file.seek(spec.start + first * (len(data) // shape[0]))
-            if file.readinto(data.data) != len(data):
-                raise ValueError(f"{path} is cut off")
-            columns[name] = column
-    return columns
+        is_text = os.fsencode(path).decode(errors="replace") == str(path)
+        with safe_open(path if is_text else f"/proc/self/fd/{file.fileno()}", "pt") as columns:
+            yield columns
 
 
 def file_digest(path: Path) -> str:

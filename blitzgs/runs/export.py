@@ -26,8 +26,9 @@ from blitzgs.formats.models import Format, check_replaces, offset_of
 from blitzgs.formats.selection import Selected, Selection
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint, run_files
+from blitzgs.runs.cameras import SHARED_EXPOSURES
 from blitzgs.runs.checkpoint import CheckpointError
-from blitzgs.runs.checkpoint_files import DAMAGE, Shard, header_of, read_rows, verified
+from blitzgs.runs.checkpoint_files import DAMAGE, Shard, opened, verified
 from blitzgs.runs.folder import Model
 from blitzgs.runs.folder_checks import check_own
 from blitzgs.runs.lod import lod_gate, model_gate
@@ -310,7 +311,10 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
         run_files.compare_with_file(config, folder / run_files.CONFIG)
         gate = lod_gate(config, progress)
         trained = _Shards(path, manifest.shards, config, progress.step, space.extent, gate is not None)
-        exposed = manifest.shared is not None and "exposures" in header_of(path / manifest.shared.file)
+        exposed = False
+        if manifest.shared is not None:
+            with opened(path / manifest.shared.file) as shared:
+                exposed = SHARED_EXPOSURES in shared.keys()  # noqa: SIM118
         return RunSource(trained, space, _comments(config, space, gate, exposed), config, progress)
     if refused:
         raise CheckpointError(f"no sound checkpoint in {folder}: {'; '.join(refused)}")
@@ -334,14 +338,17 @@ class _Shards:
 
     @property
     def degree(self) -> int:
-        return int(header_of(self.path / self.shards[0].file)["sh"].shape[1] ** 0.5) - 1
+        with opened(self.path / self.shards[0].file) as file:
+            return math.isqrt(file.get_slice("sh").get_shape()[1]) - 1
 
     def blocks(self) -> Iterator[Gaussians]:
         optimiser = TableAdam(self.config.optimiser, Schedule(self.config.schedule), self.extent, "cpu")
         for shard in self.shards:
             for first in range(0, shard.rows, gaussians.BLOCK):
                 last = min(first + gaussians.BLOCK, shard.rows)
-                table = GaussianTable(read_rows(self.path / shard.file, first, last))
+                with opened(self.path / shard.file) as file:
+                    rows = {name: file.get_slice(name)[first:last] for name in file.keys()}  # noqa: SIM118
+                table = GaussianTable(rows)
                 with torch.no_grad():
                     optimiser.catch_up(table, None, self.step)
                 yield Gaussians(

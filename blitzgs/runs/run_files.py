@@ -90,16 +90,23 @@ class Progress:
 
 @dataclass
 class TrainedModel:
-    """A model read from a run's checkpoint, without pending optimiser steps, ready to render."""
+    """A model read from a run's checkpoint, with its pending optimiser steps (`restore`) or without."""
 
     config: Config
     progress: Progress  # progress of the run at the checkpoint
     space: Space  # maps between the trained world and the capture's world
     table: GaussianTable  # this rank's Gaussians
+    run_id: str = ""  # identifies the run in its log
+    source: str = ""  # name of the checkpoint and why it was chosen, as text
+    # Tensors that are the same on all ranks: `TileOwners.columns`, and those of the exposures.
+    shared: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
     # Bytes of a device that the Gaussians may take, if the run trained with a pool; else 0.
     pool_bytes: int = 0
-    # Gain and bias of each training photograph, [T, 2, 3]; None if the run has none.
-    exposures: torch.Tensor | None = None
+
+    @property
+    def exposures(self) -> torch.Tensor | None:
+        """Gain and bias of each training photograph, [T, 2, 3]; None if the run has none."""
+        return stored_exposures(self.shared)
 
     def gaussians_on(self, device: torch.device) -> TableOrPool:
         """Return the Gaussians that views are rendered from on a device.
@@ -157,23 +164,9 @@ def _memory_left(device: torch.device) -> int:
     return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else available_bytes() or 0
 
 
-@dataclass
-class Restored:
-    """The content of a run's checkpoint."""
-
-    table: GaussianTable  # this rank's Gaussians
-    progress: Progress  # progress of the run at the checkpoint
-    space: Space  # maps between the trained world and the capture's world
-    config: Config
-    run_id: str  # identifies the run in its log
-    source: str  # name of the checkpoint and why it was chosen, as text
-    # Tensors that are the same on all ranks: `TileOwners.columns`, and those of the exposures.
-    shared: dict[str, torch.Tensor]
-
-
 def restore(
     folder: Path, ranks: Ranks, device: torch.device | None = None, only: str | None = None
-) -> Restored | None:
+) -> TrainedModel | None:
     """Read a run's newest undamaged checkpoint, or the one named `only`; None: the run has no checkpoint.
 
     The Gaussians go to `device`, else to the ranks' device. CheckpointError: all checkpoints are damaged, or
@@ -194,9 +187,8 @@ def restore(
         # Each rank had an order of its own, and the spread is of another number of blocks.
         sort_rows(table)
         progress.sorted_spread = 0
-    return Restored(
-        table, progress, space, config, state.get("run", ""), f"{loaded.name} ({why}{skipped})", loaded.shared
-    )
+    source = f"{loaded.name} ({why}{skipped})"
+    return TrainedModel(config, progress, space, table, state.get("run", ""), source, loaded.shared)
 
 
 def parsed(state: Mapping[str, Any], path: Path) -> tuple[Progress, Space, Config]:
@@ -239,19 +231,17 @@ def open_model(
     check_is_run(folder)
     pool_bytes = int((_resident_gb(folder / CONFIG) if resident_gb is None else resident_gb) * 1e9)
     home = torch.device("cpu") if pool_bytes > 0 else ranks.device
-    restored = restore(folder, ranks, home, only)
-    if restored is None:
+    model = restore(folder, ranks, home, only)
+    if model is None:
         raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
-    config, progress, table = restored.config, restored.progress, restored.table
+    config, model.pool_bytes = model.config, pool_bytes
     if ranks.rank == 0:
         compare_with_file(config, folder / CONFIG)
     if data is not None:
-        config = changed(config, "data", path=str(data))
-    optimiser = TableAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
-    optimiser.catch_up(table, None, progress.step)
-    return TrainedModel(
-        config, progress, restored.space, table, pool_bytes, stored_exposures(restored.shared)
-    )
+        model.config = changed(config, "data", path=str(data))
+    optimiser = TableAdam(config.optimiser, Schedule(config.schedule), model.space.extent, home)
+    optimiser.catch_up(model.table, None, model.progress.step)
+    return model
 
 
 def _resident_gb(path: Path) -> float:
