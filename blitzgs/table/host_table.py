@@ -42,25 +42,28 @@ class HostTable(GaussianTable):
             self._store_raw(name, self.columns[name])
 
     def _store_raw(self, name: str, tensor: Tensor) -> None:
-        memory = self._memory.get(name)
-        if not (
-            memory is not None
-            and memory.dtype == tensor.dtype
-            and memory.shape[1:] == tensor.shape[1:]
-            and len(memory) >= len(tensor)
-        ):
+        if not fits(self._memory.get(name), tensor, len(tensor)):
             # Free the old memory first, so that the host never holds both.
             self._memory.pop(name, None)
             self.columns[name] = tensor
-            del memory
-            memory = self._memory[name] = self._allocate(tensor, int(GROWTH * len(tensor)))
-        self.columns[name] = memory[: len(tensor)].copy_(tensor)
+            self._memory[name] = self._allocate(tensor, int(GROWTH * len(tensor)))
+        self.columns[name] = self._memory[name][: len(tensor)].copy_(tensor)
 
     def _allocate(self, like: Tensor, rows: int) -> Tensor:
         return _allocate(like, rows, self._pinned)
 
     def _reorder(self, name: str, order: Tensor) -> None:
         self._store(name, take_rows(self[name], order))
+
+
+def fits(memory: Tensor | None, like: Tensor, rows: int) -> bool:
+    """Tell whether memory can hold some rows of a column."""
+    return (
+        memory is not None
+        and memory.dtype == like.dtype
+        and memory.shape[1:] == like.shape[1:]
+        and len(memory) >= rows
+    )
 
 
 def available_bytes() -> int | None:

@@ -19,8 +19,7 @@ from blitzgs.population.importance import is_culled
 from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import image_metrics
 from blitzgs.runs.lod import lod_gate, model_gate
-from blitzgs.table.layouts import CULL
-from blitzgs.table.table import GaussianTable
+from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.training import view_level
 from blitzgs.training.events import evaluate
 from blitzgs.training.step import Stepper
