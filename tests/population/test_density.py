@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs.config.fields import PopulationConfig
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.counter_random import hash_keys, normal
@@ -196,11 +197,9 @@ def test_children_have_their_parents_phi_and_cull_row():
 
 
 def test_the_tightest_limit_wins_and_is_named():
-    def limit(**changed):
-        none = {
-            "max_gaussians": 0, "pixels_per_gaussian": 0.0, "gaussians_per_point": 0.0, "memory_count": None,
-        }  # fmt: skip
-        return growth_limit(**none | {"pixels": 1_000_000, "points": 3_000} | changed)
+    def limit(points=3_000, memory_count=None, **changed):
+        none = {"max_gaussians": 0, "pixels_per_gaussian": 0.0, "gaussians_per_point": 0.0}
+        return growth_limit(PopulationConfig(**none | changed), 1_000_000, points, memory_count)
 
     by_pixels = GrowthLimit(41_666, "population.pixels_per_gaussian")
     by_points = GrowthLimit(31_500, "population.gaussians_per_point")
