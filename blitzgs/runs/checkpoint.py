@@ -52,7 +52,6 @@ class Saving:
         ranks: Ranks,
         keep: int = 3,
         shared: Mapping[str, Tensor] | None = None,
-        reached: Callable[[str], None] = lambda point: None,
     ) -> None:
         """Begin to write a checkpoint. Collective.
 
@@ -63,8 +62,6 @@ class Saving:
             state: the rest of what a resumed run needs, as JSON values; rank 0's is stored.
             keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
             shared: tensors that are the same on all ranks; rank 0's are stored, in a separate file.
-            reached: called at each point at which the save may be interrupted, with the point's name; the
-                tests of crashes stop the process there.
 
         Raises:
             CheckpointError: rank 0 cannot read the folder.
@@ -74,7 +71,6 @@ class Saving:
             raise ValueError(f"checkpoint: keep must be at least 1, got {keep}")
         self._rows = _common_length(columns)
         self._directory, self._state, self._ranks, self._keep = Path(directory), state, ranks, keep
-        self._reached = reached
         name, problem = "", None
         if ranks.rank == 0:
             try:
@@ -112,21 +108,19 @@ class Saving:
         ready: torch.cuda.Event | None,
     ) -> tuple[Shard | None, Shard | None, str | None, bool]:
         """Write this rank's files; return what they are, or why there are none and whether space lacks."""
-        ranks, reached = self._ranks, self._reached
+        ranks = self._ranks
         try:
-            reached("begin")
             self._folder.mkdir(parents=True, exist_ok=True)
             check_space(self._folder, columns)
-            reached("folder made")
             file = f"shard_{ranks.rank:04d}_of_{ranks.world_size:04d}.safetensors"
             # On a stream of its own, copies to the host wait for no later work.
             with torch.cuda.stream(None if ready is None else torch.cuda.Stream(device)):
                 if ready is not None:
                     ready.wait()
-                mine = Shard(file, self._rows, *write_shard(self._folder / file, columns, reached))
+                mine = Shard(file, self._rows, *write_shard(self._folder / file, columns))
                 common = None
                 if shared:
-                    written = write_shard(self._folder / SHARED, shared, lambda point: None)
+                    written = write_shard(self._folder / SHARED, shared)
                     common = Shard(SHARED, 0, *written)
             return mine, common, None, True
         except OSError as error:
@@ -150,7 +144,7 @@ class Saving:
             try:
                 with ranks.watchdog.working("finishing a checkpoint"):
                     shards = [shard for shard, _, _ in results if shard]
-                    finish(self._folder, path, shards, common, self._state, ranks.world_size, self._reached)
+                    finish(self._folder, path, shards, common, self._state, ranks.world_size)
             except OSError as error:
                 problems.append(f"rank 0 could not write: {explain(error)}")
                 lacks_space = is_lack_of_space(error)
@@ -164,7 +158,7 @@ class Saving:
             )
         if ranks.rank == 0:
             try:
-                self.deleting = _delete_old(self._directory, self._keep, self._reached)
+                self.deleting = _delete_old(self._directory, self._keep)
             except OSError as error:
                 # The new checkpoint is complete; the next save tries to delete the old ones again.
                 warnings.warn(f"an older checkpoint could not be deleted: {error}", stacklevel=2)
@@ -271,12 +265,11 @@ def read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.devi
     return columns
 
 
-def _delete_old(directory: Path, keep: int, reached: Callable[[str], None]) -> Thread:
+def _delete_old(directory: Path, keep: int) -> Thread:
     """Start to delete all but the newest `keep`: deleting gigabytes takes seconds."""
     for name in names_of(directory)[:-keep]:
         # Rename first: an interrupted deletion must not leave half a checkpoint under a final name.
         (directory / name).rename(directory / (_UNFINISHED + name))
-        reached("old one renamed")
     # The next save makes a folder that is not among these.
     deleting = Thread(target=_delete, args=(list(directory.glob(_UNFINISHED + "*")),))
     deleting.start()

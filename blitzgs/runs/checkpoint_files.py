@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -97,7 +97,6 @@ def finish(
     shared: Shard | None,
     state: Mapping[str, Any],
     world_size: int,
-    reached: Callable[[str], None],
 ) -> None:
     """Write the manifest beside the shards and give the folder its final name, each step synced."""
     missing = [shard.file for shard in shards if not (unfinished / shard.file).exists()]
@@ -113,15 +112,11 @@ def finish(
     content = json.loads(json.dumps(content))  # tuples become lists: what is read back has the same digest
     with open(unfinished / MANIFEST, "w") as file:
         json.dump(content | {"sha256": _digest(content)}, file, indent=1)
-        reached("manifest written")
         file.flush()
         os.fsync(file.fileno())
     sync_to_disk(unfinished)
-    reached("manifest synced")
     unfinished.rename(path)
-    reached("renamed")
     sync_to_disk(path.parent)
-    reached("finished")
 
 
 _DTYPES = {
@@ -139,10 +134,10 @@ _DTYPES = {
 _CHUNK_BYTES = 64 << 20
 
 
-def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[str], None]) -> tuple[int, str]:
+def write_shard(path: Path, columns: Mapping[str, Tensor]) -> tuple[int, str]:
     """Write and sync columns, on any device; return the size in bytes and the SHA-256 in hexadecimal.
 
-    `reached` is called at labelled points. ValueError: a column has a dtype that the format lacks.
+    ValueError: a column has a dtype that the format lacks.
     """
     # Widest elements first, so that every column starts at a multiple of its element size.
     names = sorted(columns, key=lambda name: (-columns[name].element_size(), name))
@@ -174,19 +169,13 @@ def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[st
 
         put(len(head).to_bytes(8, "little"))
         put(head)
-        for index, name in enumerate(names):
+        for name in names:
             flat = columns[name].detach().contiguous().view(-1).view(torch.uint8)
             for part in flat.split(_CHUNK_BYTES):
                 put(memoryview(part.cpu().numpy()))
-            if index == len(names) // 2:
-                file.flush()
-                reached("shard half written")
         file.flush()
-        reached("shard written")
         os.fsync(file.fileno())
         size = file.tell()
-    # The end of the block has waited for the thread.
-    reached("shard synced")
     return size, digest.hexdigest()
 
 
