@@ -231,17 +231,9 @@ def rasterization(
         gaussians = with_covariances(gaussians, covars, sparse_grad, return_normals)
     if with_ut:
         gaussians = with_lenses(gaussians, camera_model, rolling_shutter, ut_params, **lens)
+    degree, antialiased = sh_degree or 0, rasterize_mode == "antialiased"
     projection = ProjectionOptions(
-        width,
-        height,
-        tile_size,
-        sh_degree or 0,
-        near_plane,
-        far_plane,
-        eps2d,
-        radius_clip,
-        antialiased=rasterize_mode == "antialiased",
-        raw=False,
+        width, height, tile_size, degree, near_plane, far_plane, eps2d, radius_clip, antialiased, False
     )
     background = None
     if backgrounds is not None:

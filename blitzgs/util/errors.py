@@ -1,16 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors with a remedy: arguments of the wrong type, and memory that does not suffice."""
+"""Errors with a remedy: packages that are missing, arguments of the wrong type, and lack of memory."""
 
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from numbers import Real
+from types import ModuleType
 
 import psutil
 import torch
 from torch import Tensor
 
 from blitzgs.util.terminal import amount
+
+
+def require(package: str, why: str) -> ModuleType:
+    """Import an optional package (ImportError: it is not installed; the message says `why` it is needed)."""
+    try:
+        return import_module(package)
+    except ImportError as error:
+        raise ImportError(f"{why} ({error})") from error
 
 
 def check_tensor(name: str, value: object) -> None:
