@@ -10,8 +10,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from blitzgs.util.output import write_file
 from blitzgs.viewer.paths import CameraPath, Keyframe, from_json, to_json
 from blitzgs.viewer.world import Stance
@@ -55,8 +53,7 @@ class Route:
         """Add the present viewpoint."""
         visitor = self._visitor
         stance, aspect = visitor.stance, visitor.client.camera.aspect
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = stance.rotation, visitor.world.capture_position(stance.position)
+        pose = visitor.world.capture_pose(stance)
         self.path.keyframes.append(Keyframe(pose, math.degrees(stance.fov), aspect))
         self._tell()
 
