@@ -26,8 +26,8 @@ from blitzgs.ops.population import density_stats_
 from blitzgs.population.importance import PHI
 from blitzgs.runs import run_files
 from blitzgs.runs.guard import LossGuard, ModelLostError
-from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.log import RunLog
+from blitzgs.runs.run_files import lod_gate
 from blitzgs.spawn.gate import lineage_subject
 from blitzgs.table.pool import PoolError
 from blitzgs.training import view_level
@@ -305,19 +305,11 @@ class Trainer:
         Radii are counted in pixels of the whole photograph, and gradients do not depend on the resolution.
         """
         splats, views, table = frame.projected, frame.views, self.state.stepper.table
-        density_stats_(
-            table["grad_sum"],
-            table["grad_count"],
-            table["max_radii"],
-            splats.visible_ids,
-            splats.splat_offsets,
-            v_means2d,
-            splats.conics if reduction == 1 else splats.conics / reduction**2,
-            views.width,
-            views.height,
-            float(len(views)),
-            table[PHI] if self.state.config.population.phi and PHI in table else None,
-        )
+        conics = splats.conics if reduction == 1 else splats.conics / reduction**2
+        of_splats = splats.visible_ids, splats.splat_offsets, v_means2d, conics
+        phi = table[PHI] if self.state.config.population.phi and PHI in table else None
+        statistics = table["grad_sum"], table["grad_count"], table["max_radii"]
+        density_stats_(*statistics, *of_splats, views.width, views.height, float(len(views)), phi)
 
     def _announce(self) -> None:
         """Log the start of the training: origin, population, views and ranks."""

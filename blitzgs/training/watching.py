@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs.lod import model_gate
+from blitzgs.runs.run_files import model_gate
 from blitzgs.table.pool import Pool
 from blitzgs.training.events import save
 from blitzgs.training.state import TrainingState
