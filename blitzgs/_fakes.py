@@ -41,8 +41,8 @@ def _by_names(name: str, fake: Callable[[Arguments], Any]) -> Callable[..., Any]
 # Ops that return nothing.
 _IN_PLACE = (
     "copy_to_host_", "density_stats_", "gate_views_", "lazy_adam_catch_up_", "lazy_adam_step_", "mass_cut_",
-    "position_noise_", "project_bwd_step_", "put_rows_", "swap_blocks_", "take_rows_", "update_block_bounds_",
-    "view_sums_",
+    "position_noise_", "project_bwd_step_", "put_rows_", "share_rows_", "swap_blocks_", "take_rows_",
+    "update_block_bounds_", "view_sums_",
 )  # fmt: skip
 
 
@@ -177,6 +177,7 @@ _FAKES: dict[str, Callable[[Arguments], Any]] = {
     "find_non_finite": lambda a: _ints(a.columns[0]),
     "first_rows": lambda a: [t.new_empty(n, *t.shape[1:]) for t, n in zip(a.columns, a.lengths, strict=True)],
     "gather_splats": lambda a: [_ints(a.packed, sum(a.group_sizes), width) for width in a.widths],
+    "hash_key": lambda a: torch.empty_like(a.hashes),
     "intersect": _intersect,
     "key_histogram": lambda a: _longs(a.keys, 1 << a.width),
     "knn_distances": lambda a: a.points.new_empty(a.points.shape[0], a.k),
@@ -186,6 +187,7 @@ _FAKES: dict[str, Callable[[Arguments], Any]] = {
         max(0, len(a.table) - a.explicit_steps), 28 * a.like.dtype.itemsize, dtype=torch.uint8
     ),
     "morton_keys": lambda a: _longs(a.points, a.points.shape[0]),
+    "overlap": lambda a: torch.empty_like(a.opacities),
     "photometric_bwd": lambda a: _contiguous(a.renders),
     "photometric_fwd": lambda a: tuple(a.renders.new_empty(a.renders.shape[0]) for _ in range(2)),
     "photometric_fwd_bwd": _photometric_fwd_bwd,

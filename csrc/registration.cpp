@@ -255,6 +255,13 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "position_noise_(Tensor(a!) means, Tensor quats, Tensor scales, Tensor opacities, Tensor ids, Tensor "
       "visible_ids, int seed, int step, float threshold, float strength) -> ()");
 
+  // Relocation: what N Gaussians at one place composite; and rows that stand for `copies` Gaussians from now
+  // on. moments: Adam's first moments of all parameters, then the second ones.
+  m.def("overlap(Tensor opacities, Tensor copies) -> Tensor");
+  m.def(
+      "share_rows_(Tensor(a!) opacities, Tensor(b!) scales, Tensor(c!)[] moments, Tensor rows, "
+      "Tensor copies, float least) -> ()");
+
   // What the spawn gate knows of candidates. columns: (grad_sum, grad_count, opacities, scales, birth, level,
   // exp_avg_sq.sh).
   m.def(
@@ -268,9 +275,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def("sectors_of_rows(Tensor rows) -> Tensor");
   m.def("rows_of_sectors(Tensor sectors, int n) -> Tensor");
 
-  // Rows of a column in another order; and rows of a column overwritten by others, or by zeros.
-  m.def("take_rows_(Tensor(a!) out, Tensor column, Tensor rows) -> ()");
-  m.def("put_rows_(Tensor(a!) column, Tensor rows, Tensor? fresh) -> ()");
+  // Rows of columns in another order; and rows of columns overwritten by others, or (no `fresh`) by zeros.
+  m.def("take_rows_(Tensor(a!)[] out, Tensor[] columns, Tensor rows) -> ()");
+  m.def("put_rows_(Tensor(a!)[] columns, Tensor rows, Tensor[] fresh) -> ()");
   // The first rows of columns, in the same memory without autograd's knowledge.
   m.def("first_rows(Tensor[] columns, int[] lengths) -> Tensor[]");
 
@@ -282,6 +289,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "swap_blocks_(Tensor(a!)[] pool, Tensor(b!)[] table, int n_written, Tensor slots, Tensor leaving, "
       "Tensor coming) -> ()");
+
+  // Hashes with one more key: a tensor, or a number where it is absent.
+  m.def("hash_key(Tensor hashes, Tensor? keys, int number) -> Tensor");
 
   // Keys that sample without replacement, and counts of keys by a digit of their bits.
   m.def("sampling_keys(Tensor weights, Tensor ids, int seed, int event) -> Tensor");

@@ -10,29 +10,26 @@ from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-# SplitMix64 (Steele, Lea, Flood 2014) as signed 64-bit integers, whose products wrap as unsigned ones do.
-_GOLDEN = 0x9E3779B97F4A7C15 - (1 << 64)
-_MIX_1 = 0xBF58476D1CE4E5B9 - (1 << 64)
-_MIX_2 = 0x94D049BB133111EB - (1 << 64)
-
 
 def hash_keys(*keys: Tensor | int) -> Tensor:
-    """Hash tuples of integers to 64 well-mixed bits.
+    """Hash tuples of integers to 64 well-mixed bits (SplitMix64; Steele, Lea, Flood 2014).
 
     `keys`: int64 tensors of one shape (or broadcastable) and integers; at least one tensor. Returns int64 of
     the broadcast shape, all 64 bits random. The order of the keys matters.
     """
-    tensors = [key for key in keys if isinstance(key, Tensor)]
-    state = torch.zeros((), dtype=torch.int64, device=tensors[0].device)
+    tensors = torch.broadcast_tensors(*(key.long() for key in keys if isinstance(key, Tensor)))
+    flat = iter([tensor.reshape(-1) for tensor in tensors])
+    state = torch.zeros(tensors[0].numel(), dtype=torch.int64, device=tensors[0].device)
     for key in keys:
-        value = key.to(torch.int64) if isinstance(key, Tensor) else key
-        state = _mix(state + _GOLDEN ^ value)
-    return state
+        state = torch.ops.blitzgs.hash_key(
+            state, *((next(flat), 0) if isinstance(key, Tensor) else (None, key))
+        )
+    return state.view(tensors[0].shape)
 
 
 def uniform(*keys: Tensor | int) -> Tensor:
     """Draw float64 numbers uniform in (0, 1), one per key tuple; see `hash_keys`."""
-    return (_shift_right(hash_keys(*keys), 11).double() + 0.5) * 2.0**-53
+    return (((hash_keys(*keys) >> 11) & ((1 << 53) - 1)).double() + 0.5) * 2.0**-53
 
 
 def normal(*keys: Tensor | int) -> Tensor:
@@ -43,17 +40,6 @@ def normal(*keys: Tensor | int) -> Tensor:
     )
     first, second = pairs.unbind(-1)
     return (-2.0 * first.log()).sqrt() * (2.0 * math.pi * second).cos()
-
-
-def _mix(value: Tensor) -> Tensor:
-    value = (value ^ _shift_right(value, 30)) * _MIX_1
-    value = (value ^ _shift_right(value, 27)) * _MIX_2
-    return value ^ _shift_right(value, 31)
-
-
-def _shift_right(value: Tensor, bits: int) -> Tensor:
-    """Shift right and fill with zeros; torch's own shift of int64 repeats the sign bit."""
-    return (value >> bits) & ((1 << (64 - bits)) - 1)
 
 
 KEY_BITS = 32

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -103,20 +102,37 @@ def overlap(opacities: Tensor, copies: Tensor) -> Tensor:
     """Return the integral of what N equal Gaussians at one position composite, over that of one of opacity 1.
 
     sum_{i=1}^{N} sum_{k=0}^{i-1} C(i-1, k) (-1)^k o^(k+1) / sqrt(k + 1), along a line through the centre
-    (Kheradmand et al. 2024, eq. 9). The sum over i of C(i-1, k) is C(N, k+1), which leaves one sum.
+    (Kheradmand et al. 2024, eq. 9).
 
     Args:
         opacities: o, float64 [M]; the sum alternates, and its terms exceed it by up to 10^5.
         copies: N, int64 [M], 1 to `MAX_COPIES`.
     """
-    n = copies.double()
-    term, total = torch.full_like(n, -1.0), torch.zeros_like(n)
-    # Terms with k > N are zero. Few rows have many copies, so reading the largest N saves most of the terms.
-    most = int(copies.max()) if copies.shape[0] > 0 else 0
-    for k in range(1, most + 1):
-        term = term * (n - (k - 1)) / k * -opacities
-        total += term / math.sqrt(k)
-    return total
+    overlaps: Tensor = torch.ops.blitzgs.overlap(opacities, copies)
+    return overlaps
+
+
+def share_rows_(
+    opacities: Tensor, scales: Tensor, moments: Sequence[Tensor], rows: Tensor, copies: Tensor, least: float
+) -> None:
+    """Let rows of a table stand for several copies each, in place.
+
+    Opacities and scales become those of `blitzgs.population.relocation.shared_among_copies`. Moments are
+    scaled as the gradients are: each of N Gaussians in one place has 1/N of the gradient of the Gaussian
+    before, and that of the logit of its opacity o changes by o' / o, since (1 - o')^N = 1 - o.
+
+    Args:
+        opacities: float32 [N], logits.
+        scales: float32 [N, 3], logarithms.
+        moments: Adam's first moments of the five parameters, then the second ones, float32 [N, ...].
+        rows: int64 [M], each at most once; not checked.
+        copies: int64 [M], 1 to `MAX_COPIES`; the row itself is one.
+        least: sharing does not reduce a logit below this.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes.
+    """
+    torch.ops.blitzgs.share_rows_(opacities, scales, list(moments), rows, copies, least)
 
 
 @torch.no_grad()

@@ -15,36 +15,38 @@ from blitzgs._torch import mark_coalesced, raw_indices, raw_values
 from blitzgs.ops.derivatives import linear_map
 
 
-def take_rows(column: Tensor, rows: Tensor, out: Tensor | None = None) -> Tensor:
-    """Return the rows `rows` of a column, as `column.index_select(0, rows)` does.
+def take_rows(
+    columns: Sequence[Tensor], rows: Tensor, out: Sequence[Tensor] | None = None
+) -> Sequence[Tensor]:
+    """Return the rows `rows` of each column, as `column.index_select(0, rows)` does.
 
     For rows whose size is a multiple of 16 bytes, torch's op is slower, because it uses a whole block of
     threads for each.
 
     Args:
-        column: [N, ...], any dtype.
+        columns: [N, ...], any dtypes.
         rows: int64 [M], from 0 to N - 1; not checked.
-        out: [M, ...], contiguous, gets the rows; it may not overlap the column. None: a new tensor.
+        out: [M, ...], contiguous, get the rows; they may not overlap the columns. None: new tensors.
 
     Returns:
-        [M, ...].
+        [M, ...] of each column.
 
     Raises:
         RuntimeError: shapes or dtypes do not fit.
     """
     if out is None:
-        out = column.new_empty((len(rows), *column.shape[1:]))
-    torch.ops.blitzgs.take_rows_(out, column, rows)
+        out = [column.new_empty((len(rows), *column.shape[1:])) for column in columns]
+    torch.ops.blitzgs.take_rows_(out, columns, rows)
     return out
 
 
-def put_rows_(column: Tensor, rows: Tensor, fresh: Tensor | None = None) -> None:
-    """Overwrite rows of a column, in place (RuntimeError: shapes or dtypes do not fit).
+def put_rows_(columns: Sequence[Tensor], rows: Tensor, fresh: Sequence[Tensor] = ()) -> None:
+    """Overwrite rows of columns, in place (RuntimeError: shapes or dtypes do not fit).
 
-    `column`: [N, ...], any dtype, contiguous. `rows`: int64 [M], from 0 to N - 1, each at most once; not
-    checked. `fresh`: what the rows become, [M, ...], of the dtype and row shape of `column`; None: zeros.
+    `columns`: [N, ...], any dtypes, contiguous. `rows`: int64 [M], from 0 to N - 1, each at most once; not
+    checked. `fresh`: what the rows become, [M, ...], of the dtype and row shape of each column; none: zeros.
     """
-    torch.ops.blitzgs.put_rows_(column, rows, fresh)
+    torch.ops.blitzgs.put_rows_(columns, rows, fresh)
 
 
 def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:

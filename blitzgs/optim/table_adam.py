@@ -149,14 +149,16 @@ class Pending:
     def _catch_up_part(self, rows: Tensor) -> None:
         table = self._table
         names = (*PARAMETERS, *EXP_AVGS, *EXP_AVG_SQS, "last_step", "moment_step")
-        part = {name: take_rows(table[name], rows).to(self._device) for name in names}
+        taken = take_rows([table[name] for name in names], rows)
+        part = {name: column.to(self._device) for name, column in zip(names, taken, strict=True)}
         params, exp_avgs, exp_avg_sqs = (
             [part[name] for name in group] for group in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)
         )
         state = AdamState(params, exp_avgs, exp_avg_sqs, part["last_step"], part["moment_step"])
         lazy_adam_catch_up_(state, self._optimiser.schedule, self._step)
-        for name in (*PARAMETERS, "last_step"):
-            put_rows_(table[name], rows, part[name].to(table.device))
+        names = (*PARAMETERS, "last_step")
+        current = [part[name].to(table.device) for name in names]
+        put_rows_([table[name] for name in names], rows, current)
 
 
 def _state_of(table: GaussianTable) -> AdamState:

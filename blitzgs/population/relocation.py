@@ -13,8 +13,8 @@ from torch.nn.functional import softplus
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
 from blitzgs.ops.counter_random import sampling_keys
-from blitzgs.ops.population import MAX_COPIES, overlap, position_noise_
-from blitzgs.ops.rows import put_rows_, take_rows
+from blitzgs.ops.population import MAX_COPIES, overlap, position_noise_, share_rows_
+from blitzgs.ops.rows import take_rows
 from blitzgs.optim.table_adam import Pending
 from blitzgs.population.density import (
     CHILDREN_OF_A_SPLIT,
@@ -27,7 +27,7 @@ from blitzgs.population.density import (
 from blitzgs.spawn.candidates import spawn_features
 from blitzgs.spawn.lineage import Births, Cause, Lineage
 from blitzgs.table.placement import place
-from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable, opacity_logit
+from blitzgs.table.table import PARAMETERS, GaussianTable, opacity_logit
 
 # Opacities are the weights of the draw, as integers in units of 2^-31, so that sums do not depend on the
 # order.
@@ -56,9 +56,9 @@ def relocate(
     (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", section 3.4). A Gaussian and
     its copies have one position, and share opacity and size such that together they look like the Gaussian
     before (`shared_among_copies`). The copied Gaussian keeps its moments, scaled as its gradients are
-    (`_keep_moments`), and the copies begin with moments of zero. Copies have the level, phi and cull row of
-    the Gaussian that they copy, and no statistics. Draws and ids depend only on (seed, time, id), so the
-    result depends neither on the order of the rows nor on the number of ranks.
+    (`share_rows_`), and the copies begin with moments of zero. Copies have the level, phi and cull row of the
+    Gaussian that they copy, and no statistics. Draws and ids depend only on (seed, time, id), so the result
+    depends neither on the order of the rows nor on the number of ranks.
 
     Args:
         table: changed in place; the rows are those of `placement.place`.
@@ -95,7 +95,13 @@ def relocate(
     features = None
     if lineage is not None:
         features = spawn_features(table, parents, torch.zeros_like(parents).bool(), time, extent, level_count)
-    _set_shares(table, sources, copies + 1, rules.min_opacity)
+    # Sharing must not reduce the opacity below the limit, or the Gaussian would count as dead. With moments
+    # of zero a row would move by several times its learning rate in its next steps, as Adam's bias correction
+    # is that of the run, not of the row. Each event copies the most opaque Gaussians, and such steps of all
+    # of them undo what a run has learnt (docs/decisions.md).
+    least = opacity_logit(rules.min_opacity)
+    moments = (*table.exp_avgs, *table.exp_avg_sqs)
+    share_rows_(table["opacities"], table["scales"], moments, sources, copies + 1, least)
     new = _copies(table, parents, copies, time, step)
     if lineage is not None and features is not None:
         lineage.born(Births(new["id"], new["parent"], new["means"], features), step)
@@ -158,42 +164,6 @@ def draw_in_proportion(
     return whole.add_(smallest(keys, ids, rest, ranks)).clamp_(max=MAX_COPIES - 1)
 
 
-def _set_shares(table: GaussianTable, sources: Tensor, copies: Tensor, min_opacity: float) -> None:
-    """Set opacities and scales of the rows `sources` to their shares, and scale their moments."""
-    before = table["opacities"][sources]
-    opacities, scales = shared_among_copies(before, table["scales"][sources], copies)
-    # Sharing must not reduce the opacity below the limit, or the Gaussian would count as dead.
-    table["opacities"][sources] = opacities.clamp(min=opacity_logit(min_opacity)).float()
-    table["scales"][sources] = scales.float()
-    _keep_moments(table, sources, copies, before)
-
-
-def _keep_moments(table: GaussianTable, sources: Tensor, copies: Tensor, before: Tensor) -> None:
-    """Scale the moments of the rows `sources`, of which there are now `copies` each, as their gradients are.
-
-    Each of N Gaussians in one place has 1/N of the gradient of the Gaussian before. That of the logit l of
-    its opacity o changes by the factor o' / o, since (1 - o')^N = 1 - o.
-
-    With moments of zero instead, a row would move by several times its learning rate in its next steps, as
-    Adam's bias correction is that of the run and not of the row. In each event the most opaque Gaussians are
-    copied, and such steps of all of them undo what a run has learnt (docs/decisions.md).
-
-    Args:
-        table: changed in place.
-        sources: int64 [M].
-        copies: N, int64 [M].
-        before: logits of the opacities before they were shared, [M].
-    """
-    share = 1.0 / copies.double()
-    dimmed = table["opacities"][sources].double().sigmoid() / before.double().sigmoid()
-    for names, power in ((EXP_AVGS, 1), (EXP_AVG_SQS, 2)):
-        of_opacities, of_others = (dimmed**power).float(), (share**power).float()
-        for name, parameter in zip(names, PARAMETERS, strict=True):
-            factor = of_opacities if parameter == "opacities" else of_others
-            rows = take_rows(table[name], sources)
-            put_rows_(table[name], sources, rows.mul_(factor.view(-1, *[1] * (rows.dim() - 1))))
-
-
 def _copies(table: GaussianTable, rows: Tensor, counts: Tensor, time: int, step: int) -> dict[str, Tensor]:
     """Return new rows that copy each of `rows` as often as `counts` has it."""
     first = counts.cumsum(0) - counts
@@ -201,7 +171,8 @@ def _copies(table: GaussianTable, rows: Tensor, counts: Tensor, time: int, step:
     slots = torch.arange(len(rows), device=rows.device)
     slots -= first.repeat_interleave(counts, output_size=len(rows))
     slots += CHILDREN_OF_A_SPLIT + 1
-    new = {name: take_rows(table[name], rows) for name in (*PARAMETERS, "level")}
+    names = (*PARAMETERS, "level")
+    new = dict(zip(names, take_rows([table[name] for name in names], rows), strict=True))
     new |= table.inherited(rows)
     parents = table["id"][rows]
     return new | {

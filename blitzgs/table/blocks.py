@@ -71,9 +71,11 @@ def _without_far(points: Tensor) -> Tensor:
     if len(points) == 0:
         return points
     sample = points[:: -(-len(points) // _SAMPLE)]
-    sample = sample.where(sample.isfinite(), torch.nan)
-    # Quantiles that are values of the sample are the same on all devices.
-    low, high = (sample.nanquantile(q, dim=0, interpolation="nearest") for q in (_SHARE, 1 - _SHARE))
+    # Of each axis, the finite values in order, and infinite ones. Quantiles that are values of the sample are
+    # the same on all devices.
+    ordered = sample.where(sample.isfinite(), torch.inf).sort(dim=0).values
+    last = (sample.isfinite().sum(dim=0) - 1).clamp(min=0).double()
+    low, high = ordered.gather(0, torch.stack((_SHARE * last, (1 - _SHARE) * last)).round().long())
     reach = _REACH * (high - low).amax()
     known = reach > 0
     low, high = (low - reach).where(known, -torch.inf), (high + reach).where(known, torch.inf)

@@ -53,7 +53,7 @@ class HostTable(GaussianTable):
         return _allocate(like, rows, self._pinned)
 
     def _reorder(self, name: str, order: Tensor) -> None:
-        self._store(name, take_rows(self[name], order))
+        self._store(name, *take_rows([self[name]], order))
 
 
 def fits(memory: Tensor | None, like: Tensor, rows: int) -> bool:

@@ -340,10 +340,10 @@ class GaussianTable:
         old = self.columns[name]
         room = min(len(self._memory.get(name, old)), int(GROWTH * len(old)))
         if name == CULL or room == len(old):
-            self._store(name, take_rows(self[name], order))
+            self._store(name, *take_rows([self[name]], order))
         else:
             memory = self._allocate(old, room)
-            take_rows(old, order, memory[: len(old)])
+            take_rows([old], order, [memory[: len(old)]])
             self._memory[name], self.columns[name] = memory, memory[: len(old)]
 
     def replace(self, placement: Placement, new: Mapping[str, Tensor], most: int | None = None) -> None:
@@ -353,11 +353,13 @@ class GaussianTable:
         that the table will ever have; None: unknown.
         """
         self._check_new(new)
-        for name in self._to_change():
-            column = self._lengthen(name, placement.total, most)
-            if len(placement.moved_from) > 0:
-                put_rows_(column, placement.moved_to, take_rows(column, placement.moved_from))
-            put_rows_(column, placement.new, new.get(name))
+        columns = {name: self._lengthen(name, placement.total, most) for name in self._to_change()}
+        if len(placement.moved_from) > 0:
+            every = list(columns.values())
+            put_rows_(every, placement.moved_to, take_rows(every, placement.moved_from))
+        put_rows_([columns[name] for name in new], placement.new, list(new.values()))
+        put_rows_([column for name, column in columns.items() if name not in new], placement.new)
+        for name, column in columns.items():
             if name == CULL:
                 self._store(name, column[: placement.total])
             elif placement.total != len(self.columns[name]):
@@ -374,10 +376,10 @@ class GaussianTable:
         sent = counts.tolist()
         received = ranks.exchange_counts(counts).tolist()
         for name in self._to_change():
-            moved = take_rows(self[name], order)
+            (moved,) = take_rows([self[name]], order)
             del self[name]
             self._store(name, ranks.all_to_all(moved, sent, received))
 
     def _select(self, rows: Tensor) -> None:
         for name in self._to_change():
-            self._store(name, take_rows(self[name], rows))
+            self._store(name, *take_rows([self[name]], rows))

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Counter-based random numbers: a draw depends on its key alone, so it is the same on every rank and device.
-// The functions give the same bits as blitzgs/ops/counter_random.py: SplitMix64 (Steele, Lea, Flood 2014)
-// over a tuple of keys.
+// SplitMix64 (Steele, Lea, Flood 2014) over a tuple of keys.
 #pragma once
 #include <cmath>
 #include <cstdint>

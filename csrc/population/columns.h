@@ -82,6 +82,19 @@ BLITZGS_HD float sampling_key(const SamplingKeys& args, std::int64_t i) {
   return static_cast<float>(-std::log(uniform_of(hash)) / static_cast<double>(args.weights[i]));
 }
 
+// Adds one more key to hashes: a tensor [n], or the same number for all.
+struct HashKey {
+  const std::int64_t* hashes;
+  const std::int64_t* keys;  // null: number
+  std::int64_t number, n;
+  std::int64_t* out;
+
+  BLITZGS_HD void operator()(std::int64_t i) const {
+    const auto hash = static_cast<std::uint64_t>(hashes[i]);
+    out[i] = static_cast<std::int64_t>(hash_key(hash, keys ? keys[i] : number));
+  }
+};
+
 constexpr int kMaxDigitBits = 11;
 
 struct KeyHistogram {

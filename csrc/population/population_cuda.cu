@@ -9,6 +9,7 @@
 #include "population/columns.h"
 #include "population/density.h"
 #include "population/knn.h"
+#include "population/relocation.h"
 
 namespace blitzgs::cuda {
 
@@ -74,6 +75,9 @@ void tree_sums(const TreeSumsArgs& args, CudaStream stream) {
 
 template void for_each_row(const DensityStats<float>&, CudaStream);
 template void for_each_row(const SpawnFeatures&, CudaStream);
+template void for_each_row(const HashKey&, CudaStream);
+template void for_each_row(const Overlap&, CudaStream);
+template void for_each_row(const ShareRows&, CudaStream);
 
 namespace {
 

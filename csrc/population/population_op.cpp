@@ -5,6 +5,7 @@
 #include "common/rows.h"
 #include "population/columns.h"
 #include "population/knn.h"
+#include "population/relocation.h"
 
 namespace blitzgs {
 namespace {
@@ -60,14 +61,13 @@ std::int64_t row_elements(const Tensor& column) {
 
 // Copies rows of `column` (absent: zeros) to `out`; from and to (columns.h) are absent or int64 [n].
 void copy_rows(const char* op, Tensor& out, const std::optional<Tensor>& to, const Tensor* column,
-               const std::optional<Tensor>& from, std::int64_t n) {
+               const std::optional<Tensor>& from, std::int64_t n, CudaStream stream) {
   const std::int64_t row_bytes = row_elements(out) * static_cast<std::int64_t>(out.element_size());
   BLITZGS_CHECK(row_bytes < (1 << 16), op, "rows must be shorter than 64 KiB, got ", row_bytes, " bytes");
-  DeviceScope scope(out);
   backend::copy_rows({column ? static_cast<const std::byte*>(column->const_data_ptr()) : nullptr,
                       data_or_null<std::int64_t>(from), static_cast<std::byte*>(out.mutable_data_ptr()),
                       data_or_null<std::int64_t>(to), n, row_bytes},
-                     scope.stream);
+                     stream);
 }
 
 void check_rows_alike(const char* op, const char* name, const Tensor& rows, const Tensor& column) {
@@ -76,30 +76,99 @@ void check_rows_alike(const char* op, const char* name, const Tensor& rows, cons
                 name, " must be like those of column, got ", shape_of(rows), " for ", shape_of(column));
 }
 
-void take_rows_(Tensor out, const Tensor& column_in, const Tensor& rows_in) {
-  constexpr const char* kOp = "take_rows";
-  BLITZGS_CHECK(column_in.dim() >= 1, "take_rows", "column must have rows, got ", shape_of(column_in));
-  const std::optional<Tensor> rows = checked(kOp, "rows", rows_in, ScalarType::Long, {-1});
-  check_rows_alike(kOp, "out", out, column_in);
-  check_contiguous(kOp, "out", out);
-  const std::int64_t n = rows->size(0);
-  BLITZGS_CHECK(out.size(0) == n, "take_rows", "out must have ", n, " rows, got ", shape_of(out));
-  const Tensor column = as_contiguous(column_in);
-  copy_rows(kOp, out, std::nullopt, &column, rows, n);
+// Checks tensors that the op writes: with rows, in contiguous memory, and on the device of `rows`.
+void check_written(const char* op, const char* name, const Tensor& written, const Tensor& rows) {
+  BLITZGS_CHECK(written.dim() >= 1, op, name, " must have rows, got ", shape_of(written));
+  check_contiguous(op, name, written);
+  check_device(op, name, written, rows, "rows");
 }
 
-void put_rows_(Tensor column, const Tensor& rows_in, const std::optional<Tensor>& fresh_in) {
-  constexpr const char* kOp = "put_rows_";
-  BLITZGS_CHECK(column.dim() >= 1, "put_rows_", "column must have rows, got ", shape_of(column));
-  check_contiguous(kOp, "column", column);
+void take_rows_(std::vector<Tensor> out, const std::vector<Tensor>& columns, const Tensor& rows_in) {
+  constexpr const char* kOp = "take_rows";
+  BLITZGS_CHECK(out.size() == columns.size(), kOp, "there must be as many out as columns, got ", out.size(),
+                " for ", columns.size());
   const std::optional<Tensor> rows = checked(kOp, "rows", rows_in, ScalarType::Long, {-1});
   const std::int64_t n = rows->size(0);
-  if (!fresh_in) return copy_rows(kOp, column, rows, nullptr, std::nullopt, n);
-  check_rows_alike(kOp, "fresh", *fresh_in, column);
-  BLITZGS_CHECK(fresh_in->size(0) == n, "put_rows_", "fresh must have ", n, " rows, got ",
-                shape_of(*fresh_in));
-  const Tensor fresh = as_contiguous(*fresh_in);
-  copy_rows(kOp, column, rows, &fresh, std::nullopt, n);
+  DeviceScope scope(*rows);
+  for (std::size_t c = 0; c < columns.size(); ++c) {
+    BLITZGS_CHECK(columns[c].dim() >= 1, kOp, "column must have rows, got ", shape_of(columns[c]));
+    check_device(kOp, "column", columns[c], *rows, "rows");
+    check_written(kOp, "out", out[c], *rows);
+    check_rows_alike(kOp, "out", out[c], columns[c]);
+    BLITZGS_CHECK(out[c].size(0) == n, kOp, "out must have ", n, " rows, got ", shape_of(out[c]));
+    const Tensor column = as_contiguous(columns[c]);
+    copy_rows(kOp, out[c], std::nullopt, &column, rows, n, scope.stream);
+  }
+}
+
+void put_rows_(std::vector<Tensor> columns, const Tensor& rows_in, const std::vector<Tensor>& fresh) {
+  constexpr const char* kOp = "put_rows_";
+  BLITZGS_CHECK(fresh.empty() || fresh.size() == columns.size(), kOp,
+                "fresh must be empty or as many as columns, got ", fresh.size(), " for ", columns.size());
+  const std::optional<Tensor> rows = checked(kOp, "rows", rows_in, ScalarType::Long, {-1});
+  const std::int64_t n = rows->size(0);
+  DeviceScope scope(*rows);
+  for (std::size_t c = 0; c < columns.size(); ++c) {
+    check_written(kOp, "column", columns[c], *rows);
+    if (fresh.empty()) {
+      copy_rows(kOp, columns[c], rows, nullptr, std::nullopt, n, scope.stream);
+      continue;
+    }
+    check_device(kOp, "fresh", fresh[c], *rows, "rows");
+    check_rows_alike(kOp, "fresh", fresh[c], columns[c]);
+    BLITZGS_CHECK(fresh[c].size(0) == n, kOp, "fresh must have ", n, " rows, got ", shape_of(fresh[c]));
+    const Tensor values = as_contiguous(fresh[c]);
+    copy_rows(kOp, columns[c], rows, &values, std::nullopt, n, scope.stream);
+  }
+}
+
+Tensor hash_with_key(const Tensor& hashes_in, const std::optional<Tensor>& keys_in, std::int64_t number) {
+  constexpr const char* kOp = "hash_key";
+  const Tensor hashes = checked(kOp, "hashes", hashes_in, ScalarType::Long, {-1});
+  const std::int64_t n = hashes.size(0);
+  const std::optional<Tensor> keys = checked(kOp, "keys", keys_in, ScalarType::Long, {n});
+  Tensor out = make_empty(hashes, {n});
+  DeviceScope scope(hashes);
+  backend::for_each_row(HashKey{data<std::int64_t>(hashes), data_or_null<std::int64_t>(keys), number, n,
+                                mutable_data<std::int64_t>(out)},
+                        scope.stream);
+  return out;
+}
+
+Tensor overlap(const Tensor& opacities_in, const Tensor& copies_in) {
+  constexpr const char* kOp = "overlap";
+  const Tensor opacities = checked(kOp, "opacities", opacities_in, ScalarType::Double, {-1}),
+               copies = checked(kOp, "copies", copies_in, ScalarType::Long, {opacities.size(0)});
+  Tensor overlaps = make_empty(opacities, {opacities.size(0)});
+  DeviceScope scope(opacities);
+  backend::for_each_row(Overlap{data<double>(opacities), data<std::int64_t>(copies), opacities.size(0),
+                                mutable_data<double>(overlaps)},
+                        scope.stream);
+  return overlaps;
+}
+
+void share_rows_(Tensor opacities, Tensor scales, std::vector<Tensor> moments, const Tensor& rows_in,
+                 const Tensor& copies_in, double least) {
+  constexpr const char* kOp = "share_rows_";
+  check_in_place(kOp, "opacities", opacities, ScalarType::Float, {-1});
+  const std::int64_t count = opacities.size(0);
+  check_in_place(kOp, "scales", scales, ScalarType::Float, {count, 3});
+  const Tensor rows = checked(kOp, "rows", rows_in, ScalarType::Long, {-1}),
+               copies = checked(kOp, "copies", copies_in, ScalarType::Long, {rows.size(0)});
+  BLITZGS_CHECK(moments.size() == ShareRows::kColumns, kOp, "there must be ", ShareRows::kColumns,
+                " moments, got ", moments.size());
+  DeviceScope scope(opacities);
+  ShareRows args{mutable_data<float>(opacities), mutable_data<float>(scales), {},
+                 data<std::int64_t>(rows),       data<std::int64_t>(copies),  rows.size(0),
+                 static_cast<float>(least)};
+  for (int c = 0; c < ShareRows::kColumns; ++c) {
+    check_dtype(kOp, "a moment", moments[c], ScalarType::Float);
+    check_written(kOp, "a moment", moments[c], rows);
+    BLITZGS_CHECK(moments[c].size(0) == count, kOp, "a moment must have ", count, " rows, got ",
+                  shape_of(moments[c]));
+    args.moments[c] = {mutable_data<float>(moments[c]), static_cast<int>(row_elements(moments[c]))};
+  }
+  backend::for_each_row(args, scope.stream);
 }
 
 Tensor sampling_keys(const Tensor& weights_in, const Tensor& ids_in, std::int64_t seed, std::int64_t event) {
@@ -252,6 +321,9 @@ BLITZGS_REGISTER(m) {
   m.impl("density_stats_", TORCH_BOX(&blitzgs::density_stats_));
   m.impl("take_rows_", TORCH_BOX(&blitzgs::take_rows_));
   m.impl("put_rows_", TORCH_BOX(&blitzgs::put_rows_));
+  m.impl("hash_key", TORCH_BOX(&blitzgs::hash_with_key));
+  m.impl("overlap", TORCH_BOX(&blitzgs::overlap));
+  m.impl("share_rows_", TORCH_BOX(&blitzgs::share_rows_));
   m.impl("sampling_keys", TORCH_BOX(&blitzgs::sampling_keys));
   m.impl("key_histogram", TORCH_BOX(&blitzgs::key_histogram));
   m.impl("find_non_finite", TORCH_BOX(&blitzgs::find_non_finite));

@@ -12,17 +12,17 @@ from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.counter_random import hash_keys
-from blitzgs.ops.population import MAX_COPIES
+from blitzgs.ops.population import MAX_COPIES, share_rows_
 from blitzgs.optim import table_adam
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.density import DensityRules
 from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.population.relocation import draw_in_proportion, relocate, shared_among_copies
 from blitzgs.spawn.lineage import Cause
-from blitzgs.table.table import EXP_AVG_SQS, PARAMETERS, GaussianTable
+from blitzgs.table.table import EXP_AVG_SQS, PARAMETERS, GaussianTable, opacity_logit
 from blitzgs.view.levels import Levels, measure_levels
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import needs_cuda
+from tests.helpers import DEVICES, needs_cuda
 from tests.population.test_density import LEVELS, SEED, STEP, TIME, random_table
 
 
@@ -179,6 +179,41 @@ def test_the_copies_of_other_rows_change_no_bit():
         assert all(torch.equal(x[i], y[i]) for x, y in zip(together, alone, strict=True))
     none = shared_among_copies(opacities[:0], scales[:0], copies[:0])
     assert [tuple(part.shape) for part in none] == [(0,), (0, 3)]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_rows_that_stand_for_copies_equal_torch_s(device):
+    n, least = 3 * MAX_COPIES, opacity_logit(0.05)
+    g = torch.Generator().manual_seed(4)
+    opacities, scales = torch.linspace(-4, 16, n), torch.randn(n, 3, generator=g)
+    moments = [torch.randn(n, *shape, generator=g) for shape in [(3,), (4,), (3,), (), (16, 3)] * 2]
+    rows = torch.randperm(n, generator=g)[: 2 * MAX_COPIES]
+    copies = torch.arange(len(rows)) % MAX_COPIES + 1
+    logits, logarithms = shared_among_copies(opacities[rows], scales[rows], copies)
+    logits = logits.clamp(min=least)
+    expected = [column.clone() for column in (opacities, scales, *moments)]
+    expected[0][rows], expected[1][rows] = logits.float(), logarithms.float()
+    share, dimmed = 1.0 / copies.double(), logits.sigmoid() / opacities[rows].double().sigmoid()
+    for i, column in enumerate(expected[2:]):
+        factor = (dimmed if i % 5 == 3 else share) ** (1 if i < 5 else 2)
+        column[rows] *= factor.float().view(-1, *[1] * (column.dim() - 1))
+    got = [column.to(device) for column in (opacities, scales, *moments)]
+    share_rows_(got[0], got[1], got[2:], rows.to(device), copies.to(device), least)
+    for column, wanted in zip(got, expected, strict=True):
+        torch.testing.assert_close(column.cpu(), wanted, rtol=3e-7, atol=0)
+
+
+def test_errors_and_opcheck_of_the_ops_of_relocation():
+    rows, moments = torch.tensor([1]), [torch.zeros(2, 3) for _ in range(10)]
+    shared = (torch.zeros(2), torch.zeros(2, 3), moments, rows, torch.tensor([3]), -2.0)
+    torch.library.opcheck(torch.ops.blitzgs.share_rows_, shared)
+    torch.library.opcheck(torch.ops.blitzgs.overlap, (torch.rand(3).double(), torch.tensor([1, 2, 3])))
+    for key in (torch.tensor([5]), None):
+        torch.library.opcheck(torch.ops.blitzgs.hash_key, (rows, key, 3))
+    with pytest.raises(RuntimeError, match="there must be 10 moments, got 9"):
+        share_rows_(*shared[:2], moments[1:], *shared[3:])
+    with pytest.raises(RuntimeError, match=r"a moment must have 2 rows, got \[3, 3\]"):
+        share_rows_(*shared[:2], [torch.zeros(3, 3), *moments[1:]], *shared[3:])
 
 
 @pytest.mark.parametrize("copies", [2, 5, 30])
