@@ -90,7 +90,7 @@ class Trainer:
         # On CUDA a record is written one step later, so that the host does not wait for its figures.
         self._writes_late = ranks.device.type == "cuda"
         self._warned_of_masks = False
-        self._watching: Watching | None = None
+        self._watching = Watching(state, None)
         self.memory: list[int] = []  # samples of what this rank's GPU has allocated
 
     def watch(self, watcher: Watcher | None) -> None:
@@ -112,13 +112,11 @@ class Trainer:
         folder = state.folder if state.ranks.rank == 0 else None
         board = state.config.log.tensorboard
         state.log = RunLog(folder, state.schedule.iterations, state.images_seen, board, state.run_id)
-        wants = never
-        if self._watching is not None:
-            state.log.listener, wants = self._watching.told, self._watching.wants
+        state.log.listener = self._watching.told
         state.start_clock()
         try:
             with StopRequest() as stop:
-                agreement = Agreement(state.ranks, stop, state.save_clock, wants)
+                agreement = Agreement(state.ranks, stop, state.save_clock, self._watching.wants)
                 state.stops = lambda: agreement.now(state.progress.step).signal is not None
                 if not self._take_steps(agreement):
                     return None
@@ -183,7 +181,7 @@ class Trainer:
         if decision.written:
             with state.stage("checkpoint"):
                 save.finish_checkpoint(state)
-        if decision.watched and self._watching is not None:
+        if decision.watched:
             self._write_record()
             self._watching.serve(state.stops)
 
@@ -222,8 +220,7 @@ class Trainer:
     def close(self) -> None:
         """Stop loading batches and close the log."""
         state = self.state
-        if self._watching is not None:
-            self._watching.close()
+        self._watching.close()
         for text in dict.fromkeys(self.warned):
             state.log.event(state.images_seen, "warned", {"warning": text})
         self.loader.close()

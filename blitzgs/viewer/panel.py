@@ -18,7 +18,7 @@ from blitzgs.view.draw import LEVEL_COLOURS
 from blitzgs.view.look import MODES
 from blitzgs.viewer import compare
 from blitzgs.viewer.frustums import Frustums
-from blitzgs.viewer.route import Route, note, safe_name, save_beside
+from blitzgs.viewer.paths import Route, note, safe_name, save_beside
 from blitzgs.viewer.settings import Triple
 from blitzgs.viewer.visitor import Shown, Visitor
 from blitzgs.viewer.world import SCALE

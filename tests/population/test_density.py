@@ -288,7 +288,7 @@ def test_floaters_are_weak_and_far_or_large():
     ])  # fmt: skip
     means = torch.cat([sound, extra])
     scales = torch.full((len(means), 3), -2.0) + 0.1 * torch.rand(len(means), 3)
-    scales[-2, 1] = 3.0
+    scales[len(sound)], scales[-2, 1] = -2.0, 3.0
     counted = torch.full((len(means),), 9)
     counted[-5:] = torch.tensor([1, 1, 0, 1, 3])
     found = floaters(means, scales, counted, 1)
