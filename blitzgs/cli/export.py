@@ -29,6 +29,7 @@ from blitzgs.runs.export import (
     Watched,
     export,
     export_file,
+    export_folder,
     open_source,
     source_of,
     without_antialiasing,
@@ -130,6 +131,11 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
         help="leave out floaters and fringes that at most K training photographs saw (default: %(const)s)",
     )
     _add_selection(parser)
+    parser.add_argument(
+        "--spz-tiles",
+        action="store_true",
+        help="with --tiles: SPZ inside the tiles, for CesiumJS, and no page",
+    )
     for name, help_text in (
         ("tile-gaussians", "Gaussians of a tile (default: 32768)"),
         ("processes", "processes that write tiles (default: as many as CPU cores)"),
@@ -177,7 +183,7 @@ def run(args: argparse.Namespace) -> int:
     with ending_by_exception():
         if args.tiles or args.streamed_sog:
             return _export_tiles(args, _selection(args))
-        _refuse(args, ("tile_gaussians", "processes"), f"is for {_TILES}")
+        _refuse(args, ("tile_gaussians", "processes", "spz_tiles"), f"is for {_TILES}")
         return _export_html(args) if args.html else _export_file(args)
 
 
@@ -190,28 +196,39 @@ def _refuse(args: argparse.Namespace, flags: Iterable[str], reason: str) -> None
 
 def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
     _refuse(args, ("max_mb", "coordinates", "classic", "clean"), f"is not for {_TILES}")
+    if args.streamed_sog:
+        _refuse(args, ("spz_tiles",), "is for --tiles")
     from blitzgs.formats.streamed_sog import write_streamed_sog
-    from blitzgs.formats.tiles import TILE, write_tiles
+    from blitzgs.formats.tiles import TILE, Written, write_tiles
     from blitzgs.viewer.web import open_city
 
     start, city = time.monotonic(), open_city(args.model, checked=selection is None)
     source, path = city.source, args.tiles or args.streamed_sog
-    sizes = {"most": args.tile_gaussians or TILE, "processes": args.processes or len(os.sched_getaffinity(0))}
+    most, processes = args.tile_gaussians or TILE, args.processes or len(os.sched_getaffinity(0))
+    x, y, z = city.offset.tolist()
+    beside: Path | None = None
+    done: list[Written] = []
     with image_progress("Exporting", unit="") as report:
+
+        def write_streamed(folder: Path, found: GaussianSource) -> None:
+            done.append(write_streamed_sog(folder, found, most, processes, report))
+
         source = Watched(source, report)
         if selection is not None:
-            source = Selected(source, selection, tuple(city.offset.tolist()))
+            source = Selected(source, selection, (x, y, z))
         if args.tiles:
-            written = write_tiles(
-                path, source, city.transform(), city.scene, city.title, report=report, **sizes
-            )
+            place = city.transform(), city.scene, city.title
+            done.append(write_tiles(path, source, *place, most, processes, report, args.spz_tiles))
         else:
-            written = write_streamed_sog(path, source, **sizes, report=report)
+            beside = export_folder(source, (x, y, z), city.extent, write_streamed, path)
+    (written,) = done
     print(
         f"{path}: {written.gaussians:,} Gaussians in {written.tiles:,} tiles, {written.bytes / 1e6:.1f} MB, "
         f"{time.monotonic() - start:.0f} s"
     )
-    if args.tiles:
+    if beside is not None:
+        print(f"coordinates are relative to ({x!r}, {y!r}, {z!r}), as {beside} says")
+    if args.tiles and not args.spz_tiles:
         print(f"look at it: blitzgs view {shlex.quote(str(path))}")
     return 0
 
