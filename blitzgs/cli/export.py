@@ -78,6 +78,7 @@ contribute least are left out; the page and the output of this command say how m
 A city that no browser holds at once is written as a folder that viewers load piece by piece:
 
   blitzgs export RUN|CHECKPOINT|FILE --tiles CITY            # 3D Tiles 1.1; then blitzgs view CITY
+  blitzgs export RUN|CHECKPOINT|FILE --tiles CITY --spz-tiles  # for CesiumJS
   blitzgs export RUN|CHECKPOINT|FILE --streamed-sog CITY     # for SuperSplat
 
 Memory does not grow with a run or a PLY file; the disk needs two and a half times the size of the model.
@@ -310,7 +311,14 @@ def _export_run(
             score = contributions(open_model(args.model, ranks)).cpu()
         if args.clean is not None:
             kept = _cleaned(model, run_folder, args, path, ranks)
-        if args.classic and model.config.model.antialiased:
+        if args.classic and not model.config.model.antialiased:
+            print(
+                "--classic changes nothing: the model was trained without model.antialiased", file=sys.stderr
+            )
+        elif args.classic:
+            print(
+                "antialiasing is baked into the opacities: right at the training views' distance, else nearly"
+            )
             stored = folder.cameras()
             model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
         crs = ""
@@ -382,11 +390,7 @@ def _explain(exported: Exported, antialiased: bool, kind: Format, args: argparse
         print(f"coordinates are relative to ({x!r}, {y!r}, {z!r}), as {exported.sidecar} says")
     elif args.coordinates == "capture":
         print(f"coordinates are rounded by up to {exported.rounding:.3g}")
-    if args.classic and not antialiased:
-        print("--classic changes nothing: the model was trained without model.antialiased", file=sys.stderr)
-    elif args.classic:
-        print("antialiasing is baked into the opacities: right at the training views' distance, else nearly")
-    elif antialiased and kind.title.endswith("PLY"):
+    if antialiased and kind.title.endswith("PLY"):
         print(
             "the model is antialiased (comment SplatRenderMode: mip): viewers that do not know this show it "
             "too opaque; for those, export with --classic",
