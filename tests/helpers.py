@@ -244,8 +244,8 @@ _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: 
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
-def read_glb(path):
-    """Return the JSON and the attributes of the only primitive by name, by the glTF specification alone."""
+def glb_parts(path):
+    """Return the JSON and the bytes of a GLB file."""
     data = path.read_bytes()
     magic, version, length = struct.unpack_from("<4sII", data)
     assert (magic, version, length) == (b"glTF", 2, len(data))
@@ -256,6 +256,12 @@ def read_glb(path):
     assert kind == b"BIN\0" and body_size % 4 == 0 and 28 + size + body_size == len(data)
     body = data[28 + size :]
     assert content["buffers"] == [{"byteLength": len(body)}]
+    return content, body
+
+
+def read_glb(path):
+    """Return the JSON and the attributes of the only primitive by name, by the glTF specification alone."""
+    content, body = glb_parts(path)
     (mesh,) = content["meshes"]
     (primitive,) = mesh["primitives"]
     assert primitive["mode"] == 0

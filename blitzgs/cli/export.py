@@ -29,6 +29,7 @@ from blitzgs.runs.export import (
     Watched,
     export,
     export_file,
+    export_folder,
     open_source,
     source_of,
     without_antialiasing,
@@ -75,6 +76,7 @@ contribute least are left out; the page and the output of this command say how m
 A city that no browser holds at once is written as a folder that viewers load piece by piece:
 
   blitzgs export RUN|CHECKPOINT|FILE --tiles CITY            # 3D Tiles 1.1; then blitzgs view CITY
+  blitzgs export RUN|CHECKPOINT|FILE --tiles CITY --spz-tiles  # for CesiumJS
   blitzgs export RUN|CHECKPOINT|FILE --streamed-sog CITY     # for SuperSplat
 
 Memory does not grow with a run or a PLY file; the disk needs two and a half times the size of the model.
@@ -88,6 +90,7 @@ FOLDERS = """
 FLAGS = f"""
 --max-mb MB  with --html: largest size of the file in megabytes (default: {MAX_MB})
 --classic  for viewers without antialiasing: write opacities that make up for it
+--spz-tiles  with --tiles: SPZ inside the tiles, for CesiumJS, and no page
 --tile-gaussians N  with --tiles and --streamed-sog: Gaussians of a tile (default: 32768)
 --processes N  with --tiles and --streamed-sog: processes that write tiles (default: as many as CPU cores)
 """
@@ -154,7 +157,7 @@ def run(args: argparse.Namespace) -> int:
     with ending_by_exception():
         if args.tiles or args.streamed_sog:
             return _export_tiles(args, _selection(args))
-        _refuse(args, ("tile_gaussians", "processes"), f"is for {_TILES}")
+        _refuse(args, ("tile_gaussians", "processes", "spz_tiles"), f"is for {_TILES}")
         return _export_html(args) if args.html else _export_file(args)
 
 
@@ -167,28 +170,39 @@ def _refuse(args: argparse.Namespace, flags: Iterable[str], reason: str) -> None
 
 def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
     _refuse(args, ("max_mb", "coordinates", "classic", "clean"), f"is not for {_TILES}")
+    if args.streamed_sog:
+        _refuse(args, ("spz_tiles",), "is for --tiles")
     from blitzgs.formats.streamed_sog import write_streamed_sog
-    from blitzgs.formats.tiles import TILE, write_tiles
+    from blitzgs.formats.tiles import TILE, Written, write_tiles
     from blitzgs.viewer.web import open_city
 
     start, city = time.monotonic(), open_city(args.model, checked=selection is None)
     source, path = city.source, args.tiles or args.streamed_sog
-    sizes = {"most": args.tile_gaussians or TILE, "processes": args.processes or len(os.sched_getaffinity(0))}
+    most, processes = args.tile_gaussians or TILE, args.processes or len(os.sched_getaffinity(0))
+    x, y, z = city.offset.tolist()
+    beside: Path | None = None
+    done: list[Written] = []
     with image_progress("Exporting", unit="") as report:
+
+        def write_streamed(folder: Path, found: GaussianSource) -> None:
+            done.append(write_streamed_sog(folder, found, most, processes, report))
+
         source = Watched(source, report)
         if selection is not None:
-            source = Selected(source, selection, tuple(city.offset.tolist()))
+            source = Selected(source, selection, (x, y, z))
         if args.tiles:
-            written = write_tiles(
-                path, source, city.transform(), city.scene, city.title, report=report, **sizes
-            )
+            place = city.transform(), city.scene, city.title
+            done.append(write_tiles(path, source, *place, most, processes, report, args.spz_tiles))
         else:
-            written = write_streamed_sog(path, source, **sizes, report=report)
+            beside = export_folder(source, (x, y, z), city.extent, write_streamed, path)
+    (written,) = done
     print(
         f"{path}: {written.gaussians:,} Gaussians in {written.tiles:,} tiles, {written.bytes / 1e6:.1f} MB, "
         f"{time.monotonic() - start:.0f} s"
     )
-    if args.tiles:
+    if beside is not None:
+        print(f"coordinates are relative to ({x!r}, {y!r}, {z!r}), as {beside} says")
+    if args.tiles and not args.spz_tiles:
         print(f"look at it: blitzgs view {shlex.quote(str(path))}")
     return 0
 
@@ -270,7 +284,14 @@ def _export_run(
             score = contributions(open_model(args.model, ranks)).cpu()
         if args.clean is not None:
             kept = _cleaned(model, run_folder, args, path, ranks)
-        if args.classic and model.config.model.antialiased:
+        if args.classic and not model.config.model.antialiased:
+            print(
+                "--classic changes nothing: the model was trained without model.antialiased", file=sys.stderr
+            )
+        elif args.classic:
+            print(
+                "antialiasing is baked into the opacities: right at the training views' distance, else nearly"
+            )
             stored = folder.cameras()
             model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
         crs = ""
@@ -342,11 +363,7 @@ def _explain(exported: Exported, antialiased: bool, kind: Format, args: argparse
         print(f"coordinates are relative to ({x!r}, {y!r}, {z!r}), as {exported.sidecar} says")
     elif args.coordinates == "capture":
         print(f"coordinates are rounded by up to {exported.rounding:.3g}")
-    if args.classic and not antialiased:
-        print("--classic changes nothing: the model was trained without model.antialiased", file=sys.stderr)
-    elif args.classic:
-        print("antialiasing is baked into the opacities: right at the training views' distance, else nearly")
-    elif antialiased and kind.title.endswith("PLY"):
+    if antialiased and kind.title.endswith("PLY"):
         print(
             "the model is antialiased (comment SplatRenderMode: mip): viewers that do not know this show it "
             "too opaque; for those, export with --classic",

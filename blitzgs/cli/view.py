@@ -135,7 +135,9 @@ def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
             f"{folder / TILESET} is damaged ({error}): write it again with blitzgs export"
         ) from error
     if not complete or not (folder / PAGE).is_file():
-        raise ValueError(f"{folder} was not written by blitzgs export --tiles: open it with another viewer")
+        raise ValueError(
+            f"{folder} was not written by blitzgs export --tiles, or with --spz-tiles: use another viewer"
+        )
     try:
         return ThreadingHTTPServer((host, port), partial(_Handler, directory=str(folder)))
     except (OSError, OverflowError) as error:

@@ -9,6 +9,7 @@ model's up there; the coordinates themselves stay unchanged. What the format has
 levels are the attribute _LEVEL.
 
 The columns follow each other, so that each is contiguous; a block of Gaussians is written into all of them.
+With KHR_gaussian_splatting_compression_spz_2, an SPZ file stands for the columns.
 """
 
 from __future__ import annotations
@@ -24,11 +25,13 @@ import numpy.typing as npt
 import torch
 
 from blitzgs.formats.gaussians import SH_C0, Gaussians, GaussianSource, unit_quats
+from blitzgs.formats.packed import write_spz
 from blitzgs.formats.partition import around
 from blitzgs.util.output import check_replaceable, new_file
 from blitzgs.util.rotations import quaternions
 
-_PREFIX = "KHR_gaussian_splatting:"
+EXTENSION, SPZ_EXTENSION = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
+_PREFIX = f"{EXTENSION}:"
 _FLOAT, _BYTE = 5126, 5121
 # A chunk's length has 32 bits.
 _LARGEST = (1 << 32) - 1
@@ -93,6 +96,27 @@ def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float]
         file.write(struct.pack("<II", size, 0x004E4942))
 
 
+def write_spz_glb(path: Path, model: Gaussians) -> None:
+    """Write Gaussians whose up is +Z as a GLB with an SPZ file inside, as CesiumJS 1.144 reads it.
+
+    It reads no rotation of the node, only a matrix, and stops at accessors of opacities and of SH degree 0,
+    which SPZ's decoder gives as COLOR_0. ImportError: gsply is missing. ValueError, OSError: as `write_glb`.
+    """
+    model.check()
+    write_spz(packed := path.with_suffix(".spz"), model)
+    data = packed.read_bytes()
+    packed.unlink()
+    means = model.means.double().numpy() * [1.0, -1.0, -1.0]
+    box = np.stack([means.min(axis=0), means.max(axis=0)])
+    implied = (f"{_PREFIX}OPACITY", f"{_PREFIX}SH_DEGREE_0_COEF_0")
+    columns = [column for column in _columns(len(model), model.degree, False) if column.name not in implied]
+    text = _json(model, columns, len(data), box, None)
+    text, data = text.ljust(-(-len(text) // 4) * 4), data.ljust(-(-len(data) // 4) * 4, b"\0")
+    with new_file(path) as partial:
+        head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
+        partial.write_bytes(head + text + struct.pack("<II", len(data), 0x004E4942) + data)
+
+
 def _columns(count: int, degree: int, has_levels: bool) -> list[_Column]:
     kinds = [("POSITION", "VEC3", _FLOAT, 12), (f"{_PREFIX}ROTATION", "VEC4", _FLOAT, 16)]
     kinds += [(f"{_PREFIX}SCALE", "VEC3", _FLOAT, 12), (f"{_PREFIX}OPACITY", "SCALAR", _FLOAT, 4)]
@@ -138,18 +162,18 @@ def _json(
     columns: list[_Column],
     size: int,
     box: npt.NDArray[np.float64],
-    up: tuple[float, float, float],
+    up: tuple[float, float, float] | None,
 ) -> bytes:
+    """Return the JSON of a GLB; without `up`, of one whose only buffer view, of `size` bytes, is SPZ."""
     count = len(source)
     accessors: list[dict[str, Any]] = [
-        {"bufferView": i, "componentType": column.component, "count": count, "type": column.type}
-        for i, column in enumerate(columns)
+        {"componentType": column.component, "count": count, "type": column.type} for column in columns
     ]
     accessors[0] |= {"min": box[0].tolist(), "max": box[1].tolist()}
     for column, accessor in zip(columns, accessors, strict=True):
         if column.component == _BYTE:
             accessor["normalized"] = True
-    extension = {
+    extension: dict[str, Any] = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
         "projection": "perspective",
@@ -158,22 +182,32 @@ def _json(
     primitive = {
         "mode": 0,
         "attributes": {column.name: i for i, column in enumerate(columns)},
-        "extensions": {"KHR_gaussian_splatting": extension},
+        "extensions": {EXTENSION: extension},
     }
-    content = {
+    content: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "BlitzGS", "extras": {"comments": source.comments}},
-        "extensionsUsed": ["KHR_gaussian_splatting"],
+        "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": _rotation_to_y(up)}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
-        "bufferViews": [
+        "buffers": [{"byteLength": -(-size // 4) * 4}],
+    }
+    if up is None:
+        extension["extensions"] = {SPZ_EXTENSION: {"bufferView": 0}}
+        content["extensionsUsed"] = content["extensionsRequired"] = [EXTENSION, SPZ_EXTENSION]
+        content["bufferViews"] = [{"buffer": 0, "byteOffset": 0, "byteLength": size}]
+        # SPZ's half turn back, then +Z to +Y; column by column.
+        matrix = [1.0, 0, 0, 0, 0, 0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1]
+        content["nodes"] = [{"mesh": 0, "matrix": matrix}]
+    else:
+        for view, accessor in enumerate(accessors):
+            accessor["bufferView"] = view
+        content["bufferViews"] = [
             {"buffer": 0, "byteOffset": c.offset, "byteLength": c.width * count, "target": 34962}
             for c in columns
-        ],
-        "buffers": [{"byteLength": size}],
-    }
+        ]
+        content["nodes"] = [{"mesh": 0, "rotation": _rotation_to_y(up)}]
     return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
 
 

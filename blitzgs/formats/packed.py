@@ -276,7 +276,7 @@ def read_splat(path: Path) -> Gaussians:
 
 
 def write_spz(path: Path, source: GaussianSource) -> None:
-    """Write an SPZ file of version 3, which all its readers know.
+    """Write an SPZ file of version 3; readers from before the end of 2025 may know 2 alone.
 
     The model is read twice, block by block; a temporary file in the same folder holds the columns.
     """

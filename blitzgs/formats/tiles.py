@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A model as 3D Tiles 1.1: `tileset.json`, a GLB file with KHR_gaussian_splatting for each tile, and a page.
 
+The page and this module's GLB files go together; with SPZ inside the files, as CesiumJS wants them, there is
+no page.
+
 The leaves of the tree hold the Gaussians by region, each in one. A tile above stands for its children
 (refine REPLACE): it has an eighth as many, merged from theirs (`blitzgs.formats.proxies`), so all tiles
 have at most a seventh more than the model. Bounding volumes are boxes of what a view can show, in the model's
@@ -28,7 +31,7 @@ import numpy.typing as npt
 import torch
 
 from blitzgs.formats.gaussians import GaussianSource, is_antialiased
-from blitzgs.formats.glb import shortest_turn, write_glb
+from blitzgs.formats.glb import EXTENSION, SPZ_EXTENSION, shortest_turn, write_glb, write_spz_glb
 from blitzgs.formats.partition import BITS, Partition, Parts, around, extents
 from blitzgs.formats.proxies import Rows, merged, moments, shown
 from blitzgs.formats.web_page import WebScene, tiles_page
@@ -38,7 +41,6 @@ from blitzgs.util.progress import Report, follow_parent
 TILESET, PAGE = "tileset.json", "index.html"
 # Gaussians of a tile: 8 MB at SH degree 3.
 TILE = 32_768
-_EXTENSION = "KHR_gaussian_splatting"
 # A tile has at most one Gaussian for so many of its children.
 _FEWER = 8
 # Pixels of the error of a tile in which a cell of its merged Gaussians is one pixel wide.
@@ -89,6 +91,7 @@ def write_tiles(
     most: int = TILE,
     processes: int = 1,
     report: Report = lambda done, total: None,
+    spz: bool = False,
 ) -> Written:
     """Write a tileset; its folder appears under its name only when it is complete.
 
@@ -101,6 +104,7 @@ def write_tiles(
         most: Gaussians of a tile; a leaf that would be smaller than a 256th of the region may have more.
         processes: that merge and encode.
         report: called with the number of tiles written, and of all.
+        spz: compress the tiles, and write no page.
 
     Raises:
         ValueError: there is no Gaussian, or a value is not finite.
@@ -111,13 +115,13 @@ def write_tiles(
         partition = Partition(source, folder)
         root, parts = divided(partition, most)
         (folder / "tiles").mkdir()
-        writer = _Writer(folder, parts, partition.box, is_antialiased(source))
+        writer = _Writer(folder, parts, partition.box, is_antialiased(source), spz)
         _encode_all(writer, root, processes, report)
         parts.file.unlink()
         writer.proxies.unlink(missing_ok=True)
         content, _ = _node(root)
         content["transform"] = transform.T.ravel().tolist()
-        used = {"extensionsUsed": [_EXTENSION], "extensionsRequired": [_EXTENSION]}
+        names = [EXTENSION, SPZ_EXTENSION] if spz else [EXTENSION]
         tileset = {
             "asset": {"version": "1.1", "generator": "BlitzGS"},
             # As long as the scene is larger than that, something is shown.
@@ -126,13 +130,14 @@ def write_tiles(
             # 3D Tiles 1.1 has GLB contents of its own; by this, viewers learn before the first content which
             # glTF extensions they need.
             "extensionsUsed": ["3DTILES_content_gltf"],
-            "extensions": {"3DTILES_content_gltf": used},
+            "extensions": {"3DTILES_content_gltf": {"extensionsUsed": names, "extensionsRequired": names}},
             "extras": {
                 "gaussians": len(source), "degree": source.degree, "comments": source.comments,
                 "view": asdict(scene),
             },
         }  # fmt: skip
-        write_file(folder / PAGE, tiles_page(title))
+        if not spz:
+            write_file(folder / PAGE, tiles_page(title))
         write_file(folder / TILESET, json.dumps(tileset, allow_nan=False))
     tiles = list(root.every())
     return Written(len(tiles), sum(tile.bytes for tile in tiles), len(source))
@@ -260,6 +265,7 @@ class _Writer:
     parts: Parts  # the model's rows
     box: Array  # where most of the model is, [2, 3]
     antialiased: bool  # whether viewers compensate the screen-space blur
+    spz: bool  # whether files are compressed
 
     @property
     def proxies(self) -> Path:
@@ -282,7 +288,10 @@ class _Writer:
             gaussians = shown(rows, self.parts.comments)
         path = self.folder / _uri(tile)
         # glTF's up is +Y and that of 3D Tiles +Z; viewers turn contents between the two.
-        write_glb(path, gaussians, up=(0.0, 0.0, 1.0))
+        if self.spz:
+            write_spz_glb(path, gaussians)
+        else:
+            write_glb(path, gaussians, up=(0.0, 0.0, 1.0))
         return extents(gaussians), len(gaussians), path.stat().st_size, edge
 
     def _moments(self, tile: Tile) -> Rows:

@@ -84,19 +84,51 @@ def export(
     centred = coordinates == "centred" or (coordinates == "auto" and rounding > _MAX_ROUNDING * middle)
     if coordinates == "auto" and kind.quantised:
         centred |= float(np.linalg.norm(offset)) > 2 * space.extent * space.unit
-    sidecar = _sidecar(path)
+    _write_moved(source, space.offset, centred, kind.write, path, crs)
     if centred:
-        _write_centred(source, space.offset, kind, path, crs)
-        return Exported(space.offset, sidecar, _spacing(reach[0]))
-    shift = torch.from_numpy(offset)
-    moved = Changed(
-        source, lambda block: replace(block, means=(block.means.double() + shift).float()), source.comments
-    )
-    kind.write(path, moved)
-    # The offset of an earlier export to this name would move the model once more.
-    if _has_offset(sidecar):
-        sidecar.unlink()
+        return Exported(space.offset, _sidecar(path), _spacing(reach[0]))
     return Exported(None, None, rounding)
+
+
+def export_folder(
+    source: GaussianSource,
+    offset: tuple[float, float, float],
+    extent: float,
+    write: Callable[[Path, GaussianSource], object],
+    path: Path,
+) -> Path | None:
+    """Write Gaussians around `offset` in the capture's coordinates, if these are near their origin.
+
+    Else they stay around the offset; returns the file that states it. `extent`: size of the capture. `write`
+    makes the folder. FileExistsError, OSError: as `export`.
+    """
+    centred = float(np.linalg.norm(offset)) > 2 * extent
+    _write_moved(source, offset, centred, write, path)
+    return _sidecar(path) if centred else None
+
+
+def _write_moved(
+    source: GaussianSource,
+    offset: tuple[float, float, float],
+    centred: bool,
+    write: Callable[[Path, GaussianSource], object],
+    path: Path,
+    crs: str = "",
+) -> None:
+    """Write a model around an offset, stated beside it, or in the coordinates that include the offset."""
+    if centred:
+        return _write_centred(source, offset, write, path, crs)
+    write(path, _shifted(source, np.array(offset), source.comments))
+    # The offset of an earlier export to this name would move the model once more.
+    if _has_offset(_sidecar(path)):
+        _sidecar(path).unlink()
+
+
+def _shifted(source: GaussianSource, shift: npt.NDArray[np.float64], comments: list[str]) -> GaussianSource:
+    step = torch.from_numpy(shift)
+    return Changed(
+        source, lambda block: replace(block, means=(block.means.double() + step).float()), comments
+    )
 
 
 def export_file(source: GaussianSource, kind: Format, path: Path) -> Exported:
@@ -117,15 +149,17 @@ def export_file(source: GaussianSource, kind: Format, path: Path) -> Exported:
             _sidecar(path).unlink()
         return Exported(None, None, 0.0)
     lines = [line for line in source.comments if offset_of([line]) == (0, 0, 0)]
-    back = torch.from_numpy(shift)
-    moved = Changed(source, lambda block: replace(block, means=(block.means.double() - back).float()), lines)
     x, y, z = (offset + shift).tolist()
-    _write_centred(moved, (x, y, z), kind, path)
+    _write_centred(_shifted(source, -shift, lines), (x, y, z), kind.write, path)
     return Exported((x, y, z), _sidecar(path), 0.0)
 
 
 def _write_centred(
-    source: GaussianSource, offset: tuple[float, float, float], kind: Format, path: Path, crs: str = ""
+    source: GaussianSource,
+    offset: tuple[float, float, float],
+    write: Callable[[Path, GaussianSource], object],
+    path: Path,
+    crs: str = "",
 ) -> None:
     """Write a model around an offset, which goes into the header and a file beside."""
     sidecar = _sidecar(path)
@@ -135,7 +169,7 @@ def _write_centred(
         )
     x, y, z = offset
     lines = [*source.comments, f"comment offset {x!r} {y!r} {z!r}"]
-    kind.write(path, Changed(source, lambda block: block, lines))
+    write(path, Changed(source, lambda block: block, lines))
     meaning = "capture coordinates = coordinates in the file + offset"
     content = {"file": path.name, "offset": offset, "meaning": meaning}
     write_file(sidecar, json.dumps(content | ({"crs": crs} if crs else {}), indent=1))

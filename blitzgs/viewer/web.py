@@ -172,6 +172,7 @@ class City:
 
     source: GaussianSource  # the Gaussians, in the capture's unit around `offset`
     offset: Array  # origin of the source in the capture's coordinates, [3]
+    extent: float  # the capture's size, in its unit
     frame: WorldFrame | None  # where the capture lies in the world; None: nobody says
     scene: WebScene  # how the page shows the model, in the coordinates of the source
     title: str  # name of the run or the file
@@ -217,7 +218,7 @@ def open_city(path: Path, checked: bool = True) -> City:
         space, config = run.space, run.config
     world = World(space, cameras, box.mean(axis=0) / space.unit)
     scene = web_scene(world, render_options(config, space, source.degree), space.unit)
-    return City(source, offset, frame, scene, path.resolve().stem)
+    return City(source, offset, space.extent * space.unit, frame, scene, path.resolve().stem)
 
 
 def to_globe(frame: WorldFrame, origin: Array) -> Array:

@@ -17,7 +17,7 @@ from blitzgs.formats.gaussians import MIP, Gaussians
 from blitzgs.formats.tiles import new_folder, upright, write_tiles
 from blitzgs.formats.web_page import WebScene
 from blitzgs.util.progress import ending_by_exception
-from tests.helpers import read_glb
+from tests.helpers import glb_parts, read_glb
 
 LOD = "comment lod reference_distance 40.0 fork 2.0 levels 4 finest 3"
 SCENE = WebScene(0.01, 1e4, 0.3, False, (0, 0, 0), (0, 0, 1), (20, -30, 30), (20, 20, 0), 0.9)
@@ -98,6 +98,39 @@ def test_the_tileset_has_the_fields_of_3d_tiles_1_1(written):
     assert done.bytes == sum((path / file).stat().st_size for file in files)
     assert sorted(os.listdir(path)) == ["index.html", "tiles", "tileset.json"]
     assert "the city" in (path / "index.html").read_text()
+
+
+def test_tiles_with_spz_inside_say_so_and_are_turned_back(tmp_path):
+    gaussforge = pytest.importorskip("gaussforge")
+    model = city(800, levels=False)
+    done = write_tiles(tmp_path / "t", model, np.eye(4), SCENE, "the city", most=300, spz=True)
+    assert sorted(os.listdir(tmp_path / "t")) == ["tiles", "tileset.json"]  # the page reads no SPZ
+    assert not list(tmp_path.rglob("*.spz")) and done.bytes < 40 * 1.2 * len(model)
+    tileset = json.loads((tmp_path / "t" / "tileset.json").read_text())
+    names = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
+    contents = tileset["extensions"]["3DTILES_content_gltf"]
+    assert contents["extensionsUsed"] == contents["extensionsRequired"] == names
+    found = []
+    for node, _ in nodes(tileset["root"]):
+        content, body = glb_parts(tmp_path / "t" / node["content"]["uri"])
+        assert content["extensionsUsed"] == content["extensionsRequired"] == names
+        (primitive,) = content["meshes"][0]["primitives"]
+        inner = primitive["extensions"][names[0]]["extensions"][names[1]]
+        view = content["bufferViews"][inner["bufferView"]]
+        spz = gaussforge.GaussForge().read(body[view["byteOffset"] :][: view["byteLength"]], "spz")["data"]
+        positions = np.frombuffer(spz["positions"], "<f4").reshape(-1, 3)
+        place = content["accessors"][primitive["attributes"]["POSITION"]]
+        assert place["count"] == len(positions) == node["content"]["extras"]["gaussians"]
+        np.testing.assert_allclose(
+            [place["min"], place["max"]], [positions.min(0), positions.max(0)], atol=1e-3
+        )
+        assert not any("bufferView" in accessor for accessor in content["accessors"])
+        turn = np.array(content["nodes"][0]["matrix"]).reshape(4, 4).T[:3, :3]
+        if "children" not in node:
+            found.append(positions @ turn.T)
+    x, y, z = model.means.numpy().T
+    wanted = np.stack([x, z, -y], axis=1)  # +Z is +Y in glTF
+    np.testing.assert_allclose(np.sort(np.concatenate(found), axis=0), np.sort(wanted, axis=0), atol=1e-3)
 
 
 def test_errors_fall_and_volumes_hold_what_is_inside(written):

@@ -344,6 +344,8 @@ def test_antialiased_models_are_marked_and_can_be_baked(tmp_path, capsys):
     assert "comment SplatRenderMode: mip" in read_ply(tmp_path / "aa.ply").comments
     assert "--classic" in capsys.readouterr().err
     assert main(["export", str(folder.path), "--ply", str(tmp_path / "classic.ply"), "--classic"]) == 0
+    out, errors = capsys.readouterr()
+    assert "antialiasing is baked into the opacities" in out and "changes nothing" not in errors
     classic = read_ply(tmp_path / "classic.ply")
     assert not any("SplatRenderMode" in comment for comment in classic.comments)
     # A viewer without antialiasing shows the baked model far closer to what was trained.

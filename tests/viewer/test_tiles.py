@@ -154,6 +154,24 @@ def test_a_run_is_written_as_tiles(trained, tmp_path, capsys):
     assert 0.1 * model.space.extent < far / model.space.unit < 10 * model.space.extent
 
 
+@pytest.mark.parametrize("offset", [(5.0, 6.0, 7.0), (5e5, 4.6e6, 0.0)])
+def test_streamed_sog_has_the_coordinates_of_other_files(tmp_path, capsys, offset):
+    model, far = city(200), offset[0] > 100
+    x, y, z = offset
+    model.comments.append(f"comment offset {x} {y} {z}")
+    save_ply(tmp_path / "m.ply", model)
+    command = ["export", str(tmp_path / "m.ply"), "--streamed-sog", str(tmp_path / "s"), "--processes", "1"]
+    assert main(command) == 0
+    meta = json.loads((tmp_path / "s" / "0_0" / "meta.json").read_text())["means"]
+    ends = np.array([meta["mins"], meta["maxs"]])
+    wanted = np.stack([model.means.numpy().min(axis=0), model.means.numpy().max(axis=0)])
+    wanted = wanted if far else wanted + offset
+    np.testing.assert_allclose(np.sign(ends) * np.expm1(abs(ends)), wanted, rtol=1e-5)
+    stated = tmp_path / "s.offset.json"
+    assert stated.exists() == far == (f"as {stated} says" in capsys.readouterr().out)
+    assert not far or json.loads(stated.read_text())["offset"] == list(offset)
+
+
 def test_a_file_is_written_as_tiles_and_flags_choose(tmp_path, capsys, failure):
     save_ply(tmp_path / "m.ply", city(800))
     flags = ["--tiles", str(tmp_path / "t"), "--crop", "0", "0", "-9", "20", "99", "99", "--processes", "1"]
@@ -172,6 +190,7 @@ def test_a_file_is_written_as_tiles_and_flags_choose(tmp_path, capsys, failure):
         (["--tiles", str(tmp_path / "t")], "is not an empty folder"),
         (["--tiles", str(tmp_path / "u"), "--max-mb", "3"], "--max-mb is not for --tiles"),
         (["--ply", str(tmp_path / "u.ply"), "--processes", "3"], "--processes is for --tiles"),
+        (["--streamed-sog", str(tmp_path / "u"), "--spz-tiles"], "--spz-tiles is for --tiles"),
     ):
         assert reason in failure("export", tmp_path / "m.ply", *flags)
     (tmp_path / "cut.ply").write_bytes((tmp_path / "m.ply").read_bytes()[:-100])
