@@ -113,14 +113,16 @@ def test_equals_dense_adam_over_thousands_of_steps(dtype):
     schedule = schedule_of(steps, dtype)
     state = State(n, dtype)
     rates = schedule.lr_table
-    exact, rounded = DenseAdam(state.params, rates), DenseAdam(state.params, rates, torch.float32)
+    exact = DenseAdam(state.params, rates)
+    rounded = DenseAdam(state.params, rates, dtype) if dtype == torch.float32 else exact
     start = [p.clone() for p in exact.params()]
     generator = torch.Generator().manual_seed(3)
     for step in range(1, steps + 1):
         ids, grads = random_step(n, dtype, generator)
         state.step(grads, ids, schedule, step)
         exact.step(grads, ids, step)
-        rounded.step(grads, ids, step)
+        if rounded is not exact:
+            rounded.step(grads, ids, step)
         if step == steps // 2:
             state.catch_up(None, schedule, step)
     assert int(state.last_step.min()) < steps  # rows really were left behind

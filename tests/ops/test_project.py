@@ -178,7 +178,8 @@ def test_dense_gradients_equal_scattered_compact_ones(backend, degree, coefficie
         expected = part.new_zeros(701, *part.shape[1:]).index_copy(0, ids, part)
         assert torch.equal(whole, expected)
     assert torch.equal(compact[5], dense[5])
-    torch.library.opcheck(torch.ops.blitzgs.project_bwd, arguments, {"dense": True})
+    if degree in (3, None) and dtype == torch.float32:
+        torch.library.opcheck(torch.ops.blitzgs.project_bwd, arguments, {"dense": True})
 
 
 def test_non_finite_gaussians_are_dropped_and_others_are_unchanged():
