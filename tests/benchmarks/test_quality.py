@@ -18,7 +18,7 @@ from opponents.spatial_partition import HALO, LEAST_SEEN, Grid, coverage, divide
 from quality_plan import RunSpec, runs_of
 
 from blitzgs.distributed.group import Ranks
-from tests.helpers import DEVICES
+from tests.helpers import DEVICES, refused
 from tests.training.tiny import OVERRIDES, tiny_scene
 
 FLAGS = " ".join(f"--{text}" for text in OVERRIDES)
@@ -150,8 +150,7 @@ def test_several_ranks_train_one_run_to_the_same_model(tmp_path, capture):
 
 
 def test_a_capture_without_a_view_to_measure_is_named():
-    with pytest.raises(ValueError, match="nothing can be measured: all pixels of the views are masked"):
-        quality_run.means_of({"views": {}})
+    refused(ValueError, "nothing can be measured: all pixels of the", quality_run.means_of, {"views": {}})
 
 
 def nadir(x, y, height=1.0):
@@ -212,8 +211,7 @@ def test_cameras_are_given_to_the_blocks_that_they_see_or_stand_in(flight):
 def test_cameras_in_a_line_have_no_grid(flight):
     flight.cameras = [nadir(x, 0.0) for x in range(5)]
     flight.train = list(range(5))
-    with pytest.raises(ValueError, match="span no plane"):
-        Grid(flight, 2, 2)
+    refused(ValueError, "span no plane", Grid, flight, 2, 2)
 
 
 def test_a_partition_is_trained_merged_and_measured_beside_the_whole(tmp_path, capture):

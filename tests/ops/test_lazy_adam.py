@@ -11,7 +11,7 @@ from blitzgs.ops.lazy_adam import (
     lazy_adam_catch_up_,
     lazy_adam_step_,
 )
-from tests.helpers import DEVICES, needs_cuda
+from tests.helpers import DEVICES, needs_cuda, refused
 
 COEFFICIENTS = 4
 BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
@@ -302,8 +302,7 @@ def test_a_schedule_makes_its_tables_once(steps, dtype):
 
 def test_a_schedule_of_another_dtype_is_refused():
     state, _ = one_update(dtype=torch.float64)
-    with pytest.raises(RuntimeError, match="final_rules must have shape"):
-        state.catch_up(None, schedule_of(4000, torch.float32), 5)
+    refused(RuntimeError, "final_rules must have", state.catch_up, None, schedule_of(4000, torch.float32), 5)
 
 
 @pytest.mark.cuda
@@ -357,8 +356,7 @@ def test_empty_list_and_zero_gradient():
 
 def test_errors_name_the_value():
     state, schedule = one_update()
-    with pytest.raises(ValueError, match=r"beta1=0.9, beta2=0.5"):
-        AdamSchedule(schedule.lr_table, 0.9, 0.5, EPS)
+    refused(ValueError, r"beta1=0.9, beta2=0.5", AdamSchedule, schedule.lr_table, 0.9, 0.5, EPS)
     with pytest.raises(
         RuntimeError, match="step 9999 is outside the learning-rate table, which ends at step 4000"
     ):
