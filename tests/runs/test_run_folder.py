@@ -368,9 +368,7 @@ def test_export_refuses_a_name_that_promises_another_format(trained, tmp_path, c
 # Paths may have any characters.
 
 
-@pytest.mark.parametrize(
-    "name", ["emoji 🏙", "bytes \udcff\udcfe", "[/b]", ":x: [red]", "a: b # {c}", "astral 𝔸", "quote \"'"]
-)
+@pytest.mark.parametrize("name", ["emoji 🏙 [/b] :x: [red]", "bytes \udcff\udcfe", "a: b # {c} 𝔸 \"'"])
 def test_any_path_works(trained, tmp_path, capfd, name):
     data, out = tmp_path / f"data {name}", tmp_path / f"run {name}"
     shutil.copytree(trained[0], data)
