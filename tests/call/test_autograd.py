@@ -39,6 +39,13 @@ def second_derivative_through_arranged_splats(scene):
     gradient.sum().backward()
 
 
+def second_derivative_of_raw_parameters(scene):
+    p = raw_parameters(scene)
+    image = raw(p, scene, sparse_grad=False)[0]
+    gradients = torch.autograd.grad(image.square().sum(), list(p.values()), create_graph=True)
+    sum(gradient.square().sum() for gradient in gradients).backward()
+
+
 def hessian(scene):
     def loss(means):
         return rasterize_scene(replace(scene, means=means))[0].sum()
@@ -62,6 +69,7 @@ def second_derivative_of_the_loss_function(scene):
         second_derivative_through_arranged_splats,
         hessian,
         second_derivative_of_the_loss_function,
+        second_derivative_of_raw_parameters,
     ],
 )
 def test_a_second_derivative_is_refused(device, differentiate_twice):

@@ -272,16 +272,6 @@ def test_sparse_gradients_need_leaves():
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("name", NAMES)
-def test_a_second_derivative_is_refused(device, name):
-    scene = random_scene(n=30, cameras=1, device=device)
-    p = raw_parameters(scene)
-    (gradient,) = torch.autograd.grad(raw(p, scene, sparse_grad=False)[0].sum(), [p[name]], create_graph=True)
-    with pytest.raises(RuntimeError, match="has first derivatives only"):
-        (gradient.square().sum() + sum(t.sum() for t in p.values())).backward()
-
-
-@pytest.mark.parametrize("device", DEVICES)
 def test_gradients_of_two_views_may_come_at_once(device):
     """The second view catches up rows that the first one read, which must not spoil the first's gradient."""
     scene = random_scene(n=50, cameras=2, width=20, height=16, device=device)

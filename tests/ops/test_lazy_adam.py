@@ -155,18 +155,6 @@ def one_update(n=7, dtype=torch.float64):
     return state, schedule
 
 
-@pytest.mark.parametrize("gap", [1, 2, 30, 200, 3000])
-def test_one_catch_up_equals_many(gap):
-    once, schedule = one_update()
-    often, _ = one_update()
-    for step in range(2, 2 + gap, max(1, gap // 50)):
-        often.catch_up(None, schedule, step)
-    often.catch_up(None, schedule, 1 + gap)
-    once.catch_up(None, schedule, 1 + gap)
-    for a, b in zip(once.params, often.params, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
-
-
 def test_eps_is_exact_where_it_matters():
     """Gradients at and below eps take the explicit path and agree with dense Adam there too."""
     schedule = schedule_of(400, torch.float64)

@@ -2,7 +2,7 @@
 """What is seen of a training: a viewer on its state, glances, figures and curves."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +15,6 @@ from blitzgs.training.events import evaluate as glances
 from blitzgs.training.events.evaluate import Glances, evenly_ordered
 from blitzgs.training.state import FALL, WINDOW, Curve
 from blitzgs.training.trainer import Trainer
-from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Look, Wish
 from blitzgs.view.views import viewmat
 from blitzgs.view.visible import VisibleFinder
@@ -150,11 +149,6 @@ def test_a_rank_that_cannot_draw_does_not_end_the_training(tmp_path):
     (pictures, failures, images), (_, _, other) = run_ranks(_fails_on_the_second_rank, 2, tmp_path)
     assert (pictures, failures) == (0, {"rank 1: no room"})
     assert images == other == 20
-
-
-def test_intrinsics_are_centred():
-    K = intrinsics(200, 100, np.pi / 2)  # noqa: N806
-    np.testing.assert_allclose(K, [[50, 0, 100], [0, 50, 50], [0, 0, 1]])
 
 
 def test_a_model_in_host_memory_is_shown(tmp_path):
@@ -308,9 +302,3 @@ def test_a_reset_begins_the_curve_anew():
     curve.restart()
     curve, said = followed([15.0] * (2 * WINDOW), curve)
     assert not said and curve.fall == 0
-
-
-def test_a_curve_survives_a_resume():
-    curve, _ = followed([25.0] * 20)
-    again = Curve(**asdict(curve))
-    assert again == curve and followed([19.0] * 30, again)[1]
