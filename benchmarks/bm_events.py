@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measures density events (relocation and growth) of a large table, and what they do to steps.
+
+    python benchmarks/bm_events.py [--millions 1 4 12] [--device cuda] [--json FILE]
+    torchrun --nproc-per-node=4 benchmarks/bm_events.py [--millions 12]
+
+The table is the `aerial` scene of `scenes.py`, dealt round-robin to the ranks, each row some steps behind.
+Before every event, `--dead` of the Gaussians become transparent; an event replaces them, and the table grows
+by 5 % in each of the first `--events` and not in as many after them. Times are medians and means, in ms by
+the host's clock with the device idle before and after, of the slowest rank. "event" is an event as in a
+training. With one rank, steps of `--views` views are measured before the events, after them, and
+once the table is sorted again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import torch
+from bm_step import BEHIND, LOSS, OPTIONS, RATE, STEP, make_table, random_photographs
+from harness import make_parser, write_json
+from scenes import BenchmarkScene, aerial
+
+from blitzgs.config.fields import Config, OptimiserConfig
+from blitzgs.config.schedule import Event, Schedule
+from blitzgs.distributed.group import Ranks
+from blitzgs.frame.ownership import TileOwners
+from blitzgs.optim.table_adam import TableAdam
+from blitzgs.runs.log import RunLog
+from blitzgs.runs.run_files import Progress
+from blitzgs.table.blocks import morton_order
+from blitzgs.table.table import GaussianTable
+from blitzgs.training.events import densify
+from blitzgs.training.state import TrainingState
+from blitzgs.training.step import Stepper
+
+
+class Measured:
+    """Seconds of the parts of events.
+
+    Attributes:
+        seconds: of each call, by the part's name.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self.seconds: dict[str, list[float]] = defaultdict(list)
+
+    def time(self, name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """Call a function, with the device idle before and after."""
+        _wait(self._device)
+        begin = time.perf_counter()
+        result = function(*args, **kwargs)
+        _wait(self._device)
+        self.seconds[name].append(time.perf_counter() - begin)
+        return result
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def rows_of(scene: BenchmarkScene, ranks: Ranks) -> torch.Tensor:
+    """Return the rows of this rank's share of a scene."""
+    mine = torch.arange(ranks.rank, len(scene.means), ranks.world_size, device=scene.means.device)
+    return mine[morton_order(scene.means[mine])]
+
+
+def make_state(scene: BenchmarkScene, table: GaussianTable, ranks: Ranks) -> TrainingState:
+    """Return a state that has what density events need."""
+    config = replace(
+        Config(),
+        schedule=replace(Config().schedule, batch_size=len(scene.viewmats)),
+        population=replace(
+            Config().population, strategy="relocation", min_opacity=0.005, prune_screen_radius=0.0,
+            prune_world_scale=0.0, pixels_per_gaussian=0.0, gaussians_per_point=0.0,
+        ),
+    )  # fmt: skip
+    schedule = Schedule(config.schedule)
+    optimiser = TableAdam(OptimiserConfig(*[RATE] * 5), schedule, 1.0, ranks.device)
+    owners = TileOwners(ranks)
+    capture = SimpleNamespace(cameras=[], train=[], points=[])
+    progress = Progress(step=STEP, sh_degree=3, level_count=1, peak_gaussians=0, seconds=0.0)
+    return TrainingState(
+        config=config,
+        capture=cast(Any, capture),
+        images=cast(Any, None),
+        folder=Path(),
+        ranks=ranks,
+        schedule=schedule,
+        space=cast(Any, SimpleNamespace(extent=float(scene.means[:, :2].abs().max()))),
+        table=table,
+        progress=progress,
+        views=cast(Any, None),
+        sampler=cast(Any, None),
+        optimiser=optimiser,
+        stepper=Stepper(table, optimiser, owners, LOSS, 1.0),
+        owners=owners,
+        run_id="",
+        origin="",
+        save_clock=cast(Any, None),
+        veto=None,
+        lineage=None,
+        log=RunLog(None, 1, 0, tensorboard=False),
+    )
+
+
+class Events:
+    """Runs events on the table of a state, and steps between them."""
+
+    def __init__(self, state: TrainingState, scene: BenchmarkScene, dead: float) -> None:
+        self.state, self._dead, self._time = state, dead, 0
+        self._batch = random_photographs(scene) if state.ranks.world_size == 1 else None
+        self.sorts = 0
+        sort = state.sort
+
+        def counted() -> None:
+            self.sorts += 1
+            sort()
+
+        state.sort = counted  # type: ignore[method-assign]
+
+    def prepare(self) -> None:
+        """Put every row some steps behind."""
+        table = self.state.table
+        for name in ("last_step", "moment_step"):
+            table[name].copy_(STEP - (table["id"] % BEHIND).int())
+        self.state.stepper.reindex()
+
+    def prepare_event(self) -> None:
+        """Put every row some steps behind, and make some transparent."""
+        table = self.state.table
+        self._time += 1
+        generator = torch.Generator(table.device).manual_seed(self._time * 1000 + self.state.ranks.rank)
+        chosen = torch.rand(len(table), generator=generator, device=table.device) < self._dead
+        table["opacities"].masked_fill_(chosen, -9.0)
+        self.prepare()
+
+    def event(self) -> None:
+        """Run an event."""
+        densify.run_density_event(self.state, Event(self._time, 0, "densify"))
+
+    def step_ms(self, repeats: int = 12) -> float | None:
+        """Return the median ms of a step; None with several ranks."""
+        if self._batch is None:
+            return None
+        measured = Measured(self.state.ranks.device)
+        for _ in range(repeats):
+            self.prepare()
+            measured.time("step", self._step)
+        return 1e3 * statistics.median(measured.seconds["step"][2:])
+
+    def _step(self) -> None:
+        assert self._batch is not None
+        frame, terms, _ = self.state.stepper.forward(STEP + 1, OPTIONS, self._batch)
+        self.state.stepper.backward(STEP + 1, frame, terms)
+
+
+def grows_by(config: Config, growth: float) -> Config:
+    """Return a configuration with another growth."""
+    return replace(config, population=replace(config.population, growth=growth))
+
+
+def slowest(ranks: Ranks, values: dict[str, float]) -> dict[str, float]:
+    """Return the largest of all ranks' values, by name."""
+    everywhere = ranks.all_gather_object(values)
+    return {name: max(other.get(name, 0.0) for other in everywhere) for name in values}
+
+
+def measure(millions: float, ranks: Ranks, args: argparse.Namespace) -> dict[str, Any]:
+    """Measure the events of one size, as a whole."""
+    if ranks.device.type == "cuda":
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+    scene = aerial(int(millions * 1e6), str(ranks.device), views=args.views)
+    table = make_table(scene, rows_of(scene, ranks))
+    state = make_state(scene, table, ranks)
+    events = Events(state, scene, args.dead)
+    result: dict[str, Any] = {"millions": millions, "ranks": ranks.world_size}
+    table_gb = sum(table.row_bytes.values()) * len(table) / 1e9
+    events.prepare_event()
+    events.event()  # warms up, and sorts if this version sorts rarely
+    result["step sorted"] = events.step_ms()
+    measured = Measured(ranks.device)
+    for growth in (0.05, 0.0):
+        state.config = grows_by(state.config, growth)
+        for _ in range(args.events):
+            events.prepare_event()
+            ranks.barrier()
+            measured.time(f"event, growth {growth:g}", events.event)
+        result[f"step after growth {growth:g}"] = events.step_ms()
+    result["rows"] = state.population()
+    result["sorts"] = events.sorts
+    state.sort()
+    result["step sorted again"] = events.step_ms()
+    times = {name: 1e3 * statistics.median(seconds) for name, seconds in measured.seconds.items()}
+    times |= {f"mean {name}": 1e3 * statistics.mean(seconds) for name, seconds in measured.seconds.items()}
+    result |= slowest(ranks, times)
+    result["each event"] = [round(1e3 * s, 2) for seconds in measured.seconds.values() for s in seconds]
+    if ranks.device.type == "cuda":
+        result["table_gb"], result["peak_gb"] = table_gb, torch.cuda.max_memory_allocated() / 1e9
+    return result
+
+
+@torch.no_grad()
+def main() -> None:
+    """Measure all sizes; print tables, and write JSON when a file is named."""
+    parser = make_parser(__doc__)
+    parser.add_argument(
+        "--millions", type=float, nargs="+", default=[1, 4, 12], help="Gaussians (%(default)s)"
+    )
+    parser.add_argument("--events", type=int, default=5, help="timed events of each kind (%(default)s)")
+    parser.add_argument("--views", type=int, default=4, help="views of a step (%(default)s)")
+    parser.add_argument("--dead", type=float, default=0.01, help="share that dies at an event (%(default)s)")
+    args = parser.parse_args()
+    ranks = Ranks.from_environment(args.device)
+    results = [measure(millions, ranks, args) for millions in args.millions]
+    if ranks.rank == 0:
+        for result in results:
+            shown = ", ".join(
+                f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in result.items()
+            )
+            print(shown, flush=True)
+        if args.json:
+            write_json(args.json, args.device, results=results)
+    ranks.close()
+
+
+if __name__ == "__main__":
+    main()
