@@ -68,7 +68,8 @@ def test_errors_name_the_value_of_copy_rows():
         put_rows_(torch.zeros(3, 4), rows, torch.zeros(1, 2))
     with pytest.raises(RuntimeError, match="fresh must be Float, got Double"):
         put_rows_(torch.zeros(3), rows, torch.zeros(1, dtype=torch.float64))
-    refused(RuntimeError, r"fresh must have 1 rows, got", put_rows_, torch.zeros(3), rows, torch.zeros(2))
+    with pytest.raises(RuntimeError, match=r"fresh must have 1 rows, got \[2\]"):
+        put_rows_(torch.zeros(3), rows, torch.zeros(2))
 
 
 def test_opcheck_of_copy_rows():
@@ -135,7 +136,8 @@ def test_new_rows_need_a_mask_and_may_inherit_it():
     table = random_gaussians(100)
     table[CULL] = random_rows(100, 1)
     more = random_gaussians(5)
-    refused(ValueError, r"new rows lack the columns", table.append, {name: more[name] for name in more})
+    with pytest.raises(ValueError, match=r"new rows lack the columns \['cull'\]"):
+        table.append({name: more[name] for name in more})
     parents = torch.tensor([7, 7, 0, 99, 3])
     table.append({name: more[name] for name in more} | table.inherited(parents))
     assert torch.equal(table[CULL][100:], table[CULL][parents])
@@ -233,13 +235,16 @@ def test_swapped_blocks_have_the_right_contents(device):
 def test_errors_name_the_value_of_pool_ops():
     pool, table = columns(512, "cpu"), columns(1024, "cpu")
     lists = [torch.zeros(2, dtype=torch.int32)] * 3
-    refused(RuntimeError, "the same columns, at most 48; got 6 and", swap_blocks_, pool, table[1:], 1, *lists)
+    with pytest.raises(RuntimeError, match="the same columns, at most 48; got 6 and 5"):
+        swap_blocks_(pool, table[1:], 1, *lists)
     with pytest.raises(RuntimeError, match=r"rows of pool and table must be alike, got \[512, 3\] and"):
         swap_blocks_([pool[0]], [table[0][:, :2].contiguous()], 1, *lists)
-    refused(RuntimeError, "a column of the pool must be", swap_blocks_, [pool[1]], [table[3]], 1, *lists)
+    with pytest.raises(RuntimeError, match="a column of the pool must be Long, got Float"):
+        swap_blocks_([pool[1]], [table[3]], 1, *lists)
     with pytest.raises(RuntimeError, match="columns must be contiguous"):
         swap_blocks_([pool[0][:, :1]], [table[0][:, :1]], 1, *lists)
-    refused(RuntimeError, "slots must be Int, got", swap_blocks_, pool, table, 1, lists[0].long(), *lists[1:])
+    with pytest.raises(RuntimeError, match="slots must be Int, got Long"):
+        swap_blocks_(pool, table, 1, lists[0].long(), *lists[1:])
     with pytest.raises(RuntimeError, match=r"coming must have shape \[2\], got \[1\]"):
         swap_blocks_(pool, table, 1, *lists[:2], lists[2][:1])
     viewmats, Ks = make_views(33)
@@ -316,7 +321,8 @@ def test_digits_of_keys_are_counted_under_a_prefix(device, count):
 
 
 def test_errors_name_the_value_of_sampling():
-    refused(RuntimeError, r"ids must have shape \[3\]", sampling_keys, torch.ones(3), torch.arange(2), 0, 0)
+    with pytest.raises(RuntimeError, match=r"ids must have shape \[3\], got \[2\]"):
+        sampling_keys(torch.ones(3), torch.arange(2), 0, 0)
     with pytest.raises(RuntimeError, match="a digit must have 1 to 11 of 32 bits, got 12 after 20"):
         key_histogram(torch.ones(3), torch.zeros(1, dtype=torch.int64), 20, 12)
 
