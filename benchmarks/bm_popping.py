@@ -229,18 +229,8 @@ def main(arguments: list[str] | None = None) -> None:
     out = options.out or options.run / "popping"
     flight = {name: getattr(options, name) for name in ("frames", "width", "camera")}
     found = popping(options.run, out, options.device, **flight)
-    rows = [
-        {
-            "levels": mode,
-            "largest change": found[mode]["largest_change"],
-            "mean change": found[mode]["mean_change"],
-            "largest popping": found[mode].get("largest", 0.0),
-            "mean popping": found[mode].get("mean", 0.0),
-            "worst pixels": found[mode].get("pixel", 0.0),
-            "kept": found[mode].get("kept", 1.0),
-        }
-        for mode in MODES
-    ]
+    nothing = {"mean": 0.0, "largest": 0.0, "pixel": 0.0, "kept": 1.0}
+    rows = [{"levels": mode} | nothing | found[mode] for mode in MODES]
     title = f"Popping of {options.run.name} over {found['frames']} frames, {found['levels']} levels"
     report(title, rows, options.json, options.device)
 
