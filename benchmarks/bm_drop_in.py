@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import make_parser, report
+from harness import make_parser, report, synchronize
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer
 from torch import Tensor
 
@@ -150,11 +150,10 @@ ARMS = {"gsplat": Gsplat, "import": OneImport, "four": FourSwaps}
 
 def seconds_of(trainer: GsplatTrainer, until: int) -> float:
     """Continue the training and return the seconds it took."""
-    synchronize = torch.cuda.synchronize if trainer.device.type == "cuda" else lambda: None
-    synchronize()
+    synchronize(trainer.device)
     start = time.perf_counter()
     trainer.train_to(until)
-    synchronize()
+    synchronize(trainer.device)
     return time.perf_counter() - start
 
 

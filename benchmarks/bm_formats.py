@@ -10,7 +10,6 @@ themselves at most, without pages of files; RUN may be a PLY file.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import subprocess
@@ -21,6 +20,7 @@ from pathlib import Path
 
 import psutil
 import torch
+from harness import make_parser
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -77,9 +77,8 @@ def own_bytes(process: int) -> int:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__, device=None)
     parser.add_argument("run", type=Path)
-    parser.add_argument("--json", type=Path)
     parser.add_argument("--memory", action="store_true")
     args = parser.parse_args()
     if args.memory:
@@ -98,8 +97,7 @@ def main() -> int:
         for name, kind in FORMATS.items():
             path = Path(folder) / f"model-{name}{kind.suffix}"
             begin = time.perf_counter()
-            source = source_of(model)
-            export(source, model.space, kind, path)
+            export(source_of(model), model.space, kind, path)
             seconds = time.perf_counter() - begin
             found = read(path)
             columns = trained_columns(found, model.space, Ranks())

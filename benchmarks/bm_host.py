@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import make_parser, report, write_json
+from harness import make_parser, report, synchronize, write_json
 from scenes import aerial
 
 from blitzgs import l1_ssim, rasterization, raw_rasterization
@@ -68,17 +68,16 @@ def measure(
     given = (scene.means, scene.quats, scene.scales, scene.opacities, colors)
     parameters = [t.detach().clone().requires_grad_() for t in given]
     v_renders = torch.ones(views, HEIGHT, WIDTH, 3, device=device)
-    synchronize = torch.cuda.synchronize if scene.means.is_cuda else lambda: None
     samples = []
     for _ in range(repeats // 10 + repeats):
         begin = time.perf_counter()
         renders, _, meta = rasterization(*parameters, scene.viewmats, scene.Ks, WIDTH, HEIGHT, **options)
         if read_meta:
             list(meta.values())
-        synchronize()
+        synchronize(device)
         middle = time.perf_counter()
         torch.autograd.grad(renders, parameters, v_renders)
-        synchronize()
+        synchronize(device)
         samples.append((middle - begin, time.perf_counter() - middle))
     return [1e6 * statistics.median(times) for times in zip(*samples[repeats // 10 :], strict=True)]
 

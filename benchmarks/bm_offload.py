@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 from bm_step import LOSS, OPTIONS, RATE, make_table
-from harness import make_parser, write_json
+from harness import make_parser, synchronize, write_json
 from report_tables import offload_lines
 from scenes import BenchmarkScene, aerial, look_at
 
@@ -105,25 +105,21 @@ class Survey:
 
     def steps(self, stepper: Stepper, order: BatchSampler, first: int, count: int) -> float:
         """Take steps; return the seconds of one."""
-        self._synchronise()
-        begin = time.perf_counter()
-        for step in range(first, first + count):
-            frame, terms, _ = stepper.forward(step, OPTIONS, self.batch(order.batch(step - 1)))
-            stepper.backward(step, frame, terms)
-        self._synchronise()
-        return (time.perf_counter() - begin) / count
+
+        def take() -> None:
+            for step in range(first, first + count):
+                frame, terms, _ = stepper.forward(step, OPTIONS, self.batch(order.batch(step - 1)))
+                stepper.backward(step, frame, terms)
+
+        return self.timed(take) / count
 
     def timed(self, call: Callable[[], object]) -> float:
         """Return the seconds of a call."""
-        self._synchronise()
+        synchronize(self.ranks.device)
         begin = time.perf_counter()
         call()
-        self._synchronise()
+        synchronize(self.ranks.device)
         return time.perf_counter() - begin
-
-    def _synchronise(self) -> None:
-        if self.ranks.device.type == "cuda":
-            torch.cuda.synchronize(self.ranks.device)
 
 
 def table_bytes(table: GaussianTable) -> int:

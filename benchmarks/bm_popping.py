@@ -48,20 +48,29 @@ MODES = ("full", "gated", "smooth")
 FARTHEST, NEAREST = 4.0, 0.5
 
 
-def popping(
-    run: Path,
+def popping(run: Path, out: Path | None = None, device: str = "cpu", **options: Any) -> dict[str, Any]:
+    """Measure the popping of the model of a run: as `popping_of`, on a device."""
+    ranks = Ranks(device=torch.device(device))
+    return popping_of(run_files.open_model(run, ranks), load_cameras(run).cameras, ranks, out, **options)
+
+
+@torch.no_grad()
+def popping_of(
+    model: TrainedModel,
+    cameras: Any,
+    ranks: Ranks,
     out: Path | None = None,
-    device: str = "cpu",
     frames: int = 240,
     width: int = 640,
     camera: str | None = None,
 ) -> dict[str, Any]:
-    """Measure the popping of a run's model.
+    """Measure the popping of a model.
 
     Args:
-        run: folder of the run.
+        model: the model in memory.
+        cameras: of its capture.
+        ranks: this process alone, with the device that renders the frames.
         out: folder for popping.svg and popping.mp4; None: write nothing.
-        device: renders the frames.
         frames: number of frames of the flight, at least 2.
         width: width of the frames in pixels, at most that of the camera.
         camera: name of the view along whose axis the flight goes; None: the view closest to the mean axis.
@@ -75,22 +84,6 @@ def popping(
         ValueError: there are fewer than 2 frames, no view of that name, or nothing in front of the camera.
         OSError: the clip cannot be written.
     """
-    ranks = Ranks(device=torch.device(device))
-    model = run_files.open_model(run, ranks)
-    return popping_of(model, load_cameras(run).cameras, ranks, out, frames, width, camera)
-
-
-@torch.no_grad()
-def popping_of(
-    model: TrainedModel,
-    cameras: Any,
-    ranks: Ranks,
-    out: Path | None = None,
-    frames: int = 240,
-    width: int = 640,
-    camera: str | None = None,
-) -> dict[str, Any]:
-    """Measure the popping of a model in memory: as `popping`, with the cameras of its capture."""
     if frames < 2:
         raise ValueError(f"a flight has at least 2 frames, got {frames}")
     viewmats, K, size = _flight(model, cameras, frames, width, camera)
@@ -233,19 +226,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--camera", help="name of the view whose axis is flown along")
     options = parser.parse_args(arguments)
     out = options.out or options.run / "popping"
-    found = popping(options.run, out, options.device, options.frames, options.width, options.camera)
-    rows = [
-        {
-            "levels": mode,
-            "largest change": found[mode]["largest_change"],
-            "mean change": found[mode]["mean_change"],
-            "largest popping": found[mode].get("largest", 0.0),
-            "mean popping": found[mode].get("mean", 0.0),
-            "worst pixels": found[mode].get("pixel", 0.0),
-            "kept": found[mode].get("kept", 1.0),
-        }
-        for mode in MODES
-    ]
+    flight = {name: getattr(options, name) for name in ("frames", "width", "camera")}
+    found = popping(options.run, out, options.device, **flight)
+    nothing = {"mean": 0.0, "largest": 0.0, "pixel": 0.0, "kept": 1.0}
+    rows = [{"levels": mode} | nothing | found[mode] for mode in MODES]
     title = f"Popping of {options.run.name} over {found['frames']} frames, {found['levels']} levels"
     report(title, rows, options.json, options.device)
 

@@ -24,9 +24,9 @@ from typing import Any
 
 import bm_popping
 import torch
-from harness import environment
+from harness import environment, synchronize
 from quality_plan import RunSpec
-from quality_run import describe, means_of, synchronize, write
+from quality_run import describe, means_of, write
 
 from blitzgs.config.fields import Config
 from blitzgs.distributed.group import Ranks

@@ -159,6 +159,12 @@ def report(
         write_json(path, device, title=title, rows=list(rows))
 
 
+def synchronize(device: torch.device | str) -> None:
+    """Wait for the GPU, if the device is one."""
+    if torch.device(device).type == "cuda":
+        torch.cuda.synchronize(device)
+
+
 def median_ms(
     function: Callable[..., Any], inputs: Sequence[tuple[Any, ...]], repeats: int = 30, warm_up: int = 5
 ) -> float:

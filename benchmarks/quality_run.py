@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import commit, environment
+from harness import commit, environment, synchronize
 from opponents import spatial_partition
 from opponents.gsplat_training import GsplatTrainer
 from quality_plan import RunSpec
@@ -104,12 +104,6 @@ def means_of(metrics: dict[str, Any]) -> dict[str, float]:
     return means
 
 
-def synchronize(device: torch.device) -> None:
-    """Wait for the GPU."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-
-
 class RecordedTrainer(Trainer):
     """A trainer that measures its model during training, and saves no checkpoint."""
 
@@ -156,10 +150,7 @@ def train_ours(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:
         trainer.recorder, trainer.lpips = recorder, load_lpips(spec.lpips)
         if trainer.train() is None:
             raise InterruptedError("stopped by a signal")
-    return figures(recorder, trainer.state.progress.peak_gaussians) | {
-        "population": trainer.population,
-        "largest_fall": trainer.state.curve.fall,
-    }
+    return figures(recorder, trainer.state.progress.peak_gaussians) | {"population": trainer.population}
 
 
 def train_opponent(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:

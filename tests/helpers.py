@@ -158,9 +158,12 @@ def ssim_map(x: Tensor, y: Tensor, padding: int = 5) -> Tensor:
     """
     x, y = (t.double().permute(0, 3, 1, 2) for t in (x, y))
     line = torch.exp(-((torch.arange(11, dtype=torch.float64, device=x.device) - 5) ** 2) / 4.5)
-    window = torch.outer(line, line)
-    window = (window / window.sum()).expand(3, 1, 11, 11)
-    blur = partial(torch.nn.functional.conv2d, weight=window, padding=padding, groups=3)
+    line = (line / line.sum()).expand(3, 1, 1, 11)
+    conv = partial(torch.nn.functional.conv2d, groups=3)
+
+    def blur(t: Tensor) -> Tensor:
+        return conv(conv(t, line, padding=(0, padding)), line.mT, padding=(padding, 0))
+
     mx, my = blur(x), blur(y)
     vx, vy, cov = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
     top = (2 * mx * my + 0.01**2) * (2 * cov + 0.03**2)

@@ -16,6 +16,7 @@ import pytest
 
 import blitzgs
 from blitzgs import _library
+from tests.helpers import refused
 from tests.small_suite import TESTS, kernel_of, kernels_in_source
 
 
@@ -45,8 +46,7 @@ def test_a_library_that_was_not_rebuilt_is_named(tmp_path, monkeypatch):
     changed.write_text("// other ops")
     monkeypatch.setattr(_library, "REGISTRATION", changed)
     message = "libblitzgs_cpu.so was built before the ops changed .*: run `make build`"
-    with pytest.raises(ImportError, match=message):
-        _library.load_libraries()
+    refused(ImportError, message, _library.load_libraries)
 
 
 def test_a_library_that_is_missing_is_named(tmp_path):

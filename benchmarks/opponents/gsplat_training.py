@@ -22,9 +22,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from blitzgs import rasterization, relocate
+from blitzgs import quat_scale_to_covar_preci, rasterization, relocate
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.images import ImageStore
@@ -102,37 +101,6 @@ class GsplatOptions:
         return max(1, int(time * self.steps_scaler))
 
 
-def covariances(
-    quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
-) -> tuple[Tensor, None]:
-    """Return R S S^T R^T of each Gaussian, [N, 3, 3]; replaces gsplat's `quat_scale_to_covar_preci`.
-
-    The products are written out, because a batched product of such small matrices would take most of a step.
-
-    Args:
-        quats: [N, 4] (w, x, y, z), need not be normalised.
-        scales: [N, 3], standard deviations.
-        compute_covar: only True.
-        compute_preci: only False.
-        triu: only False.
-    """
-    if not compute_covar or compute_preci or triu:
-        raise NotImplementedError("only whole covariance matrices")
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(dim=1)
-    rotation = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    variances = scales.square().unbind(dim=1)
-    entries = [
-        sum(a * b * v for a, b, v in zip(rotation[i], rotation[j], variances, strict=True))
-        for i in range(3)
-        for j in range(3)
-    ]
-    return torch.stack(entries, dim=1).view(-1, 3, 3), None
-
-
 def load_strategies() -> Any:
     """Import gsplat's strategies; MCMCStrategy calls two functions of gsplat's CUDA extension, here ours.
 
@@ -148,7 +116,7 @@ def load_strategies() -> Any:
             f"its wheel, which is importable as it is, on PYTHONPATH ({error})"
         ) from error
     ops.compute_relocation = lambda opacities, scales, ratios, binoms: relocate(opacities, scales, ratios, 0)
-    ops.quat_scale_to_covar_preci = covariances
+    ops.quat_scale_to_covar_preci = quat_scale_to_covar_preci
     return strategies
 
 

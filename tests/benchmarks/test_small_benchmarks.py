@@ -2,6 +2,7 @@
 """Benchmarks of one figure: accuracy, host time of a call, gsplat's loop, tiles, popping."""
 
 import json
+import re
 import sys
 from dataclasses import replace
 
@@ -37,15 +38,6 @@ def test_every_call_is_measured(tmp_path, monkeypatch, capsys):
     assert "sparse, meta" in capsys.readouterr().out
     assert list(steps) == ["render", "loss", "backward", "optimisers", "all"] and min(steps.values()) > 0
     assert all(row["one optimiser, host us"] > 0 for row in written["steps"])
-
-
-@pytest.mark.parametrize("in_one", [False, True])
-def test_the_trainer_whose_steps_are_measured_learns(in_one):
-    trainer = bm_host.Trainer("cpu", in_one)
-    before = {name: value.detach().clone() for name, value in trainer.params.items()}
-    for _ in range(3):
-        trainer.step()
-    assert all(not value.equal(before[name]) for name, value in trainer.params.items())
 
 
 def test_the_loop_learns_with_each_arm(tmp_path, capsys):
@@ -98,10 +90,9 @@ def test_smooth_levels_pop_less(trained, tmp_path, device, capsys):
     pytest.importorskip("av", reason="the extra film is not installed")
     arguments = [str(trained), "--frames", "200", "--device", device, "--out", str(tmp_path / "shown")]
     bm_popping.main([*arguments, "--json", str(tmp_path / "found.json")])
-    assert "Popping of run over 200 frames" in capsys.readouterr().out
-    found = bm_popping.popping(trained, None, device, frames=200)
-    gated, smooth = found["gated"], found["smooth"]
-    assert found["levels"] > 2 and gated["kept"] < 1 and smooth["kept"] < 1
+    assert re.search(r"Popping of run over 200 frames, ([3-9]|\d\d) levels", capsys.readouterr().out)
+    full, gated, smooth = json.loads((tmp_path / "found.json").read_text())["rows"]
+    assert gated["kept"] < 1 and smooth["kept"] < 1 == full["kept"] and full["largest"] == 0
     assert 0 < smooth["largest"] < 0.7 * gated["largest"]
     assert smooth["pixel"] < 0.7 * gated["pixel"]
     assert gated["largest_change"] > smooth["largest_change"]
@@ -129,8 +120,7 @@ def test_a_model_of_one_level_does_not_pop(trained, monkeypatch):
 
 def test_errors_name_the_remedy(trained):
     refused(ValueError, "at least 2 frames, got 1", bm_popping.popping, trained, frames=1)
-    with pytest.raises(ValueError, match="no view 'x.jpg'; it has for example 00.png"):
-        bm_popping.popping(trained, camera="x.jpg")
+    refused(ValueError, "no view 'x.jpg'; it has for example", bm_popping.popping, trained, camera="x.jpg")
 
 
 @pytest.fixture(scope="module")
@@ -216,11 +206,3 @@ def test_aerial_workload():
     assert float(scene.means[:, :2].abs().max()) < 502
     flattest = scene.scales.argmin(1) == 2
     assert float(flattest.float().mean()) > 0.8
-
-
-def test_aerial_gaussians_lie_in_their_surface():
-    scene = aerial(50_000)
-    on_ground = scene.means[:, 2] < 0.2
-    w, x, y, z = scene.quats[on_ground].unbind(1)
-    up = 1 - 2 * (x * x + y * y)  # z component of the turned z axis
-    assert float(up.median()) > 0.95

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import blitzgs
-from tests.helpers import BACKENDS, random_scene, rasterize_scene
+from tests.helpers import BACKENDS, random_scene, rasterize_scene, refused
 
 BROWN = (-0.2, 0.05, 0.0, 0.0, 0.0, 0.0, 0.005, -0.008, 0.002, 0.0, -0.003, 0.0)
 FISHEYE = (0.05, -0.02, 0.01, 0.0)
@@ -195,5 +195,4 @@ def test_lenses_that_are_not_finite_are_named():
 )
 def test_what_does_not_go_together_is_refused_by_name(options, message):
     scene = wide_scene(n=4)
-    with pytest.raises(ValueError, match=message):
-        blitzgs.rasterization(**{**vars(scene), **options})
+    refused(ValueError, message, blitzgs.rasterization, **{**vars(scene), **options})

@@ -242,21 +242,15 @@ def test_optimizers_may_be_one_of_any_class():
     expected = raw(p, scene)[0]
     for optimizer_class in (torch.optim.Adam, LazyAdam):
         assert torch.equal(raw(p, scene, optimizers=optimizer_class(p.values()))[0], expected)
-    with pytest.raises(
-        TypeError, match="optimizers must be an optimiser, or a mapping or a sequence .* NoneT"
-    ):
-        raw(p, scene, optimizers=None)
+    refused(TypeError, "optimizers must be an optimiser, or a mapping or a", raw, p, scene, optimizers=None)
 
 
 def test_wrong_shapes_are_refused_by_name():
     scene = random_scene(n=20)
     p = raw_parameters(scene)
-    with pytest.raises(ValueError, match=r"shN must be \[N, K, 3\] with N = 20, got \[19, 15, 3\]"):
-        raw({**p, "shN": p["shN"][:19]}, scene)
-    with pytest.raises(ValueError, match=r"means must be \[N, 3\], got \[1, 20, 3\]"):
-        raw({**p, "means": p["means"][None]}, scene)
-    with pytest.raises(ValueError, match="shN is on meta and means on cpu; move one"):
-        raw({**p, "shN": p["shN"].to("meta")}, scene)
+    refused(ValueError, r"shN must be \[N, K, 3\] with N = 20, got", raw, {**p, "shN": p["shN"][:19]}, scene)
+    refused(ValueError, r"means must be \[N, 3\], got \[1, 20", raw, {**p, "means": p["means"][None]}, scene)
+    refused(ValueError, "shN is on meta and means on cpu", raw, {**p, "shN": p["shN"].to("meta")}, scene)
     with pytest.raises(TypeError, match=r"quats must be a torch\.Tensor, got ndarray"):
         raw({**p, "quats": p["quats"].detach().numpy()}, scene)
     with pytest.raises(ValueError, match="sh_degree 3 needs 16 SH coefficients, got 4"):
@@ -275,16 +269,6 @@ def test_sparse_gradients_need_leaves():
     p = raw_parameters(scene)
     p["sh0"] = p["sh0"] * 2
     raw(p, scene, render_mode="D")[0].sum().backward()  # SH get no gradient
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("name", NAMES)
-def test_a_second_derivative_is_refused(device, name):
-    scene = random_scene(n=30, cameras=1, device=device)
-    p = raw_parameters(scene)
-    (gradient,) = torch.autograd.grad(raw(p, scene, sparse_grad=False)[0].sum(), [p[name]], create_graph=True)
-    with pytest.raises(RuntimeError, match="has first derivatives only"):
-        (gradient.square().sum() + sum(t.sum() for t in p.values())).backward()
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -216,8 +216,7 @@ def test_a_mask_of_another_shape_is_refused(tmp_path):
             assert ImageStore(capture).mask(0).all()
             continue
         message = r"masks/v00.png is 48 x 48, which does not fit .* 64 x 48 .*: make it from"
-        with pytest.raises(ValueError, match=message):
-            load_capture(tmp_path)
+        refused(ValueError, message, load_capture, tmp_path)
         with pytest.raises(ValueError, match=message):  # the file has changed
             ImageStore(capture).mask(0)
 

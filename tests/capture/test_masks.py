@@ -12,6 +12,7 @@ from blitzgs.capture.image_files import decode_mask, decode_rgb, described, read
 from blitzgs.capture.images import ImageStore
 from blitzgs.capture.masks import find_masks
 from tests.capture.helpers import png, smooth_image, tiff, write_capture, write_image
+from tests.helpers import refused
 
 SHAPE = (48, 64)
 
@@ -192,8 +193,7 @@ def test_messages_about_masks_speak_of_masks(tmp_path):
     path = root / "masks" / "a.png"
     path.write_bytes(WAYS["black and white"][:-20])
     store = ImageStore(load_capture(root))
-    with pytest.raises(ValueError, match=r"the mask .*masks/a.png: at byte \d+: truncated PNG"):
-        store.mask(0)
+    refused(ValueError, r"the mask .*masks/a.png: at byte \d+: truncated PNG", store.mask, 0)
 
 
 def test_a_photograph_is_not_taken_for_its_own_mask(tmp_path):
@@ -380,8 +380,7 @@ def test_bands_that_cannot_be_used_are_refused_by_name(tmp_path, bands, extra, r
     for dtype in (np.uint8, np.uint16):
         root = write_capture(tmp_path / np.dtype(dtype).name, ["a.tif"])
         (root / "images" / "a.tif").write_bytes(tiff(np.zeros((48, 64, bands), dtype=dtype), extra))
-        with pytest.raises(ValueError, match=f"a.tif: not supported: {reason}"):
-            load_capture(root)
+        refused(ValueError, f"a.tif: not supported: {reason}", load_capture, root)
 
 
 def test_unused_bands_are_said_at_load_and_alpha_is_counted(tmp_path):

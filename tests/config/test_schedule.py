@@ -148,12 +148,6 @@ def test_learning_rates():
         torch.testing.assert_close(table[step], 2.0 * expected, rtol=1e-6, atol=0.0)
 
 
-def test_positions_can_stand_still():
-    schedule = Schedule(ScheduleConfig(iterations=100))
-    table = schedule.learning_rates(OptimiserConfig(position=0.0), extent=2.0)
-    assert not table[:, 0].any() and table[1:, 1:].all()
-
-
 def test_opacities_are_reset_while_densifying_and_after_the_density_event_of_the_same_image():
     config = ScheduleConfig(
         iterations=3_000, densify_from=100, densify_until=1_500, densify_every=100, reset_every=500

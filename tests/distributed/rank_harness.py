@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs a function on M ranks, with Gloo on the CPU and NCCL on M GPUs; with fewer GPUs, ranks share them.
 
-A fork server imports torch once, so CPU ranks start quickly; a CUDA context does not survive a fork.
+A fork server imports once what ranks need, so CPU ranks start quickly; a CUDA context does not survive a
+fork.
 """
 
 import multiprocessing
@@ -19,7 +20,9 @@ from blitzgs.distributed.group import Ranks
 from tests.helpers import needs_cuda
 
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["torch", "torch.distributed", "blitzgs.cli.train"])
+CONTEXT.set_forkserver_preload(
+    ["torch", "torch.distributed", "blitzgs.cli.train", "tests.training.tiny", "tests.capture.helpers"]
+)
 
 
 def _child(function, rank, world_size, port, timeout_seconds, join, device, transport, arguments, pipe):
@@ -97,21 +100,8 @@ def run_ranks(
     processes, pipes = [], []
     for rank in range(world_size):
         receiver, sender = context.Pipe(duplex=False)
-        process = context.Process(
-            target=_child,
-            args=(
-                function,
-                rank,
-                world_size,
-                store.port,
-                timeout_seconds,
-                join,
-                device,
-                transport,
-                payload,
-                sender,
-            ),
-        )
+        job = (function, rank, world_size, store.port, timeout_seconds, join, device, transport, payload)
+        process = context.Process(target=_child, args=(*job, sender))
         process.start()
         sender.close()
         processes.append(process)

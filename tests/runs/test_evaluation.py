@@ -27,7 +27,7 @@ from blitzgs.runs.evaluation import correct_colours, image_metrics, load_lpips
 from blitzgs.runs.export import export, open_source, source_of
 from blitzgs.runs.folder import open_run
 from blitzgs.runs.world import in_world, load_world_frame, rotated_harmonics, save_world_frame
-from tests.helpers import export_ply, save_checkpoint, ssim_map
+from tests.helpers import export_ply, refused, save_checkpoint, ssim_map
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -84,8 +84,7 @@ def test_lpips_is_a_torchscript_module(tmp_path):
     metric = load_lpips(str(path))
     assert metric is not None
     assert float(metric(torch.zeros(1, 3, 4, 4), torch.ones(1, 3, 4, 4))) == 1.0
-    with pytest.raises(ValueError, match=r"missing.pt is not .*\(--lpips\)"):
-        load_lpips(str(tmp_path / "missing.pt"))
+    refused(ValueError, r"missing.pt is not .*\(--lpips\)", load_lpips, str(tmp_path / "missing.pt"))
 
 
 def test_a_checkpoint_is_streamed_with_its_pending_steps(trained, tmp_path, monkeypatch):

@@ -52,8 +52,7 @@ def test_a_run_is_read_without_the_trainer(trained):
 
 def test_a_model_asks_for_a_device_that_exists(trained, monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
-    with pytest.raises(ValueError, match="device cuda: this torch .*; install one with CUDA"):
-        blitzgs.open_run(trained[1]).model("cuda")
+    refused(ValueError, "device cuda: this torch .*; install one", blitzgs.open_run(trained[1]).model, "cuda")
     assert blitzgs.open_run(trained[1]).model(torch.device("cpu")).means.device.type == "cpu"
 
 
@@ -371,9 +370,7 @@ def test_export_refuses_a_name_that_promises_another_format(trained, tmp_path, c
 # Paths may have any characters.
 
 
-@pytest.mark.parametrize(
-    "name", ["emoji 🏙", "bytes \udcff\udcfe", "[/b]", ":x: [red]", "a: b # {c}", "astral 𝔸", "quote \"'"]
-)
+@pytest.mark.parametrize("name", ["emoji 🏙 [/b] :x: [red]", "bytes \udcff\udcfe", "a: b # {c} 𝔸 \"'"])
 def test_any_path_works(trained, tmp_path, capfd, name):
     data, out = tmp_path / f"data {name}", tmp_path / f"run {name}"
     shutil.copytree(trained[0], data)

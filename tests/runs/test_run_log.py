@@ -304,8 +304,13 @@ def other(trained, tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("known_by", ["cameras", "log"])
-@pytest.mark.parametrize("command", ["eval", "render", "export", "resume", "extend"])
+@pytest.mark.parametrize(
+    ("command", "known_by"),
+    [
+        *((command, "cameras") for command in ("eval", "render", "export", "resume", "extend")),
+        ("eval", "log"),
+    ],
+)
 def test_a_checkpoint_of_another_run_is_refused(trained, other, tmp_path, capsys, command, known_by):
     run = tmp_path / "run"
     shutil.copytree(trained[1], run)

@@ -208,12 +208,6 @@ def test_mistakes_with_files_name_them(trained, tmp_path, failure):
     assert "downscale 100 leaves 1 x 1 pixels" in small
 
 
-def test_eval_without_held_out_views_says_so(trained, tmp_path, failure):
-    flags = as_flags("config=defaults", *OVERRIDES) + ["--schedule.scale=0.02", "--data.split=0"]
-    assert main(["train", "--data", str(trained[0]), "--out", str(tmp_path / "run"), *flags]) == 0
-    assert "no test views: choose another --split" in failure("eval", tmp_path / "run")
-
-
 def test_show_config_and_help(capsys):
     assert main(["train", "--show-config", "--schedule.batch_size=4"]) == 0
     assert json.loads(capsys.readouterr().out)["schedule"]["batch_size"] == 4

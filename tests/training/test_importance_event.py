@@ -38,6 +38,7 @@ from blitzgs.training.events import importance
 from blitzgs.training.trainer import Trainer
 from blitzgs.util import progress
 from tests.distributed.rank_harness import on_each_device, run_ranks
+from tests.helpers import refused
 from tests.training import tiny
 from tests.training.tiny import (
     Images,
@@ -233,8 +234,7 @@ def test_lineage_of_a_run_that_was_saved_before_its_first_step_adds_up(tmp_path,
     """The first Gaussians were logged before a photograph could not be read, and stay logged."""
     pytest.importorskip("pyarrow")
     monkeypatch.setattr(Images, "get", lambda self, index, factor=1: Path("/photos/00.png").read_bytes())
-    with pytest.raises(PhotographError, match="put the photograph back"):
-        train(tmp_path, "population.lineage=true")
+    refused(PhotographError, "put the photograph back", train, tmp_path, "population.lineage=true")
     monkeypatch.undo()
     lineage_of_the_resumed(tmp_path)
 
@@ -421,6 +421,5 @@ def test_a_pass_that_a_signal_cuts_short_happens_after_the_resume(tmp_path, monk
     ],
 )
 def test_a_pass_that_keeps_nothing_ends_the_run_before_it_is_saved(tmp_path, options, named):
-    with pytest.raises(ModelLostError, match=named):
-        train(tmp_path, *options, "schedule.checkpoint_every=10")
+    refused(ModelLostError, named, train, tmp_path, *options, "schedule.checkpoint_every=10")
     assert len(run_files.open_model(tmp_path, Ranks()).table) > 0

@@ -18,7 +18,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.capture.lens import Lens
 from blitzgs.cli import main
 from blitzgs.config.fields import Config
-from blitzgs.config.files import load_config, recipe_path
+from blitzgs.config.files import load_config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.training import inputs
@@ -293,14 +293,6 @@ def test_the_memory_of_a_known_population(capture):
     assert on_cpu.host_bytes == 400_000_000 + 3 * VIEWS * WIDTH * HEIGHT + found.device_bytes
 
 
-def test_a_lower_degree_takes_less(capture):
-    few, many = (
-        estimate(config_of("population.max_gaussians=400", f"model.sh_degree={degree}"), capture, True, 2)
-        for degree in (0, 3)
-    )
-    assert many.device_bytes - few.device_bytes == 400 * (3 * 45 * 4 + 180 - 12)
-
-
 def test_minutes_are_those_that_were_asked_for(capture):
     assert estimate(config_of("schedule.minutes=7"), capture, False, 2).minutes == 7
     one, four = (estimate(config_of(), capture, False, cores).minutes for cores in (1, 4))
@@ -314,8 +306,3 @@ def test_growth_ends_at_the_limit_and_its_mean_is_over_images():
     most, mean = _grown(100, 130, 0.2, schedule)
     assert (most, mean) == (130, pytest.approx((10 * 100 + 10 * 120 + 80 * 130) / 100))
     assert _grown(100, 10**6, 0.2, schedule)[0] == 172
-
-
-def test_the_recipes_limit_the_population(capture):
-    found = estimate(load_config(recipe_path("smoke"), []), capture, False, 2)
-    assert len(capture.points) <= found.gaussians <= 100_000

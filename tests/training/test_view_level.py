@@ -26,6 +26,7 @@ from blitzgs.training.step import Stepper
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.gate import centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
+from tests.helpers import refused
 from tests.training import tiny
 from tests.training.tiny import (
     OVERRIDES,
@@ -328,5 +329,4 @@ def test_the_mask_is_cleared_halfway_after_the_last_pass():
 
 
 def test_a_mask_needs_the_passes():
-    with pytest.raises(ConfigError, match="view.cull: needs population.importance=true"):
-        tiny_config("view.cull=true")
+    refused(ConfigError, "view.cull: needs population.importance=true", tiny_config, "view.cull=true")

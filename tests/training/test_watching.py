@@ -2,7 +2,7 @@
 """What is seen of a training: a viewer on its state, glances, figures and curves."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,11 +15,11 @@ from blitzgs.training.events import evaluate as glances
 from blitzgs.training.events.evaluate import Glances, evenly_ordered
 from blitzgs.training.state import FALL, WINDOW, Curve
 from blitzgs.training.trainer import Trainer
-from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Look, Wish
 from blitzgs.view.views import viewmat
 from blitzgs.view.visible import VisibleFinder
 from tests.distributed.rank_harness import run_ranks
+from tests.helpers import refused
 from tests.training.tiny import assert_same_table, events_of, tiny_config, tiny_scene, train
 
 
@@ -151,11 +151,6 @@ def test_a_rank_that_cannot_draw_does_not_end_the_training(tmp_path):
     assert images == other == 20
 
 
-def test_intrinsics_are_centred():
-    K = intrinsics(200, 100, np.pi / 2)  # noqa: N806
-    np.testing.assert_allclose(K, [[50, 0, 100], [0, 50, 50], [0, 0, 1]])
-
-
 def test_a_model_in_host_memory_is_shown(tmp_path):
     settings = ("schedule.iterations=20", "memory.resident_gb=0.001")
     trainer, watcher, summary = watched_run(tmp_path, *settings)
@@ -201,13 +196,11 @@ def test_figures_of_training_views_are_called_so(tmp_path, capsys):
 def test_a_model_without_gaussians_is_no_result(tmp_path):
     config = tiny_config("population.min_opacity=0.98")
     running = Trainer(config, *tiny_scene(), tmp_path / "a", Ranks())
-    with pytest.raises(ModelLostError, match="the density event after 20 images pruned the last Gaussian"):
-        running.train()
+    refused(ModelLostError, "the density event after 20 images pruned the last Gaussian", running.train)
     running = Trainer(tiny_config("schedule.iterations=2"), *tiny_scene(), tmp_path / "b", Ranks())
     running.state.table.keep(torch.zeros(len(running.state.table), dtype=torch.bool))
     running.state.stepper.reindex()
-    with pytest.raises(ModelLostError, match="no Gaussian is left"):
-        running.train()
+    refused(ModelLostError, "no Gaussian is left", running.train)
     assert not list(tmp_path.glob("*/checkpoints/*"))
 
 
@@ -309,9 +302,3 @@ def test_a_reset_begins_the_curve_anew():
     curve.restart()
     curve, said = followed([15.0] * (2 * WINDOW), curve)
     assert not said and curve.fall == 0
-
-
-def test_a_curve_survives_a_resume():
-    curve, _ = followed([25.0] * 20)
-    again = Curve(**asdict(curve))
-    assert again == curve and followed([19.0] * 30, again)[1]

@@ -23,7 +23,7 @@ from blitzgs.view.look import MODES, Look
 from blitzgs.view.views import render_options, viewmat
 from blitzgs.view.visible import VisibleFinder
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import DEVICES
+from tests.helpers import DEVICES, refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
 
 
@@ -168,8 +168,7 @@ def test_ranks_draw_together(trained, drawer, scene):
 )
 def test_impossible_looks_are_refused(change, what):
     fields = {"viewmat": np.eye(4), "K": intrinsics(8, 8, 1.0), "width": 8, "height": 8}
-    with pytest.raises(ValueError, match=what):
-        Look(**(fields | change))
+    refused(ValueError, what, Look, **fields | change)
 
 
 def flat_scene(points, cameras, seed=0):

@@ -23,7 +23,7 @@ from blitzgs.viewer.studio import open_model
 from blitzgs.viewer.web import open_city, to_globe
 from tests.browser import Browser, needs_chromium, wait_for
 from tests.formats.test_tiles import SCENE, city, nodes
-from tests.helpers import read_glb
+from tests.helpers import read_glb, refused
 from tests.viewer.test_parts import camera_at
 
 WIDTH, HEIGHT = 320, 240
@@ -121,11 +121,9 @@ def test_damaged_folders_are_refused(tmp_path):
         (good.replace("BlitzGS", "another"), "was not written by blitzgs export --tiles"),
     ):
         (folder / "tileset.json").write_text(text)
-        with pytest.raises(ValueError, match=reason):
-            tiles_server(folder, "127.0.0.1", 0)
+        refused(ValueError, reason, tiles_server, folder, "127.0.0.1", 0)
     (folder / "tileset.json").write_text(good)
-    with pytest.raises(OSError, match=r"cannot listen on 203\.0\.113\.1:0"):
-        tiles_server(folder, "203.0.113.1", 0)
+    refused(OSError, r"cannot listen on 203\.0\.113\.1:0", tiles_server, folder, "203.0.113.1", 0)
 
 
 def contents(folder):
@@ -234,8 +232,7 @@ def test_a_georeferenced_run_lies_on_the_globe(trained, tmp_path):
     # An ENU frame of its own: no map projection.
     local = enu_frame(47.3, 8.5, 400.0, "gps")
     np.testing.assert_allclose(to_globe(local, np.zeros(3))[:3, :3], local.rotation, atol=1e-7)
-    with pytest.raises(ValueError, match="a file: "):
-        to_globe(WorldFrame("EPSG:99999999", source="a file"), np.zeros(3))
+    refused(ValueError, "a file: ", to_globe, WorldFrame("EPSG:99999999", source="a file"), np.zeros(3))
 
 
 def test_geo_json_of_a_run_is_used(trained, tmp_path):

@@ -25,6 +25,7 @@ from blitzgs.viewer.studio import open_model
 from blitzgs.viewer.web import contributions, web_file
 from blitzgs.viewer.world import World, looking
 from tests.browser import Browser, needs_chromium, wait_for
+from tests.helpers import refused
 
 WIDTH, HEIGHT = 160, 120
 # The header of a model with octree levels; levels 2 and 3 end before the far half of the scene.
@@ -144,8 +145,7 @@ def test_what_does_not_fit_is_left_out_and_stated(tmp_path):
     left_out = whole.gaussians - least.gaussians
     assert f"{left_out:,} of {whole.gaussians:,} Gaussians" in least.left_out
     assert least.left_out in least.text
-    with pytest.raises(ValueError, match="holds no Gaussian: choose a larger --max-mb"):
-        web_file(opened, 20_000)
+    refused(ValueError, "holds no Gaussian: choose a larger --max-mb", web_file, opened, 20_000)
 
 
 def test_the_order_is_that_of_contributions(trained):
