@@ -143,13 +143,13 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=6,
         metavar=tuple("xyzXYZ"),
-        help="keep this box of the capture's coordinates",
+        help="keep this box, in the capture's coordinates (with --coordinates world: the world's)",
     )
     arguments.add_path(
         parser,
         "--crop-polygon",
         "FILE",
-        'keep this region: a GeoJSON polygon, or lines "x y", in the capture\'s coordinates',
+        'keep this region: a GeoJSON polygon, or lines "x y", in the coordinates of --crop',
     )
     parser.add_argument(
         "--crop-axes", choices=("xy", "xz", "yz"), help="axes of the polygon's corners (default: xy)"
@@ -296,7 +296,7 @@ def _export_run(
         if args.classic and model.config.model.antialiased:
             stored = folder.cameras()
             model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
-        crs = ""
+        crs = None
         if coordinates == "world":
             frame = load_world_frame(run_folder)
             if frame is None:

@@ -92,6 +92,10 @@ def read_gaussians(path: Path | str) -> Gaussians:
     holds values that cannot be shown; names the file. ImportError: a package is missing; says which.
     """
     path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(
+            f"{path} is a folder and no file of Gaussians: blitzgs export makes one of a run"
+        )
     with open(path, "rb") as file:
         start = file.read(_HEADER)
     if start.startswith(b"ply"):

@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 
 from blitzgs.capture.cameras import Float64
+from blitzgs.capture.capture import Capture
 from blitzgs.capture.colmap import rotation_to_quat
+from blitzgs.capture.lengths import Sight
 from blitzgs.capture.world import GEO, WorldFrame, read_world_frame
 from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
@@ -111,6 +113,16 @@ def trained_columns(found: Gaussians, space: Space, ranks: Ranks) -> dict[str, T
         "id": torch.arange(len(found))[rows],
     }
     return {name: column.contiguous() for name, column in columns.items()}
+
+
+def check_seen(found: Gaussians, path: Path, capture: Capture) -> None:
+    """Refuse a file of which no view of a capture shows a Gaussian (ValueError): its world is another."""
+    positions = found.means.double().numpy() + offset_of(found.comments) - capture.offset
+    if not np.isfinite(Sight.of(capture.cameras, positions).nearest).any():
+        raise ValueError(
+            f"{path}: no view of {capture.root} sees one of its {len(found):,} Gaussians: the file must have "
+            "the coordinates of that capture, not those of the world or of another program"
+        )
 
 
 def gate_of(found: Gaussians, unit: float) -> LodGate | None:
