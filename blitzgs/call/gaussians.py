@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import lru_cache
+from itertools import count
 from typing import Any
 
 import torch
@@ -164,6 +166,7 @@ def knn(points: Tensor, k: int) -> Tensor:
 
 PADDINGS = ("same", "valid")
 _REACH = 5  # of the window, px
+_MOST = 2.0  # of float targets: more is no photograph from 0 to 1, however bright
 
 
 def l1_ssim(
@@ -224,6 +227,8 @@ def l1_ssim(
         )
     if renders.numel() == 0:
         return renders.sum()  # zero with a gradient; the mean over no views is NaN
+    if targets.is_floating_point() and type(targets) is Tensor and not torch.compiler.is_compiling():
+        _warn_of_range(targets)
     x, y = renders, targets
     if renders.dim() != 4:  # else leave the images as they are: a view would be a node of autograd's graph
         x, y = renders.reshape(-1, *renders.shape[-3:]), targets.reshape(-1, *targets.shape[-3:])
@@ -262,6 +267,20 @@ def _check_types(renders: object, targets: object, masks: object) -> None:
         )
     if isinstance(masks, Tensor) and masks.dtype not in (torch.bool, torch.uint8):
         raise TypeError(f"masks must be bool or uint8, got {masks.dtype}; pass masks != 0")
+
+
+_float_calls = count()
+
+
+def _warn_of_range(targets: Tensor) -> None:
+    """Warn if the photographs of the process's first call go to 255; later ones would wait for the GPU."""
+    if next(_float_calls) or (targets.is_cuda and torch.cuda.is_current_stream_capturing()):
+        return
+    if (most := float(targets.detach().amax())) > _MOST:
+        warnings.warn(
+            f"blitzgs.l1_ssim: targets go to {most:g}: they are uint8, or floats from 0 to 1 (targets / 255)",
+            stacklevel=3,
+        )
 
 
 def _has_tangent(images: Tensor) -> bool:

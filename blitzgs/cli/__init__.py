@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import gc
 import os
+import re
 import signal
 import sys
 import threading
@@ -98,7 +99,10 @@ def _run(given: list[str]) -> int:
     chosen = next((text for text in given if not text.startswith("-")), "")
     name = f"blitzgs {chosen}" if chosen in COMMANDS else "blitzgs"
     # Our warnings are about the user's data, so they are shown without the line of code that raised them.
-    warnings.formatwarning = lambda message, *_, **__: printable(f"{name}: warning: {message}") + "\n"
+    # Those of libraries may have several lines.
+    warnings.formatwarning = lambda message, *_, **__: (
+        printable(f"{name}: warning: " + re.sub(r"\s*\n\s*", " ", str(message).strip())) + "\n"
+    )
     try:
         with _importing(name):
             parser, commands = parser_of([chosen])

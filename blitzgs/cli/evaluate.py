@@ -20,7 +20,7 @@ from blitzgs.runs import run_files
 from blitzgs.runs.cameras import input_files, warn_of_changes
 from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
 from blitzgs.runs.run_files import lod_gate, model_gate
-from blitzgs.runs.world import gate_of, model_of_file
+from blitzgs.runs.world import check_seen, gate_of, model_of_file
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.training.understood import largest_size
 from blitzgs.util.progress import image_progress
@@ -83,6 +83,7 @@ def run(args: argparse.Namespace) -> int:
             config = changed(config, "data", allow_missing=True)
         capture, images = open_capture(config, ranks, "--allow-missing")
         if path.is_file():
+            check_seen(found, path, capture)
             model = model_of_file(
                 found, config, Space.of(capture.offset, capture.extent), capture.near, ranks
             )

@@ -95,7 +95,7 @@ FLAGS = f"""
 --processes N  with --tiles and --streamed-sog: processes that write tiles (default: as many as CPU cores)
 """
 SELECTION = """
---crop-polygon FILE  keep this region: a GeoJSON polygon, or lines "x y", in the capture's coordinates
+--crop-polygon FILE  keep this region: a GeoJSON polygon, or lines "x y", in the coordinates of --crop
 --min-opacity O  keep Gaussians of at least this opacity
 --most N  keep the N Gaussians that contribute most to views of the capture (of a file: of the largest opacity
     times length)
@@ -141,7 +141,7 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=6,
         metavar=tuple("xyzXYZ"),
-        help="keep this box of the capture's coordinates",
+        help="keep this box, in the capture's coordinates (with --coordinates world: the world's)",
     )
     parser.add_argument(
         "--crop-axes", choices=("xy", "xz", "yz"), help="axes of the polygon's corners (default: xy)"
@@ -294,7 +294,7 @@ def _export_run(
             )
             stored = folder.cameras()
             model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
-        crs = ""
+        crs = None
         if coordinates == "world":
             frame = load_world_frame(run_folder)
             if frame is None:

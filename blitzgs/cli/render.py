@@ -296,7 +296,10 @@ def _shared_box(table: GaussianTable, ranks: Ranks) -> npt.NDArray[np.float64]:
 def _exposures(found: Tensor | None, stored: RunCameras) -> dict[int, Tensor]:
     """Return gain and bias, float32 [2, 3], of each training view, by its index among the cameras."""
     if found is None:
-        raise ValueError("--exposure: the run was trained without model.exposure")
+        raise ValueError(
+            "--exposure: the run has no exposures: it was trained without model.exposure, or its photographs "
+            "have the same"
+        )
     if len(found) != len(stored.train):
         raise ValueError(f"--exposure: the run has {len(found)} photographs, not {len(stored.train)}")
     return dict(zip(stored.train, found.float(), strict=True))

@@ -33,6 +33,7 @@ from blitzgs.training.inputs import open_capture, read_ahead
 from blitzgs.training.state import TrainingState
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import check_worlds, understood
+from blitzgs.util.output import check_outside
 from blitzgs.util.progress import Laps
 from blitzgs.util.terminal import printable
 
@@ -166,6 +167,8 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.check:
         return _check(args, config)
+    if (photographs := Path(config.data.path) / config.data.images).is_dir():
+        check_outside(args.out, photographs)
     job, laps = config.ranks, Laps(since_start=True)
     laps.lap("imports")
     if not args.no_sfm:

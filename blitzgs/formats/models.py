@@ -105,6 +105,10 @@ def read_gaussians(path: Path | str) -> Gaussians:
     holds values that cannot be shown; names the file. ImportError: a package is missing; says which.
     """
     path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(
+            f"{path} is a folder and no file of Gaussians: blitzgs export makes one of a run"
+        )
     kind = format_of(path)
     if kind is None or kind.read is None:
         raise ValueError(f"{path} is no model: PLY, compressed PLY, SPZ, SOG and .splat files are read")

@@ -56,7 +56,12 @@ class Exported:
 
 
 def export(
-    source: GaussianSource, space: Space, kind: Format, path: Path, coordinates: str = "auto", crs: str = ""
+    source: GaussianSource,
+    space: Space,
+    kind: Format,
+    path: Path,
+    coordinates: str = "auto",
+    crs: str | None = None,
 ) -> Exported:
     """Write a model as a file.
 
@@ -68,7 +73,8 @@ def export(
         source: the Gaussians, in the capture's unit around the model's origin.
         coordinates: "capture" writes the capture's coordinates, "centred" the re-centred ones; "auto" writes
             the capture's if the format resolves them finely enough.
-        crs: reference system of the capture's coordinates, for the file of the offset; empty: unknown.
+        crs: reference system of world coordinates, for the file of the offset; empty: unknown. None: the
+            coordinates are the capture's.
 
     Raises:
         ValueError: `coordinates` has another value, or there is a value that cannot be shown.
@@ -113,7 +119,7 @@ def _write_moved(
     centred: bool,
     write: Callable[[Path, GaussianSource], object],
     path: Path,
-    crs: str = "",
+    crs: str | None = None,
 ) -> None:
     """Write a model around an offset, stated beside it, or in the coordinates that include the offset."""
     if centred:
@@ -159,7 +165,7 @@ def _write_centred(
     offset: tuple[float, float, float],
     write: Callable[[Path, GaussianSource], object],
     path: Path,
-    crs: str = "",
+    crs: str | None = None,
 ) -> None:
     """Write a model around an offset, which goes into the header and a file beside."""
     sidecar = _sidecar(path)
@@ -170,7 +176,7 @@ def _write_centred(
     x, y, z = offset
     lines = [*source.comments, f"comment offset {x!r} {y!r} {z!r}"]
     write(path, Changed(source, lambda block: block, lines))
-    meaning = "capture coordinates = coordinates in the file + offset"
+    meaning = f"{'capture' if crs is None else 'world'} coordinates = coordinates in the file + offset"
     content = {"file": path.name, "offset": offset, "meaning": meaning}
     write_file(sidecar, json.dumps(content | ({"crs": crs} if crs else {}), indent=1))
 

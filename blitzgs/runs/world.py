@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from blitzgs.capture.capture import Capture
+from  import Sight
 from blitzgs.capture.world import GEO, WorldFrame, read_world_frame
 from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
@@ -116,6 +118,16 @@ def trained_table(found: Gaussians, space: Space, ranks: Ranks) -> GaussianTable
     """Return this rank's Gaussians on its device, in the order of `trained_columns`, for rendering only."""
     columns = trained_columns(found, space, ranks)
     return GaussianTable.of_parameters({name: column.to(ranks.device) for name, column in columns.items()})
+
+
+def check_seen(found: Gaussians, path: Path, capture: Capture) -> None:
+    """Refuse a file of which no view of a capture shows a Gaussian (ValueError): its world is another."""
+    positions = found.means.double().numpy() + offset_of(found.comments) - capture.offset
+    if not np.isfinite(Sight.of(capture.cameras, positions).nearest).any():
+        raise ValueError(
+            f"{path}: no view of {capture.root} sees one of its {len(found):,} Gaussians: the file must have "
+            "the coordinates of that capture, not those of the world or of another program"
+        )
 
 
 def gate_of(found: Gaussians, unit: float) -> LodGate | None:

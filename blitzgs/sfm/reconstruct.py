@@ -29,7 +29,7 @@ from blitzgs.sfm.engine import (
 )
 from blitzgs.sfm.photographs import Photographs, judge_positions
 from blitzgs.sfm.report import Reconstruction, examine
-from blitzgs.util.output import locked, write_file
+from blitzgs.util.output import check_outside, locked, write_file
 from blitzgs.util.progress import image_progress
 
 PAIRS = ("auto", "gps", "sequence", "exhaustive")
@@ -68,8 +68,7 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
     """
     backend()
     folder = photographs.folder
-    if capture.resolve().is_relative_to(folder.resolve()):
-        raise ValueError(f"{capture} is in the folder of the photographs: choose a folder outside {folder}")
+    check_outside(capture, folder)
     work = capture / WORK
     if not work.is_dir() and (capture / "sparse").exists():
         raise FileExistsError(

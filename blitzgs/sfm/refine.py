@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -22,9 +23,11 @@ from blitzgs.capture.colmap import (
     read_model,
     world_to_camera,
 )
+from blitzgs.capture.names import IMAGE_SUFFIXES
 from blitzgs.sfm.engine import has_pycolmap, run_pycolmap
 from blitzgs.sfm.reconstruct import WORK, at_work
 from blitzgs.sfm.report import misses
+from blitzgs.util.output import check_outside
 from blitzgs.util.progress import image_progress
 
 # A refined model replaces the old one if the median miss falls to this share of what it was.
@@ -78,8 +81,10 @@ def refine(root: Path, capture: Path) -> Refined:
             "refined; blitzgs sfm finds poses of photographs"
         )
     folder, capture = models[0][0], capture.absolute()
-    if capture.resolve().is_relative_to(root.resolve()):
-        raise ValueError(f"{capture} is in the capture itself: choose a folder outside {root}")
+    check_outside(capture, root)
+    others = _others(root, folder)
+    if not any(path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES for path in others):
+        raise ValueError(f"{root} has no photographs beside its model: name the folder of the capture")
     model = read_model(folder, points2d=True)
     missed = _distances(model)
     if not (~np.isnan(missed)).any():
@@ -87,8 +92,18 @@ def refine(root: Path, capture: Path) -> Refined:
             f"{folder} does not say at which pixels photographs saw its points, which tell lens and poses: "
             "blitzgs sfm finds poses of the photographs anew"
         )
-    if capture.is_dir() and any(path.name != WORK for path in capture.iterdir()):
+    # What an interrupted call left is used again.
+    ours = {path.name: path.resolve() for path in others}
+    if capture.is_dir() and any(
+        path.name != WORK and path.resolve() != ours.get(path.name) for path in capture.iterdir()
+    ):
         raise FileExistsError(f"{capture} is not empty: choose another folder for the refined capture")
+    if len(models) > 1:
+        warnings.warn(
+            f"of {len(models)} COLMAP models, {folder.relative_to(root)} is refined, with {models[0][1]} "
+            f"images; {capture} does not have the others",
+            stacklevel=2,
+        )
     work = capture / WORK
     work.mkdir(parents=True, exist_ok=True)
     with at_work(work) as lock, image_progress("poses", unit="rounds") as report:
@@ -102,12 +117,16 @@ def refine(root: Path, capture: Path) -> Refined:
         run_pycolmap("refine", job, work / "colmap.log", lock, heard)
     refined = _compare(model, missed, read_model(found, points2d=True))
     source = found if refined.adopted else folder
-    (sparse := capture / "sparse" / "0").mkdir(parents=True)
+    shutil.rmtree(sparse := work / "sparse", ignore_errors=True)
+    (sparse / "0").mkdir(parents=True)
     for file in (complete_files(source) or {}).values():
-        shutil.copyfile(file, sparse / file.name)
+        shutil.copyfile(file, sparse / "0" / file.name)
     shutil.rmtree(found)
-    _link_others(root, folder, capture)
+    for path in others:
+        if not (link := capture / path.name).is_symlink():
+            link.symlink_to(path.resolve(), target_is_directory=path.is_dir())
     (work / "refined.json").write_text(json.dumps(asdict(refined), indent=1))
+    sparse.rename(capture / "sparse")
     return refined
 
 
@@ -169,10 +188,9 @@ def _lens(camera: ColmapCamera) -> str:
     return f"{camera.model} {', '.join(f'{value:.5g}' for value in camera.params.tolist())}"
 
 
-def _link_others(root: Path, model: Path, capture: Path) -> None:
-    """Link what a capture has beside its model."""
+def _others(root: Path, model: Path) -> list[Path]:
+    """Return what a capture has beside its model."""
     inside = model.relative_to(root).parts
-    for path in root.iterdir():
-        own = path.name in (*inside[:1], WORK) or (not inside and path.stem in (*FILES, "rigs", "frames"))
-        if not own:
-            (capture / path.name).symlink_to(path.resolve(), target_is_directory=path.is_dir())
+    names = (*inside[:1], WORK)
+    files = () if inside else (*FILES, "rigs", "frames")
+    return [path for path in root.iterdir() if path.name not in names and path.stem not in files]

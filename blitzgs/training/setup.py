@@ -26,7 +26,7 @@ from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_came
 from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
 from blitzgs.runs.log import LOG, RunLog
 from blitzgs.runs.run_files import Progress
-from blitzgs.runs.world import save_world_frame, trained_columns
+from blitzgs.runs.world import check_seen, save_world_frame, trained_columns
 from blitzgs.spawn.gate import lineage_subject, open_spawn_gate
 from blitzgs.spawn.lineage import Ledger, Lineage, initial_births
 from blitzgs.table.blocks import sort_rows
@@ -303,7 +303,7 @@ def first_gaussians(
     centres = trained_centres([capture.cameras[i] for i in together], space).to(device)
     levels = measure_levels(points, centres, FORK)
     if config.model.start:
-        table, count, degree = _of_file(config, space, ranks, home)
+        table, count, degree = _of_file(config, capture, space, ranks, home)
         found = count
     else:
         first = octree_gaussians(
@@ -327,7 +327,7 @@ def first_gaussians(
 
 
 def _of_file(
-    config: Config, space: Space, ranks: Ranks, home: torch.device
+    config: Config, capture: Capture, space: Space, ranks: Ranks, home: torch.device
 ) -> tuple[GaussianTable, int, int]:
     """Return a table of this rank's Gaussians of `model.start`, their number on all ranks, and degree."""
     path, degree, most = Path(config.model.start), config.model.sh_degree, config.population.max_gaussians
@@ -336,5 +336,6 @@ def _of_file(
     if count == 0 or 0 < most < count:
         limit = f"population.max_gaussians is {most:,}" if count else "a training needs some"
         raise ValueError(f"{path} (model.start) holds {count:,} Gaussians: {limit}")
+    check_seen(found, path, capture)
     columns = trained_columns(with_degree(found, degree), space, ranks)
     return GaussianTable.create({name: column.to(home) for name, column in columns.items()}), count, known

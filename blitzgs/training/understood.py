@@ -260,6 +260,8 @@ def hints_of(state: TrainingState) -> list[str]:
             [factor for factor, _ in state.config.schedule.resolution],
         ),
     ]
+    if state.config.model.exposure and state.stepper.exposures is None:
+        hints.append("model.exposure: the photographs have the same exposure, so none is modelled")
     if state.progress.step == 0:  # a resumed run keeps its batches and images
         hints.append(large_images_hint(capture, state.config.data.downscale, ranks.device.type))
         hints.append(small_batch_hint(state.schedule.batch_size, ranks.world_size))

@@ -221,6 +221,12 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
+def check_outside(path: Path, inputs: Path) -> None:
+    """Check that new files in `path` would not lie in a folder of inputs (else ValueError)."""
+    if path.resolve().is_relative_to(inputs.resolve()):
+        raise ValueError(f"{path} is in {inputs}, whose files are read: choose a folder outside it")
+
+
 def is_lack_of_space(error: OSError) -> bool:
     """Tell whether an error would not have happened with more space on the disk."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT)

@@ -2,6 +2,8 @@
 """`blitzgs.l1_ssim` is the mean of `photometric_loss`, which has tests of its own."""
 
 import contextlib
+import warnings
+from itertools import count
 
 import pytest
 import torch
@@ -73,6 +75,16 @@ def test_leading_dimensions_and_floating_targets():
     assert torch.equal(blitzgs.l1_ssim(renders, targets, masks), expected)
     single = blitzgs.l1_ssim(renders[0, 0], targets[0, 0].double() / 255, masks[0, 0])
     assert relative_error(single, blitzgs.l1_ssim(renders[:1, 0], targets[:1, 0], masks[:1, 0])) < 1e-12
+
+
+def test_the_first_photographs_that_are_no_shares_are_named(monkeypatch):
+    renders, targets, _ = images("cpu", torch.float64, 2, 2)
+    monkeypatch.setattr("blitzgs.call.gaussians._float_calls", count())
+    with pytest.warns(UserWarning, match=r"targets go to 25\d: they are uint8, or floats from 0 to 1"):
+        blitzgs.l1_ssim(renders, targets.double())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        blitzgs.l1_ssim(renders, targets.double())
 
 
 @pytest.mark.parametrize("shape", [(0, 8, 8), (2, 0, 8), (2, 2, 0, 8), (0, 8)], ids=str)

@@ -63,6 +63,13 @@ def test_a_file_is_measured_as_its_run(trained, whole, tmp_path, capsys, failure
     assert main(["eval", str(whole), *flags, "--downscale=2"]) == 0
     assert "pictures of 1 views, 24 x 16 pixels" in capsys.readouterr().err
     assert "add --data CAPTURE" in failure("eval", whole)
+    far = read_gaussians(whole)
+    write_ply(tmp_path / "far.ply", **vars(dataclasses.replace(far, means=far.means + 1e5)))
+    unseen = f"sees one of its {len(far):,} Gaussians: the file must have the coordinates of that capture"
+    assert unseen in failure("eval", tmp_path / "far.ply", "--data", trained[0])
+    start = ("train", "--data", trained[0], "--out", tmp_path / "run", "--config=defaults", "--start")
+    assert unseen in failure(*start, tmp_path / "far.ply")
+    assert "is a folder and no file of Gaussians: blitzgs export" in failure(*start, trained[1])
 
 
 def test_a_training_begins_with_a_file(trained, whole, tmp_path, capsys):
@@ -211,7 +218,8 @@ def test_control_points_give_the_world(trained, survey, tmp_path, capsys):
     assert frame.crs == "EPSG:32632" and frame.scale == pytest.approx(12.5, rel=1e-9)
     np.testing.assert_allclose(frame.to_world(np.ones(3)), 12.5 * TURN @ np.ones(3) + SHIFT, atol=1e-6)
     assert main(["export", str(trained[1]), "--ply", str(tmp_path / "m.ply"), "--coordinates", "world"]) == 0
-    assert json.loads((tmp_path / "m.ply.offset.json").read_text())["crs"] == "EPSG:32632"
+    offset = json.loads((tmp_path / "m.ply.offset.json").read_text())
+    assert offset["crs"] == "EPSG:32632" and offset["meaning"].startswith("world coordinates = ")
     # Into the next zone, where grid north is elsewhere: a turn by the convergence of both.
     pytest.importorskip("pyproj")
     assert main(["align", str(trained[1]), "--crs", "EPSG:32633"]) == 0

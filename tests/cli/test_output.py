@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,12 @@ def shell(script, **variables):
 
 
 FULL = "standard output cannot be written (No space left on device)"
+
+
+def test_a_warning_is_one_line(monkeypatch):
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+    main([])
+    assert warnings.formatwarning("a:\n  b\x07\n", UserWarning, "x.py", 1) == "blitzgs: warning: a: b\\x07\n"
 
 
 # Without a buffer (PYTHONUNBUFFERED) the first line fails, with one the last flush. What is closed has none.

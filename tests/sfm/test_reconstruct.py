@@ -258,7 +258,7 @@ def test_what_cannot_work_is_said(tmp_path, monkeypatch, capsys):
 
     assert "is no folder of photographs" in message("nothing", "capture")
     assert "is no folder of photographs" in message(next((tmp_path / "photos").iterdir()), "capture")
-    assert "is in the folder of the photographs" in message("photos", "photos/capture")
+    assert "whose files are read: choose a folder outside it" in message("photos", "photos/capture")
     (tmp_path / "other/sparse").mkdir(parents=True)
     assert "has a model that blitzgs sfm did not make" in message("photos", "other")
     with monkeypatch.context() as patch:

@@ -2,11 +2,13 @@
 """A capture with a lens that is nearly right gets the right one, and poses that fit it."""
 
 import json
+import shutil
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from blitzgs.capture.colmap import read_model
+from blitzgs.capture.colmap import FILES, read_model
 from blitzgs.capture.lens import Lens
 from blitzgs.cli import main
 from blitzgs.sfm import engine
@@ -144,8 +146,12 @@ def test_wrong_observations_are_left_out(scene, tmp_path):
 
 def test_what_cannot_be_refined_is_refused(scene, tmp_path, monkeypatch):
     capture, _ = scene(4)
-    with pytest.raises(ValueError, match="is in the capture itself: choose a folder outside"):
+    with pytest.raises(ValueError, match=r"is in .*capture, whose files are read: choose a folder outside"):
         refine(capture, capture / "new")
+    with pytest.raises(
+        ValueError, match="has no photographs beside its model: name the folder of the capture"
+    ):
+        refine(capture / "sparse/0", tmp_path / "new")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("")
     with pytest.raises(FileExistsError, match="full is not empty: choose another folder"):
@@ -166,6 +172,22 @@ def test_what_cannot_be_refined_is_refused(scene, tmp_path, monkeypatch):
     with pytest.raises(ImportError, match=r"pip install 'blitzgs\[sfm\]'"):
         refine(capture, tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_a_model_appears_whole_and_alone(scene, tmp_path, monkeypatch):
+    """What an interrupted call left is used by the next; models that are left out are named."""
+    capture, _ = scene(20)
+    shutil.copytree(capture / "sparse/0", capture / "sparse/1")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt), pytest.warns(UserWarning):
+        patch.setattr("blitzgs.sfm.refine.asdict", Mock(side_effect=KeyboardInterrupt))
+        refine(capture, tmp_path / "new")
+    assert not (tmp_path / "new/sparse").exists() and (tmp_path / "new/images").is_symlink()
+    with pytest.warns(UserWarning, match="of 2 COLMAP models, sparse/0 is refined, with 20 images"):
+        refine(capture, tmp_path / "new")
+    assert sorted(path.name for path in (tmp_path / "new/sparse").rglob("*")) == [
+        "0",
+        *(f"{name}.bin" for name in FILES),
+    ]
 
 
 @pytest.mark.parametrize(("count", "away", "found"), [(20, 40, 40), (10, 40, 0), (20, 1, 0)])

@@ -206,6 +206,8 @@ def test_mistakes_with_files_name_them(trained, tmp_path, failure):
     assert "--minutes: the run in" in limited and "leave out --minutes" in limited and "--extend" in limited
     small = failure("train", *data, "--data.downscale=100")
     assert "downscale 100 leaves 1 x 1 pixels" in small
+    among = failure("train", *data[:2], "--out", trained[0] / "images/run")
+    assert "images/run is in " in among and "choose a folder outside it" in among
 
 
 def test_show_config_and_help(capsys):

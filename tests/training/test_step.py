@@ -33,6 +33,7 @@ from tests.distributed.rank_harness import run_ranks
 from tests.helpers import DEVICES, parameter_gradients
 from tests.training.tiny import (
     assert_same_table,
+    events_of,
     look_at_origin,
     random_gaussians,
     tiny_config,
@@ -322,9 +323,14 @@ def test_photographs_of_fields_differ_if_their_exposures_do(tmp_path, exposure):
         tmp_path / "fields", extent=60, views=8, width=96, height=64, points_per_view=80, oblique=0,
         built=False, grain=2.0, exposure=exposure,
     )  # fmt: skip
-    config = tiny_config(f"data.path={str(folder)!r}", "data.split=0")
+    config = tiny_config(
+        f"data.path={str(folder)!r}", "data.split=0", "model.exposure=true", "schedule.iterations=1"
+    )
     capture, images = open_capture(config, Ranks())
     gains = track_gains(capture, images, Ranks())
-    images.close()
     assert gains is not None and torch.allclose(gains.mean(0), torch.ones(3).double())
     assert exposures_differ(gains) == (exposure > 0)
+    Trainer(config, capture, images, tmp_path / "run", Ranks()).train()
+    images.close()
+    hints = [event["hint"] for event in events_of(tmp_path / "run", "hint")]
+    assert any("so none is modelled" in hint for hint in hints) == (exposure == 0)
