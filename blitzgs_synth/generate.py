@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from blitzgs.capture.colmap import (
     FILES,
@@ -24,11 +25,11 @@ from blitzgs.capture.colmap import (
     ColmapModel,
     ColmapPoints,
     read_model,
-    rotation_to_quat,
     write_model,
 )
 from blitzgs.util.output import PARTIAL, write_file
 from blitzgs.util.progress import image_progress
+from blitzgs.util.rotations import quaternions
 from blitzgs_synth.flight import View, plan_flight
 from blitzgs_synth.photographs import CORNERS, Progress, each, take_photographs
 from blitzgs_synth.plan import PRESETS, CityOptions, Doubles, Ints, Plan
@@ -203,7 +204,7 @@ def colmap_model(views: list[View], cloud: Cloud) -> ColmapModel:
     images = ColmapImages(
         ids=image_ids,
         camera_ids=np.ones(len(views), np.uint32),
-        quats=np.stack([rotation_to_quat(v.rotation) for v in views]),
+        quats=quaternions(torch.from_numpy(np.stack([v.rotation for v in views]))).numpy(),
         translations=np.stack([v.translation for v in views]),
         names=[v.name for v in views],
         point2d_offsets=np.concatenate([[0], np.cumsum(totals)]).astype(np.uint64),

@@ -230,6 +230,15 @@ class SourceView:
     # two that exclude each other; None if they do not say.
     part: str | None = None
 
+    def pixels_of(self, points: Float64) -> Float64:
+        """Return the pixels [S, 2] at which the view shows points [M, 3], occluded ones too; others not."""
+        x, y, depth = self.world_to_camera[:3, :3] @ points.T + self.world_to_camera[:3, 3:]
+        front = depth > 0
+        with np.errstate(all="ignore"):
+            pixels = np.stack(self.lens.project(x[front] / depth[front], y[front] / depth[front]), axis=1)
+            inside = (pixels >= 0) & (pixels < [self.lens.width, self.lens.height])
+        return np.asarray(pixels[inside.all(axis=1)])
+
 
 def camera_centres(world_to_camera: Float64) -> Float64:
     """Return the positions [N, 3] of rigid poses [N, 4, 4]."""

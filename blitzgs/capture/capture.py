@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import warnings
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,14 +28,13 @@ from blitzgs.capture.cameras import (
     same_shape,
     scaled_matrix,
 )
-from blitzgs.capture.check_files import FindDamage, damaged
 from blitzgs.capture.image_files import ImageHeader, read_header
-from blitzgs.capture.layouts import Source, read_layout
-from blitzgs.capture.lengths import Sight, StrayCamera, find_apart, measured_extent
+from blitzgs.capture.layouts import About, read_layout
+from blitzgs.capture.lengths import blind_views, find_apart, measured_extent, near_plane, nearest_depths
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.masks import check_mask_sizes, check_masks, find_masks
+from blitzgs.capture.masks import FindDamage, check_mask_sizes, check_masks, damaged, find_masks
 from blitzgs.capture.names import MissingImagesError as MissingImagesError
-from blitzgs.capture.names import check_inside, existing, to_convert
+from blitzgs.capture.names import check_inside, existing, relative_to, to_convert
 from blitzgs.capture.projects.find import FoundProject, folder_of, project_at
 from blitzgs.capture.usable import (
     check_lenses,
@@ -48,7 +45,8 @@ from blitzgs.capture.usable import (
     without_strays,
     without_unused,
 )
-from blitzgs.util.errors import check_number
+from blitzgs.config.ranges import CHOICES
+from blitzgs.util.errors import check_number, located, warn
 
 # In pixels. SSIM compares windows of 11 pixels, and a much smaller image shows too little to train on.
 _LEAST_SIDE = 8
@@ -80,30 +78,11 @@ class Capture:
     has_alpha: bool
     """Whether some image has an alpha channel; `ImageStore` composites it over its background."""
     near: float
-    """Near plane by the depths of the points that training views see (`Sight.near`), in world units."""
+    """Near plane (`lengths.near_plane`) by the depths of the points that training views see, world units."""
     apart: list[int]
     """Cameras that are so far from the others that no length is measured by them."""
     about: About
     """What was read and what was left out."""
-
-
-@dataclass(frozen=True)
-class About:
-    """What `load_capture` decided, for messages."""
-
-    source: Source
-    split: str  # what decided on the held-out views
-    # The cameras whose pose is wrong; they are left out unless `stray_cameras` keeps them.
-    strays: list[StrayCamera]
-    unused: int  # number of frames that are in no list of the file's own split
-    missing: int  # number of views whose image is not on disk
-    blind: int  # number of views that see none of the points
-    random_points: bool  # whether the capture has no points, so that training starts from random ones
-    points_from: str = ""  # the file of the points, relative to the capture
-    colors_from: str = ""  # what in it gives their colours; empty: nothing
-    with_alpha: int = 0  # number of photographs that have alpha
-    extra_bands: int = 0  # number of photographs with a band that is neither colour nor alpha; it is not used
-    damaged: int = 0  # number of views that `allow_missing` left out because their image or mask is damaged
 
 
 def load_capture(
@@ -147,7 +126,7 @@ def load_capture(
             them; no length is measured by them either way.
         inside_only: refuse names that lead outside the capture, for captures that somebody else has made;
             otherwise they are read with a warning.
-        find_damage: see `check_files.damaged`; called with `allow_missing` only. The ranks of a job divide
+        find_damage: see `masks.damaged`; called with `allow_missing` only. The ranks of a job divide
             the files among them.
 
     Raises:
@@ -156,7 +135,7 @@ def load_capture(
     """
     root, project = _root_of(Path(path), images)
     _check_options(downscale, exif, undistort, stray_cameras)
-    views, points, source = read_layout(root, images, downscale, sparse, project)
+    views, points, about = read_layout(root, images, downscale, sparse, project)
     if not views:
         raise ValueError(f"{root}: its COLMAP model or transforms.json lists no images")
     listed = len(views)
@@ -175,14 +154,13 @@ def load_capture(
     folders = [root / images, *([root / masks] if isinstance(masks, str) else [])]
     named = [path for view in views for path in (view.path, view.mask_path)] + [points.path]
     check_inside([path for path in named if path is not None], root, folders, inside_only)
-    kept = existing([v.name for v in views], [v.path for v in views], root, images, allow_missing)
-    missing = len(views) - len(kept)
-    kept, found, damage = _with_files(views, kept, root, masks, find_damage if allow_missing else None)
-    kept = without_strays(views, kept, strays, keep=stray_cameras == "keep")
-    place = {index: position for position, index in enumerate(kept)}
-    views = [replace(views[index], mask_path=found[index]) for index in kept]
-    train, test = ([place[index] for index in part if index in place] for part in (train, test))
-    apart_left = [place[index] for index in kept if apart[index]]
+    held_out, far = ({views[index].name for index in some} for some in (test, np.flatnonzero(apart)))
+    posed, views = len(views), existing(views, root, images, allow_missing)
+    missing = posed - len(views)
+    views, damage = _with_masks(views, root, masks, find_damage if allow_missing else None)
+    views = without_strays(views, strays, posed, keep=stray_cameras == "keep")
+    train, test = ([i for i, v in enumerate(views) if (v.name in held_out) is part] for part in (False, True))
+    apart_left = [index for index, view in enumerate(views) if view.name in far]
     if not train:
         raise MissingImagesError(f"{root}: no image of a training view is on disk and whole")
     headers = _headers(views)
@@ -197,23 +175,23 @@ def load_capture(
         points = points_at_random(root, [c for i, c in enumerate(cameras) if i not in apart_left], offset)
     points.positions = points.positions - offset
     extent = measured_extent(train_centres, points.positions)
-    sight = Sight.of(cameras, points.positions)
-    blind = sight.blind(cameras, points.positions)
-    near = sight.near([i for i in train if i not in apart_left] if has_points else [], extent)
+    nearest = nearest_depths(cameras, points.positions)
+    blind = blind_views(nearest, cameras, points.positions)
+    near = near_plane(nearest[[i for i in train if has_points and i not in apart_left]], extent)
     with_alpha = sum(header.has_alpha for header in headers)
-    about = About(
-        source,
-        why,
-        strays,
-        unused,
-        missing,
-        blind,
-        not has_points,
-        _relative(points.path, root),
-        points.colors_from,
-        with_alpha,
-        sum(header.extra_bands > 0 for header in headers),
-        len(damage),
+    about = replace(
+        about,
+        split=why,
+        strays=strays,
+        unused=unused,
+        missing=missing,
+        blind=blind,
+        random_points=not has_points,
+        points_from="" if points.path is None else str(relative_to(root, points.path)),
+        colors_from=points.colors_from,
+        with_alpha=with_alpha,
+        extra_bands=sum(header.extra_bands > 0 for header in headers),
+        damaged=len(damage),
     )
     return Capture(
         root,
@@ -237,12 +215,8 @@ def _check_options(downscale: float, exif: str, undistort: str, stray_cameras: s
     check_number("downscale", downscale)
     if not downscale >= 1:  # NaN too
         raise ValueError(f"downscale must be at least 1, got {downscale}")
-    for option, value, allowed in (
-        ("exif", exif, ("auto", "apply", "ignore")),
-        ("undistort", undistort, ("crop", "mask")),
-        ("stray_cameras", stray_cameras, ("drop", "keep")),
-    ):
-        if value not in allowed:
+    for option, value in (("exif", exif), ("undistort", undistort), ("stray_cameras", stray_cameras)):
+        if value not in (allowed := CHOICES[f"data.{option}"]):
             raise ValueError(f"{option} must be one of {', '.join(allowed)}, got {value!r}")
 
 
@@ -253,10 +227,9 @@ def _headers(views: list[SourceView]) -> list[ImageHeader]:
     check_masks([view.mask_path for view in views])
     extra_bands = [view.name for view, header in zip(views, headers, strict=True) if header.extra_bands]
     if extra_bands:
-        warnings.warn(
+        warn(
             f"{len(extra_bands)} of {len(views)} photographs have a further band that their file does not "
-            f"call alpha (first: {extra_bands[0]}), near infrared for example; it is not used",
-            stacklevel=3,
+            f"call alpha (first: {extra_bands[0]}), near infrared for example; it is not used"
         )
     return headers
 
@@ -274,32 +247,20 @@ def _root_of(path: Path, images: str) -> tuple[Path, FoundProject | None]:
     return folder_of(path, images), project
 
 
-def _with_files(
-    views: Sequence[SourceView],
-    kept: list[int],
-    root: Path,
-    masks: str | bool | None,
-    find_damage: FindDamage | None,
-) -> tuple[list[int], dict[int, Path | None], dict[int, str]]:
-    """Return the views that are left, the mask of each, and what is wrong with those that are left out."""
-    some = [views[index] for index in kept]
-    found = find_masks(root, masks, [view.name for view in some], [view.mask_path for view in some])
-    files = [(view.path, mask) for view, mask in zip(some, found, strict=True)]
-    damage = {} if find_damage is None else find_damage(files)
-    if damage:
-        warnings.warn(
-            f"{len(damage)} of {len(some)} images or their masks are damaged; dropped (first: "
-            f"{next(iter(damage.values()))})",
-            stacklevel=3,
+def _with_masks(
+    views: list[SourceView], root: Path, masks: str | bool | None, find_damage: FindDamage | None
+) -> tuple[list[SourceView], dict[int, str]]:
+    """Return the views that are whole, with their masks, and what is wrong with the others."""
+    found = find_masks(root, masks, [view.name for view in views], [view.mask_path for view in views])
+    views = [replace(view, mask_path=mask) for view, mask in zip(views, found, strict=True)]
+    if find_damage is None:
+        return views, {}
+    if damage := find_damage([(view.path, view.mask_path) for view in views]):
+        warn(
+            f"{len(damage)} of {len(views)} images or their masks are damaged; dropped (first: "
+            f"{next(iter(damage.values()))})"
         )
-    left = [place for place in range(len(kept)) if place not in damage]
-    return [kept[place] for place in left], {kept[place]: found[place] for place in left}, damage
-
-
-def _relative(path: Path | None, root: Path) -> str:
-    if path is None:
-        return ""
-    return str(path.relative_to(root) if path.is_relative_to(root) else path)
+    return [view for index, view in enumerate(views) if index not in damage], damage
 
 
 def _camera(
@@ -326,10 +287,8 @@ def _camera(
         )
     lens = view.lens.scaled(width, height)
     if lens not in plans:
-        try:
+        with located(f"the camera of {view.path}"):
             plans[lens] = rectify(lens, policy)
-        except ValueError as error:
-            raise ValueError(f"the camera of {view.path}: {error}") from error
     plan = plans[lens]
     # Images from images_N are downscaled already; only the rest of the factor is applied while decoding.
     already = max(1.0, view.lens.width / width) if downscale > 1 else 1.0

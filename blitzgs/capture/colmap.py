@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -94,50 +94,45 @@ def camera_models() -> dict[str, list[str]]:
     return {name: params.split(",") for _, name, params in native.camera_models()}
 
 
-def find_model(path: Path) -> Path | None:
-    """Return the folder of a sparse model below `path` (sparse/0, sparse, `path`, colmap/...), or None.
-
-    Of several numbered models, which COLMAP makes of parts that it could not join, it is the largest.
-    """
-    models = find_models(path)
-    return models[0][0] if models else None
-
-
 def find_models(path: Path) -> list[tuple[Path, int]]:
-    """Return the folders of the sparse models below `path` in one place, with their numbers of images.
+    """Return the sparse models below `path` in one place (sparse/0, sparse, `path`, colmap/...).
 
-    The largest comes first. The number is 0 if there is only one model, which nobody compares.
+    Each is a folder and its number of images. Of several numbered models, which COLMAP makes of parts that it
+    could not join, the largest comes first. The number is 0 if there is only one, which nobody compares.
     """
     for folder in ("sparse", ".", "colmap/sparse"):
         numbered = _numbered(path / folder) if folder != "." else []
         if len(numbered) > 1:
             counted = [(model, count_images(model)) for model in numbered]
             return sorted(counted, key=lambda model: -model[1])  # stable: of equal ones, the first
-        if numbered or _has(path / folder, all):
+        if numbered or complete_files(path / folder):
             return [(numbered[0] if numbered else path / folder, 0)]
     return []
 
 
 def find_incomplete_model(path: Path) -> Path | None:
-    """Return the folder that `find_model` would return if none of its files were missing, or None."""
+    """Return the folder of a model that lacks files, where `find_models` would look for it, or None."""
     folders = ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap/sparse")
-    return next((path / folder for folder in folders if _has(path / folder, any)), None)
+    kinds = [(name, suffix) for name in FILES for suffix in _SUFFIXES]
+    return next((path / f for f in folders if any(_file(path / f, *kind).is_file() for kind in kinds)), None)
 
 
 def _numbered(folder: Path) -> list[Path]:
     """Return the complete models in the folders 0, 1, ... of a folder, in the order of their numbers."""
-    found = [model for model in folder.glob("[0-9]*") if model.name.isdecimal() and _has(model, all)]
+    found = [model for model in folder.glob("[0-9]*") if model.name.isdecimal() and complete_files(model)]
     return sorted(found, key=lambda model: int(model.name))
 
 
-def _has(folder: Path, enough: Callable[[Iterable[bool]], bool]) -> bool:
-    return any(enough(_file(folder, name, suffix).is_file() for name in FILES) for suffix in _SUFFIXES)
+def complete_files(folder: Path) -> dict[str, Path] | None:
+    """Return the files of a model by their names in `FILES`, binary ones first; None: one is missing."""
+    kinds = ({name: _file(folder, name, suffix) for name in FILES} for suffix in _SUFFIXES)
+    return next((files for files in kinds if all(path.is_file() for path in files.values())), None)
 
 
 def _file(folder: Path, name: str, suffix: str) -> Path:
     """Return a file of a model; its points may be in points3D.ply alone, or in a file of another program."""
     path = folder / (name + suffix)
-    others = [folder / (name + other) for other in (".bin", ".txt")]
+    others = [folder / (name + other) for other in _SUFFIXES]
     if name == "points3D" and not any(other.is_file() for other in others):
         path = next((p for s in POINT_SUFFIXES if (p := path.with_suffix(s)).is_file()), path)
     return path
@@ -145,11 +140,9 @@ def _file(folder: Path, name: str, suffix: str) -> Path:
 
 def count_images(folder: Path) -> int:
     """Return the number of images of a model; 0 if its file is damaged, so that an undamaged one is used."""
-    path = folder / "images.bin"
-    if not all(_file(folder, name, ".bin").is_file() for name in FILES):
-        path = folder / "images.txt"
+    files = complete_files(folder)
     try:
-        return len(native.read_images(os.fsencode(path), False)["ids"])
+        return len(native.read_images(os.fsencode(files["images"]), False)[0]) if files else 0
     except ValueError:
         return 0
 
@@ -162,60 +155,32 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
     the byte offset or line, and the reason.
     """
     folder = Path(folder)
-    binary, text = ({name: _file(folder, name, suffix) for name in FILES} for suffix in _SUFFIXES)
-    complete = (kind for kind in (binary, text) if all(path.is_file() for path in kind.values()))
-    paths = next(complete, binary if binary["cameras"].is_file() else text)
-    for path in paths.values():
-        if not path.is_file():
-            raise FileNotFoundError(f"{path} is missing: {folder} is not a complete COLMAP sparse model")
-    elsewhere = paths["points3D"].suffix in POINT_SUFFIXES
-    return ColmapModel(
-        [ColmapCamera(*row) for row in native.read_cameras(os.fsencode(paths["cameras"]))],
-        ColmapImages(**native.read_images(os.fsencode(paths["images"]), points2d)),
-        ColmapPoints()
-        if elsewhere
-        else ColmapPoints(**native.read_points(os.fsencode(paths["points3D"]), tracks)),
-        paths["points3D"],
-    )
+    paths = complete_files(folder)
+    if paths is None:
+        suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+        lost = next(path for name in FILES if not (path := _file(folder, name, suffix)).is_file())
+        raise FileNotFoundError(f"{lost} is missing: {folder} is not a complete COLMAP sparse model")
+    cameras = [ColmapCamera(*row) for row in native.read_cameras(os.fsencode(paths["cameras"]))]
+    images, points = native.read_images(os.fsencode(paths["images"]), points2d), ColmapPoints()
+    if paths["points3D"].suffix not in POINT_SUFFIXES:
+        points = ColmapPoints(*native.read_points(os.fsencode(paths["points3D"]), tracks))
+    return ColmapModel(cameras, ColmapImages(*images), points, paths["points3D"])
 
 
 def write_model(folder: Path | str, model: ColmapModel) -> None:
     """Write a sparse model as .bin files, creating the folder.
 
-    ValueError: columns disagree in length, a camera's parameters do not fit its model, or a name cannot stand
-    in the file.
+    ValueError: a camera's parameters do not fit its model, or a name cannot stand in the file.
     """
-    _check(model)
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    for name, content in zip(FILES, _bytes_of(model), strict=True):
-        Path(folder, f"{name}.bin").write_bytes(content)
-
-
-def _check(model: ColmapModel) -> None:
-    """Refuse a model that its files could not hold."""
     for camera in model.cameras:
         if len(camera.params) != len(camera_models()[camera.model]):
             raise ValueError(f"camera {camera.id}: {len(camera.params)} parameters do not fit {camera.model}")
-    images, points = model.images, model.points
-    n, m = len(images.ids), len(points.ids)
-    for what, found, wanted in (
-        ("images: quats [N, 4]", images.quats.shape, (n, 4)),
-        ("images: translations [N, 3]", images.translations.shape, (n, 3)),
-        ("images: camera_ids [N]", images.camera_ids.shape, (n,)),
-        ("images: names [N]", (len(images.names),), (n,)),
-        ("images: points2d [O, 2]", images.points2d.shape, (int(images.point2d_offsets[-1]), 2)),
-        ("images: point3d_ids [O]", images.point3d_ids.shape, (int(images.point2d_offsets[-1]),)),
-        ("points: positions [M, 3]", points.positions.shape, (m, 3)),
-        ("points: colors [M, 3]", points.colors.shape, (m, 3)),
-        ("points: errors [M]", points.errors.shape, (m,)),
-        ("points: track_image_ids", points.track_image_ids.shape, (int(points.track_offsets[-1]),)),
-        ("points: track_point2d_ids", points.track_point2d_ids.shape, (int(points.track_offsets[-1]),)),
-    ):
-        if found != wanted:
-            raise ValueError(f"{what} must have the shape {wanted}, got {found}")
-    for name in images.names:
+    for name in model.images.names:
         if not name or "\0" in name or "\n" in name:
             raise ValueError(f"images: the name {name!r} is empty or has a NUL or line break in it")
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    for name, content in zip(FILES, _bytes_of(model), strict=True):
+        Path(folder, f"{name}.bin").write_bytes(content)
 
 
 def _bytes_of(model: ColmapModel) -> Iterator[bytes]:
@@ -248,42 +213,15 @@ def _joined(heads: list[bytes], offsets: npt.NDArray[np.uint64], rows: npt.NDArr
     return b"".join(parts)
 
 
-def quats_to_rotations(quats: Float64) -> Float64:
-    """Return the rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z) of any length; zero: NaN."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def rotation_to_quat(rotation: Float64) -> Float64:
-    """Return (w, x, y, z), w >= 0, of a rotation matrix [3, 3], through its largest component."""
-    r = rotation
-    squares = np.array(
-        [
-            1 + r[0, 0] + r[1, 1] + r[2, 2],
-            1 + r[0, 0] - r[1, 1] - r[2, 2],
-            1 - r[0, 0] + r[1, 1] - r[2, 2],
-            1 - r[0, 0] - r[1, 1] + r[2, 2],
-        ]
-    )
-    largest = int(squares.argmax())
-    a, b, c = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    d, e, f = r[1, 0] + r[0, 1], r[0, 2] + r[2, 0], r[2, 1] + r[1, 2]
-    rows = np.array(
-        [[squares[0], a, b, c], [a, squares[1], d, e], [b, d, squares[2], f], [c, e, f, squares[3]]]
-    )
-    quat: Float64 = rows[largest] / np.linalg.norm(rows[largest])
-    return quat if quat[0] >= 0 else -quat
-
-
 def world_to_camera(images: ColmapImages) -> Float64:
-    """Return the poses as matrices [N, 4, 4]."""
-    poses = np.tile(np.eye(4), (len(images.ids), 1, 1))
-    poses[:, :3, :3] = quats_to_rotations(images.quats)
+    """Return the poses as matrices [N, 4, 4]; a quaternion of zeros gives NaN."""
+    import torch
+
+    from blitzgs.util.rotations import quaternion_matrices
+
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unit = images.quats / np.linalg.norm(images.quats, axis=1, keepdims=True)
+    poses = np.tile(np.eye(4), (len(unit), 1, 1))
+    poses[:, :3, :3] = quaternion_matrices(torch.from_numpy(unit)).numpy()
     poses[:, :3, 3] = images.translations
     return poses

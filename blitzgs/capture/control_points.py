@@ -7,7 +7,7 @@ import csv
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -28,12 +28,20 @@ _TRIPLES = 500
 
 @dataclass
 class ControlPoint:
-    """A surveyed place and its marks."""
+    """A surveyed place and its marks; the fields from `problem` on are those of `place` and `align`."""
 
     name: str  # of the point
     world: Float64  # east, north, height
     # photograph's name, x and y in its pixels; the corner of the first pixel is (0, 0).
     marks: list[tuple[str, float, float]] = field(default_factory=list)
+    problem: str = ""  # why it is not used; empty: it is
+    position: Float64 | None = None  # [3] in the capture's own world; None: `problem` says why there is none
+    seen: list[tuple[Camera, float, float]] = field(
+        default_factory=list
+    )  # marks in the capture's photographs
+    # [3] in world units, the fitted place minus the surveyed one.
+    offset: Float64 = field(default_factory=lambda: np.full(3, math.nan))
+    reprojection: float = math.nan  # root mean square distance in pixels of the surveyed place from the marks
 
 
 def read_control_points(path: Path) -> tuple[list[ControlPoint], str]:
@@ -98,39 +106,23 @@ def _add(points: dict[str, ControlPoint], name: str, image: str, words: Sequence
     point.marks.append((image, x, y))
 
 
-@dataclass
-class Placed:
-    """A control point in the coordinates of a capture."""
-
-    point: ControlPoint  # surveyed place and marks
-    position: Float64 | None = None  # [3] in the capture's own world; None: `problem` says why there is none
-    problem: str = ""  # why it is not used; empty: it is
-    cameras: list[Camera] = field(default_factory=list)  # of its marks
-    pixels: Float64 = field(default_factory=lambda: np.zeros((0, 2)))  # [M, 2] its marks
-    # [3] in world units, the fitted place minus the surveyed one.
-    offset: Float64 = field(default_factory=lambda: np.full(3, math.nan))
-    reprojection: float = math.nan  # root mean square distance in pixels of the surveyed place from the marks
-
-
-def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Float64) -> list[Placed]:
-    """Find the points in the capture, by the rays through their marks in pixels of the photographs.
+def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Float64) -> list[ControlPoint]:
+    """Return points with their places in the capture, by the rays through their marks in the photographs.
 
     The cameras are those of a capture that was loaded without downscaling, `origin` is its `Capture.offset`.
     """
-    by_name = _by_name(cameras)
-    found = []
+    by_name, found = _by_name(cameras), []
     for point in points:
-        seen = [(by_name.get(_key(image)), image, x, y) for image, x, y in point.marks]
-        known = [(camera, x, y) for camera, _, x, y in seen if camera is not None]
-        placed = Placed(point, None, "", [c for c, _, _ in known], np.array([[x, y] for _, x, y in known]))
+        marks = [(by_name.get(_key(image)), image, x, y) for image, x, y in point.marks]
+        placed = replace(point, seen=[(camera, x, y) for camera, _, x, y in marks if camera is not None])
         found.append(placed)
-        if len({camera.name for camera, _, _ in known}) < 2:
-            lost = [image for camera, image, _, _ in seen if camera is None]
+        if len({camera.name for camera, _, _ in placed.seen}) < 2:
+            lost = [image for camera, image, _, _ in marks if camera is None]
             placed.problem = "marked in fewer than 2 views" + (f" ({lost[0]} is none)" if lost else "")
             continue
         try:
-            rays = [normalised(c.rectification.lens, x, y) for c, x, y in known]
-            placed.position = _intersect(placed.cameras, np.array(rays)) + origin
+            rays = [normalised(camera.rectification.lens, x, y) for camera, x, y in placed.seen]
+            placed.position = _intersect([camera for camera, _, _ in placed.seen], np.array(rays)) + origin
         except ValueError as error:
             placed.problem = str(error)
     return found
@@ -215,28 +207,28 @@ def _intersect(cameras: Sequence[Camera], rays: Float64) -> Float64:
     return np.asarray(at)
 
 
-def align(placed: Sequence[Placed], origin: Float64, crs: str, source: str) -> WorldFrame:
+def align(points: Sequence[ControlPoint], origin: Float64, crs: str, source: str) -> WorldFrame:
     """Fit the similarity to the points that agree, and write residuals into all that were found.
 
     Of five points or more, those that contradict the others are left out (least median of squares over
-    triples: P. J. Rousseeuw, JASA 1984); `Placed.problem` says so. ValueError: fewer than three points can be
+    triples: P. J. Rousseeuw, JASA 1984); their `problem` says so. ValueError: fewer than three points can be
     used, or they lie on a line.
     """
-    used = [point for point in placed if point.position is not None]
+    used = [point for point in points if point.position is not None]
     if len(used) < 3:
-        reasons = "; ".join(f"{p.point.name}: {p.problem}" for p in placed if p.problem)
+        reasons = "; ".join(f"{p.name}: {p.problem}" for p in points if p.problem)
         raise ValueError(
-            f"{len(used)} of {len(placed)} control points can be used, and 3 are needed"
+            f"{len(used)} of {len(points)} control points can be used, and 3 are needed"
             + f" ({reasons})" * bool(reasons)
         )
     capture = np.stack([p.position for p in used if p.position is not None])
-    world = np.stack([p.point.world for p in used])
+    world = np.stack([p.world for p in used])
     kept = _consensus(capture, world)
     frame = fit_similarity(capture[kept], world[kept], crs, source)
     for point, position, good in zip(used, capture, kept, strict=True):
-        point.offset = frame.to_world(position) - point.point.world
+        point.offset = frame.to_world(position) - point.world
         point.problem = "" if good else "contradicts the others and is left out"
-        surveyed = frame.from_world(point.point.world) - origin
+        surveyed = frame.from_world(point.world) - origin
         point.reprojection = _reprojection(point, surveyed)
     return frame
 
@@ -265,13 +257,13 @@ def _consensus(capture: Float64, world: Float64) -> np.ndarray:
     return np.asarray(distances <= max(limit, 1e-9 * float(np.ptp(world, axis=0).max())))
 
 
-def _reprojection(point: Placed, position: Float64) -> float:
+def _reprojection(point: ControlPoint, position: Float64) -> float:
     """Return the root mean square distance of a position [3], re-centred, from a point's marks, in pixels."""
     squares = []
-    for camera, pixel in zip(point.cameras, point.pixels, strict=True):
+    for camera, column, row in point.seen:
         x, y, z = camera.world_to_camera[:3, :3] @ position + camera.world_to_camera[:3, 3]
         if z <= 0:
             return math.inf
         u, v = camera.rectification.lens.project(np.array([x / z]), np.array([y / z]))
-        squares.append((u[0] - pixel[0]) ** 2 + (v[0] - pixel[1]) ** 2)
+        squares.append((u[0] - column) ** 2 + (v[0] - row) ** 2)
     return math.sqrt(float(np.mean(squares)))

@@ -31,7 +31,6 @@ from torch import Tensor
 
 from blitzgs.capture.cameras import Camera, Rectification
 from blitzgs.capture.capture import Capture
-from blitzgs.capture.check_files import FileCheck, mask_error
 from blitzgs.capture.image_files import (
     ImageFile,
     UInt8,
@@ -43,7 +42,7 @@ from blitzgs.capture.image_files import (
     reduced,
     reduced_mask,
 )
-from blitzgs.capture.masks import misfit
+from blitzgs.capture.masks import FileCheck, mask_error, misfit
 from blitzgs.capture.shared_images import BoundedCache as BoundedCache
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.formats import native

@@ -5,21 +5,23 @@ from __future__ import annotations
 
 import re
 import shlex
-import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
+from typing import Any
 
 import numpy as np
 
 from blitzgs.capture import colmap, transforms
 from blitzgs.capture.cameras import SourceView
-from blitzgs.capture.lens import Lens
-from blitzgs.capture.names import ImageFinder, to_convert
+from blitzgs.capture.lengths import StrayCamera
+from blitzgs.capture.lens import lenses_of
+from blitzgs.capture.names import find_images, relative_to, to_convert
 from blitzgs.capture.points import SourcePoints, file_points, transforms_points
 from blitzgs.capture.projects.find import FoundProject, find_project, read_project
 from blitzgs.capture.world import WorldFrame, frame_beside
+from blitzgs.util.errors import located, warn
 
 _PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 # What programs write beside the images of a synthetic capture.
@@ -27,19 +29,31 @@ _BY_PRODUCT = re.compile(r"(?i)(depth|normal|disp|mask|alpha|segmentation)s?(_?\
 
 
 @dataclass(frozen=True)
-class Source:
-    """Which files were read, and what of them was not."""
+class About:
+    """What was read of a capture and what was decided, for messages; `load_capture` knows all of it."""
 
     cameras: str  # the model or files that the poses are from, relative to the capture
-    split: str = ""  # what in the files decides on the split
+    split_from: str = ""  # what in the files decides on the split
     notes: tuple[str, ...] = ()  # what the reader decided between fields or files, and what has no effect
     without_camera: int = 0  # photographs beside those of the views that have no camera
     frame: WorldFrame | None = None  # where the capture lies in the world; None: the files do not say
+    split: str = ""  # what decided on the held-out views
+    # The cameras whose pose is wrong; they are left out unless `stray_cameras` keeps them.
+    strays: Sequence[StrayCamera] = ()
+    unused: int = 0  # number of frames that are in no list of the file's own split
+    missing: int = 0  # number of views whose image is not on disk
+    blind: int = 0  # number of views that see none of the points
+    random_points: bool = False  # whether the capture has no points, so that training starts from random ones
+    points_from: str = ""  # the file of the points, relative to the capture
+    colors_from: str = ""  # what in it gives their colours; empty: nothing
+    with_alpha: int = 0  # number of photographs that have alpha
+    extra_bands: int = 0  # number of photographs with a band that is neither colour nor alpha; it is not used
+    damaged: int = 0  # number of views that `allow_missing` left out because their image or mask is damaged
 
 
 def read_layout(
     root: Path, images: str, downscale: float, sparse: str = "largest", project: FoundProject | None = None
-) -> tuple[list[SourceView], SourcePoints, Source]:
+) -> tuple[list[SourceView], SourcePoints, About]:
     """Read the views and points of a folder in any of the layouts of docs/captures.md, or of a `project`.
 
     `downscale` (which decides on the folder of images) and `sparse` are those of `load_capture`.
@@ -50,26 +64,26 @@ def read_layout(
             f"{root} is not a folder: name the folder of the capture (images and a COLMAP model) with --data"
         )
     if project is not None:
-        views, points, source = _read_project(root, project, images, downscale)
-        return views, points, _with_photographs(root, source, views)
+        views, points, about = _read_project(root, project, images, downscale)
+        return views, points, _with_photographs(root, about, views)
     models, notes = _models(root, sparse)
     folder = models[0] if models else None
-    parts = [part for part in ("train", "val") if colmap.find_model(root / part)]
+    parts = {part: found[0][0] for part in ("train", "val") if (found := colmap.find_models(root / part))}
     by_default = sparse in ("largest", "all")
     has_transforms = by_default and bool(transforms.find_transforms(root))
     if has_transforms and (folder is None or "colmap" in folder.relative_to(root).parts):
-        views, points, source = _read_transforms(root, folder)
+        views, points, about = _read_transforms(root, folder)
     elif folder is not None:
         read = [_read_colmap(root, model, images, downscale) for model in models]
         views, points = read[0] if len(read) == 1 else _joined(root, read)
         shown = " and ".join(str(model.relative_to(root)) for model in models if model != root)
-        source = Source(shown or "cameras, images and points3D", "", tuple(notes))
+        about = About(shown or "cameras, images and points3D", "", tuple(notes))
     elif "train" in parts:
-        found = [_read_colmap(root / p, _model_in(root / p), images, downscale, part=p) for p in parts]
-        views, points = [view for views, _ in found for view in views], found[0][1]
-        source = Source(" and ".join(str(_model_in(root / p).relative_to(root)) for p in parts))
+        read = [_read_colmap(root / p, model, images, downscale, part=p) for p, model in parts.items()]
+        views, points = [view for views, _ in read for view in views], read[0][1]
+        about = About(" and ".join(str(model.relative_to(root)) for model in parts.values()))
     elif (project := find_project(root)) is not None:
-        views, points, source = _read_project(root, project, images, downscale)
+        views, points, about = _read_project(root, project, images, downscale)
     else:
         incomplete = colmap.find_incomplete_model(root)
         if incomplete is not None:
@@ -78,22 +92,17 @@ def read_layout(
             f"{root} holds no capture: expected a COLMAP model (sparse/0 with cameras, images and points3D "
             f"as .bin or .txt), transforms.json, or a project of another program{_hint(root)}"
         )
-    if source.frame is None:
-        source = replace(source, frame=frame_beside(root))
-    return views, points, _with_photographs(root, source, views)
+    if about.frame is None:
+        about = replace(about, frame=frame_beside(root))
+    return views, points, _with_photographs(root, about, views)
 
 
 def _read_project(
     root: Path, project: FoundProject, images: str, downscale: float
-) -> tuple[list[SourceView], SourcePoints, Source]:
-    names, paths, lenses, content, points = read_project(root, project, images, downscale)
-    views = [
-        SourceView(name, path, None, lens, view.world_to_camera)
-        for name, path, lens, view in zip(names, paths, lenses, content.views, strict=True)
-    ]
-    file = project.file.relative_to(root) if project.file.is_relative_to(root) else project.file
-    cameras = f"{file} ({project.kind.program})"
-    return views, points, Source(cameras, notes=tuple(content.notes), frame=content.frame)
+) -> tuple[list[SourceView], SourcePoints, About]:
+    views, points, content = read_project(root, project, images, downscale)
+    cameras = f"{relative_to(root, project.file)} ({project.program})"
+    return views, points, About(cameras, notes=tuple(content.notes), frame=content.frame)
 
 
 def _hint(root: Path) -> str:
@@ -113,18 +122,13 @@ def _hint(root: Path) -> str:
     return to_convert(names)
 
 
-def _model_in(root: Path) -> Path:
-    folder = colmap.find_model(root)
-    assert folder is not None
-    return folder
-
-
 def _models(root: Path, sparse: str) -> tuple[list[Path], list[str]]:
     """Return the COLMAP models to read, the largest first, and a line if others are left out."""
     if sparse not in ("largest", "all"):
         named = root / sparse
-        if colmap.find_models(named) and (model := _model_in(named)).is_relative_to(root):
-            return [model], []
+        found = colmap.find_models(named)[:1]
+        if found and found[0][0].is_relative_to(root):
+            return [found[0][0]], []
         raise FileNotFoundError(
             f"data.sparse: {named} has no complete COLMAP model (cameras, images and points3D); name its "
             "folder relative to the capture, or use 'largest' or 'all'"
@@ -139,7 +143,7 @@ def _models(root: Path, sparse: str) -> tuple[list[Path], list[str]]:
         f"of {len(models)} COLMAP models, the largest is used: {counts} (others with --data.sparse=FOLDER; "
         "--data.sparse=all reads all, if they have the same world coordinates)"
     )
-    warnings.warn(note, stacklevel=4)
+    warn(note)
     return [models[0][0]], [note]
 
 
@@ -148,21 +152,14 @@ def _joined(
 ) -> tuple[list[SourceView], SourcePoints]:
     """Return the views and points of several models; of an image in two of them, the first counts."""
     views = {view.name: view for found, _ in reversed(parts) for view in found}
-    points = [points for _, points in parts]
-    tracks = [p.track_lengths for p in points if p.track_lengths is not None]
-    errors = [p.errors for p in points if p.errors is not None]
-    joined = SourcePoints(
-        np.concatenate([p.positions for p in points]),
-        np.concatenate([p.colors for p in points]),
-        np.concatenate(tracks) if len(tracks) == len(points) else None,
-        np.concatenate(errors) if len(errors) == len(points) else None,
-        points[0].path,
-        points[0].colors_from,
-    )
-    return list(views.values()), joined
+    columns = [points.columns() for _, points in parts]
+    common = [name for name in columns[0] if all(name in others for others in columns)]
+    joined: dict[str, Any] = {name: np.concatenate([each[name] for each in columns]) for name in common}
+    first = parts[0][1]
+    return list(views.values()), SourcePoints(**joined, path=first.path, colors_from=first.colors_from)
 
 
-def _with_photographs(root: Path, source: Source, views: Sequence[SourceView]) -> Source:
+def _with_photographs(root: Path, about: About, views: Sequence[SourceView]) -> About:
     """Add the number of photographs that have no camera, and say it.
 
     They are searched in the folders of those that have one, so that folders of masks or of smaller copies do
@@ -182,15 +179,14 @@ def _with_photographs(root: Path, source: Source, views: Sequence[SourceView]) -
         and not _BY_PRODUCT.search(file.stem)
     )
     if without:
-        warnings.warn(
-            f"{len(without)} of {len(without) + len(used)} photographs have no camera in {source.cameras} "
-            f"and are not used (first: {without[0].name})",
-            stacklevel=4,
+        warn(
+            f"{len(without)} of {len(without) + len(used)} photographs have no camera in {about.cameras} "
+            f"and are not used (first: {without[0].name})"
         )
-    return replace(source, without_camera=len(without))
+    return replace(about, without_camera=len(without))
 
 
-def _read_transforms(root: Path, model: Path | None) -> tuple[list[SourceView], SourcePoints, Source]:
+def _read_transforms(root: Path, model: Path | None) -> tuple[list[SourceView], SourcePoints, About]:
     content = transforms.read_transforms(root)
     notes = list(content.notes)
     if content.files[0].name == "transforms.json":
@@ -199,23 +195,17 @@ def _read_transforms(root: Path, model: Path | None) -> tuple[list[SourceView], 
             notes.append(f"transforms.json is read, and {', '.join(beside)} beside it not")
     for note in notes:
         if not note.startswith("fields without effect"):
-            warnings.warn(f"{content.files[0]}: {note}", stacklevel=4)
-    source = Source(" and ".join(path.name for path in content.files), content.split, tuple(notes))
-    return content.frames, transforms_points(root, content, model), source
+            warn(f"{content.files[0]}: {note}")
+    about = About(" and ".join(path.name for path in content.files), content.split, tuple(notes))
+    return content.frames, transforms_points(root, content, model), about
 
 
 def _read_colmap(
     root: Path, folder: Path, images: str, downscale: float, part: str = ""
 ) -> tuple[list[SourceView], SourcePoints]:
     model = colmap.read_model(folder)
-    lenses: dict[int, Lens] = {}
-    for camera in model.cameras:
-        if camera.id in lenses:
-            raise ValueError(f"{folder}: there are two cameras {camera.id}")
-        try:
-            lenses[camera.id] = Lens(camera.model, camera.width, camera.height, tuple(camera.params.tolist()))
-        except ValueError as error:
-            raise ValueError(f"{folder}: camera {camera.id}: {error}") from error
+    with located(str(folder)):
+        lenses = lenses_of(model.cameras)
     names = model.images.names
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)
@@ -226,17 +216,12 @@ def _read_colmap(
             f"{folder}: the cameras of {len(unknown)} images (first: {unknown[0]}) are not there"
         )
     lens_of = [lenses[c] for c in model.images.camera_ids.tolist()]
-    paths = ImageFinder(root, images).find_all(names, lens_of, downscale)
+    paths = find_images(root, images, names, lens_of, downscale)
     poses = colmap.world_to_camera(model.images)
-    prefix = f"{part}/" if part else ""
     views = [
-        SourceView(prefix + name, path, None, lens, pose)
+        SourceView(f"{part}/{name}" if part else name, path, None, lens, pose)
         for name, path, lens, pose in zip(names, paths, lens_of, poses, strict=True)
     ]
     if model.points_path is not None and model.points_path.suffix in colmap.POINT_SUFFIXES:
         return views, file_points(model.points_path)
-    p = model.points
-    path = model.points_path
-    return views, SourcePoints(
-        p.positions, p.colors, p.track_lengths, p.errors, path, "the model's own colours"
-    )
+    return views, SourcePoints.of_model(model.points, model.points_path, "the model's own colours")

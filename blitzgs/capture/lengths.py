@@ -7,7 +7,6 @@ power of two has the same lengths, scaled exactly.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture.cameras import Camera, Float64, SourceView, camera_centres
+from blitzgs.util.errors import warn
 
 # Cameras whose distance is below this share of the points' distance count as being in one place: the parallax
 # between them is far below a pixel.
@@ -91,18 +91,11 @@ def find_apart(
 
 def _shown(view: SourceView, points: Float64) -> float:
     """Return the share of an image's sides on which a view shows the inner 90 % of what it sees."""
-    x, y, depth = view.world_to_camera[:3, :3] @ points.T + view.world_to_camera[:3, 3:]
-    front = depth > 0
-    u, v = view.lens.project(x[front] / depth[front], y[front] / depth[front])
-    with np.errstate(invalid="ignore"):
-        inside = (u >= 0) & (u < view.lens.width) & (v >= 0) & (v < view.lens.height)
-    if inside.sum() < 2:
+    pixels = view.pixels_of(points)
+    if len(pixels) < 2:
         return 0.0
-    spans = (
-        float(np.subtract(*np.quantile(pixels[inside], [0.95, 0.05]))) / side
-        for pixels, side in ((u, view.lens.width), (v, view.lens.height))
-    )
-    return max(spans)
+    spans = np.subtract(*np.quantile(pixels, [0.95, 0.05], axis=0)) / [view.lens.width, view.lens.height]
+    return float(spans.max())
 
 
 def depths_seen(camera: Camera, points: Float64) -> Float64:
@@ -115,59 +108,51 @@ def depths_seen(camera: Camera, points: Float64) -> Float64:
     return np.asarray(depth[(u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)])
 
 
-@dataclass(frozen=True)
-class Sight:
-    """What the views see of the points, by a sample of them."""
+def nearest_depths(cameras: Sequence[Camera], points: Float64) -> Float64:
+    """Return the depth [V] of the nearest re-centred points [M, 3] that each view sees, by a sample of them.
 
-    # [V] depth of the nearest points that each view sees, without the nearest 2 % of them; infinite for a
-    # view that sees none.
-    nearest: Float64
-    names: list[str]
+    The nearest 2 % are skipped; infinite for a view that sees none.
+    """
+    sample = sampled(points, len(cameras))
+    nearest = np.full(len(cameras), np.inf)
+    for index, camera in enumerate(cameras):
+        depths = depths_seen(camera, sample)
+        if len(depths):
+            # At least one point is skipped where there are several.
+            rank = min(len(depths) - 1, max(1, int(_SKIPPED_POINTS * len(depths))))
+            nearest[index] = np.partition(depths, rank)[rank]
+    return nearest
 
-    @classmethod
-    def of(cls, cameras: Sequence[Camera], points: Float64) -> Sight:
-        """Measure the views of cameras; `points` [M, 3] are re-centred."""
-        sample = sampled(points, len(cameras))
-        nearest = np.full(len(cameras), np.inf)
-        for index, camera in enumerate(cameras):
-            depths = depths_seen(camera, sample)
-            if len(depths):
-                # At least one point is skipped where there are several.
-                rank = min(len(depths) - 1, max(1, int(_SKIPPED_POINTS * len(depths))))
-                nearest[index] = np.partition(depths, rank)[rank]
-        return cls(nearest, [camera.name for camera in cameras])
 
-    def blind(self, cameras: Sequence[Camera], points: Float64) -> int:
-        """Return how many views see none of the points; warn if most do, and name the first."""
-        blind = [name for name, depth in zip(self.names, self.nearest, strict=True) if np.isinf(depth)]
-        if 2 * len(blind) > len(self.names):
-            warnings.warn(
-                f"{len(blind)} of {len(self.names)} views (first: {blind[0]}) see none of the points: do the "
-                "poses and the points belong together, and do the cameras look along +z?",
-                stacklevel=3,
-            )
-        if len(blind) == len(self.names):  # a view may see points that are not in the sample
-            some = cameras[:: max(1, len(cameras) // 64)]
-            return len(blind) - sum(len(depths_seen(camera, points)) > 0 for camera in some)
-        return len(blind)
+def blind_views(nearest: Float64, cameras: Sequence[Camera], points: Float64) -> int:
+    """Return how many views see none of the points; warn if most do, and name the first."""
+    blind = [camera.name for camera, depth in zip(cameras, nearest, strict=True) if np.isinf(depth)]
+    if 2 * len(blind) > len(cameras):
+        warn(
+            f"{len(blind)} of {len(cameras)} views (first: {blind[0]}) see none of the points: do the poses "
+            "and the points belong together, and do the cameras look along +z?"
+        )
+    if len(blind) == len(cameras):  # a view may see points that are not in the sample
+        some = cameras[:: max(1, len(cameras) // 64)]
+        return len(blind) - sum(len(depths_seen(camera, points)) > 0 for camera in some)
+    return len(blind)
 
-    def near(self, views: Sequence[int], extent: float) -> float:
-        """Return the near plane: less than the depth of what views see, and at most 0.01 x the extent."""
-        most = NEAR_OF_EXTENT * extent
-        depths = np.sort(self.nearest[list(views)])
-        depths = depths[np.isfinite(depths)]
-        if len(depths) == 0:
-            return most
-        near = min(most, _NEAR_OF_DEPTH * float(depths[int(_SKIPPED_VIEWS * len(depths))]))
-        lost = int((depths <= most).sum())
-        if 2 * lost > len(depths):
-            # The cameras are spread over far more than they are away from what they show, as along a street.
-            warnings.warn(
-                f"{lost} of {len(depths)} views begin to see points at less than {NEAR_OF_EXTENT:g} x the "
-                f"extent ({most:.4g}), so the near plane is at {near:.4g}; model.near sets another",
-                stacklevel=3,
-            )
-        return near
+
+def near_plane(nearest: Float64, extent: float) -> float:
+    """Return a near plane: less than the depths that views see, and at most 0.01 x the extent."""
+    most = NEAR_OF_EXTENT * extent
+    depths = np.sort(nearest[np.isfinite(nearest)])
+    if len(depths) == 0:
+        return most
+    near = min(most, _NEAR_OF_DEPTH * float(depths[int(_SKIPPED_VIEWS * len(depths))]))
+    lost = int((depths <= most).sum())
+    if 2 * lost > len(depths):
+        # The cameras are spread over far more than they are away from what they show, as along a street.
+        warn(
+            f"{lost} of {len(depths)} views begin to see points at less than {NEAR_OF_EXTENT:g} x the extent "
+            f"({most:.4g}), so the near plane is at {near:.4g}; model.near sets another"
+        )
+    return near
 
 
 def measured_extent(centres: Float64, points: Float64) -> float:
@@ -177,10 +162,7 @@ def measured_extent(centres: Float64, points: Float64) -> float:
     if extent > _LEAST_SPREAD * distance:
         return extent
     extent = distance
-    warnings.warn(
-        f"all training cameras are in one place: extent is the points' median distance, {extent:g}",
-        stacklevel=4,
-    )
+    warn(f"all training cameras are in one place: extent is the points' median distance, {extent:g}")
     return extent or 1.0
 
 

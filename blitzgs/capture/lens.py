@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.capture.colmap import camera_models
+from blitzgs.capture.colmap import ColmapCamera, camera_models
+from blitzgs.util.errors import located
 
 Array = npt.NDArray[np.float64]
 _OWN_MODELS = {"BROWN": ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "skew"]}
@@ -106,6 +107,17 @@ class Lens:
         return fx * u + cx, fy * v + cy
 
 
+def lenses_of(cameras: Sequence[ColmapCamera]) -> dict[int, Lens]:
+    """Return the lenses of a COLMAP model by id (ValueError: one makes no sense, or two have one id)."""
+    lenses: dict[int, Lens] = {}
+    for camera in cameras:
+        if camera.id in lenses:
+            raise ValueError(f"there are two cameras {camera.id}")
+        with located(f"camera {camera.id}"):
+            lenses[camera.id] = Lens(camera.model, camera.width, camera.height, tuple(camera.params.tolist()))
+    return lenses
+
+
 def check_lens(lens: Lens) -> str:
     """Return what is unusual about a lens, or an empty text.
 
@@ -141,9 +153,11 @@ def _polynomial(r2: Array, coefficients: Sequence[float]) -> Array:
     return 1 + value
 
 
-def _tangential(u: Array, v: Array, p1: float, p2: float) -> tuple[Array, Array]:
+def _tangential(u: Array, v: Array, scale: Array | float, p1: float, p2: float) -> tuple[Array, Array]:
+    """Return scaled directions with the shift of a lens whose parts are not on one axis."""
     r2 = u * u + v * v
-    return 2 * p1 * u * v + p2 * (r2 + 2 * u * u), 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+    du, dv = 2 * p1 * u * v + p2 * (r2 + 2 * u * u), 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+    return u * scale + du, v * scale + dv
 
 
 def _radial(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
@@ -152,23 +166,18 @@ def _radial(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
 
 
 def _opencv(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
-    scale = _polynomial(u * u + v * v, k[:2])
-    du, dv = _tangential(u, v, k[2], k[3])
-    return u * scale + du, v * scale + dv
+    return _tangential(u, v, _polynomial(u * u + v * v, k[:2]), k[2], k[3])
 
 
 def _brown(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
-    scale = _polynomial(u * u + v * v, k[:4])
-    du, dv = _tangential(u, v, k[4], k[5])
-    u, v = u * scale + du, v * scale + dv
+    u, v = _tangential(u, v, _polynomial(u * u + v * v, k[:4]), k[4], k[5])
     return u + k[6] * v, v
 
 
 def _full_opencv(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
     r2 = u * u + v * v
     scale = _polynomial(r2, (k[0], k[1], k[4])) / _polynomial(r2, k[5:8])
-    du, dv = _tangential(u, v, k[2], k[3])
-    return u * scale + du, v * scale + dv
+    return _tangential(u, v, scale, k[2], k[3])
 
 
 def _fov(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
@@ -197,17 +206,16 @@ def _thin_prism_fisheye(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, 
     k1, k2, p1, p2, k3, k4, sx1, sy1 = k
     u, v = _equidistant(u, v)
     r2 = u * u + v * v
-    scale = _polynomial(r2, (k1, k2, k3, k4))
-    du, dv = _tangential(u, v, p1, p2)
-    return u * scale + du + sx1 * r2, v * scale + dv + sy1 * r2
+    u, v = _tangential(u, v, _polynomial(r2, (k1, k2, k3, k4)), p1, p2)
+    return u + sx1 * r2, v + sy1 * r2
 
 
 def _rad_tan_thin_prism_fisheye(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
     u, v = _radial(*_equidistant(u, v), k[:6])
     p0, p1, s0, s1, s2, s3 = k[6:]
     r2 = u * u + v * v
-    du, dv = _tangential(u, v, p1, p0)
-    return u + du + r2 * (s0 + s1 * r2), v + dv + r2 * (s2 + s3 * r2)
+    u, v = _tangential(u, v, 1.0, p1, p0)
+    return u + r2 * (s0 + s1 * r2), v + r2 * (s2 + s3 * r2)
 
 
 def _division(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the masks of a capture's images: the mask that belongs to an image, and no other."""
+"""Finds the mask of each image of a capture, and checks photographs and masks before they are needed."""
 
 from __future__ import annotations
 
-import warnings
+import threading
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from pathlib import Path, PurePosixPath
 
 from blitzgs.capture.cameras import Camera, same_shape
-from blitzgs.capture.image_files import decode_mask, read_header, read_whole
+from blitzgs.capture.image_files import check_photograph, decode_mask, read_header, read_whole
 from blitzgs.capture.names import files_below, unified, what_is_at
+from blitzgs.util.errors import warn
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp", ".avif", ".jp2")
 # What programs call the mask of a.jpg, the names that are tried first first.
@@ -65,10 +66,7 @@ def find_masks(
             f"{PurePosixPath(unified(names[0])).name}.png, or use --data.masks=false"
         )
     if unused:
-        warnings.warn(
-            f"{len(unused)} of {len(files)} masks in {folder} belong to no image (first: {unused[0]})",
-            stacklevel=3,
-        )
+        warn(f"{len(unused)} of {len(files)} masks in {folder} belong to no image (first: {unused[0]})")
     return found
 
 
@@ -172,17 +170,15 @@ def check_masks(masks: Sequence[Path | None]) -> None:
     if not shares:
         return
     if max(shares) == 0:
-        warnings.warn(
+        warn(
             f"the masks exclude nothing ({len(shares)} of {len(paths)} were looked at; first: {sample[0]}): "
-            "black or transparent pixels are excluded, all others count",
-            stacklevel=3,
+            "black or transparent pixels are excluded, all others count"
         )
     elif min(shares) == 1:
-        warnings.warn(
+        warn(
             f"the masks exclude every pixel ({len(shares)} of {len(paths)} were looked at; first: "
             f"{sample[0]}): black or transparent pixels are excluded, and in lossy files (JPEG) dark ones "
-            "too; write masks as PNG with white where pixels count, or use --data.masks=false",
-            stacklevel=3,
+            "too; write masks as PNG with white where pixels count, or use --data.masks=false"
         )
 
 
@@ -191,3 +187,89 @@ def _share(path: Path) -> float | None:
         return 1.0 - float(decode_mask(read_whole(path)).mean())
     except (OSError, ValueError):
         return None
+
+
+# Returns what is wrong with photographs and their masks, as `damaged` does.
+FindDamage = Callable[[Sequence[tuple[Path, Path | None]]], dict[int, str]]
+
+
+def mask_error(error: Exception) -> ValueError:
+    """Return an error that says that the file is a mask."""
+    return ValueError(f"the mask {error}")
+
+
+def read_mask_file(path: Path) -> None:
+    """Decode a mask (ValueError: it is damaged; says that it is a mask)."""
+    try:
+        decode_mask(read_whole(path))
+    except ValueError as error:
+        raise mask_error(error) from error
+
+
+def damaged(files: Sequence[tuple[Path, Path | None]]) -> dict[int, str]:
+    """Return what is wrong with photographs and their masks, by index; those without damage are left out."""
+
+    def problem(pair: tuple[Path, Path | None]) -> str | None:
+        try:
+            check_photograph(pair[0])
+            if pair[1] is not None:
+                read_mask_file(pair[1])
+        except (OSError, ValueError) as error:
+            return str(error)
+        return None
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        return {i: text for i, text in enumerate(pool.map(problem, files)) if text is not None}
+
+
+class FileCheck:
+    """Checks the files of views one after the other in a thread of its own, while others are in use."""
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        order: Sequence[int],
+        counted: Callable[[Camera], bool],
+        whole: Container[Path],
+    ) -> None:
+        """Start to check files.
+
+        `counted`: decodes a view's mask, and tells whether some pixel counts. `whole`: files of opaque
+        photographs that others have checked meanwhile.
+        """
+        # What is wrong with the first damaged file that was found; None so far.
+        self.damage: str | None = None
+        self._cameras, self._order, self._counted, self._whole = cameras, order, counted, whole
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="blitzgs-check", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop the thread; files that were not checked yet stay unchecked."""
+        self._stop.set()
+        self._thread.join()
+
+    def wait(self) -> None:
+        """Wait until all files are checked or one is damaged."""
+        self._thread.join()
+
+    def _run(self) -> None:
+        blank = []
+        for index in self._order:
+            if self._stop.is_set():
+                return
+            camera = self._cameras[index]
+            try:
+                has_pixels = camera.image_path in self._whole or check_photograph(camera.image_path)
+                if camera.mask_path is not None:
+                    has_pixels = self._counted(camera) and has_pixels
+            except (OSError, ValueError) as error:
+                self.damage = str(error)
+                return
+            if not has_pixels:
+                blank.append(camera.name)
+        if blank:
+            warn(
+                f"{len(blank)} photographs have no pixel that counts, as they are transparent or masked "
+                f"everywhere (first: {blank[0]})"
+            )

@@ -11,13 +11,14 @@ import os
 import re
 import stat
 import unicodedata
-import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePath, PurePosixPath
 
+from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
+from blitzgs.util.errors import warn
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".avif", ".jp2", ".gif")
 # Of photographs that have to be converted; the cameras may have been found before that.
@@ -32,6 +33,11 @@ _DEEPEST = 8
 def unified(name: str) -> str:
     """Return a path with slashes, without `.` parts, and with composed letters."""
     return unicodedata.normalize("NFC", str(PurePosixPath(name.replace("\\", "/"))))
+
+
+def relative_to(root: Path, path: Path) -> Path:
+    """Return a path as one below `root`, where it is below it."""
+    return path.relative_to(root) if path.is_relative_to(root) else path
 
 
 def _any_case(name: str) -> str:
@@ -91,10 +97,9 @@ def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dic
         if not new:
             continue
         name, file = next(iter(new.items()))
-        warnings.warn(
+        warn(
             f"{len(new)} of {len(found) + len(wanted)} files have other names in {folder} than in the "
-            f"capture's file: {file} is used for {name} (names that differ only in {ignored})",
-            stacklevel=3,
+            f"capture's file: {file} is used for {name} (names that differ only in {ignored})"
         )
         matches |= {name: folder / file for name, file in new.items()}
         used = set(new.values())
@@ -173,10 +178,9 @@ def check_inside(paths: Iterable[Path], root: Path, allowed: Sequence[Path], ref
     outside = [path for path in paths if not _is_below(os.path.normpath(path.absolute()), bases)]
     if not refuse:
         if outside:
-            warnings.warn(
+            warn(
                 f"{len(outside)} names of the capture lead outside {root} (first: {outside[0]}); "
-                "--data.inside_only=true refuses them",
-                stacklevel=2,
+                "--data.inside_only=true refuses them"
             )
         return
     # A link inside the capture belongs to the capture, so it must not lead outside either.
@@ -201,48 +205,42 @@ class MissingImagesError(FileNotFoundError):
     """Some of the images that a capture names are not on disk."""
 
 
-class ImageFinder:
-    """Finds a capture's files: in the images folder, a scaled images_N, or Mega-NeRF's train/ and val/."""
+def find_images(
+    root: Path, images: str, names: Sequence[str], lenses: Sequence[Lens], downscale: float
+) -> list[Path]:
+    """Return the file of each name, relative to the folder `images` of a capture.
 
-    def __init__(self, root: Path, images: str = "images") -> None:
-        """Look below `root`; `images` is the folder that the names of the model are relative to."""
-        self.root = root
-        self.images = images
-        self._mapping = _mega_nerf_mapping(root)
+    It is in a scaled images_N if that has all images at the right size, in the folder itself, or in the
+    train/ and val/ of Mega-NeRF. For an image that is found nowhere the returned path does not exist.
+    """
+    if downscale > 1 and float(downscale).is_integer():
+        folder = root / f"{images}_{int(downscale)}"
+        if folder.is_dir():
+            paths = [_with_any_suffix(folder / name) for name in names]
+            problem = _first_problem(folder, names, lenses, paths, downscale)
+            if problem is None:
+                return [path for path in paths if path is not None]
+            warn(f"{problem}; downscaling {images} instead")
+    mapping = _mega_nerf_mapping(root)
+    files = {name: _find(root, images, name, mapping.get(name)) for name in names}
+    lost = [name for name, path in files.items() if not path.is_file()]
+    found = list(files.keys() - set(lost))
+    files |= match_names(lost, found, root / images)
+    return [files[name] for name in names]
 
-    def find_all(self, names: Sequence[str], lenses: Sequence[Lens], downscale: float) -> list[Path]:
-        """Return the file of each name, from images_N if it has all images at the right size.
 
-        For an image that is found nowhere the returned path does not exist.
-        """
-        if downscale > 1 and float(downscale).is_integer():
-            folder = self.root / f"{self.images}_{int(downscale)}"
-            if folder.is_dir():
-                paths = [_with_any_suffix(folder / name) for name in names]
-                problem = _first_problem(folder, names, lenses, paths, downscale)
-                if problem is None:
-                    return [path for path in paths if path is not None]
-                warnings.warn(f"{problem}; downscaling {self.images} instead", stacklevel=2)
-        files = [self._find(name) for name in names]
-        there = [path.is_file() for path in files]
-        lost = [name for name, found in zip(names, there, strict=True) if not found]
-        found = [name for name, is_there in zip(names, there, strict=True) if is_there]
-        matches = match_names(lost, found, self.root / self.images)
-        return [matches.get(name, path) for name, path in zip(names, files, strict=True)]
-
-    def _find(self, name: str) -> Path:
-        first = self.root / self.images / name
-        if first.is_file():
-            return first
-        mapped = self._mapping.get(name)
-        for folder in ("", "train/rgbs", "val/rgbs", "train/images", "val/images", "rgbs"):
-            base = self.root / folder
-            for path in (base / name, base / PurePath(name).name):
-                if path.is_file():
-                    return path
-            if mapped is not None and (found := _with_any_suffix(base / mapped)) is not None:
-                return found
+def _find(root: Path, images: str, name: str, mapped: str | None) -> Path:
+    first = root / images / name
+    if first.is_file():
         return first
+    for folder in ("", "train/rgbs", "val/rgbs", "train/images", "val/images", "rgbs"):
+        base = root / folder
+        for path in (base / name, base / PurePath(name).name):
+            if path.is_file():
+                return path
+        if mapped is not None and (found := _with_any_suffix(base / mapped)) is not None:
+            return found
+    return first
 
 
 def _first_problem(
@@ -286,28 +284,25 @@ def read_lines(path: Path) -> list[str]:
     return os.fsdecode(path.read_bytes()).removeprefix("\ufeff").splitlines()
 
 
-def existing(names: Sequence[str], paths: Sequence[Path], root: Path, images: str, allow: bool) -> list[int]:
-    """Return the indices of the views whose image is on disk; with `allow`, warn of the others.
+def existing(views: Sequence[SourceView], root: Path, images: str, allow: bool) -> list[SourceView]:
+    """Return the views whose image is on disk; with `allow`, warn of the others.
 
     MissingImagesError, FileNotFoundError: images are missing, or all are. ValueError: two views have one
     image.
     """
-    exists = [path.is_file() for path in paths]
-    owners = defaultdict(list)
-    for name, path, there in zip(names, paths, exists, strict=True):
-        if there:
-            owners[path].append(name)
-    if twice := next((found for found in owners.values() if len(found) > 1), None):
-        raise ValueError(f"{root}: {twice[0]} and {twice[1]} would be the same file; put both images there")
-    missing = [(name, path) for name, path, there in zip(names, paths, exists, strict=True) if not there]
-    found = [index for index, there in enumerate(exists) if there]
+    exists = {view: view.path.is_file() for view in views}
+    found, missing = ([view for view in views if exists[view] is there] for there in (True, False))
+    owners: dict[Path, str] = {}
+    for view in found:
+        if (other := owners.setdefault(view.path, view.name)) != view.name:
+            raise ValueError(f"{root}: {other} and {view.name} would be the same file; put both images there")
     if not missing:
         return found
-    shown = ", ".join(name for name, _ in missing[:5]) + (", ..." if len(missing) > 5 else "")
+    shown = ", ".join(view.name for view in missing[:5]) + (", ..." if len(missing) > 5 else "")
     # The names of a transforms.json are paths in the capture; those of a COLMAP model, in its image folder.
-    are_paths = all(path == root / name for name, path in missing)
+    are_paths = all(view.path == root / view.name for view in missing)
     folder = root if are_paths else root / images
-    message = f"{len(missing)} of {len(names)} images are not in {folder}: {shown}"
+    message = f"{len(missing)} of {len(views)} images are not in {folder}: {shown}"
     if instead := _instead(folder, missing):
         message, remedy = f"{message}; {instead}", "put the photographs themselves there"
         if not allow:
@@ -325,12 +320,12 @@ def existing(names: Sequence[str], paths: Sequence[Path], root: Path, images: st
         raise FileNotFoundError(f"{message}; {remedy}")
     if not allow:
         raise MissingImagesError(f"{message}; put them back, or leave those views out with allow_missing")
-    warnings.warn(f"{message}; dropped", stacklevel=3)
+    warn(f"{message}; dropped")
     return found
 
 
-def _instead(folder: Path, missing: Sequence[tuple[str, Path]]) -> str | None:
+def _instead(folder: Path, missing: Sequence[SourceView]) -> str | None:
     """Return what is in the place of the images, if something is."""
     if os.path.lexists(folder) and not folder.is_dir():
         return f"{folder} is {what_is_at(folder) or 'a file, no folder'}"
-    return next((f"{path} is {what}" for _, path in missing if (what := what_is_at(path))), None)
+    return next((f"{v.path} is {what}" for v in missing if (what := what_is_at(v.path))), None)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,6 +15,7 @@ from blitzgs.capture.cameras import Float64, camera_centres
 from blitzgs.capture.names import unified
 from blitzgs.capture.transforms import Transforms
 from blitzgs.formats.ply import read_point_cloud
+from blitzgs.util.errors import optional_package, warn
 
 SUFFIXES = (".las", ".laz", ".e57")
 # A start needs no more: denser clouds are thinned evenly while they are read.
@@ -42,15 +42,12 @@ def _step(path: Path, count: int) -> int:
     """Return of how many points one is kept, and say it."""
     step = max(1, -(-count // _MOST))
     if step > 1:
-        warnings.warn(f"{path}: every {step}th of {count:,} points is used", stacklevel=5)
+        warn(f"{path}: every {step}th of {count:,} points is used")
     return step
 
 
 def _read_las(path: Path) -> tuple[Float64, npt.NDArray[np.uint8] | None, Any]:
-    try:
-        import laspy
-    except ImportError as error:
-        raise ImportError(f'{path}: reading it needs laspy: pip install "blitzgs[geo]"') from error
+    laspy = optional_package("laspy", "geo", f"{path}: reading it")
     with laspy.open(path) as reader:
         header = reader.header
         step, begin = _step(path, header.point_count), 0
@@ -60,14 +57,15 @@ def _read_las(path: Path) -> tuple[Float64, npt.NDArray[np.uint8] | None, Any]:
             kept = slice(-begin % step, None, step)
             begin += len(chunk)
             # Integers times scale plus offset, in float64.
-            positions.append(
-                np.stack([np.asarray(axis)[kept] for axis in (chunk.x, chunk.y, chunk.z)], axis=1)
-            )
+            positions.append(np.stack([np.asarray(chunk[axis])[kept] for axis in "xyz"], axis=1))
             if has_color:
-                colors.append(
-                    np.stack([np.asarray(c)[kept] for c in (chunk.red, chunk.green, chunk.blue)], axis=1)
-                )
-        crs = _crs(header)
+                rgb = [np.asarray(chunk[name])[kept] for name in ("red", "green", "blue")]
+                colors.append(np.stack(rgb, axis=1))
+        try:
+            crs = header.parse_crs()
+        except Exception as error:  # pyproj is not installed, or does not know the system
+            warn(f"the reference system of the points is not read ({error})")
+            crs = None
     found = np.concatenate(colors)
     if not has_color or not found.any():
         return np.concatenate(positions), None, crs
@@ -75,19 +73,8 @@ def _read_las(path: Path) -> tuple[Float64, npt.NDArray[np.uint8] | None, Any]:
     return np.concatenate(positions), (found >> (8 if found.max() > 255 else 0)).astype(np.uint8), crs
 
 
-def _crs(header: Any) -> Any:
-    try:
-        return header.parse_crs()
-    except Exception as error:  # pyproj is not installed, or does not know the system
-        warnings.warn(f"the reference system of the points is not read ({error})", stacklevel=5)
-        return None
-
-
 def _read_e57(path: Path) -> tuple[Float64, npt.NDArray[np.uint8] | None, None]:
-    try:
-        import pye57
-    except ImportError as error:
-        raise ImportError(f'{path}: reading it needs pye57: pip install "blitzgs[geo]"') from error
+    pye57 = optional_package("pye57", "geo", f"{path}: reading it")
     file = pye57.E57(str(path))
     try:
         step = _step(path, sum(file.get_header(i).point_count for i in range(file.scan_count)))
@@ -98,11 +85,9 @@ def _read_e57(path: Path) -> tuple[Float64, npt.NDArray[np.uint8] | None, None]:
             scan = file.read_scan(index, colors=with_color, ignore_missing_fields=True)
             xyz = np.stack([scan[f"cartesian{axis}"][::step] for axis in "XYZ"], axis=1).astype(np.float64)
             positions.append(xyz)
-            if with_color:
-                rgb = np.stack([scan[f"color{c}"][::step] for c in ("Red", "Green", "Blue")], axis=1)
-                colors.append(rgb.astype(np.float64))
-            else:
-                colors.append(np.full(xyz.shape, np.nan))
+            none = np.full(len(xyz), np.nan)
+            rgb = [scan[f"color{c}"][::step] if with_color else none for c in ("Red", "Green", "Blue")]
+            colors.append(np.stack(rgb, axis=1).astype(np.float64))
     finally:
         file.close()
     found = np.concatenate(colors)
@@ -132,6 +117,21 @@ class SourcePoints:
     colors_from: str = ""  # what in it gives the colours; empty: nothing
     crs: Any = None  # the reference system that the file names (pyproj's); None: it names none
 
+    def columns(self) -> dict[str, Any]:
+        """Return the columns that there are, by name."""
+        found = {name: getattr(self, name) for name in ("positions", "colors", "track_lengths", "errors")}
+        return {name: column for name, column in found.items() if column is not None}
+
+    @classmethod
+    def none(cls) -> SourcePoints:
+        """Return no points."""
+        return cls(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
+
+    @classmethod
+    def of_model(cls, points: colmap.ColmapPoints, path: Path | None, colors_from: str) -> SourcePoints:
+        """Return the points of a COLMAP model."""
+        return cls(points.positions, points.colors, points.track_lengths, points.errors, path, colors_from)
+
 
 def file_points(path: Path) -> SourcePoints:
     """Read the points of a PLY, LAS, LAZ or E57 file; warn if they have no colours; errors: `read_points`."""
@@ -139,17 +139,15 @@ def file_points(path: Path) -> SourcePoints:
         raise FileNotFoundError(f"{path} is missing: put the file of points there, or correct its name")
     if path.suffix.lower() in SUFFIXES:
         positions, colors, crs = read_points(path)
-        if colors is None:
-            warnings.warn(f"{path}: the points have no colours and start grey", stacklevel=4)
-            colors = np.full(positions.shape, 128, dtype=np.uint8)
-            return SourcePoints(positions, colors, path=path, crs=crs)
-        return SourcePoints(positions, colors, path=path, colors_from="red, green, blue", crs=crs)
+        if colors is not None:
+            return SourcePoints(positions, colors, path=path, colors_from="red, green, blue", crs=crs)
+        warn(f"{path}: the points have no colours and start grey")
+        return SourcePoints(positions, np.full(positions.shape, _GREY, np.uint8), path=path, crs=crs)
     cloud = read_point_cloud(path)
     if not cloud.colors_from and len(cloud.positions):
-        warnings.warn(
+        warn(
             f"{path}: the points have no colours and start grey: the file has {', '.join(cloud.properties)}, "
-            "and colours are read from red, green and blue",
-            stacklevel=4,
+            "and colours are read from red, green and blue"
         )
     return SourcePoints(cloud.positions, cloud.colors, path=path, colors_from=cloud.colors_from)
 
@@ -165,33 +163,29 @@ def transforms_points(root: Path, content: Transforms, model: Path | None) -> So
     if model is not None and (found := _model_points(root, content, model)) is not None:
         return found
     if plys:
-        warnings.warn(
+        warn(
             f"{content.files[0]} names no points, so {plys[0].name} beside it is not used: if its points are "
-            f'in the same world, add "ply_file_path": "{plys[0].name}"',
-            stacklevel=4,
+            f'in the same world, add "ply_file_path": "{plys[0].name}"'
         )
-    return SourcePoints(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
+    return SourcePoints.none()
 
 
 def _model_points(root: Path, content: Transforms, folder: Path) -> SourcePoints | None:
     """Return the points of a COLMAP model in the world of transforms.json; None if that is not certain."""
     model = colmap.read_model(folder)
-    shown = folder.relative_to(root)
-    moved = content.moved(model.points.positions)
     reason = _differs(model, content)
     if reason is not None:
-        warnings.warn(
-            f"{content.files[0]} names no points, and the {len(moved)} points of {shown} are not used: "
-            f"{reason}; name a PLY with ply_file_path",
-            stacklevel=5,
+        warn(
+            f"{content.files[0]} names no points, and the {len(model.points.ids)} points of "
+            f"{folder.relative_to(root)} are not used: {reason}; name a PLY with ply_file_path"
         )
         return None
-    points = model.points
     if model.points_path is not None and model.points_path.suffix in colmap.POINT_SUFFIXES:
-        read = file_points(model.points_path)
-        read.positions = content.moved(read.positions)
-        return read
-    return SourcePoints(moved, points.colors, points.track_lengths, points.errors, folder, "the model")
+        points = file_points(model.points_path)
+    else:
+        points = SourcePoints.of_model(model.points, folder, "the model")
+    points.positions = content.moved(points.positions)
+    return points
 
 
 def _differs(model: colmap.ColmapModel, content: Transforms) -> str | None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath
@@ -18,6 +17,7 @@ from blitzgs.capture.lengths import StrayCamera, random_points
 from blitzgs.capture.lens import Lens, check_lens
 from blitzgs.capture.names import read_lines
 from blitzgs.capture.points import SourcePoints
+from blitzgs.util.errors import located, warn
 
 # Coordinates from here on are damage; the squares of smaller ones are finite.
 _FARTHEST = 1e100
@@ -36,10 +36,9 @@ def with_finite_poses(views: list[SourceView]) -> list[SourceView]:
         raise ValueError(f"none of the {len(views)} views has a pose (a finite rotation and translation)")
     if len(finite) < len(views):
         first = next(v.name for v in views if not _is_usable(v.world_to_camera).all())
-        warnings.warn(
+        warn(
             f"{len(views) - len(finite)} of {len(views)} views have no finite pose and were dropped "
-            f"(first: {first})",
-            stacklevel=3,
+            f"(first: {first})"
         )
     return finite
 
@@ -52,34 +51,28 @@ def check_lenses(views: list[SourceView]) -> None:
         if view.lens in checked:
             continue
         checked.add(view.lens)
-        try:
+        with located(f"the camera of {view.name}"):
             doubt = check_lens(view.lens)
-        except ValueError as error:
-            raise ValueError(f"the camera of {view.name}: {error}") from error
         if doubt:
             unusual[view.lens] = f"{view.name}: {doubt}"
     if unusual:
-        warnings.warn(
-            f"{len(unusual)} of {len(checked)} cameras are unusual (first: {next(iter(unusual.values()))})",
-            stacklevel=3,
-        )
+        warn(f"{len(unusual)} of {len(checked)} cameras are unusual (first: {next(iter(unusual.values()))})")
 
 
 def without_strays(
-    views: list[SourceView], kept: list[int], strays: list[StrayCamera], keep: bool
-) -> list[int]:
-    """Return the views without those whose pose is wrong, unless the user keeps them, and name them."""
+    views: list[SourceView], strays: list[StrayCamera], count: int, keep: bool
+) -> list[SourceView]:
+    """Return those of `count` views whose pose is right, unless the user keeps the others, and name them."""
     if not strays:
-        return kept
+        return views
     shown = ", ".join(f"{s.name} at {s.distance:.6g}" for s in strays[:5]) + ", ..." * (len(strays) > 5)
     done = "kept" if keep else "left out; --data.stray_cameras=keep trains on them"
-    warnings.warn(
-        f"{len(strays)} of {len(views)} cameras lie far from the others, which are within "
-        f"{strays[0].others:.6g} of their middle, and show hardly a point: {shown} ({done})",
-        stacklevel=3,
+    warn(
+        f"{len(strays)} of {count} cameras lie far from the others, which are within "
+        f"{strays[0].others:.6g} of their middle, and show hardly a point: {shown} ({done})"
     )
     names = {stray.name for stray in strays}
-    return kept if keep else [index for index in kept if views[index].name not in names]
+    return views if keep else [view for view in views if view.name not in names]
 
 
 def finite_points(points: SourcePoints) -> SourcePoints:
@@ -87,29 +80,18 @@ def finite_points(points: SourcePoints) -> SourcePoints:
     finite: npt.NDArray[np.bool_] = np.asarray(_is_usable(points.positions).all(axis=1))
     if finite.all():
         return points
-    warnings.warn(
-        f"{int((~finite).sum())} of {finite.size} points are not finite and were dropped", stacklevel=3
-    )
-    return replace(
-        points,
-        positions=points.positions[finite],
-        colors=points.colors[finite],
-        track_lengths=points.track_lengths[finite] if points.track_lengths is not None else None,
-        errors=points.errors[finite] if points.errors is not None else None,
-    )
+    warn(f"{int((~finite).sum())} of {finite.size} points are not finite and were dropped")
+    return replace(points, **{name: column[finite] for name, column in points.columns().items()})
 
 
 def points_at_random(root: Path, cameras: Sequence[Camera], offset: Float64) -> SourcePoints:
     """Return uniform points of random colours in the region that the cameras look at."""
-    warnings.warn(
+    warn(
         f"{root}: the capture has no points; {_RANDOM_POINTS:,} random ones take their place. Points of the "
-        "reconstruction give a better start",
-        stacklevel=3,
+        "reconstruction give a better start"
     )
-    try:
+    with located(str(root)):
         return SourcePoints(*random_points(cameras, offset, _RANDOM_POINTS))
-    except ValueError as error:
-        raise ValueError(f"{root}: {error}") from error
 
 
 def read_cameras(path: Path, offset: Float64) -> list[Camera]:
@@ -133,23 +115,14 @@ def read_cameras(path: Path, offset: Float64) -> list[Camera]:
 
 
 def _pinhole(view: SourceView, offset: Float64) -> Camera:
-    try:
+    with located(f"the camera of {view.name}"):
         plan = rectify(view.lens, "crop")
-    except ValueError as error:
-        raise ValueError(f"the camera of {view.name}: {error}") from error
     pose = view.world_to_camera.copy()
     pose[:3, 3] += pose[:3, :3] @ offset
     return Camera(view.name, plan.width, plan.height, plan.K, pose, view.path, None, 1, plan)
 
 
 DEFAULT_EVERY = 8
-
-
-def every_nth(count: int, n: int) -> list[int]:
-    """Return the test views 0, n, 2n, ... of `count` (views sorted by name); none if n is 0."""
-    if n < 0 or n == 1:
-        raise ValueError(f"data.split: must be 0 (no view is held out) or at least 2, got {n}")
-    return list(range(0, count, n)) if n else []
 
 
 def from_list(names: Sequence[str], path: Path) -> list[int]:
@@ -193,29 +166,30 @@ def split_views(
     "auto": "val" if such a folder has views, else every 8th. ValueError: the list names unknown views, or no
     training view is left.
     """
+    given, in_val = spec, [i for i in range(len(names)) if is_val(names[i], paths[i], root)]
     if isinstance(spec, str) and spec.removeprefix("-").isdigit():
         spec = int(spec)
+    if spec == "auto" and not in_val:
+        spec = DEFAULT_EVERY if len(names) > 1 else 0
     if isinstance(spec, int):
-        test = every_nth(len(names), spec)
-    else:
-        test = [i for i in range(len(names)) if is_val(names[i], paths[i], root)]
-        if spec == "val" and not test:
+        if spec < 0 or spec == 1:
+            raise ValueError(f"data.split: must be 0 (no view is held out) or at least 2, got {spec}")
+        test = list(range(0, len(names), spec)) if spec else []
+    elif spec in ("auto", "val"):
+        test = in_val
+        if not test:
             raise ValueError(f"split 'val': no view's image is in {root / 'val'}")
-        if spec == "auto" and not test:
-            test = every_nth(len(names), DEFAULT_EVERY) if len(names) > 1 else []
-        if spec not in ("val", "auto"):
-            candidates = [root / spec, Path(spec)]
-            found = next((path for path in candidates if path.is_file()), None)
-            if found is None:
-                raise ValueError(
-                    f"split '{spec}': must be a whole number n (every n-th view is held out; 0: none), "
-                    f"'auto', 'val' or a file in {root}"
-                )
-            test = from_list(names, found)
-    held_out = set(test)
-    train = [i for i in range(len(names)) if i not in held_out]
+    else:
+        found = next((path for path in (root / spec, Path(spec)) if path.is_file()), None)
+        if found is None:
+            raise ValueError(
+                f"split '{spec}': must be a whole number n (every n-th view is held out; 0: none), "
+                f"'auto', 'val' or a file in {root}"
+            )
+        test = from_list(names, found)
+    train = sorted(set(range(len(names))).difference(test))
     if not train:
-        raise ValueError(f"split '{spec}' leaves no training view of {len(names)}")
+        raise ValueError(f"split '{given}' leaves no training view of {len(names)}")
     return train, test
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.cameras import Float64
+from blitzgs.util.errors import optional_package
 
 # The file of a run, and of a capture whose world its own files do not say.
 GEO = "geo.json"
@@ -196,11 +197,16 @@ def geodetic(position: Float64) -> tuple[float, float, float]:
 
 def pyproj_module() -> Any:
     """Return the package pyproj, which knows the reference systems (ImportError: it is not installed)."""
+    return optional_package("pyproj", "geo", "this")
+
+
+def reference_system(crs: str) -> Any:
+    """Return a reference system by its name (ImportError: pyproj is missing; ValueError: it is unknown)."""
+    pyproj = pyproj_module()
     try:
-        import pyproj
-    except ImportError as error:
-        raise ImportError('this needs the package pyproj: pip install "blitzgs[geo]"') from error
-    return pyproj
+        return pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError as error:
+        raise ValueError(f"{crs!r:.60} is no reference system: name one such as EPSG:32633") from error
 
 
 def converted(positions: Float64, source: Any, target: Any) -> Float64:
@@ -227,11 +233,7 @@ def frame_in(frame: WorldFrame, crs: str, places: Float64) -> tuple[WorldFrame, 
     scale make of the difference at the places of the capture, [N, 3]. ImportError: pyproj is not installed.
     ValueError: the reference system is unknown or has angles, or the places are too few.
     """
-    pyproj = pyproj_module()
-    try:
-        wanted = pyproj.CRS.from_user_input(crs)
-    except pyproj.exceptions.CRSError as error:
-        raise ValueError(f"{crs!r:.60} is no reference system: name one such as EPSG:32633") from error
+    wanted = reference_system(crs)
     if not (wanted.is_projected or wanted.is_geocentric):
         raise ValueError(
             f"{crs} ({wanted.name}) has angles or no place on earth: name a projected one, such as a UTM zone"
@@ -239,7 +241,7 @@ def frame_in(frame: WorldFrame, crs: str, places: Float64) -> tuple[WorldFrame, 
     if not frame.crs:
         raise ValueError("the present world has no reference system, so it cannot be converted: use --gcp")
     # The height counts too: a system of two axes keeps it above the ellipsoid.
-    old, new = (pyproj.CRS.from_user_input(c).to_3d() for c in (frame.crs, crs))
+    old, new = reference_system(frame.crs).to_3d(), wanted.to_3d()
     around = places.mean(axis=0) + np.ptp(places, axis=0).max() * 0.1 * np.concatenate(
         [np.eye(3), -np.eye(3)]
     )
@@ -261,14 +263,11 @@ def gps_positions(paths: Sequence[Path]) -> list[tuple[float, float, float] | No
     The height is the receiver's: above the ellipsoid or above sea level, as EXIF does not say. ImportError:
     Pillow, which reads the tags, is not installed.
     """
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError('reading EXIF needs Pillow: pip install "blitzgs[geo]"') from error
+    images = optional_package("PIL.Image", "geo", "reading EXIF")
     found = []
     for path in paths:
         try:
-            with Image.open(path) as image:
+            with images.open(path) as image:
                 found.append(_position(image.getexif().get_ifd(_GPS)))
         except (OSError, ValueError, SyntaxError):  # damaged, or a format without EXIF
             found.append(None)

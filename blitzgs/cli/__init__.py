@@ -40,13 +40,16 @@ blitzgs train --help explains the training; blitzgs train --help FIELD explains 
 # For each command the module, with the function that adds it if that is not `add_to`, and what it does.
 COMMANDS = {
     "sfm": ("blitzgs.cli.sfm", "find out where photographs were taken from, and write a capture"),
-    "refine": ("blitzgs.cli.refine", "find lenses and poses of a capture once more, for sharper models"),
+    "refine": (
+        "blitzgs.cli.sfm:add_refine",
+        "find lenses and poses of a capture anew, for sharper models",
+    ),
     "train": ("blitzgs.cli.train", "train a model of photographs with known cameras"),
     "eval": ("blitzgs.cli.evaluate", "measure PSNR and SSIM of a run's held-out views"),
     "render": ("blitzgs.cli.render", "render views of a model to pictures, or a path to a film"),
     "view": ("blitzgs.cli.view", "look at a model in the browser"),
-    "report": ("blitzgs.cli.report", "write the report of a run"),
-    "compare": ("blitzgs.cli.report:add_compare", "put runs side by side"),
+    "report": ("blitzgs.cli.view:add_report", "write the report of a run"),
+    "compare": ("blitzgs.cli.view:add_compare", "put runs side by side"),
     "export": ("blitzgs.cli.export", "write a model as PLY, SOG, SPZ, GLB ..., or as one HTML file to send"),
     "align": ("blitzgs.cli.align", "find out where a model lies in the world: control points, GPS, a CRS"),
     "gate": ("blitzgs.cli.gate", "fit and evaluate spawn gates, which make smaller models"),

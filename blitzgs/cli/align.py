@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import warnings
 
 import numpy as np
 
 from blitzgs.capture.cameras import Float64, camera_centres
 from blitzgs.capture.capture import Capture
-from blitzgs.capture.control_points import Placed, align, place, read_control_points
+from blitzgs.capture.control_points import ControlPoint, align, place, read_control_points
 from blitzgs.capture.world import (
     GEOCENTRIC,
     WorldFrame,
@@ -19,13 +18,14 @@ from blitzgs.capture.world import (
     fit_similarity,
     frame_in,
     gps_positions,
-    pyproj_module,
+    reference_system,
 )
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_path, add_run
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_flags, add_run
 from blitzgs.config.files import load_config
 from blitzgs.runs import run_files
 from blitzgs.runs.world import load_world_frame, save_world_frame
 from blitzgs.training.inputs import load_configured
+from blitzgs.util.errors import warn
 from blitzgs.util.terminal import printable
 
 # -1 for photographs that look straight down, or level; -1.4 between the two.
@@ -45,14 +45,19 @@ too.
 """
 
 
+GIVEN = """
+--gcp FILE  ground control points and their marks
+--gps  use the positions in the photographs' EXIF
+"""
+
+
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "align", run, summary, HELP)
     add_run(parser)
     how = parser.add_mutually_exclusive_group()
-    add_path(how, "--gcp", "FILE", "ground control points and their marks")
-    how.add_argument("--gps", action="store_true", help="use the positions in the photographs' EXIF")
-    parser.add_argument("--crs", metavar="EPSG:N", help="reference system of the points, or wanted")
+    add_flags(how, GIVEN)
+    add_flags(parser, "--crs EPSG:N  reference system of the points, or wanted")
     add_capture(parser)
 
 
@@ -87,23 +92,19 @@ def _by_points(args: argparse.Namespace, capture: Capture) -> WorldFrame:
     crs = args.crs or crs
     if crs:
         _check_lengths(crs)
-    placed = place(points, capture.cameras, capture.offset)
-    frame = align(placed, capture.offset, crs, f"{len(placed)} ground control points of {args.gcp.name}")
-    _print_residuals(placed)
+    points = place(points, capture.cameras, capture.offset)
+    frame = align(points, capture.offset, crs, f"{len(points)} ground control points of {args.gcp.name}")
+    _print_residuals(points)
     return frame
 
 
 def _check_lengths(crs: str) -> None:
     """Refuse a reference system of angles, in which points make no similarity; unknown without pyproj."""
     try:
-        pyproj = pyproj_module()
+        system = reference_system(crs)
     except ImportError:
         return
-    try:
-        angles = pyproj.CRS.from_user_input(crs).is_geographic
-    except pyproj.exceptions.CRSError as error:
-        raise ValueError(f"{crs!r:.60} is no reference system: name one such as EPSG:32633") from error
-    if angles:
+    if system.is_geographic:
         raise ValueError(f"{crs} has angles: convert the points to a projected system, such as a UTM zone")
 
 
@@ -112,23 +113,20 @@ def _warn_if_turned_over(frame: WorldFrame, capture: Capture) -> None:
     poses = np.stack([camera.world_to_camera for camera in capture.cameras])
     down, forward = (poses[:, 1:3, :3] @ frame.rotation[2]).mean(axis=0)  # by how much they point up
     if frame.crs != GEOCENTRIC and down + forward > _TURNED_OVER:
-        warnings.warn(
-            "the photographs are upside down in this world: are E and N exchanged, or are heights depths?",
-            stacklevel=2,
-        )
+        warn("the photographs are upside down in this world: are E and N exchanged, or are heights depths?")
 
 
-def _print_residuals(placed: list[Placed]) -> None:
-    width = max(5, *(len(p.point.name) for p in placed))
+def _print_residuals(points: list[ControlPoint]) -> None:
+    width = max(5, *(len(p.name) for p in points))
     print(f"{'point':{width}} marks {'dE':>10} {'dN':>10} {'dh':>10} {'3D':>10} {'px':>8}")
-    for p in placed:
+    for p in points:
         values = "".join(f" {value:10.4f}" for value in [*p.offset, float(np.linalg.norm(p.offset))])
         note = f"  {p.problem}" if p.problem else ""
-        print(printable(f"{p.point.name:{width}} {len(p.pixels):5}{values} {p.reprojection:8.2f}{note}"))
-    used = [p for p in placed if not p.problem]
+        print(printable(f"{p.name:{width}} {len(p.seen):5}{values} {p.reprojection:8.2f}{note}"))
+    used = [p for p in points if not p.problem]
     offsets = np.stack([p.offset for p in used])
     flat, up = (float(np.sqrt((part**2).sum(axis=1).mean())) for part in (offsets[:, :2], offsets[:, 2:]))
-    print(f"{len(used)} of {len(placed)} points used; RMS {flat:.4f} horizontal, {up:.4f} vertical")
+    print(f"{len(used)} of {len(points)} points used; RMS {flat:.4f} horizontal, {up:.4f} vertical")
     if len(used) == 3:
         print("three points leave no check of themselves: a fourth would show a mistake")
 
@@ -143,7 +141,7 @@ def _by_gps(args: argparse.Namespace, capture: Capture) -> WorldFrame:
     target = args.crs or GEOCENTRIC
     if args.crs:
         _check_lengths(args.crs)
-    system = pyproj_module().CRS.from_user_input(target).to_3d()
+    system = reference_system(target).to_3d()
     moved = converted(world, "EPSG:4979", system)
     frame = fit_similarity(centres, moved, target, f"EXIF GPS of {len(some)} photographs")
     apart = np.linalg.norm(frame.to_world(centres) - moved, axis=1)
@@ -164,7 +162,7 @@ def _centres(capture: Capture) -> Float64:
 
 
 def _converted(args: argparse.Namespace, capture: Capture) -> WorldFrame:
-    known = load_world_frame(args.folder) or capture.about.source.frame
+    known = load_world_frame(args.folder) or capture.about.frame
     if known is None or not known.crs:
         _check_lengths(args.crs)
         frame = known or WorldFrame()

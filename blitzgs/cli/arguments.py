@@ -4,21 +4,19 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+import difflib
+import re
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from blitzgs.config.ranges import RANGES
+from blitzgs.util.terminal import printable
 
 if TYPE_CHECKING:
     from blitzgs.capture.capture import Capture
     from blitzgs.runs.cameras import RunCameras
-import difflib
-import re
-from typing import NoReturn
-
-from blitzgs.util.terminal import printable
 
 Number = TypeVar("Number", int, float)
 Commands = argparse._SubParsersAction  # argparse has no public name for it
@@ -66,6 +64,29 @@ def add_path(parser: argparse._ActionsContainer, name: str, metavar: str, text: 
     parser.add_argument(name, type=named_path, metavar=metavar, help=text, **more)
 
 
+_PATHS = ("FILE", "DIR", "RUN", "OUT")
+_FLAG = re.compile(r"(--[\w-]+)(?: (\S+))?  (.*)", re.DOTALL)
+
+
+def add_flags(
+    parser: argparse._ActionsContainer, text: str, types: Mapping[str, Callable[[str], Any]] | None = None
+) -> None:
+    """Add the flags that a text describes.
+
+    A line is "--name METAVAR  help", or "--name  help" for a switch; indented lines go on with the help.
+    `types` has the functions that read values, by name; of others, FILE, DIR, RUN and OUT are paths.
+    """
+    for entry in re.split(r"\n(?=--)", text.strip()):
+        match = _FLAG.fullmatch(entry)
+        assert match is not None, entry
+        name, metavar, meaning = match[1], match[2], " ".join(match[3].split())
+        if metavar is None:
+            parser.add_argument(name, action="store_true", help=meaning)
+        else:
+            kind = (types or {}).get(name, named_path if metavar in _PATHS else str)
+            parser.add_argument(name, type=kind, metavar=metavar, help=meaning)
+
+
 def add_run(parser: argparse.ArgumentParser) -> None:
     """Add the argument RUN, the folder of a run."""
     add_path(parser, "folder", "RUN", "folder that blitzgs train wrote (its --out)")
@@ -78,19 +99,17 @@ def add_model(parser: argparse.ArgumentParser) -> None:
 
 def add_capture(parser: argparse.ArgumentParser) -> None:
     """Add the flag --data, the present folder of a run's capture."""
-    add_path(parser, "--data", "DIR", "folder of the capture, if it has moved since the training")
+    add_flags(parser, "--data DIR  folder of the capture, if it has moved since the training")
 
 
 def add_pool(parser: argparse.ArgumentParser) -> None:
     """Add the flag --resident-gb: views may need a larger pool on fewer ranks than the run was trained on."""
-    field = "memory.resident_gb"
-    parser.add_argument(
-        "--resident-gb",
-        type=number(float, lambda value: value in RANGES[field], str(RANGES[field])),
-        metavar="GB",
-        help="gigabytes of each device that hold Gaussians; those that do not fit stay in host memory; 0: "
-        "all are on the device (default: memory.resident_gb of the run)",
-    )
+    allowed = RANGES["memory.resident_gb"]
+    text = """
+--resident-gb GB  gigabytes of each device that hold Gaussians; those that do not fit stay in host memory; 0:
+    all are on the device (default: memory.resident_gb of the run)
+"""
+    add_flags(parser, text, {"--resident-gb": number(float, lambda value: value in allowed, str(allowed))})
 
 
 def number(
@@ -127,17 +146,10 @@ def chosen_views(split: str, cameras: Capture | RunCameras, folder: Path) -> Seq
 
 def add_device(parser: argparse.ArgumentParser, shares_gpus: bool = False) -> None:
     """Add the flag --device and, if `shares_gpus`, --share-gpus."""
-    parser.add_argument(
-        "--device",
-        default="auto",
-        help="auto (a GPU when there is one), cpu, cuda or cuda:N (default: %(default)s)",
-    )
+    add_flags(parser, "--device DEVICE  auto (a GPU when there is one), cpu, cuda or cuda:N (default: auto)")
+    parser.set_defaults(device="auto")
     if shares_gpus:
-        parser.add_argument(
-            "--share-gpus",
-            action="store_true",
-            help="with torchrun: let several processes use one GPU (slow)",
-        )
+        add_flags(parser, "--share-gpus  with torchrun: let several processes use one GPU (slow)")
 
 
 class Parser(argparse.ArgumentParser):

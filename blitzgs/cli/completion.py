@@ -10,7 +10,7 @@ from typing import NamedTuple
 from blitzgs.cli import COMMANDS, parser_of
 from blitzgs.cli.arguments import Commands, add_command
 from blitzgs.config.fields import Config
-from blitzgs.config.files import to_dict
+from blitzgs.config.files import flat, to_dict
 
 HELP = """\
 Print a script that lets the Tab key complete commands, flags and fields of the configuration:
@@ -51,14 +51,6 @@ class Flag(NamedTuple):
     help: str
 
 
-class Command(NamedTuple):
-    """A command."""
-
-    summary: str
-    flags: list[Flag]  # also of its actions
-    actions: list[str]  # words that may follow it, such as `fit` after `gate`
-
-
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "completion", run, summary, HELP)
@@ -76,47 +68,33 @@ def script(shell: str) -> str:
     commands = collect()
     if shell == "fish":
         return "\n".join(_fish(commands))
-    flags = [f"      {name}) flags='{' '.join(f.name for f in c.flags)}' ;;" for name, c in commands.items()]
-    choices = [
-        f"      '{name} {flag.name}') words='{' '.join(flag.choices)}' ;;"
-        for name, command in commands.items()
-        for flag in command.flags
-        if flag.choices
-    ]
-    choices += [
-        f"      '{name} {name}') words='{' '.join(command.actions)}' ;;"
-        for name, command in commands.items()
-        if command.actions
-    ]
+    flags, choices = [], []
+    for name, (words, its_flags) in commands.items():
+        flags.append(f"      {name}) flags='{' '.join(flag.name for flag in its_flags)}' ;;")
+        after = {flag.name: flag.choices for flag in its_flags} | {name: words}
+        choices += [
+            f"      '{name} {before}') words='{' '.join(few)}' ;;" for before, few in after.items() if few
+        ]
     text = _BASH.replace("@commands@", " ".join(commands)).replace("@flags@", "\n".join(flags))
     text = text.replace("@choices@", "\n".join(choices))
     return text if shell == "bash" else f"autoload -U +X bashcompinit && bashcompinit\n{text}"
 
 
-def collect() -> dict[str, Command]:
-    """Return all commands with their flags, from their parsers."""
-    found = {name: _command(sub, COMMANDS[name][1]) for name, sub in parser_of(COMMANDS)[1].items()}
-    for section, values in to_dict(Config()).items():
-        names = [f"{section}.{name}" for name in values] if isinstance(values, dict) else [section]
-        found["train"].flags.extend(Flag(f"--{name}", True, [], "a field") for name in names)
+def collect() -> dict[str, tuple[list[str], list[Flag]]]:
+    """Return the words that may follow each command, such as `fit` after `gate`, and its flags."""
+    found: dict[str, tuple[list[str], list[Flag]]] = {}
+    for name, parser in parser_of(COMMANDS)[1].items():
+        words: list[str] = []
+        parsers: list[argparse.ArgumentParser] = [parser]
+        for action in parser._actions:  # argparse has no public list of them
+            if isinstance(action, argparse._SubParsersAction):
+                parsers += action.choices.values()
+            if not action.option_strings:
+                words += map(str, action.choices or ())
+        flags = {flag.name: flag for each in parsers for flag in _flags(each)}
+        found[name] = words, list(flags.values())
+    found["train"][1].extend(Flag(f"--{name}", True, [], "a field") for name in flat(to_dict(Config())))
     return found
-
-
-def _command(parser: argparse.ArgumentParser, summary: str) -> Command:
-    flags = {flag.name: flag for flag in _flags(parser)}
-    actions = _children(parser)
-    for action in actions.values():
-        flags |= {flag.name: flag for flag in _flags(action)}
-    positional = [a for a in parser._actions if not a.option_strings and a.choices and not actions]
-    words = [*actions, *(str(choice) for a in positional for choice in a.choices or ())]
-    return Command(summary, list(flags.values()), words)
-
-
-def _children(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    for action in parser._actions:  # argparse has no public list of them
-        if isinstance(action, argparse._SubParsersAction):
-            return dict(action.choices)
-    return {}
 
 
 def _flags(parser: argparse.ArgumentParser) -> Iterator[Flag]:
@@ -127,13 +105,13 @@ def _flags(parser: argparse.ArgumentParser) -> Iterator[Flag]:
                 yield Flag(name, action.nargs != 0, choices, (action.help or "").partition(";")[0])
 
 
-def _fish(commands: dict[str, Command]) -> Iterator[str]:
-    for name, command in commands.items():
-        yield f"complete -c blitzgs -n __fish_use_subcommand -f -a {name} -d {_quoted(command.summary)}"
+def _fish(commands: dict[str, tuple[list[str], list[Flag]]]) -> Iterator[str]:
+    for name, (words, flags) in commands.items():
+        yield f"complete -c blitzgs -n __fish_use_subcommand -f -a {name} -d {_quoted(COMMANDS[name][1])}"
         used = f"complete -c blitzgs -n '__fish_seen_subcommand_from {name}'"
-        if command.actions:
-            yield f"{used} -f -a {_quoted(' '.join(command.actions))}"
-        for flag in command.flags:
+        if words:
+            yield f"{used} -f -a {_quoted(' '.join(words))}"
+        for flag in flags:
             value = f" -x -a {_quoted(' '.join(flag.choices))}" if flag.choices else " -r" * flag.takes_value
             yield f"{used} -l {flag.name[2:]}{value} -d {_quoted(flag.help.replace('%', ''))}"
 

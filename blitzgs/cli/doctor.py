@@ -21,13 +21,14 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
 from blitzgs import __version__
 from blitzgs._built import LIBRARY_DIR
-from blitzgs.cli.arguments import Commands, add_command, add_path
+from blitzgs.cli.arguments import Commands, add_command, add_flags
 
 HELP = """\
 Check this installation: torch, the GPUs, the libraries, optional packages, and small renderings that are
@@ -42,6 +43,10 @@ and says what mends it. The exit status is 1 if something that BlitzGS cannot do
 Put the output of --json into reports of faults.
 """
 
+FLAGS = """
+--json  print the report as JSON
+--folder DIR  measure the disk of this folder too, with a file of 64 MB that is removed
+"""
 State = Literal["ok", "warning", "missing", "failed"]
 _PACKAGE = Path(__file__).resolve().parents[1]
 # The largest errors of the small rendering in float32, and of its gradients relative to the largest of each.
@@ -50,6 +55,9 @@ _SLOW_DISK_MB_S = 50
 TIMEOUT = 120.0  # seconds of each test
 _LITTLE_MEMORY = 4 << 30
 _NOT_FOR_USERS = ("test", "lint", "all")
+_LOCAL = "allow connections to 127.0.0.1; until then train with one process"
+_NCCL = "NCCL_DEBUG=WARN blitzgs doctor"
+_REPORT = "report this with `blitzgs doctor --json`"
 _REINSTALL = "pip install --force-reinstall --no-deps blitzgs (in a checkout: make build)"
 
 
@@ -72,10 +80,7 @@ class ProbeError(Exception):
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "doctor", run, summary, HELP)
-    parser.add_argument("--json", action="store_true", help="print the report as JSON")
-    add_path(
-        parser, "--folder", "DIR", "measure the disk of this folder too, with a file of 64 MB that is removed"
-    )
+    add_flags(parser, FLAGS)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -98,23 +103,38 @@ def examine(folder: Path | None = None) -> list[Line]:
     lines = [Line("blitzgs", "ok", f"{__version__} in {_PACKAGE}"), _system(), _memory(), *_packages()]
     torch_line = _torch()
     gpus = torch_line.values.get("gpus", [])
-    lines += [torch_line, _driver(), *(_gpu(number, gpu) for number, gpu in enumerate(gpus)), _nvcc()]
+    lines += [
+        torch_line,
+        _looked("driver", "restart the machine, or install the driver again", False, _driver),
+    ]
+    lines += [*(_gpu(number, gpu) for number, gpu in enumerate(gpus)), _looked("nvcc", "", False, _nvcc)]
     works = torch_line.state in ("ok", "warning")
-    checks: list[Callable[[], Line]] = [lambda: _library("io")]
+    checks: list[tuple[str, str, bool, Callable[[], Line]]] = []
+    checks.append(("lib io", _REINSTALL, True, partial(_library, "io")))
     if works:
         backends = ["cpu", *(["cuda"] if gpus else [])]
-        checks += [lambda name=name: _library(name, gpus) for name in backends]  # type: ignore[misc]
-        checks += [lambda device=device: _render(device) for device in backends]  # type: ignore[misc]
-        checks.append(lambda: _exchange("cpu"))
+        checks += [(f"lib {name}", _REINSTALL, True, partial(_library, name, gpus)) for name in backends]
+        checks += [(f"render {name}", _REINSTALL, True, partial(_render, name)) for name in backends]
+        checks.append(("exchange Gloo", _LOCAL, False, partial(_exchange, "cpu")))
         if gpus:
-            checks.append(lambda: _exchange("cuda") if len(gpus) > 1 else _nccl())
+            several = len(gpus) > 1
+            remedy, nccl = (_LOCAL, partial(_exchange, "cuda")) if several else (_NCCL, _nccl)
+            checks.append(("exchange NCCL", remedy, False, nccl))
     if folder is not None:
-        checks.append(lambda: _disk(folder))
+        checks.append(("disk", "choose a folder that can be written", False, partial(_disk, folder)))
     with ThreadPoolExecutor(2) as pool:
-        lines += pool.map(lambda check: check(), checks)
+        lines += pool.map(lambda check: _looked(*check), checks)
     if not works:
         lines.append(Line("self-tests", "failed", "not run without torch", torch_line.remedy))
     return lines
+
+
+def _looked(name: str, remedy: str, required: bool, look: Callable[[], Line]) -> Line:
+    """Return what a look finds; a probe that fails is a line too."""
+    try:
+        return look()
+    except ProbeError as error:
+        return Line(name, "failed", str(error), remedy, required)
 
 
 def probe(name: str, *arguments: str) -> dict[str, Any]:
@@ -215,7 +235,7 @@ def _torch_bounds() -> dict[str, str]:
     try:
         wanted = metadata.requires("blitzgs") or []
     except metadata.PackageNotFoundError:
-        return {}
+        wanted = []
     torch = next((text for text in wanted if re.match(r"torch\b", text)), "")
     found = dict(re.findall(r"(>=|<)\s*([\d.]+)", torch))
     return {sign: found[sign] for sign in (">=", "<") if sign in found}
@@ -249,10 +269,7 @@ def _driver() -> Line:
     query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     if shutil.which("nvidia-smi") is None:
         return Line("driver", "missing", "no NVIDIA driver: BlitzGS trains on the CPU", "", False)
-    try:
-        version = run_command(query).split("\n")[0]
-    except ProbeError as error:
-        return Line("driver", "failed", str(error), "restart the machine, or install the driver again", False)
+    version = run_command(query).split("\n")[0]
     return Line("driver", "ok", f"NVIDIA {version}", "", False)
 
 
@@ -266,10 +283,7 @@ def _gpu(number: int, gpu: dict[str, Any]) -> Line:
 def _nvcc() -> Line:
     if shutil.which("nvcc") is None:
         return Line("nvcc", "missing", "only needed to build the CUDA library from the sources", "", False)
-    try:
-        found = re.search(r"release [\d.]+", run_command(["nvcc", "--version"]))
-    except ProbeError as error:
-        return Line("nvcc", "warning", str(error), "", False)
+    found = re.search(r"release [\d.]+", run_command(["nvcc", "--version"]))
     return Line("nvcc", "ok", found[0] if found else "", "", False)
 
 
@@ -280,10 +294,7 @@ def _library(name: str, gpus: Sequence[dict[str, Any]] = ()) -> Line:
         return Line(line, "missing", str(path), _REINSTALL)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     text = f"{path.stat().st_size / 1e6:.1f} MB, sha256 {digest}"
-    try:
-        found = probe("library", name)
-    except ProbeError as error:
-        return Line(line, "failed", f"{text}: {error}", _REINSTALL)
+    found = probe("library", name)
     if "cuda" in found:
         text += f", CUDA {found['cuda']} for {found['architectures']}"
         native = [gpu["architecture"].removeprefix("sm_") for gpu in gpus]
@@ -295,16 +306,13 @@ def _library(name: str, gpus: Sequence[dict[str, Any]] = ()) -> Line:
 
 
 def _render(device: str) -> Line:
-    try:
-        found = probe("render", device)
-    except ProbeError as error:
-        return Line(f"render {device}", "failed", str(error), _REINSTALL)
+    found = probe("render", device)
     good = found["image_error"] <= _IMAGE_ERROR and found["gradient_error"] <= _GRADIENT_ERROR
     text = (
         f"error of the image {found['image_error']:.1e}, of gradients {found['gradient_error']:.1e} "
         f"({found['seconds']:.1f} s)"
     )
-    remedy = "" if good else "report this with `blitzgs doctor --json`"
+    remedy = "" if good else _REPORT
     return Line(f"render {device}", "ok" if good else "failed", text, remedy, values=found)
 
 
@@ -312,25 +320,18 @@ def _exchange(device: str) -> Line:
     """Let two processes render together."""
     port = _free_port()
     name = "exchange " + ("Gloo" if device == "cpu" else "NCCL")
-    try:
-        with ThreadPoolExecutor(2) as pool:
-            found = list(pool.map(lambda rank: probe("exchange", device, rank, port), "01"))
-    except ProbeError as error:
-        remedy = "allow connections to 127.0.0.1; until then train with one process"
-        return Line(name, "failed", str(error), remedy, False)
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda rank: probe("exchange", device, rank, port), "01"))
     good = all(part["differing_values"] == 0 and part["covered"] > 0.1 for part in found)
     text = f"two ranks, {found[0]['backend']}: " + (
         "the bits of one" if good else "another image than one rank's"
     )
-    remedy = "" if good else "report this with `blitzgs doctor --json`"
+    remedy = "" if good else _REPORT
     return Line(name, "ok" if good else "failed", text, remedy, False, {"ranks": found})
 
 
 def _nccl() -> Line:
-    try:
-        good = probe("nccl", _free_port())["sum"] == 28.0
-    except ProbeError as error:
-        return Line("exchange NCCL", "failed", str(error), "NCCL_DEBUG=WARN blitzgs doctor", False)
+    good = probe("nccl", _free_port())["sum"] == 28.0
     text = "one GPU: it sums" if good else "one GPU: a wrong sum"
     return Line("exchange NCCL", "ok" if good else "failed", text, "", False)
 
@@ -342,10 +343,7 @@ def _free_port() -> str:
 
 
 def _disk(folder: Path) -> Line:
-    try:
-        found = probe("disk", str(folder))
-    except ProbeError as error:
-        return Line("disk", "failed", f"{folder}: {error}", "choose a folder that can be written", False)
+    found = probe("disk", str(folder))
     slow = min(found["write_mb_s"], found["read_mb_s"]) < _SLOW_DISK_MB_S
     text = (
         f"{folder}: writes {found['write_mb_s']:.0f} and reads {found['read_mb_s']:.0f} MB/s, "

@@ -190,31 +190,17 @@ def _rendered(scene: list[Tensor], viewmat: Tensor, K: Tensor, distributed: bool
     """Return an image [1, H, W, 3]."""
     import blitzgs
 
-    means, quats, scales, opacities, colors = scene
-    return blitzgs.rasterization(
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        viewmat[None],
-        K[None],
-        _WIDTH,
-        _HEIGHT,
-        sh_degree=1,
-        distributed=distributed,
-    )[0]
+    render: Any = blitzgs.rasterization
+    view = (viewmat[None], K[None], _WIDTH, _HEIGHT)
+    return render(*scene, *view, sh_degree=1, distributed=distributed)[0]
 
 
 def _reference() -> tuple[list[Tensor], ReferenceImage]:
     from blitzgs.reference.render import render as render_reference
 
     leaves = [tensor.double().requires_grad_() for tensor in _scene()]
-    means, quats, scales, opacities, colors = leaves
-    viewmat, K = _camera(0)
-    return leaves, render_reference(
-        means, quats, scales, opacities, colors, viewmat, K, _WIDTH, _HEIGHT, sh_degree=1
-    )
+    render: Any = render_reference
+    return leaves, render(*leaves, *_camera(0), _WIDTH, _HEIGHT, sh_degree=1)
 
 
 PROBES: dict[str, Callable[..., dict[str, Any]]] = {

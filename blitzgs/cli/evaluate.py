@@ -19,7 +19,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import input_files, warn_of_changes
 from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
-from blitzgs.runs.lod import lod_gate, model_gate
+from blitzgs.runs.run_files import lod_gate, model_gate
 from blitzgs.runs.world import gate_of, model_of_file
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.training.understood import largest_size
@@ -41,37 +41,27 @@ photograph.
 """
 
 
+FLAGS = """
+--downscale N  with FILE: reduce both sides of the photographs by this factor, as data.downscale
+--out DIR  folder for the results (default: RUN/evaluation/SPLIT)
+--pictures N  number of pictures that show a render, its photograph and its error (default: %(default)s)
+--lpips FILE  also measure LPIPS, with this TorchScript module; it takes a render and its photograph,
+    [1, 3, H, W] in [-1, 1], and returns their distance
+--allow-missing  leave out views whose photograph is missing
+"""
+_FACTOR = arguments.number(int, lambda value: value >= 1, "a whole number from 1 on")
+
+
 def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = arguments.add_command(commands, "eval", run, summary, HELP)
     arguments.add_model(parser)
     arguments.add_capture(parser)
-    parser.add_argument(
-        "--downscale",
-        type=arguments.number(int, lambda value: value >= 1, "a whole number from 1 on"),
-        metavar="N",
-        help="with FILE: reduce both sides of the photographs by this factor, as data.downscale",
-    )
     arguments.add_device(parser, shares_gpus=True)
     arguments.add_pool(parser)
     arguments.add_split(parser, "measure")
-    arguments.add_path(parser, "--out", "DIR", "folder for the results (default: RUN/evaluation/SPLIT)")
-    parser.add_argument(
-        "--pictures",
-        type=int,
-        default=8,
-        metavar="N",
-        help="number of pictures that show a render, its photograph and its error (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--lpips",
-        metavar="FILE",
-        help="also measure LPIPS, with this TorchScript module; it takes a render and its photograph, "
-        "[1, 3, H, W] in [-1, 1], and returns their distance",
-    )
-    parser.add_argument(
-        "--allow-missing", action="store_true", help="leave out views whose photograph is missing"
-    )
+    arguments.add_flags(parser, FLAGS, {"--downscale": _FACTOR, "--pictures": int, "--lpips": str})
+    parser.set_defaults(pictures=8)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -59,9 +59,7 @@ Georeferenced models are written around their own origin, because the files' num
 coordinates. The offset is in FILE.offset.json and, where there is one, in the header.
 
 A PLY file of a model trained with view.lod has all its Gaussians, and most viewers show them all. The last
-property, `level`, is their level. The line
-`comment lod reference_distance D fork F levels K finest L` tells a viewer what a view keeps: level l up to
-the distance D * F^(1/2 - l), no level above L, and level 0 at any distance.
+property, `level`, and a comment tell a viewer what a view keeps (docs/guide/view-level.md).
 
 A model trained with model.antialiased is marked in formats that can say so (PLY: `comment SplatRenderMode:
 mip`). For a viewer that does not know the mark, --classic multiplies the opacities by the compensation that
@@ -82,8 +80,27 @@ A city that no browser holds at once is written as a folder that viewers load pi
 Memory does not grow with a run or a PLY file; the disk needs two and a half times the size of the model.
 See docs/guide/formats.md.
 """
+FOLDERS = """
+--html FILE  HTML file to write
+--tiles DIR  folder to make for 3D Tiles (tileset.json)
+--streamed-sog DIR  folder to make for streamed SOG (lod-meta.json)
+"""
+FLAGS = f"""
+--max-mb MB  with --html: largest size of the file in megabytes (default: {MAX_MB})
+--classic  for viewers without antialiasing: write opacities that make up for it
+--tile-gaussians N  with --tiles and --streamed-sog: Gaussians of a tile (default: 32768)
+--processes N  with --tiles and --streamed-sog: processes that write tiles (default: as many as CPU cores)
+"""
+SELECTION = """
+--crop-polygon FILE  keep this region: a GeoJSON polygon, or lines "x y", in the capture's coordinates
+--min-opacity O  keep Gaussians of at least this opacity
+--most N  keep the N Gaussians that contribute most to views of the capture (of a file: of the largest opacity
+    times length)
+--levels FIRST-LAST  keep these octree levels, for example 0-3
+"""
 _TILES = "--tiles and --streamed-sog"
 _COUNT = arguments.number(int, lambda value: value >= 1, "a whole number from 1 on")
+_MB = arguments.number(float, lambda mb: 0 < mb <= LARGEST_MB, f"a number of megabytes up to {LARGEST_MB}")
 
 
 def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) -> None:
@@ -95,31 +112,14 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     kind = parser.add_mutually_exclusive_group(required=True)
     for name, found in FORMATS.items():
         arguments.add_path(kind, f"--{name}", "FILE", f"{found.title} file to write")
-    arguments.add_path(kind, "--html", "FILE", "HTML file to write")
-    for name, title in (
-        ("tiles", "3D Tiles (tileset.json)"),
-        ("streamed-sog", "streamed SOG (lod-meta.json)"),
-    ):
-        arguments.add_path(kind, f"--{name}", "DIR", f"folder to make for {title}")
-    parser.add_argument(
-        "--max-mb",
-        type=arguments.number(
-            float, lambda mb: 0 < mb <= LARGEST_MB, f"a number of megabytes up to {LARGEST_MB}"
-        ),
-        metavar="MB",
-        help=f"with --html: largest size of the file in megabytes (default: {MAX_MB})",
-    )
+    arguments.add_flags(kind, FOLDERS)
+    arguments.add_flags(parser, FLAGS, {"--max-mb": _MB, "--tile-gaussians": _COUNT, "--processes": _COUNT})
     parser.add_argument(
         "--coordinates",
         choices=(*COORDINATES, "world"),
         help="capture: the capture's coordinates; centred: relative to the model's origin; auto: the "
         "capture's if float32 can hold them; world: those of RUN/geo.json (`blitzgs align`), as auto "
         "(default: auto)",
-    )
-    parser.add_argument(
-        "--classic",
-        action="store_true",
-        help="for viewers without antialiasing: write opacities that make up for it",
     )
     parser.add_argument(
         "--clean",
@@ -130,11 +130,6 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
         help="leave out floaters and fringes that at most K training photographs saw (default: %(const)s)",
     )
     _add_selection(parser)
-    for name, help_text in (
-        ("tile-gaussians", "Gaussians of a tile (default: 32768)"),
-        ("processes", "processes that write tiles (default: as many as CPU cores)"),
-    ):
-        parser.add_argument(f"--{name}", type=_COUNT, metavar="N", help=f"with {_TILES}: {help_text}")
 
 
 def _add_selection(parser: argparse.ArgumentParser) -> None:
@@ -145,29 +140,11 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
         metavar=tuple("xyzXYZ"),
         help="keep this box of the capture's coordinates",
     )
-    arguments.add_path(
-        parser,
-        "--crop-polygon",
-        "FILE",
-        'keep this region: a GeoJSON polygon, or lines "x y", in the capture\'s coordinates',
-    )
     parser.add_argument(
         "--crop-axes", choices=("xy", "xz", "yz"), help="axes of the polygon's corners (default: xy)"
     )
-    parser.add_argument(
-        "--min-opacity", type=float, metavar="O", help="keep Gaussians of at least this opacity"
-    )
-    parser.add_argument(
-        "--most",
-        type=int,
-        metavar="N",
-        help="keep the N Gaussians that contribute most to views of the capture (of a file: of the largest "
-        "opacity times length)",
-    )
     parser.add_argument("--sh-degree", type=int, choices=range(4), help="write at most this SH degree")
-    parser.add_argument(
-        "--levels", type=_levels, metavar="FIRST-LAST", help="keep these octree levels, for example 0-3"
-    )
+    arguments.add_flags(parser, SELECTION, {"--min-opacity": float, "--most": int, "--levels": _levels})
 
 
 def run(args: argparse.Namespace) -> int:

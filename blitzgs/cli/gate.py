@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_path
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_flags, add_path
 from blitzgs.config.fields import ScheduleConfig
 from blitzgs.config.files import ConfigError, changed, load_config
 from blitzgs.config.schedule import Schedule
@@ -37,6 +37,12 @@ all births and deaths of Gaussians. The repository's docs/guide/fewer-gaussians.
 """
 
 
+FIT_FLAGS = """
+--gate-from IMAGES  also evaluate separately the spawns (births during training) from this time on; take
+    schedule.gate_from times schedule.scale of the runs that will use the gate (default: %(default)s)
+"""
+
+
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "gate", lambda _: 2, summary, HELP)
@@ -44,28 +50,17 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     fit = add_command(actions, "fit", run_fit, "fit a gate on the lineage of runs")
     add_path(fit, "runs", "RUN", "folder of a run with lineage, or a sample", nargs="+")
     add_path(fit, "--out", "FILE", "file for the gate, .json", required=True)
-    fit.add_argument(
-        "--gate-from",
-        type=float,
-        default=ScheduleConfig.gate_from,
-        metavar="IMAGES",
-        help="also evaluate separately the spawns (births during training) from this time on; take "
-        "schedule.gate_from times schedule.scale of the runs that will use the gate (default: %(default)s)",
-    )
+    add_flags(fit, FIT_FLAGS, {"--gate-from": float})
+    fit.set_defaults(gate_from=ScheduleConfig.gate_from)
     sample = add_command(actions, "sample", run_sample, "reduce the lineage of a run to one file")
     add_path(sample, "folder", "RUN", "folder of a run with lineage")
     add_path(sample, "--out", "FILE", "file for the sample, .parquet", required=True)
-    sample.add_argument(
-        "--rows",
-        type=int,
-        default=spawn_samples.MAX_ROWS,
-        metavar="N",
-        help="approximate number of births in the file (default: %(default)s)",
+    add_flags(
+        sample, "--rows N  approximate number of births in the file (default: %(default)s)", {"--rows": int}
     )
+    sample.set_defaults(rows=spawn_samples.MAX_ROWS)
     judge = add_command(actions, "evaluate", run_evaluate, "measure a gate on the lineage of runs")
-    judge.add_argument(
-        "gate", type=gate_file, metavar="GATE", help='file of a gate, or "default" (the included one)'
-    )
+    _add_gate(judge)
     add_path(judge, "runs", "RUN", "folder of a run with lineage", nargs="+")
     add_path(judge, "--out", "DIR", "folder for figures and maps", required=True)
     again = add_command(
@@ -74,16 +69,18 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
         run_replay,
         "continue one checkpoint several times: without a gate, with it, with an oracle, with random vetoes",
     )
-    again.add_argument(
-        "gate", type=gate_file, metavar="GATE", help='file of a gate, or "default" (the included one)'
-    )
+    _add_gate(again)
     add_path(again, "folder", "RUN", "folder of a run with lineage")
     add_path(again, "--out", "DIR", "folder for these runs and their figures", required=True)
-    again.add_argument(
-        "--rate", type=float, default=0.6, help="share of the candidates to withhold (default: %(default)s)"
-    )
+    add_flags(again, "--rate RATE  share of the candidates to withhold (default: 0.6)", {"--rate": float})
+    again.set_defaults(rate=0.6)
     add_capture(again)
     add_device(again, shares_gpus=True)
+
+
+def _add_gate(parser: argparse.ArgumentParser) -> None:
+    text = 'file of a gate, or "default" (the included one)'
+    parser.add_argument("gate", type=gate_file, metavar="GATE", help=text)
 
 
 def run_fit(args: argparse.Namespace) -> int:

@@ -29,7 +29,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, RunCameras, input_files, load_cameras
 from blitzgs.runs.evaluation import render_view
-from blitzgs.runs.lod import lod_gate, model_gate
+from blitzgs.runs.run_files import lod_gate, model_gate
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.util.output import OutputFolder
@@ -44,6 +44,10 @@ from blitzgs.viewer.studio import Opened, box_of, open_model
 # What may be written beside the colours.
 MEASURED: tuple[Mode, ...] = ("depth", "alpha")
 
+_DEPTH = (
+    "depth in the capture's unit = value * scale; 0: nothing is there; 65535: this far or farther. The depth "
+    "is along the axis of view, the mean of what a pixel shows."
+)
 _POSITIVE = arguments.number(float, lambda value: 0 < value < 1e6, "a positive number")
 
 HELP = """\
@@ -60,59 +64,33 @@ program (PLY, compressed PLY, SPZ, SOG, .splat). Films need the package av: pip 
 """
 
 
+FLAGS = """
+--cameras FILE  render the cameras of this transforms file or folder of a COLMAP model, in the capture's
+    coordinates; no photographs are needed
+--path PATH  render the frames of a camera path: a file, or orbit (around the scene), flight (across it) or
+    spline (along the run's cameras)
+--size WxH  with --path: pixels (default: the file's, else 1920x1080)
+--fps FPS  with --path: frames a second (default: the file's, else 30)
+--seconds SECONDS  with --path: duration (default: the file's, else 10)
+--dataparser FILE  with --path: dataparser_transforms.json of the nerfstudio training that the path was made
+    for
+--exposure  show training views with the exposure of their photographs (model.exposure), not with the mean
+--depth  also write NAME.depth.png, 16 bits; depth.json says how to convert it to the capture's unit
+--alpha  also write NAME.alpha.png, 16 bits
+--raw  write float32 arrays as .npy, colours [H, W, 3] not clamped, instead of PNG
+"""
+
+
 def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = arguments.add_command(commands, "render", run, summary, HELP)
     arguments.add_model(parser)
-    arguments.add_path(parser, "--data", "DIR", "take the cameras from this capture, not from the run")
+    arguments.add_flags(parser, "--data DIR  take the cameras from this capture, not from the run")
     arguments.add_device(parser, shares_gpus=True)
     arguments.add_pool(parser)
     arguments.add_split(parser, "render")
-    arguments.add_path(
-        parser,
-        "--cameras",
-        "FILE",
-        "render the cameras of this transforms file or folder of a COLMAP model, in the capture's "
-        "coordinates; no photographs are needed",
-    )
-    parser.add_argument(
-        "--path",
-        metavar="PATH",
-        help="render the frames of a camera path: a file, or orbit (around the scene), flight (across it) or "
-        "spline (along the run's cameras)",
-    )
-    parser.add_argument(
-        "--size", type=_size, metavar="WxH", help="with --path: pixels (default: the file's, else 1920x1080)"
-    )
-    parser.add_argument(
-        "--fps", type=_POSITIVE, help="with --path: frames a second (default: the file's, else 30)"
-    )
-    parser.add_argument(
-        "--seconds", type=_POSITIVE, help="with --path: duration (default: the file's, else 10)"
-    )
-    arguments.add_path(
-        parser,
-        "--dataparser",
-        "FILE",
-        "with --path: dataparser_transforms.json of the nerfstudio training that the path was made for",
-    )
     arguments.add_path(parser, "--out", "OUT", f"folder for pictures, or FILE{SUFFIX}", required=True)
-    parser.add_argument(
-        "--exposure",
-        action="store_true",
-        help="show training views with the exposure of their photographs (model.exposure), not with the mean",
-    )
-    parser.add_argument(
-        "--depth",
-        action="store_true",
-        help="also write NAME.depth.png, 16 bits; depth.json says how to convert it to the capture's unit",
-    )
-    parser.add_argument("--alpha", action="store_true", help="also write NAME.alpha.png, 16 bits")
-    parser.add_argument(
-        "--raw",
-        action="store_true",
-        help="write float32 arrays as .npy, colours [H, W, 3] not clamped, instead of PNG",
-    )
+    arguments.add_flags(parser, FLAGS, {"--size": _size, "--fps": _POSITIVE, "--seconds": _POSITIVE})
 
 
 _OTHER_FILMS = (".gif", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".webp")
@@ -197,7 +175,8 @@ def _render_pictures(args: argparse.Namespace, opened: Rendered, ranks: Ranks) -
     args.out.mkdir(parents=True, exist_ok=True)
     step = _depth_step(opened)
     if "depth" in modes and not args.raw and ranks.rank == 0:
-        output.write(args.out / "depth.json", _explained(step))
+        scale = json.dumps({"scale": step, "meaning": _DEPTH}, indent=1) + "\n"
+        output.write(args.out / "depth.json", scale.encode())
     drawer = Drawer(opened.subject, TileOwners(ranks), in_layers=False) if modes else None
     with image_progress("Rendering", ranks.rank == 0) as report:
         turns = _renders(opened, ranks, lambda position: position % ranks.world_size)
@@ -209,17 +188,15 @@ def _render_pictures(args: argparse.Namespace, opened: Rendered, ranks: Ranks) -
                 content = _npy(render.cpu().numpy()) if args.raw else encode_image(render, ".png")
                 output.write(colours[index], content)
             for mode in modes:
-                picture = drawer.draw(_look(opened, index, mode)) if drawer else None
+                camera = opened.cameras[index]
+                pose = viewmat(camera, opened.space)
+                look = Look(pose, np.asarray(camera.K), camera.width, camera.height, mode)
+                picture = drawer.draw(look) if drawer else None
                 if picture is not None:
                     values = picture.values.astype(np.float32)
                     full = 65535.0 if mode == "alpha" else 1 / step
                     output.write(paths[mode][index], _npy(values) if args.raw else _png16(values * full))
             report(position, len(opened.indices))
-
-
-def _look(opened: Rendered, index: int, mode: Mode) -> Look:
-    camera = opened.cameras[index]
-    return Look(viewmat(camera, opened.space), np.asarray(camera.K), camera.width, camera.height, mode)
 
 
 def _depth_step(opened: Rendered) -> float:
@@ -228,14 +205,6 @@ def _depth_step(opened: Rendered) -> float:
     centres = camera_centres(np.stack([viewmat(opened.cameras[i], opened.space) for i in opened.indices]))
     farthest = max(float(np.linalg.norm(corners - centre, axis=1).max()) for centre in centres)
     return farthest * opened.space.unit / 65534
-
-
-def _explained(step: float) -> bytes:
-    meaning = (
-        "depth in the capture's unit = value * scale; 0: nothing is there; 65535: this far or farther. The "
-        "depth is along the axis of view, the mean of what a pixel shows."
-    )
-    return (json.dumps({"scale": step, "meaning": meaning}, indent=1) + "\n").encode()
 
 
 def _png16(values: npt.NDArray[np.float32]) -> bytes:

@@ -18,9 +18,9 @@ from rich.console import Console
 from rich.table import Table
 
 from blitzgs.capture.colmap import find_models
-from blitzgs.cli.arguments import Commands, add_command, add_device, add_path, number
-from blitzgs.cli.report import kept_warnings, write_final_report
+from blitzgs.cli.arguments import Commands, add_command, add_device, add_flags, number
 from blitzgs.cli.sfm import understood_alone, with_poses
+from blitzgs.cli.view import kept_warnings, write_final_report
 from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, changed, default_recipe, load_config, recipe_path, to_dict
 from blitzgs.config.ranges import describe, describe_all, describe_page
@@ -76,55 +76,28 @@ With torchrun's --max-restarts=K and --resume, a job that loses a process contin
 """
 
 
+FLAGS = """
+--config RECIPE  name of a recipe, or a YAML file (default: aerial on a GPU, aerial_cpu on a CPU)
+--data DIR  folder of the capture, or another program's project
+--out RUN  folder for the results
+--start FILE  begin with the Gaussians of a file (PLY, SPZ, SOG, .splat) in the capture's coordinates
+--resume  continue from the newest checkpoint in RUN, if any
+--extend IMAGES|FACTOR  train the finished run in RUN longer: by a number of images (100 or more), or to a
+    multiple of its length (--extend=1.5)
+--minutes M  end after M minutes of training, with the whole schedule fitted into them (0: no limit)
+--show-config  print the resulting configuration and stop
+--check  read the capture, print what was understood and roughly what the training will take, and stop;
+    needs no GPU and no --out
+--sfm DIR  folder for the capture that is made of photographs without poses (default: RUN_capture)
+--no-sfm  refuse photographs without poses
+"""
+
+
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "train", run, summary, HELP, add_help=False)
     _add_helps(parser)
-    parser.add_argument(
-        "--config",
-        metavar="RECIPE",
-        help="name of a recipe, or a YAML file (default: aerial on a GPU, aerial_cpu on a CPU)",
-    )
-    add_path(parser, "--data", "DIR", "folder of the capture, or another program's project")
-    add_path(parser, "--out", "RUN", "folder for the results")
-    add_path(
-        parser,
-        "--start",
-        "FILE",
-        "begin with the Gaussians of a file (PLY, SPZ, SOG, .splat) in the capture's coordinates",
-    )
-    parser.add_argument(
-        "--resume", action="store_true", help="continue from the newest checkpoint in RUN, if any"
-    )
-    parser.add_argument(
-        "--extend",
-        type=_EXTENSION,
-        metavar="IMAGES|FACTOR",
-        help="train the finished run in RUN longer: by a number of images (100 or more), or to a multiple of "
-        "its length (--extend=1.5)",
-    )
-    parser.add_argument(
-        "--minutes",
-        type=float,
-        metavar="M",
-        help="end after M minutes of training, with the whole schedule fitted into them (0: no limit)",
-    )
-    parser.add_argument(
-        "--show-config", action="store_true", help="print the resulting configuration and stop"
-    )
-    parser.add_argument(
-        "--check",
-        action="store_true",
-        help="read the capture, print what was understood and roughly what the training will take, and stop; "
-        "needs no GPU and no --out",
-    )
-    add_path(
-        parser,
-        "--sfm",
-        "DIR",
-        "folder for the capture that is made of photographs without poses (default: RUN_capture)",
-    )
-    parser.add_argument("--no-sfm", action="store_true", help="refuse photographs without poses")
+    add_flags(parser, FLAGS, {"--extend": _EXTENSION, "--minutes": float})
     add_live_page(parser)
     add_device(parser, shares_gpus=True)
 
@@ -242,7 +215,7 @@ def _check(args: argparse.Namespace, config: Config) -> int:
     check_worlds(capture)
     lines = understood(config, capture, images)
     images.close()
-    used = [m for m, _ in find_models(capture.root) if m == capture.root / capture.about.source.cameras]
+    used = [m for m, _ in find_models(capture.root) if m == capture.root / capture.about.cameras]
     if used and (fit := fit_of(used[0])) is not None:
         lines.append(f"{'poses:':15}{fit}")
     rough = estimate(config, capture, _on_gpu(args), torch.get_num_threads())
@@ -341,12 +314,8 @@ def add_live_page(parser: argparse.ArgumentParser) -> None:
         metavar="PORT",
         help=f"show the training in the browser (default port: {_PORT}); needs the extra view",
     )
-    parser.add_argument(
-        "--viewer-host",
-        default="127.0.0.1",
-        metavar="HOST",
-        help="address to listen on (default: %(default)s, this machine only)",
-    )
+    add_flags(parser, "--viewer-host HOST  address to listen on (default: %(default)s, this machine only)")
+    parser.set_defaults(viewer_host="127.0.0.1")
 
 
 def live_page(state: TrainingState, port: int, host: str) -> Live | None:
@@ -374,7 +343,7 @@ def live_page(state: TrainingState, port: int, host: str) -> Live | None:
         test=capture.test,
         photograph=lambda index: np.asarray(images.get(index).numpy()),
         paths=state.folder / "paths",
-        frame=capture.about.source.frame,
+        frame=capture.about.frame,
     )
     try:
         page = Live(exhibit, state.schedule.iterations, host, port)

@@ -32,8 +32,7 @@ class Strategy:
     def check_sanity(self, params: Params, optimizers: Optimizers) -> None:
         """Check the parameters, [N, ...] each, and their optimisers.
 
-        Raises:
-            ValueError: a required parameter or an optimiser is missing, or an optimiser has several groups.
+        ValueError: a required parameter or an optimiser is missing, or an optimiser has several groups.
         """
         missing = [name for name in _REQUIRED if name not in params]
         if missing:
@@ -199,7 +198,7 @@ class DefaultStrategy(Strategy):
         lives = (~pruned).nonzero()[:, 0]
         _renew(
             params, optimizers, lambda name, _: grown[name][lives],
-            lambda moment: _where_rows(old, moment[rows])[lives],
+            lambda moment: (moment[rows] * old.view(-1, *[1] * (moment.dim() - 1)))[lives],
         )  # fmt: skip
         for name in ("grad2d", "count", "radii"):
             if name in state:
@@ -211,10 +210,8 @@ class DefaultStrategy(Strategy):
             scene.on_split(split, torch.cat([(~splits).nonzero()[:, 0], beyond]))
             scene.on_remove(pruned)
         if self.verbose:
-            print(
-                f"Step {step}: {len(cloned)} cloned, {len(split)} split, {len(rows) - len(lives)} pruned, "
-                f"now {len(lives)} Gaussians"
-            )
+            counts = f"{len(cloned)} cloned, {len(split)} split, {len(rows) - len(lives)} pruned"
+            print(f"Step {step}: {counts}, now {len(lives)} Gaussians")
 
     def _children(self, params: Params, split: Tensor) -> dict[str, Tensor]:
         """Return what differs from the parents: the first children of the rows `split`, then the second."""
@@ -248,8 +245,7 @@ class MCMCStrategy(Strategy):
         noise_opacity_t: opacity at which the noise falls to a half.
         noise_opacity_k: steepness of this fall.
 
-    Raises:
-        ValueError: `refine_every` is no number of steps.
+    ValueError: `refine_every` is no number of steps.
     """
 
     cap_max: int = 1_000_000
@@ -344,10 +340,8 @@ class MCMCStrategy(Strategy):
             if scene is not None:
                 scene.on_sample_add(sources)
         if self.verbose:
-            print(
-                f"Step {step}: {len(dead)} relocated, {max(0, added)} added, now {len(params['means'])} "
-                "Gaussians"
-            )
+            now = f"now {len(params['means'])} Gaussians"
+            print(f"Step {step}: {len(dead)} relocated, {max(0, added)} added, {now}")
 
     def _shares(self, params: Params, sources: Tensor) -> dict[str, Tensor]:
         """Return the opacities and scales when each Gaussian is copied as often as it is in `sources`."""
@@ -376,11 +370,6 @@ def _sample(weights: Tensor, count: int) -> Tensor:
     total = weights.double().cumsum(0)
     draws = torch.rand(count, dtype=torch.float64, device=weights.device) * total[-1]
     return torch.searchsorted(total, draws, right=True).clamp(max=len(weights) - 1)
-
-
-def _where_rows(chosen: Tensor, rows: Tensor) -> Tensor:
-    """Set rows [M, ...] to zero where `chosen`, bool [M], is false."""
-    return rows * chosen.view(-1, *[1] * (rows.dim() - 1))
 
 
 def _renew(

@@ -19,6 +19,7 @@ import yaml
 
 from blitzgs.config.fields import FORK, POSITION_LEFT, SH_SHARE, Config
 from blitzgs.config.fields import ConfigError as ConfigError
+from blitzgs.config.ranges import flat as flat
 from blitzgs.config.ranges import problems
 from blitzgs.util.output import write_file
 
@@ -121,15 +122,6 @@ def to_dict(config: Config) -> dict[str, Any]:
 def changed(config: Config, section: str, **fields: Any) -> Config:
     """Return a configuration with other values of some fields of a section."""
     return dataclasses.replace(config, **{section: dataclasses.replace(getattr(config, section), **fields)})
-
-
-def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the values of nested dictionaries by names such as "section.field"."""
-    found: dict[str, Any] = {}
-    for name, value in values.items():
-        nested = isinstance(value, Mapping)
-        found |= flat(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
-    return found
 
 
 def save_config(config: Config, path: Path) -> None:
@@ -322,11 +314,7 @@ def recipe_path(given: str) -> Path | None:
     """Return the YAML file of a path or of a name of `recipe_names`; None for `DEFAULTS`."""
     if Path(given).is_file():
         return Path(given)
-    if given == DEFAULTS:
-        return None
-    if (found := _recipe(given)) is not None:
-        return found
-    raise ConfigError(f"{given}: no such file or recipe; {_known(given)}")
+    return None if given == DEFAULTS else _recipe(given, f"{given}: no such file or recipe")
 
 
 def base_file(given: str, file: Path) -> Path:
@@ -335,27 +323,19 @@ def base_file(given: str, file: Path) -> Path:
     The name may end in ".yaml": a copy of a recipe's file names its base so.
     """
     beside = file.parent / given
-    if beside.is_file():
-        return beside
-    if (found := _recipe(given.removesuffix(".yaml"))) is not None:
-        return found
-    raise ConfigError(
-        f"{file}: base: {given}: no such file in {file.parent} and no such recipe; {_known(given)}"
-    )
+    problem = f"{file}: base: {given}: no such file in {file.parent} and no such recipe"
+    return beside if beside.is_file() else _recipe(given.removesuffix(".yaml"), problem)
 
 
-def _recipe(name: str) -> Path | None:
-    """Return the file of a recipe; None if there is none of this name."""
+def _recipe(name: str, problem: str) -> Path:
+    """Return the file of a recipe (ConfigError: there is none of this name; `problem` begins the message)."""
     files = (folder / f"{name}.yaml" for folder in _FOLDERS if "/" not in name)
-    return next((file for file in files if file.is_file()), None)
-
-
-def _known(given: str) -> str:
-    """Return which recipes there are, and which of them may have been meant."""
+    if (found := next((file for file in files if file.is_file()), None)) is not None:
+        return found
     known = [*recipe_names(), DEFAULTS]
-    close = difflib.get_close_matches(Path(given).stem, known, n=1)
+    close = difflib.get_close_matches(Path(name).stem, known, n=1)
     hint = f"did you mean '{close[0]}'? " if close else ""
-    return f"{hint}recipes are {', '.join(known)}"
+    raise ConfigError(f"{problem}; {hint}recipes are {', '.join(known)}")
 
 
 def default_recipe(on_gpu: bool) -> str:

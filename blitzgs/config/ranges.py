@@ -17,7 +17,7 @@ import textwrap
 import types
 import typing
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from typing import Any, get_args
 
 import yaml
@@ -100,7 +100,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
 
 def problems(config: Config) -> Iterator[str]:
     """Name each field whose value makes no sense, with the value and what is allowed."""
-    for name, value in flat_fields(config):
+    for name, value in flat(dataclasses.asdict(config)).items():
         if name in RANGES and not all(number in RANGES[name] for number in _numbers(value)):
             yield f"{name}: must be {RANGES[name]}, got {value}"
         if name in CHOICES and value not in CHOICES[name]:
@@ -160,14 +160,13 @@ def _problems_of_resolution(schedule: ScheduleConfig) -> Iterator[str]:
         yield f"schedule.resolution: its times must increase, got {times}"
 
 
-def flat_fields(section: Any, where: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield all fields of a configuration as (dotted name, value)."""
-    for entry in fields(section):
-        value = getattr(section, entry.name)
-        if is_dataclass(value):
-            yield from flat_fields(value, f"{where}{entry.name}.")
-        else:
-            yield where + entry.name, value
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the values of nested dictionaries by names such as "section.field"."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        nested = isinstance(value, Mapping)
+        found |= flat(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
+    return found
 
 
 _WIDTH = 100

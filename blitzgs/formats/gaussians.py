@@ -5,8 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
+import numpy as np
+import numpy.typing as npt
 import psutil
 import torch
 from torch import Tensor
@@ -18,8 +21,11 @@ from blitzgs.util.terminal import amount
 BLOCK = 1 << 18
 # Name of a header line that viewers look for (Brush, PlayCanvas and others).
 MIP = "comment SplatRenderMode: mip"
+# What a DC coefficient of 1 adds to a colour: the constant spherical harmonic.
+SH_C0 = 0.28209479177387814
 # Logarithm of a scale that float32 cannot hold.
 _LARGEST_SCALE = 88.0
+_COLUMNS = ("means", "quats", "scales", "opacities", "sh")
 
 
 class GaussianSource(Protocol):
@@ -80,16 +86,12 @@ class Gaussians:
 
     def rows(self, rows: Tensor | slice) -> Gaussians:
         """Return some of the Gaussians."""
-        return replace(
-            self,
-            means=self.means[rows],
-            quats=self.quats[rows],
-            scales=self.scales[rows],
-            opacities=self.opacities[rows],
-            sh=self.sh[rows],
-            normals=None if self.normals is None else self.normals[rows],
-            levels=None if self.levels is None else self.levels[rows],
-        )
+        return replace(self, **{name: column[rows] for name, column in self._columns().items()})
+
+    def _columns(self) -> dict[str, Any]:
+        """Return the columns that there are, by name."""
+        found = {name: getattr(self, name) for name in (*_COLUMNS, "normals", "levels")}
+        return {name: column for name, column in found.items() if column is not None}
 
     def blocks(self) -> Iterator[Gaussians]:
         """Yield all Gaussians in order, at most `BLOCK` at a time."""
@@ -99,7 +101,7 @@ class Gaussians:
     def sound(self) -> Tensor:
         """Tell which Gaussians have values that a viewer can show, bool [N]; see `check`."""
         bad = torch.zeros(len(self), dtype=torch.bool)
-        for name in ("means", "quats", "scales", "opacities", "sh"):
+        for name in _COLUMNS:
             bad |= _bad_rows(name, getattr(self, name))
         return ~bad
 
@@ -112,7 +114,7 @@ class Gaussians:
         n, k = len(self.means), self.sh.shape[1] if isinstance(self.sh, Tensor) and self.sh.ndim == 3 else 0
         shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}
         shapes |= {"normals": (n, 3), "levels": (n,)}
-        given = {name: getattr(self, name) for name in shapes if getattr(self, name) is not None}
+        given = self._columns()
         for name, tensor in given.items():
             check_tensor(name, tensor)
             rows = _bad_rows(name, tensor)
@@ -148,17 +150,9 @@ def check_memory(holds: str, count: int, degree: int, copies: int = 2) -> None:
 
 def joined(parts: list[Gaussians]) -> Gaussians:
     """Return parts of a model, at least one, as one; normals are left out."""
+    columns: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in _COLUMNS}
     levels = [part.levels for part in parts if part.levels is not None]
-    return replace(
-        parts[0],
-        means=torch.cat([part.means for part in parts]),
-        quats=torch.cat([part.quats for part in parts]),
-        scales=torch.cat([part.scales for part in parts]),
-        opacities=torch.cat([part.opacities for part in parts]),
-        sh=torch.cat([part.sh for part in parts]),
-        normals=None,
-        levels=torch.cat(levels) if levels else None,
-    )
+    return replace(parts[0], normals=None, levels=torch.cat(levels) if levels else None, **columns)
 
 
 def is_antialiased(source: GaussianSource) -> bool:
@@ -182,3 +176,31 @@ def unit_quats(quats: Tensor) -> Tensor:
     unit[~unit.any(dim=1), 0] = 1
     unit /= unit.abs().amax(dim=1, keepdim=True)
     return unit / torch.linalg.vector_norm(unit, dim=1, keepdim=True)
+
+
+def degree_of(rest: int, path: Path) -> int:
+    """Return the SH degree of a PLY file with so many properties f_rest (ValueError: none has them)."""
+    degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(rest)
+    if degree is None:
+        raise ValueError(f"{path}: {rest} f_rest properties fit no SH degree (0, 9, 24 or 45 do)")
+    return degree
+
+
+def without_largest(quats: Tensor, bits: int) -> tuple[Tensor, Tensor]:
+    """Return all components but the largest of unit quaternions [N, 4], and its place, int64 [N].
+
+    The components, int64 [N, 3], have so many bits: 0 stands for -sqrt(1/2).
+    """
+    largest = quats.abs().argmax(dim=1, keepdim=True)
+    turned = quats * quats.gather(1, largest).sign()
+    others, most = turned[torch.arange(4)[None] != largest].reshape(-1, 3), (1 << bits) - 1
+    return ((others * 2**0.5 + 1) / 2 * most).round().clamp(0, most).long(), largest[:, 0]
+
+
+def with_largest(shares: npt.NDArray[np.float32], largest: npt.NDArray[Any]) -> Tensor:
+    """Return unit quaternions [N, 4] from what `without_largest` says, its components divided by the most."""
+    others = (shares - 0.5) * 2**0.5
+    quats = np.empty((len(others), 4), np.float32)
+    quats[np.arange(4) != largest[:, None]] = others.ravel()
+    quats[np.arange(len(quats)), largest] = np.sqrt(np.maximum(0, 1 - (others**2).sum(axis=1)))
+    return torch.from_numpy(quats)

@@ -21,13 +21,15 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
-from blitzgs.formats.gaussians import Gaussians, GaussianSource, unit_quats
+from blitzgs.formats.gaussians import SH_C0, Gaussians, GaussianSource, unit_quats
+from blitzgs.formats.partition import around
 from blitzgs.util.output import check_replaceable, new_file
+from blitzgs.util.rotations import quaternions
 
 _PREFIX = "KHR_gaussian_splatting:"
 _FLOAT, _BYTE = 5126, 5121
-_SH_C0 = 0.28209479177387814
 # A chunk's length has 32 bits.
 _LARGEST = (1 << 32) - 1
 # Up in the PLY files of most trainers, whose world is that of the first camera.
@@ -45,12 +47,6 @@ class _Column:
     width: int  # bytes of a Gaussian
 
 
-def glb_bytes(count: int, degree: int, has_levels: bool = False) -> int:
-    """Return the size of a file without its JSON."""
-    columns = _columns(count, degree, has_levels)
-    return columns[-1].offset + columns[-1].width * count
-
-
 def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float] = COLMAP_UP) -> None:
     """Write Gaussians as a GLB file; it appears under its name only when it is complete.
 
@@ -66,7 +62,7 @@ def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float]
     """
     check_replaceable(path, (b"glTF",), " and is not a GLB file")
     count, columns = len(source), _columns(len(source), source.degree, source.has_levels)
-    size = glb_bytes(count, source.degree, source.has_levels)
+    size = columns[-1].offset + columns[-1].width * count
     if count == 0:
         raise ValueError(f"{path}: the model has no Gaussian, and glTF has no empty primitives")
     if size > _LARGEST - (1 << 20):
@@ -83,12 +79,7 @@ def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float]
         start, body = 0, 20 + room + 8
         for block in source.blocks():
             block.check()
-            box = np.stack(
-                [
-                    np.minimum(box[0], block.means.amin(0).double().numpy()),
-                    np.maximum(box[1], block.means.amax(0).double().numpy()),
-                ]
-            )
+            box = around([box, torch.stack(block.means.aminmax(dim=0)).double().numpy()])
             for column, values in zip(columns, _values(block, path), strict=True):
                 file.seek(body + column.offset + column.width * start)
                 file.write(np.ascontiguousarray(values).data)
@@ -128,7 +119,7 @@ def _values(block: Gaussians, path: Path) -> list[Array]:
     for name, values in (("scales", scales), ("sh", sh)):
         if not np.isfinite(values).all():
             raise ValueError(f"{path}: {name} are not finite in float32, which glTF requires")
-    colors = np.concatenate([0.5 + _SH_C0 * sh[:, 0], opacities[:, None]], axis=1)
+    colors = np.concatenate([0.5 + SH_C0 * sh[:, 0], opacities[:, None]], axis=1)
     columns: list[Array] = [
         block.means.numpy(),
         unit_quats(block.quats)[:, [1, 2, 3, 0]].float().numpy(),
@@ -188,9 +179,14 @@ def _json(
 
 def _rotation_to_y(up: tuple[float, float, float]) -> list[float]:
     """Return the shortest rotation from `up` to +Y as x, y, z, w; half a turn about x from -Y."""
-    x, y, z = np.array(up, dtype=np.float64) / np.linalg.norm(up)
-    if y < -1 + 1e-12:
-        return [1.0, 0.0, 0.0, 0.0]
-    # The half-way quaternion: (up x Y, 1 + up . Y), normalised.
-    quat = np.array([-z, 0.0, x, 1 + y])
-    return [float(value) for value in quat / np.linalg.norm(quat)]
+    w, x, y, z = quaternions(torch.from_numpy(shortest_turn(up, 1))[None])[0].tolist()
+    return [x, y, z, w]
+
+
+def shortest_turn(direction: tuple[float, float, float], axis: int) -> npt.NDArray[np.float64]:
+    """Return the shortest rotation [3, 3] from a direction to an axis of the coordinates, +X, +Y or +Z."""
+    unit, target = np.array(direction, np.float64) / np.linalg.norm(direction), np.eye(3)[axis]
+    if unit[axis] < -1 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    cross = np.outer(target, unit) - np.outer(unit, target)
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1 + unit[axis]))

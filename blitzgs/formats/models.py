@@ -14,6 +14,7 @@ from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased
 from blitzgs.formats.glb import write_glb
 from blitzgs.formats.ply import PlySource, read_ply, save_ply
 from blitzgs.formats.sog import read_sog, write_sog
+from blitzgs.util.errors import located
 from blitzgs.util.output import check_replaceable
 
 _HEADER = 1 << 16
@@ -21,10 +22,11 @@ _HEADER = 1 << 16
 
 @dataclass(frozen=True)
 class Format:
-    """A format that models are written in."""
+    """A format that models are written in, and most are read from."""
 
     title: str  # what it is
     suffix: str  # end of its files' names
+    read: Callable[[Path], Gaussians] | None  # reads a file whole; None: it is not read
     # Writes a file block by block; it appears under its name only when it is complete.
     write: Callable[[Path, GaussianSource], None]
     starts: tuple[bytes, ...] = ()  # how its files begin, of which one is true; empty: nothing tells
@@ -50,15 +52,18 @@ class Format:
 # By the name of the flag of `blitzgs export`.
 FORMATS = {
     "ply": Format(
-        "PLY", ".ply", save_ply, (b"ply",), ("antialiasing", "levels"), quantised=False
+        "PLY", ".ply", read_ply, save_ply, (b"ply",), ("antialiasing", "levels"), quantised=False
     ),
     "compressed-ply": Format(
-        "compressed PLY", ".ply", packed.write_compressed_ply, (b"ply",), ("antialiasing",)
+        "compressed PLY", ".ply", packed.read_compressed_ply, packed.write_compressed_ply, (b"ply",),
+        ("antialiasing",),
     ),
-    "splat": Format(".splat", ".splat", packed.write_splat, harmonics=False),
-    "spz": Format("SPZ", ".spz", packed.write_spz, (b"\x1f\x8b", b"NGSP"), ("antialiasing",)),
-    "sog": Format("SOG", ".sog", write_sog, (b"PK",), ("antialiasing",)),
-    "glb": Format("GLB", ".glb", write_glb, (b"glTF",), ("levels",), quantised=False),
+    "splat": Format(".splat", ".splat", packed.read_splat, packed.write_splat, harmonics=False),
+    "spz": Format(
+        "SPZ", ".spz", packed.read_spz, packed.write_spz, (b"\x1f\x8b", b"NGSP"), ("antialiasing",)
+    ),
+    "sog": Format("SOG", ".sog", read_sog, write_sog, (b"PK",), ("antialiasing",)),
+    "glb": Format("GLB", ".glb", None, write_glb, (b"glTF",), ("levels",), quantised=False),
 }  # fmt: skip
 
 
@@ -73,16 +78,24 @@ def check_replaces(path: Path, kind: Format) -> None:
         raise ValueError(f"{path}: the file will be {kind.title}: choose a name that ends in {kind.suffix}")
 
 
+def format_of(path: Path) -> Format | None:
+    """Return the format of a file by its beginning, else by the end of its name; None: neither tells."""
+    with open(path, "rb") as file:
+        start = file.read(_HEADER)
+    if b" packed_position" in start.partition(b"end_header")[0]:
+        return FORMATS["compressed-ply"] if start.startswith(b"ply") else None
+    known = (kind for kind in FORMATS.values() if kind.starts and start.startswith(kind.starts))
+    named = (kind for kind in FORMATS.values() if not kind.starts and path.suffix.lower() == kind.suffix)
+    return next(known, None) or next(named, None)
+
+
 def open_gaussians(path: Path, checked: bool = True) -> GaussianSource:
     """Open a model that any program wrote; one in INRIA's layout is read block by block, others at once.
 
     Without `checked`, the blocks have values that cannot be shown, which a `Selected` leaves out. ValueError,
     ImportError: see `read_gaussians`.
     """
-    with open(path, "rb") as file:
-        header = file.read(_HEADER).partition(b"end_header")[0]
-    is_inria = header.startswith(b"ply") and b" packed_position" not in header
-    return PlySource(path, checked) if is_inria else read_gaussians(path)
+    return PlySource(path, checked) if format_of(path) is FORMATS["ply"] else read_gaussians(path)
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
@@ -92,23 +105,12 @@ def read_gaussians(path: Path | str) -> Gaussians:
     holds values that cannot be shown; names the file. ImportError: a package is missing; says which.
     """
     path = Path(path)
-    with open(path, "rb") as file:
-        start = file.read(_HEADER)
-    if start.startswith(b"ply"):
-        header = start.partition(b"end_header")[0]
-        found = packed.read_compressed_ply(path) if b" packed_position" in header else read_ply(path)
-    elif start.startswith((b"\x1f\x8b", b"NGSP")):
-        found = packed.read_spz(path)
-    elif start.startswith(b"PK"):
-        found = read_sog(path)
-    elif path.suffix.lower() == ".splat":
-        found = packed.read_splat(path)
-    else:
+    kind = format_of(path)
+    if kind is None or kind.read is None:
         raise ValueError(f"{path} is no model: PLY, compressed PLY, SPZ, SOG and .splat files are read")
-    try:
+    found = kind.read(path)
+    with located(str(path)):
         found.check()
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
     return found
 
 

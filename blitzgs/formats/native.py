@@ -78,18 +78,13 @@ class _Reply:
         self._free(self._handle)
 
 
-class _Memory:
-    """A column of a reply as numpy takes it; an array of it keeps the reply alive."""
-
-    def __init__(self, reply: _Reply, column: _Column, dtype: np.dtype[Any]) -> None:
-        self._reply = reply
-        data, shape = (column.data, False), (column.size,)
-        self.__array_interface__ = {"version": 3, "shape": shape, "typestr": dtype.str, "data": data}
-
-
 def _array_of(reply: _Reply, column: _Column) -> Array:
     dtype = _TYPES[column.type]
-    return np.asarray(_Memory(reply, column, dtype)) if column.size else np.empty(0, dtype)
+    if not column.size:
+        return np.empty(0, dtype)
+    memory: Any = (ctypes.c_byte * (column.size * dtype.itemsize)).from_address(column.data)
+    memory.reply = reply  # whose memory it is
+    return np.frombuffer(memory, dtype)
 
 
 def _call(name: str, *arguments: Path | Array, keeps_gil: bool = False) -> list[Array]:
@@ -142,37 +137,19 @@ def read_cameras(path: Path) -> list[tuple[int, str, int, int, Array]]:
     return list(zip(ids.tolist(), names, widths.tolist(), heights.tolist(), each, strict=True))
 
 
-def read_images(path: Path, with_points2d: bool) -> dict[str, Any]:
-    """Read images.bin or .txt, as the fields of `ColmapImages`."""
-    ids, quats, translations, camera_ids, names, ends, offsets, points2d, point3d_ids = _call(
-        "read_images", path, _array([with_points2d], "u8")
-    )
-    return {
-        "ids": ids,
-        "quats": quats.reshape(-1, 4),
-        "translations": translations.reshape(-1, 3),
-        "camera_ids": camera_ids,
-        "names": _texts(names, ends),
-        "point2d_offsets": offsets,
-        "points2d": points2d.reshape(-1, 2),
-        "point3d_ids": point3d_ids,
-    }
+def read_images(path: Path, with_points2d: bool) -> list[Any]:
+    """Read images.bin or .txt: the columns of `ColmapImages`, in its order."""
+    columns = _call("read_images", path, _array([with_points2d], "u8"))
+    ids, quats, translations, camera_ids, names, ends, offsets, points2d, point3d_ids = columns
+    poses = [quats.reshape(-1, 4), translations.reshape(-1, 3)]
+    return [ids, camera_ids, *poses, _texts(names, ends), offsets, points2d.reshape(-1, 2), point3d_ids]
 
 
-def read_points(path: Path, with_tracks: bool) -> dict[str, Array]:
-    """Read points3D.bin or .txt, as the fields of `ColmapPoints`."""
-    ids, positions, colors, errors, offsets, image_ids, point2d_ids = _call(
-        "read_points", path, _array([with_tracks], "u8")
-    )
-    return {
-        "ids": ids,
-        "positions": positions.reshape(-1, 3),
-        "colors": colors.reshape(-1, 3),
-        "errors": errors,
-        "track_offsets": offsets,
-        "track_image_ids": image_ids,
-        "track_point2d_ids": point2d_ids,
-    }
+def read_points(path: Path, with_tracks: bool) -> list[Array]:
+    """Read points3D.bin or .txt: the columns of `ColmapPoints`, in its order."""
+    columns = _call("read_points", path, _array([with_tracks], "u8"))
+    ids, positions, colors, *others = columns
+    return [ids, positions.reshape(-1, 3), colors.reshape(-1, 3), *others]
 
 
 def read_ply(

@@ -8,7 +8,6 @@ free memory before it sees it. It writes, and reads SPZ.
 from __future__ import annotations
 
 import gzip
-import importlib
 import re
 import shutil
 import struct
@@ -17,7 +16,6 @@ import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -27,13 +25,17 @@ import torch
 from blitzgs.formats.gaussians import (
     BLOCK,
     MIP,
+    SH_C0,
     Gaussians,
     GaussianSource,
     check_memory,
+    degree_of,
     is_antialiased,
     joined,
     unit_quats,
+    with_largest,
 )
+from blitzgs.util.errors import optional_package
 from blitzgs.util.output import new_file
 
 # Deflate compresses by at most this factor.
@@ -45,21 +47,19 @@ _SPZ_EXTENSIONS = 1 << 20
 # Gaussians of a chunk of compressed PLY, and bytes of its bounds.
 _CHUNK, _CHUNK_BYTES = 256, 72
 _BOUNDS, _WORDS = ("x y z", "scale_x scale_y scale_z", "r g b"), ("position", "rotation", "scale", "color")
-_SH_C0 = 0.28209479177387814
-_COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
 # Signs of the SH coefficients after half a turn about x, in the order of INRIA's basis.
 _HALF_TURN = torch.tensor([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=torch.float32)
 
 Floats = npt.NDArray[np.float32]
 
 
-def _package(name: str) -> ModuleType:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ImportError(
-            f'this format needs the package {name} ({error}): pip install "blitzgs[formats]"'
-        ) from error
+def _gsply() -> Any:
+    return optional_package("gsply", "formats", "this format")
+
+
+def _rest(degree: int) -> int:
+    """Return the number of SH coefficients of a Gaussian beyond its DC."""
+    return 3 * ((degree + 1) ** 2 - 1)
 
 
 def unit_blocks(source: GaussianSource) -> Iterator[Gaussians]:
@@ -88,7 +88,7 @@ def unit_blocks(source: GaussianSource) -> Iterator[Gaussians]:
 
 def _gsdata(model: Gaussians) -> Any:
     rest = model.sh[:, 1:].contiguous().numpy()
-    return _package("gsply").GSData.from_arrays(
+    return _gsply().GSData.from_arrays(
         means=model.means.numpy(),
         scales=model.scales.numpy(),
         quats=model.quats.numpy(),
@@ -104,11 +104,11 @@ def _gsdata(model: Gaussians) -> Any:
 
 def write_compressed_ply(path: Path, source: GaussianSource) -> None:
     """Write a compressed PLY file block by block, with the header lines of the model."""
-    count, rest = len(source), 3 * (_COEFFICIENTS[source.degree] - 1)
+    count, rest = len(source), _rest(source.degree)
     chunks, first = -(-count // _CHUNK), 0
     with new_file(path) as partial, open(partial, "r+b") as file:
         for block in unit_blocks(source):
-            content: bytes = _package("gsply").compress_to_bytes(_gsdata(block))
+            content: bytes = _gsply().compress_to_bytes(_gsdata(block))
             header, _, body = content.partition(b"end_header\n")
             if first == 0:
                 for element, of_all in (("chunk", chunks), ("vertex", count), ("sh", count)):
@@ -157,9 +157,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
     }
     count, chunks = elements.get("vertex", 0), elements.get("chunk", 0)
     rest = sum(line.startswith("property uchar f_rest_") for line in layout)
-    degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(rest)
-    if degree is None:
-        raise ValueError(f"{path}: {rest} f_rest properties fit no SH degree (0, 9, 24 or 45 do)")
+    degree = degree_of(rest, path)
     columns = sum(line.startswith(("property float min_", "property float max_")) for line in layout)
     if columns not in (12, 18) or chunks != -(-count // _CHUNK) or elements.get("sh", count) != count:
         raise ValueError(
@@ -188,7 +186,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
         quats=torch.empty(count, 4),
         scales=torch.empty(count, 3),
         opacities=torch.empty(count),
-        sh=torch.empty(count, _COEFFICIENTS[degree], 3),
+        sh=torch.empty(count, (degree + 1) ** 2, 3),
         comments=comments,
     )
     for first in range(0, count, BLOCK):
@@ -201,13 +199,10 @@ def read_compressed_ply(path: Path) -> Gaussians:
 def _unpack(
     to: Gaussians, bounds: Floats, words: npt.NDArray[np.uint32], codes: npt.NDArray[np.uint8]
 ) -> None:
-    """Write the values of a block of a compressed PLY file into its Gaussians.
+    """Write the values of a block of a compressed PLY file into views of its N Gaussians.
 
-    Args:
-        to: views of N Gaussians.
-        bounds: least and largest x y z, scales and perhaps colours of its chunks, [C, 2 or 3, 2, 3].
-        words: packed position, rotation, scale and colour, [N, 4].
-        codes: f_rest, [N, 3 (K - 1)].
+    `bounds`: least and largest x y z, scales and perhaps colours of its chunks, [C, 2 or 3, 2, 3]. `words`:
+    packed position, rotation, scale and colour, [N, 4]. `codes`: f_rest, [N, 3 (K - 1)].
     """
     chunks = np.arange(len(words)) // _CHUNK
 
@@ -226,19 +221,11 @@ def _unpack(
     to.means[:] = torch.from_numpy(between(0, shares(0, 11, 10, 11)))
     to.scales[:] = torch.from_numpy(between(1, shares(2, 11, 10, 11)))
     to.opacities[:] = torch.from_numpy(colors[:, 3].clip(1e-6, 1 - 1e-6)).logit()
-    to.sh[:, 0] = torch.from_numpy((tints - 0.5) / _SH_C0)
+    to.sh[:, 0] = torch.from_numpy((tints - 0.5) / SH_C0)
     steps = (codes + np.float32(0.5)) / 256
     steps[codes == 0], steps[codes == 255] = 0, 1
     to.sh[:, 1:] = torch.from_numpy(steps * 8 - 4).reshape(len(words), 3, -1).transpose(1, 2)
-    to.quats[:] = quats_without_largest((shares(1, 2, 10, 10, 10)[:, 1:] - 0.5) * 2**0.5, words[:, 1] >> 30)
-
-
-def quats_without_largest(others: Floats, largest: npt.NDArray[Any]) -> torch.Tensor:
-    """Return unit quaternions [N, 4] from all components but the largest, [N, 3], and its place [N]."""
-    quats = np.empty((len(others), 4), np.float32)
-    quats[np.arange(4) != largest[:, None]] = others.ravel()
-    quats[np.arange(len(quats)), largest] = np.sqrt(np.maximum(0, 1 - (others**2).sum(axis=1)))
-    return torch.from_numpy(quats)
+    to.quats[:] = with_largest(shares(1, 2, 10, 10, 10)[:, 1:], words[:, 1] >> 30)
 
 
 # --- .splat: 32 bytes a Gaussian, without header ---
@@ -252,7 +239,7 @@ def write_splat(path: Path, source: GaussianSource) -> None:
         for block in unit_blocks(source):
             rows = np.zeros(len(block), dtype=_SPLAT)
             rows["mean"], rows["scale"] = block.means.numpy(), block.scales.exp().numpy()
-            shade = torch.cat([0.5 + _SH_C0 * block.sh[:, 0], block.opacities.sigmoid()[:, None]], dim=1)
+            shade = torch.cat([0.5 + SH_C0 * block.sh[:, 0], block.opacities.sigmoid()[:, None]], dim=1)
             rows["color"] = (shade.clamp(0, 1) * 255).round().numpy()
             rows["quat"] = (block.quats * 128 + 128).round().clamp(0, 255).numpy()
             file.write(rows.data)
@@ -281,7 +268,7 @@ def read_splat(path: Path) -> Gaussians:
         quats=torch.from_numpy((rows["quat"].astype(np.float32) - 128) / 128),
         scales=torch.from_numpy(np.maximum(scales, -30)),
         opacities=torch.from_numpy(np.log(opacities / (1 - opacities))).float(),
-        sh=torch.from_numpy((colors[:, None, :3] - 0.5) / _SH_C0).float(),
+        sh=torch.from_numpy((colors[:, None, :3] - 0.5) / SH_C0).float(),
     )
 
 
@@ -301,10 +288,10 @@ def write_spz(path: Path, source: GaussianSource) -> None:
     middle = float(torch.cat(middles).median().clamp(-15, 15).exp())
     bits = int(np.clip(np.ceil(np.log2(16 / middle)), 12, 24))
     bits = max(1, min(bits, int(np.floor(np.log2((2**23 - 1) / largest)))))
-    widths, first = (9, 1, 3, 3, 4, 3 * (_COEFFICIENTS[source.degree] - 1)), 0
+    widths, first = (9, 1, 3, 3, 4, _rest(source.degree)), 0
     with new_file(path) as partial, tempfile.TemporaryFile(dir=path.parent) as file:
         for block in unit_blocks(source):
-            _package("gsply").write_spz(partial, _gsdata(_half_turn(block)), fractional_bits=bits)
+            _gsply().write_spz(partial, _gsdata(_half_turn(block)), fractional_bits=bits)
             content = zlib.decompress(partial.read_bytes(), wbits=31)
             if first == 0:
                 flags = content[14] | (_SPZ_ANTIALIASED if is_antialiased(source) else 0)
@@ -329,16 +316,16 @@ def read_spz(path: Path) -> Gaussians:
     magic, version, count, degree, _, flags = struct.unpack_from("<IIIBBB", start)
     if magic != _SPZ_MAGIC or version not in (1, 2, 3, 4):
         raise ValueError(f"{path} is no SPZ file of version 1 to 4")
-    if degree not in _COEFFICIENTS:
+    if degree > 3:
         raise ValueError(f"{path}: SH degree {degree} is not supported, 0 to 3 are")
-    size = 16 + count * (16 + (4 if version >= 3 else 3) + 3 * (_COEFFICIENTS[degree] - 1))
+    size = 16 + count * (16 + (4 if version >= 3 else 3) + _rest(degree))
     check_memory(f"{path} says that it holds", count, degree)
     if deflated:
         if size > _DEFLATE * path.stat().st_size:
             raise ValueError(f"{path}: {path.stat().st_size:,} bytes cannot hold {count:,} Gaussians")
         _inflated(path, size, _SPZ_EXTENSIONS)
     try:
-        found = _package("gsply").read_spz(path)
+        found = _gsply().read_spz(path)
     except Exception as error:  # the package raises what its parts raise
         if isinstance(error, (ImportError, MemoryError)):
             raise

@@ -12,7 +12,7 @@ from __future__ import annotations
 import errno
 import math
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,32 +35,14 @@ Ints = npt.NDArray[np.int64]
 _Places = npt.NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class Counts:
-    """How many Gaussians the occupied cells have.
-
-    Attributes:
-        cells: keys of the cells, sorted, int64 [E].
-        counts: number of Gaussians in each cell, int64 [E].
-    """
-
-    cells: Ints
-    counts: Ints
-
-
 class Partition:
     """A model that is being sorted into parts; its temporary files are in a folder of the caller."""
 
     def __init__(self, source: GaussianSource, folder: Path) -> None:
         """Read the model for the first time.
 
-        Args:
-            source: at least one Gaussian.
-            folder: an existing folder with space for two and a half copies of the model.
-
-        Raises:
-            ValueError: there is no Gaussian, or a value is NaN or infinite.
-            OSError: the disk is full.
+        `folder` exists and has space for two and a half copies of the model. ValueError: there is no
+        Gaussian, or a value is NaN or infinite. OSError: the disk is full.
         """
         if len(source) == 0:
             raise ValueError("the model has no Gaussian, so there is nothing to write")
@@ -79,10 +61,10 @@ class Partition:
             for block in source.blocks():
                 block.check()
                 file.write(block.means.contiguous().numpy().data)
-        self._measure()
+        self._choose_grid()
+        self._count()
 
-    def _measure(self) -> None:
-        """Choose the grid."""
+    def _choose_grid(self) -> None:
         step = max(1, -(-len(self._source) // _SAMPLE))
         means = np.concatenate([chunk[::step] for chunk in self._chunks()]).astype(np.float64)
         self.box = np.quantile(means, [0.002, 0.998], axis=0)
@@ -100,8 +82,7 @@ class Partition:
         index = np.floor((places - self._origin) / self._cell).clip(0, 2**BITS - 1).astype(np.int64)
         return interleaved(index, BITS)
 
-    def count(self) -> Counts:
-        """Count the Gaussians of each cell."""
+    def _count(self) -> None:
         codes, counts = np.zeros(0, np.int64), np.zeros(0, np.int64)
         for chunk in self._chunks():
             new, times = np.unique(self._codes(chunk), return_counts=True)
@@ -109,22 +90,19 @@ class Partition:
             merged = np.zeros(len(codes), np.int64)
             np.add.at(merged, inverse, np.concatenate([counts, times]))
             counts = merged
-        self._cells = codes
-        return Counts(codes, counts)
+        # Keys of the occupied cells, sorted, and the number of Gaussians in each, int64 [E].
+        self.cells, self.counts = codes, counts
 
-    def place(self, parts: Ints, counts: Ints) -> Parts:
+    def place(self, parts: Ints) -> Parts:
         """Read the model again and sort its rows.
 
-        Args:
-            parts: the part of each cell of `count`, int64 [E]; each of 0 to P - 1 occurs.
-            counts: `Counts.counts`.
+        `parts`: the part of each of `cells`, int64 [E]; each of 0 to P - 1 occurs.
         """
-        starts = np.concatenate([[0], np.cumsum(np.bincount(parts, counts).astype(np.int64))])
-        position = starts[:-1].copy()
-        size, chunks = 4 * self._width, _Cursor(self._chunks())
+        starts = np.concatenate([[0], np.cumsum(np.bincount(parts, self.counts).astype(np.int64))])
+        position, size = starts[:-1].copy(), 4 * self._width
         with open(self._rows, "wb") as file:
             for block in self._source.blocks():
-                found = parts[np.searchsorted(self._cells, self._codes(chunks.take(len(block))))]
+                found = parts[np.searchsorted(self.cells, self._codes(block.means.numpy()))]
                 rows = np.empty((len(block), self._width), "<f4")
                 rows[:, 0:3], rows[:, 3:7] = block.means.numpy(), block.quats.numpy()
                 rows[:, 7:10], rows[:, 10] = block.scales.numpy(), block.opacities.numpy()
@@ -136,43 +114,21 @@ class Partition:
                     file.seek(int(position[one]) * size)
                     file.write(rows[some].data)
                     position[one] += len(some)
+        if (position != starts[1:]).any():
+            raise ValueError("the model changed between its two readings: write it when no training does")
         self._places.unlink()
         return Parts(self._rows, self._width, self._source.comments, self._source.has_levels, starts)
 
 
-class _Cursor:
-    """Takes as many places at a time as a block has rows."""
-
-    def __init__(self, chunks: Iterator[_Places]) -> None:
-        self._chunks, self._left = chunks, np.zeros((0, 3), np.float32)
-
-    def take(self, count: int) -> _Places:
-        while len(self._left) < count:
-            more = next(self._chunks, None)
-            if more is None:
-                raise ValueError("the model has more Gaussians in its second reading than in its first")
-            self._left = np.concatenate([self._left, more])
-        taken, self._left = self._left[:count], self._left[count:]
-        return taken
-
-
 @dataclass(frozen=True)
 class Parts:
-    """The sorted rows on disk; may be sent to another process.
+    """The sorted rows on disk; may be sent to another process."""
 
-    Attributes:
-        file: float32 rows: mean 3, quaternion 4, log scales 3, opacity logit, level, SH.
-        width: numbers of a row.
-        comments: header lines of the model.
-        has_levels: whether the model has trained levels.
-        starts: first row of each part, and the number of rows, int64 [P + 1].
-    """
-
-    file: Path
-    width: int
-    comments: list[str]
-    has_levels: bool
-    starts: Ints
+    file: Path  # float32 rows: mean 3, quaternion 4, log scales 3, opacity logit, level, SH
+    width: int  # numbers of a row
+    comments: list[str]  # header lines of the model
+    has_levels: bool  # whether the model has trained levels
+    starts: Ints  # first row of each part, and the number of rows, int64 [P + 1]
 
     def read(self, part: int) -> Gaussians:
         """Read the Gaussians of a part."""
@@ -195,6 +151,12 @@ def interleaved(index: Ints, bits: int) -> Ints:
         for axis in range(3):
             codes |= ((index[:, axis] >> bit) & 1) << (3 * bit + axis)
     return codes
+
+
+def around(boxes: Sequence[Array]) -> Array:
+    """Return the box of boxes, [2, 3] each."""
+    every = np.stack(boxes)
+    return np.stack([every[:, 0].min(axis=0), every[:, 1].max(axis=0)])
 
 
 def extents(gaussians: Gaussians) -> Array:

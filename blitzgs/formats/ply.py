@@ -22,11 +22,10 @@ import torch
 from torch import Tensor
 
 from blitzgs.formats import native
-from blitzgs.formats.gaussians import BLOCK, Gaussians, GaussianSource
+from blitzgs.formats.gaussians import BLOCK, SH_C0, Gaussians, GaussianSource, degree_of
 from blitzgs.util.output import check_replaceable, new_file
 
 LEVEL = "level"
-_REST_TO_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
 
 
 def _property_names(coefficients: int) -> list[str]:
@@ -35,9 +34,12 @@ def _property_names(coefficients: int) -> list[str]:
     return [*names, "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 
 
-def _read_table(path: Path) -> tuple[list[str], npt.NDArray[np.void]]:
-    comments, properties, count, rows, _ = native.read_ply(os.fsencode(path))
-    return comments, np.frombuffer(rows, dtype=np.dtype(properties), count=count)
+def _read_table(
+    path: Path, first: int = 0, most: int = 2**64 - 1
+) -> tuple[list[str], npt.NDArray[np.void], int]:
+    """Return the header lines, up to `most` rows from number `first` on, and the number of all rows."""
+    comments, properties, count, rows, total = native.read_ply(os.fsencode(path), first, most)
+    return comments, np.frombuffer(rows, dtype=np.dtype(properties), count=count), total
 
 
 class PlySource:
@@ -68,8 +70,7 @@ class PlySource:
             yield block
 
     def _read(self, first: int, most: int) -> tuple[Gaussians, int]:
-        comments, properties, count, rows, total = native.read_ply(os.fsencode(self._path), first, most)
-        table = np.frombuffer(rows, dtype=np.dtype(properties), count=count)
+        comments, table, total = _read_table(self._path, first, most)
         return _gaussians(self._path, comments, table), total
 
 
@@ -78,16 +79,14 @@ def read_ply(path: Path | str) -> Gaussians:
 
     ValueError: the file is damaged or has no such Gaussians; names the file and the reason.
     """
-    path = Path(path)
-    return _gaussians(path, *_read_table(path))
+    comments, table, _ = _read_table(Path(path))
+    return _gaussians(Path(path), comments, table)
 
 
 def _gaussians(path: Path, comments: list[str], table: npt.NDArray[np.void]) -> Gaussians:
     names = table.dtype.names or ()
     rest = sum(name.startswith("f_rest_") for name in names)
-    if rest not in _REST_TO_COEFFICIENTS:
-        raise ValueError(f"{path}: {rest} f_rest properties fit no SH degree (0, 9, 24 or 45 do)")
-    k = _REST_TO_COEFFICIENTS[rest]
+    k = (degree_of(rest, path) + 1) ** 2
     missing = [n for n in _property_names(k) if n not in names and n not in ("nx", "ny", "nz")]
     if missing:
         raise ValueError(f"{path}: not a Gaussian PLY: the properties {', '.join(missing[:8])} are missing")
@@ -179,7 +178,8 @@ def _rows(block: Gaussians, width: int, offset: npt.NDArray[np.float64] | None) 
     """Return the bytes of a block, float32 [N, width]."""
     n, rest = len(block), 3 * (block.sh.shape[1] - 1)
     rows = np.zeros((n, width), dtype="<f4")
-    rows[:, 0:3] = _moved(block.means, offset)
+    means = block.means.detach().cpu().double().numpy()
+    rows[:, 0:3] = means if offset is None else means + np.asarray(offset)
     if block.normals is not None:
         rows[:, 3:6] = _array(block.normals)
     coefficients, end = _array(block.sh), 17 + rest
@@ -208,12 +208,6 @@ def _array(tensor: Tensor) -> npt.NDArray[np.float32]:
     return tensor.detach().to("cpu", torch.float32).numpy()
 
 
-def _moved(means: Tensor, offset: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float32]:
-    if offset is None:
-        return _array(means)
-    return (means.detach().cpu().double().numpy() + np.asarray(offset)).astype(np.float32)
-
-
 # The names of colours, in any case; a file of Gaussians has coefficients instead.
 _COLORS = [(f"{prefix}red", f"{prefix}green", f"{prefix}blue") for prefix in ("", "diffuse_", "vertex_")]
 _COLORS += [
@@ -222,7 +216,6 @@ _COLORS += [
     ("ambient_red", "ambient_green", "ambient_blue"),
 ]
 _COEFFICIENTS = ("f_dc_0", "f_dc_1", "f_dc_2")
-_SH_C0 = 0.28209479177387814
 _GREY = 128
 # Rounding and sharpening overshoot the range of a colour by this share.
 _OVERSHOOT = 0.05
@@ -242,18 +235,12 @@ class PointCloud:
     """All properties of a point."""
 
 
-def read_points(path: Path | str) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
-    """Return positions and colours of `read_point_cloud`."""
-    cloud = read_point_cloud(path)
-    return cloud.positions, cloud.colors
-
-
 def read_point_cloud(path: Path | str) -> PointCloud:
     """Read points; those of a file of Gaussians are their centres in the colours that all sides show.
 
     ValueError: the file is damaged, has no x, y, z, or has colours of another kind.
     """
-    _, table = _read_table(Path(path))
+    _, table, _ = _read_table(Path(path))
     stored = {name.lower(): name for name in reversed(table.dtype.names or ())}
     if not {"x", "y", "z"} <= stored.keys():
         raise ValueError(f"{path}: the points have no x, y, z")
@@ -266,7 +253,7 @@ def read_point_cloud(path: Path | str) -> PointCloud:
     if names is not None:
         return PointCloud(positions, _color_bytes(columns(names), path), ", ".join(names), every)
     if set(_COEFFICIENTS) <= stored.keys():
-        fractions = 0.5 + _SH_C0 * columns(_COEFFICIENTS).astype(np.float64)
+        fractions = 0.5 + SH_C0 * columns(_COEFFICIENTS).astype(np.float64)
         _check_colors(np.isfinite(fractions), fractions, path)
         colors = (np.clip(fractions, 0, 1) * 255 + 0.5).astype(np.uint8)
         return PointCloud(positions, colors, "f_dc_0 to f_dc_2", every)

@@ -117,12 +117,7 @@ def _areas(covariances: npt.NDArray[np.floating], blur: float) -> Array:
 
 
 def shown(rows: Rows, comments: list[str]) -> Gaussians:
-    """Return moments [N, 10 + 3 K] as Gaussians.
-
-    Args:
-        rows: the moments; covers above 1 make them wider and opaque.
-        comments: header lines.
-    """
+    """Return moments [N, 10 + 3 K] as Gaussians; covers above 1 make them wider and opaque."""
     matrices = torch.from_numpy(rows[:, 3:9]).double()[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].view(-1, 3, 3)
     variances, axes = torch.linalg.eigh(matrices)
     axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]

@@ -20,32 +20,20 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Selection:
-    """Conditions that a Gaussian has to meet; coordinates are those of the capture.
+    """Conditions that a Gaussian has to meet; coordinates are those of the capture."""
 
-    Attributes:
-        box: least and largest x, y, z of the means, float64 [2, 3]; None: any.
-        polygon: corners [P, 2] of a region that holds the means; None: any.
-        axes: the two coordinates of the polygon's corners.
-        min_opacity: least opacity.
-        levels: first and last octree level; None: any.
-        sh_degree: largest SH degree; None: the model's.
-        most: largest number of Gaussians; those of the highest score stay. None: no limit.
-    """
-
-    box: Array | None = None
-    polygon: Array | None = None
-    axes: tuple[int, int] = (0, 1)
-    min_opacity: float = 0.0
-    levels: tuple[int, int] | None = None
-    sh_degree: int | None = None
-    most: int | None = None
+    box: Array | None = None  # least and largest x, y, z of the means, float64 [2, 3]; None: any
+    polygon: Array | None = None  # corners [P, 2] of a region that holds the means; None: any
+    axes: tuple[int, int] = (0, 1)  # the two coordinates of the polygon's corners
+    min_opacity: float = 0.0  # least opacity
+    levels: tuple[int, int] | None = None  # first and last octree level; None: any
+    sh_degree: int | None = None  # largest SH degree; None: the model's
+    most: int | None = None  # largest number of Gaussians; those of the highest score stay. None: no limit
 
     def meets(self, block: Gaussians, origin: Array) -> Tensor:
         """Tell which Gaussians can be shown and meet the conditions but `most`, bool [N].
 
-        Args:
-            block: the Gaussians.
-            origin: the capture's coordinates of their origin, [3].
+        `origin`: the capture's coordinates of their origin, [3].
         """
         met = block.sound()
         if self.min_opacity > 0:
@@ -76,19 +64,13 @@ class Selected:
     ) -> None:
         """Choose; reads the source once.
 
-        Args:
-            source: the Gaussians.
-            selection: the conditions.
-            origin: the capture's coordinates of their origin.
-            kept: condition besides the selection's, bool [N]; None: there is none.
-            score: for `Selection.most`, float32 [N]; None: opacity times length.
-
-        Raises:
-            ValueError: no Gaussian meets the conditions, or there are no levels.
+        `origin`: the capture's coordinates of the origin. `kept`: a further condition, bool [N]. `score`: for
+        `Selection.most`, float32 [N]; None: opacity times length. ValueError: no Gaussian meets the
+        conditions, or there are no levels.
         """
-        self._source, self._degree = source, source.degree
-        if selection.sh_degree is not None:
-            self._degree = min(self._degree, selection.sh_degree)
+        self._source, self.comments, self.has_levels = source, source.comments, source.has_levels
+        wanted = selection.sh_degree
+        self.degree = source.degree if wanted is None else min(source.degree, wanted)
         met, scores, first = [], [], 0
         for block in source.blocks():
             rows = slice(first, first + len(block))
@@ -111,21 +93,6 @@ class Selected:
     def __len__(self) -> int:
         return self._count
 
-    @property
-    def degree(self) -> int:
-        """The spherical-harmonics degree."""
-        return self._degree
-
-    @property
-    def comments(self) -> list[str]:
-        """Header lines."""
-        return self._source.comments
-
-    @property
-    def has_levels(self) -> bool:
-        """Whether the Gaussians have octree levels."""
-        return self._source.has_levels
-
     def blocks(self) -> Iterator[Gaussians]:
         """Yield the chosen Gaussians in order."""
         first = 0
@@ -133,7 +100,7 @@ class Selected:
             chosen = block.rows(self._met[first : first + len(block)])
             first += len(block)
             if len(chosen):
-                yield replace(chosen, sh=chosen.sh[:, : (self._degree + 1) ** 2])
+                yield replace(chosen, sh=chosen.sh[:, : (self.degree + 1) ** 2])
 
 
 def opacity_length(opacities: Tensor, scales: Tensor) -> Tensor:
@@ -159,8 +126,7 @@ def _inside(points: Array, polygon: Array) -> npt.NDArray[np.bool_]:
 def read_polygon(path: Path) -> Array:
     """Read the corners of a region, float64 [P, 2]: a GeoJSON polygon, or lines of text with "x y".
 
-    Raises:
-        ValueError: the file has no polygon of finite corners; names it.
+    ValueError: the file has no polygon of finite corners; names it.
     """
     text = path.read_text(encoding="utf-8", errors="replace")
     try:

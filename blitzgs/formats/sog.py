@@ -21,9 +21,18 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource, check_memory, is_antialiased
-from blitzgs.formats.packed import quats_without_largest, unit_blocks
+from blitzgs.formats.gaussians import (
+    MIP,
+    Gaussians,
+    GaussianSource,
+    check_memory,
+    is_antialiased,
+    with_largest,
+    without_largest,
+)
+from blitzgs.formats.packed import unit_blocks
 from blitzgs.formats.selection import opacity_length
+from blitzgs.util.errors import located
 from blitzgs.util.output import new_file
 
 Bytes = npt.NDArray[np.uint8]
@@ -223,11 +232,8 @@ def _nearest(rows: Tensor, centres: Tensor) -> Tensor:
 
 def _quats(quats: Tensor) -> Bytes:
     """Return unit quaternions as three bytes of the smaller components and one of the omitted one, [N, 4]."""
-    largest = quats.abs().argmax(dim=1, keepdim=True)
-    turned = quats * quats.gather(1, largest).sign()
-    others = turned[torch.arange(4)[None] != largest].reshape(-1, 3)
-    codes = ((others * 2**0.5 + 1) / 2 * 255).round().clamp(0, 255)
-    return torch.cat([codes, 252.0 + largest], dim=1).to(torch.uint8).numpy()
+    others, largest = without_largest(quats, 8)
+    return torch.cat([others, 252 + largest[:, None]], dim=1).to(torch.uint8).numpy()
 
 
 def read_sog(path: Path) -> Gaussians:
@@ -258,10 +264,8 @@ def _checked_meta(path: Path, archive: zipfile.ZipFile) -> tuple[dict[str, Any],
         raise ValueError(f"{path}: the archive has no meta.json")
     if entries["meta.json"].file_size > _META_BYTES:
         raise ValueError(f"{path}: meta.json has {entries['meta.json'].file_size:,} bytes")
-    try:
+    with located(f"{path}: meta.json is no JSON"):
         meta = json.loads(archive.read("meta.json"))
-    except ValueError as error:
-        raise ValueError(f"{path}: meta.json is no JSON: {error}") from error
     count = meta["count"] if "version" in meta else meta["means"]["shape"][0]
     if type(count) is not int or count < 1:
         raise ValueError(f"{path}: meta.json names {count!r} Gaussians")
@@ -342,7 +346,7 @@ def _decoded(path: Path, archive: zipfile.ZipFile, meta: dict[str, Any], count: 
         sh = np.concatenate([sh, palette[named]], axis=1)
     return Gaussians(
         means=torch.from_numpy(means),
-        quats=quats_without_largest((turns[:, :3] / np.float32(255) - 0.5) * 2**0.5, turns[:, 3] - 252),
+        quats=with_largest(turns[:, :3] / np.float32(255), turns[:, 3] - 252),
         scales=torch.from_numpy(values("scales", codes("scales")[:, :3])),
         opacities=opacities,
         sh=torch.from_numpy(sh),

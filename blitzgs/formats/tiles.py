@@ -10,10 +10,8 @@ model's up to +Z.
 
 from __future__ import annotations
 
-import fcntl
 import glob
 import json
-import math
 import multiprocessing
 import os
 import secrets
@@ -30,11 +28,11 @@ import numpy.typing as npt
 import torch
 
 from blitzgs.formats.gaussians import GaussianSource, is_antialiased
-from blitzgs.formats.glb import write_glb
-from blitzgs.formats.partition import BITS, Counts, Partition, Parts, extents
+from blitzgs.formats.glb import shortest_turn, write_glb
+from blitzgs.formats.partition import BITS, Partition, Parts, around, extents
 from blitzgs.formats.proxies import Rows, merged, moments, shown
 from blitzgs.formats.web_page import WebScene, tiles_page
-from blitzgs.util.output import sync_to_disk, write_file
+from blitzgs.util.output import locked, sync_to_disk, write_file
 from blitzgs.util.progress import Report, follow_parent
 
 TILESET, PAGE = "tileset.json", "index.html"
@@ -51,27 +49,16 @@ Array = npt.NDArray[np.float64]
 
 @dataclass
 class Tile:
-    """A node of the tree.
+    """A node of the tree; the last three fields are known once its file is written."""
 
-    Attributes:
-        count: number of Gaussians; before a tile with children is written, the largest number.
-        part: number of the leaf's part; None: the tile has children.
-        children: tiles of its eighths.
-        number: of its file.
-        first: row of its Gaussians among those of all tiles with children.
-        box: that of what a view can show of its Gaussians, [2, 3], once it is written; so are the rest.
-        bytes: size of its file.
-        edge: of the cells in which its Gaussians were merged; 0 for leaves.
-    """
-
-    count: int
-    part: int | None = None
-    children: list[Tile] = field(default_factory=list)
-    number: int = 0
-    first: int = 0
-    box: Array = field(default_factory=lambda: np.zeros((2, 3)))
-    bytes: int = 0
-    edge: float = 0.0
+    count: int  # number of Gaussians; before a tile with children is written, the largest number
+    part: int | None = None  # number of the leaf's part; None: the tile has children
+    children: list[Tile] = field(default_factory=list)  # tiles of its eighths
+    number: int = 0  # of its file
+    first: int = 0  # row of its Gaussians among those of all tiles with children
+    box: Array = field(default_factory=lambda: np.zeros((2, 3)))  # of what a view can show of its Gaussians
+    bytes: int = 0  # size of its file
+    edge: float = 0.0  # of the cells in which its Gaussians were merged; 0 for leaves
 
     def every(self) -> Iterator[Tile]:
         """Yield the tile and those below."""
@@ -86,17 +73,11 @@ class Tile:
 
 @dataclass(frozen=True)
 class Written:
-    """What was written.
+    """What was written."""
 
-    Attributes:
-        tiles: number of files.
-        bytes: their size.
-        gaussians: number of Gaussians in them.
-    """
-
-    tiles: int
-    bytes: int
-    gaussians: int
+    tiles: int  # number of files
+    bytes: int  # their size
+    gaussians: int  # number of Gaussians of the model
 
 
 def write_tiles(
@@ -128,9 +109,7 @@ def write_tiles(
     """
     with new_folder(path) as folder:
         partition = Partition(source, folder)
-        counts = partition.count()
-        root, parts_of_cells = tree(counts, most)
-        parts = partition.place(parts_of_cells, counts.counts)
+        root, parts = divided(partition, most)
         (folder / "tiles").mkdir()
         writer = _Writer(folder, parts, partition.box, is_antialiased(source))
         _encode_all(writer, root, processes, report)
@@ -173,13 +152,13 @@ def new_folder(path: Path) -> Iterator[Path]:
         raise FileExistsError(f"{path} exists and is not an empty folder: remove it or choose another name")
     path.parent.mkdir(parents=True, exist_ok=True)
     for left in path.parent.glob(f".{glob.escape(path.name)}.{'[0-9a-f]' * 8}.partial"):
-        with suppress(OSError), _locked(left):
+        with suppress(OSError), locked(left):
             shutil.rmtree(left)
     unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
     unfinished.mkdir()
     held = ExitStack()
     with suppress(OSError):  # some file systems of networks have no locks
-        held.enter_context(_locked(unfinished))
+        held.enter_context(locked(unfinished))
     try:
         yield unfinished
         sync_to_disk(unfinished)
@@ -195,39 +174,29 @@ def new_folder(path: Path) -> Iterator[Path]:
         held.close()
 
 
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder; BlockingIOError: another process has it."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def tree(counts: Counts, most: int) -> tuple[Tile, npt.NDArray[np.int64]]:
-    """Make the tree; return its root, and the part of each cell."""
-    parts = np.full(len(counts.cells), -1, np.int64)
+def divided(partition: Partition, most: int) -> tuple[Tile, Parts]:
+    """Divide a model into parts of at most so many Gaussians; return the root of their tree, and them."""
+    keys, counts = partition.cells, partition.counts
+    parts = np.full(len(keys), -1, np.int64)
     number = first = 0
 
     def leaf(cells: npt.NDArray[np.int64]) -> Tile:
         nonlocal number
         parts[cells] = number
         number += 1
-        return Tile(int(counts.counts[cells].sum()), number - 1)
+        return Tile(int(counts[cells].sum()), number - 1)
 
     def tile(cells: npt.NDArray[np.int64], depth: int) -> Tile:
-        sizes = counts.counts[cells]
+        sizes = counts[cells]
         if sizes.sum() <= most or depth == BITS:
             return leaf(cells)
-        octants = counts.cells[cells] >> 3 * (BITS - 1 - depth) & 7
+        octants = keys[cells] >> 3 * (BITS - 1 - depth) & 7
         totals = np.bincount(octants, sizes, minlength=8)
         # Small eighths beside each other are one leaf.
         children, together = [], np.zeros(0, np.int64)
         for octant in np.flatnonzero(totals):
             inside = cells[octants == octant]
-            if len(together) and counts.counts[together].sum() + totals[octant] > most:
+            if len(together) and counts[together].sum() + totals[octant] > most:
                 children.append(leaf(together))
                 together = np.zeros(0, np.int64)
             if totals[octant] > most:
@@ -243,12 +212,12 @@ def tree(counts: Counts, most: int) -> tuple[Tile, npt.NDArray[np.int64]]:
         children = [one for child in children for one in (child.count < small and child.children or [child])]
         return Tile(min(most, max(1, sum(child.count for child in children) // _FEWER)), None, children)
 
-    root = tile(np.arange(len(counts.cells)), 0)
+    root = tile(np.arange(len(keys)), 0)
     for index, one in enumerate(root.every()):
         one.number = index
         if one.children:
             one.first, first = first, first + one.count
-    return root, parts
+    return root, partition.place(parts)
 
 
 @contextmanager
@@ -285,19 +254,12 @@ def _encode_all(writer: _Writer, root: Tile, processes: int, report: Report) -> 
 
 @dataclass(frozen=True)
 class _Writer:
-    """Writes files of tiles; may be sent to another process.
+    """Writes files of tiles; may be sent to another process."""
 
-    Attributes:
-        folder: of the tileset.
-        parts: the model's rows.
-        box: where most of the model is, [2, 3].
-        antialiased: whether viewers compensate the screen-space blur.
-    """
-
-    folder: Path
-    parts: Parts
-    box: Array
-    antialiased: bool
+    folder: Path  # of the tileset
+    parts: Parts  # the model's rows
+    box: Array  # where most of the model is, [2, 3]
+    antialiased: bool  # whether viewers compensate the screen-space blur
 
     @property
     def proxies(self) -> Path:
@@ -350,8 +312,7 @@ def _node(tile: Tile) -> tuple[dict[str, Any], Array]:
     nodes = [_node(child) for child in tile.children]
     if nodes:
         node["children"] = [child for child, _ in nodes]
-    every = np.stack([tile.box, *(box for _, box in nodes)])
-    box = np.stack([every[:, 0].min(axis=0), every[:, 1].max(axis=0)])
+    box = around([tile.box, *(box for _, box in nodes)])
     node["boundingVolume"] = {"box": _box(box)}
     return node, box
 
@@ -364,11 +325,6 @@ def _box(box: Array) -> list[float]:
 
 def upright(up: tuple[float, float, float]) -> Array:
     """Return the rotation [4, 4] that turns a direction to +Z by the shortest way."""
-    x, y, z = np.array(up, np.float64) / math.hypot(*up)
     turned = np.eye(4)
-    if z < -1 + 1e-12:
-        turned[:3, :3] = np.diag([1.0, -1.0, -1.0])
-        return turned
-    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
-    turned[:3, :3] += cross + cross @ cross / (1 + z)
+    turned[:3, :3] = shortest_turn(up, 2)
     return turned

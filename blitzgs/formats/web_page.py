@@ -15,14 +15,16 @@ import base64
 import html
 import json
 import zlib
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
+from blitzgs.formats.gaussians import Gaussians, unit_quats, without_largest
 from blitzgs.util.output import check_replaceable
 
 BLOCK = 256
@@ -34,36 +36,6 @@ _SAMPLE = 1 << 16
 
 Array = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class WebSplats:
-    """N Gaussians in an order that puts neighbours in space next to each other."""
-
-    means: npt.NDArray[np.float32]  # float32 [N, 3]
-    quats: npt.NDArray[np.float32]  # float32 [N, 4], w, x, y, z, of any length
-    scales: npt.NDArray[np.float32]  # float32 [N, 3], logarithms
-    opacities: npt.NDArray[np.float32]  # float32 [N] in [0, 1]
-    sh: npt.NDArray[np.float32]  # float32 [N, K, 3]
-    levels: Bytes | None = None  # octree levels, uint8 [N]; None: there are none
-
-    def __len__(self) -> int:
-        return len(self.means)
-
-    @property
-    def degree(self) -> int:
-        """The spherical-harmonics degree."""
-        return round(self.sh.shape[1] ** 0.5) - 1
-
-    def rows(self, rows: npt.NDArray[np.int64] | slice) -> WebSplats:
-        """Return some of the Gaussians."""
-        levels = None if self.levels is None else self.levels[rows]
-        means, quats, scales = self.means[rows], self.quats[rows], self.scales[rows]
-        return WebSplats(means, quats, scales, self.opacities[rows], self.sh[rows], levels)
-
-    def of_degree(self, degree: int) -> WebSplats:
-        """Return the Gaussians with a lower SH degree."""
-        return replace(self, sh=self.sh[:, : (degree + 1) ** 2])
 
 
 @dataclass(frozen=True)
@@ -102,18 +74,18 @@ def check_replaces_page(path: Path) -> None:
     check_replaceable(path, (mark,), ", and blitzgs did not write it")
 
 
-def packed(splats: WebSplats) -> bytes:
-    """Return the Gaussians as the page reads them, without base64."""
-    blocks = -(-len(splats) // BLOCK)
-    places, box = _quantised(splats.means, blocks, 65535)
-    sizes, sizes_range = _quantised(splats.scales, blocks, 255)
-    tints, tints_range = _quantised(splats.sh[:, 0], blocks, 255)
+def packed(splats: Gaussians) -> bytes:
+    """Return the Gaussians as the page reads them, without base64; their order puts neighbours together."""
+    blocks, sh = -(-len(splats) // BLOCK), splats.sh.numpy()
+    places, box = _quantised(splats.means.numpy(), blocks, 65535)
+    sizes, sizes_range = _quantised(splats.scales.numpy(), blocks, 255)
+    tints, tints_range = _quantised(sh[:, 0], blocks, 255)
     planes: list[npt.NDArray[np.generic]] = [box, sizes_range, tints_range]
-    planes += [places & 255, places >> 8, sizes, tints, _quaternion_bytes(splats.quats)]
-    planes.append(np.rint(splats.opacities[:, None].astype(np.float64) * 255))
+    planes += [places & 255, places >> 8, sizes, tints, _quaternion_bytes(splats)]
+    planes.append(np.rint(splats.opacities.sigmoid()[:, None].double().numpy() * 255))
     if splats.levels is not None:
-        planes.append(splats.levels[:, None])
-    rest = splats.sh[:, 1:].reshape(len(splats), -1)
+        planes.append(splats.levels[:, None].numpy())
+    rest = sh[:, 1:].reshape(len(splats), -1)
     planes.append(np.rint(rest / HARMONIC).clip(-127, 127).astype(np.int8).view(np.uint8))
     content = b"".join(
         (plane if plane.dtype == np.float32 else plane.astype(np.uint8).T).tobytes() for plane in planes
@@ -134,26 +106,19 @@ def _quantised(
     return codes, np.stack([least.T, step.T], axis=-1)
 
 
-def _quaternion_bytes(quats: npt.NDArray[np.float32]) -> Bytes:
+def _quaternion_bytes(splats: Gaussians) -> Bytes:
     """Return the rotations as 4 bytes each, [N, 4]; a zero quaternion is the identity."""
-    unit = quats.astype(np.float64)
-    unit[~unit.any(axis=1), 0] = 1
-    unit /= np.abs(unit).max(axis=1, keepdims=True)
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    left_out = np.abs(unit).argmax(axis=1)
-    unit *= np.sign(np.take_along_axis(unit, left_out[:, None], axis=1))
-    others = np.arange(4)[None] != left_out[:, None]
-    codes = np.rint((unit[others].reshape(-1, 3) * 2**0.5 + 1) / 2 * 1023).clip(0, 1023).astype(np.uint32)
-    words = codes[:, 0] | codes[:, 1] << 10 | codes[:, 2] << 20 | left_out.astype(np.uint32) << 30
-    return words.astype("<u4").view(np.uint8).reshape(-1, 4)
+    others, left_out = (part.numpy() for part in without_largest(unit_quats(splats.quats), 10))
+    words = others[:, 0] | others[:, 1] << 10 | others[:, 2] << 20 | left_out << 30
+    return np.asarray(words.astype("<u4").view(np.uint8).reshape(-1, 4))
 
 
-def estimated_bytes(splats: WebSplats) -> int:
+def estimated_bytes(splats: Gaussians) -> int:
     """Estimate the size of the Gaussians in the file from some blocks of them."""
     blocks = -(-len(splats) // BLOCK)
     chosen = np.unique(np.linspace(0, blocks - 1, min(blocks, _SAMPLE // BLOCK)).astype(np.int64))
     rows = (chosen[:, None] * BLOCK + np.arange(BLOCK)).ravel()
-    some = splats.rows(rows[rows < len(splats)])
+    some = splats.rows(torch.from_numpy(rows[rows < len(splats)]))
     return int(len(packed(some)) * 4 / 3 * len(splats) / max(1, len(some)))
 
 
@@ -167,7 +132,7 @@ def frame_bytes() -> int:
     return sum(len(_part(name)) for name in ("page.html", *_PARTS)) + 2000
 
 
-def web_page(splats: WebSplats, scene: WebScene, title: str, left_out: str = "") -> str:
+def web_page(splats: Gaussians, scene: WebScene, title: str, left_out: str = "") -> str:
     """Return the page.
 
     `splats`: at least one Gaussian. `left_out`: what the file lacks of the model, for the reader of the page;

@@ -6,12 +6,13 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from blitzgs.runs.evaluation import FOLDER, INDEX, METRICS, PARTS, preview_file
 from blitzgs.runs.folder import RunFolder, open_run
 from blitzgs.viewer.world import horizontal, up_direction
 
+T = TypeVar("T")
 Point = tuple[float, float | None, float]
 # A curve has at most this many points: means of its records.
 MAX_POINTS = 500
@@ -49,6 +51,11 @@ class RunData:
     frame: WorldFrame | None = None  # where the capture lies in the world
 
     @property
+    def figures(self) -> dict[str, float]:
+        """The numbers of the summary."""
+        return {name: value for name, value in self.summary.items() if isinstance(value, (int, float))}
+
+    @property
     def is_test(self) -> bool:
         """Whether the measured views are held out."""
         return self.cameras is None or bool(self.cameras.test)
@@ -63,9 +70,7 @@ def read_run(path: Path) -> RunData:
     except ValueError as error:
         data.problems.append(f"{error}.")
     records = [record for record in folder.log() if isinstance(record, dict) and _is_number(record.get("t"))]
-    identity = next(
-        (record.get("run") for record in reversed(records) if record.get("event") == "start"), None
-    )
+    identity = _start_of(records).get("run")
     data.log = [record for record in records if record.get("run") == identity]
     try:
         if (path / CAMERAS).exists():
@@ -76,9 +81,7 @@ def read_run(path: Path) -> RunData:
         data.problems.append(f"{error}.")
     evaluations = path / run_files.EVALUATION
     found = [
-        file
-        for file in evaluations.glob("*/metrics.json")
-        if file.parent.name.isdigit() or file.parent.name == "test"
+        file for file in evaluations.glob("*/metrics.json") if re.fullmatch(r"\d+|test", file.parent.name)
     ]
     if found:
         newest = max(found, key=lambda file: file.stat().st_mtime)
@@ -142,17 +145,16 @@ def warnings_of(data: RunData) -> list[tuple[float, str, str]]:
 
 def environment(data: RunData) -> dict[str, object]:
     """Return where the run was trained: versions, device, transport."""
-    start: dict[str, Any] = next(
-        (record for record in reversed(data.log) if record.get("event") == "start"), {}
-    )
+    start = _start_of(data.log)
     found = {name: value for name, value in start.items() if name not in _NO_ENVIRONMENT}
     found |= _mapping(data.summary.get("versions"))
-    views = {name: start[name] for name in ("train", "test") if name in start}
-    return (
-        found
-        | {f"{name} views": value for name, value in views.items()}
-        | {"run": data.summary.get("run", "")}
-    )
+    found |= {f"{name} views": start[name] for name in ("train", "test") if name in start}
+    return found | {"run": data.summary.get("run", "")}
+
+
+def _start_of(records: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the record of the newest start; empty: there is none."""
+    return next((record for record in reversed(records) if record.get("event") == "start"), {})
 
 
 def plan(data: RunData) -> dict[str, Any] | None:
@@ -194,44 +196,35 @@ def _other_views(data: RunData) -> dict[str, dict[str, float]]:
         *sorted(folder.glob(f"*/{run_files.TRAINED_VIEWS}")),
         *(folder / split / "metrics.json" for split in ("all", "train")),
     ):
-        if file.exists():
-            found |= _views_of(file, data.problems)
+        found |= _views_of(file, data.problems)
     return found
 
 
 def exposures(data: RunData) -> list[list[Any]]:
     """Return [name, gain R, G, B, bias R, G, B] of the training photographs; empty without exposures."""
-    path = data.folder.path / EXPOSURES
-    if not path.exists():
-        return []
-    try:
-        content = _mapping(json.loads(path.read_text(encoding="utf-8")))
+
+    def listed(content: Any) -> list[list[Any]]:
         rows = [
             [short_name(str(name)), *(float(part) for row in values for part in row)]
             for name, values in content.items()
         ]
         if any(len(row) != 7 for row in rows):
             raise ValueError("an exposure has another number of values")
-    except (OSError, ValueError, TypeError, RecursionError) as error:
-        data.problems.append(f"{path} is damaged ({error}).")
-        return []
-    return [rows[index] for index in evenly(list(range(len(rows))), MAX_LISTED)]
+        return [rows[index] for index in evenly(list(range(len(rows))), MAX_LISTED)]
+
+    return _parsed(data.folder.path / EXPOSURES, data.problems, listed, [])
 
 
 def pictured(data: RunData) -> dict[str, int]:
     """Return the cameras of the newest evaluation that have previews, by the names of their views."""
     if data.measured is None or data.cameras is None:
         return {}
-    path = data.measured / FOLDER / INDEX
-    try:
-        indices = json.loads(path.read_text(encoding="utf-8"))
-        cameras = data.cameras.cameras
-        return {cameras[index].name: index for index in indices if cameras[index].name in data.views}
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
-        data.problems.append(f"{path} is damaged ({error}).")
-        return {}
+    cameras, views = data.cameras.cameras, data.views
+
+    def known(indices: Any) -> dict[str, int]:
+        return {cameras[index].name: index for index in indices if cameras[index].name in views}
+
+    return _parsed(data.measured / FOLDER / INDEX, data.problems, known, {})
 
 
 def layers(data: RunData, index: int) -> dict[str, str] | None:
@@ -244,6 +237,12 @@ def layers(data: RunData, index: int) -> dict[str, str] | None:
             return None
         found[part] = "data:image/webp;base64," + base64.b64encode(content).decode()
     return found
+
+
+def stages(data: RunData) -> dict[str, float]:
+    """Return the seconds of the stages of the training."""
+    found = _mapping(data.summary.get("stages"))
+    return {str(name): round(value, 2) for name, value in found.items() if isinstance(value, (int, float))}
 
 
 def subtitle(data: RunData) -> str:
@@ -275,15 +274,24 @@ def digits(value: float, count: int = 5) -> float:
 
 
 def _views_of(file: Path, problems: list[str]) -> dict[str, dict[str, float]]:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+    def numbers(content: Any) -> dict[str, dict[str, float]]:
         return {
             str(name): {metric: float(value) for metric, value in view.items() if _is_number(value)}
             for name, view in content["views"].items()
         }
+
+    return _parsed(file, problems, numbers, {})
+
+
+def _parsed(path: Path, problems: list[str], convert: Callable[[Any], T], missing: T) -> T:
+    """Return what is made of a JSON file; `missing` if there is none, or if it is damaged, which is noted."""
+    try:
+        return convert(json.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        return missing
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        problems.append(f"{file} is damaged ({error}).")
-        return {}
+        problems.append(f"{path} is damaged ({error}).")
+        return missing
 
 
 def _mapping(value: object) -> dict[str, Any]:

@@ -102,13 +102,13 @@ def report(folder: Path, look: Mapping[str, str] | None = None) -> str:
     content = {
         "name": folder.resolve().name,
         "subtitle": gather.subtitle(data),
-        "summary": {name: value for name, value in data.summary.items() if isinstance(value, (int, float))},
+        "summary": data.figures,
         "split": "test" if data.is_test else "train",
         "metrics": metrics,
         "views": list(gather.rows_of(data.views, metrics)),
         "pictures": _pictures(data),
         "curves": gather.curves(data),
-        "stages": _stages(data),
+        "stages": gather.stages(data),
         "cameras": gather.plan(data),
         "exposures": gather.exposures(data),
         "warnings": gather.warnings_of(data),
@@ -144,13 +144,6 @@ def _pictures(data: RunData) -> list[dict[str, Any]]:
             shown = [{"label": part, "src": layers[part]} for part in ("photograph", "render", "error")]
             found.append({"name": gather.short_name(name), "note": note, "layers": shown})
     return found
-
-
-def _stages(data: RunData) -> dict[str, float]:
-    stages = data.summary.get("stages")
-    if not isinstance(stages, dict):
-        return {}
-    return {str(name): round(value, 2) for name, value in stages.items() if isinstance(value, (int, float))}
 
 
 def _text(path: Path) -> str:
@@ -194,13 +187,7 @@ def compare(folders: Sequence[Path]) -> str:
         "subtitle": "; ".join(str(folder.resolve()) for folder in folders),
         "metrics": metrics,
         "runs": [
-            {
-                "name": name,
-                "curves": gather.curves(run),
-                "summary": {
-                    key: value for key, value in run.summary.items() if isinstance(value, (int, float))
-                },
-            }
+            {"name": name, "curves": gather.curves(run), "summary": run.figures}
             for name, run in zip(names, runs, strict=True)
         ],
         "differences": differences([to_dict(run.folder.config()) for run in runs]),

@@ -13,8 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from blitzgs.capture.cameras import Float64
-from blitzgs.capture.colmap import rotation_to_quat
 from blitzgs.capture.world import GEO, WorldFrame, read_world_frame
 from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
@@ -26,6 +24,7 @@ from blitzgs.runs.folder import Model
 from blitzgs.runs.run_files import Progress, TrainedModel
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.output import write_file
+from blitzgs.util.rotations import quaternions
 from blitzgs.view.gate import LodGate
 from blitzgs.view.views import Space
 
@@ -60,7 +59,7 @@ def in_world(model: Model, frame: WorldFrame) -> Model:
     return replace(
         model,
         means=(model.means.double() @ rotation.T).float(),
-        quats=_product(rotation_to_quat(frame.rotation), model.quats.double()).float(),
+        quats=_product(quaternions(rotation[None])[0], model.quats.double()).float(),
         sh=rotated_harmonics(model.sh, rotation),
         space=moved,
     )
@@ -85,7 +84,7 @@ def rotated_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
     return out
 
 
-def _product(left: Float64, right: Tensor) -> Tensor:
+def _product(left: Tensor, right: Tensor) -> Tensor:
     """Return the products of a quaternion [4] and quaternions [N, 4], w, x, y, z."""
     w, x, y, z = left.tolist()
     rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
@@ -113,6 +112,12 @@ def trained_columns(found: Gaussians, space: Space, ranks: Ranks) -> dict[str, T
     return {name: column.contiguous() for name, column in columns.items()}
 
 
+def trained_table(found: Gaussians, space: Space, ranks: Ranks) -> GaussianTable:
+    """Return this rank's Gaussians on its device, in the order of `trained_columns`, for rendering only."""
+    columns = trained_columns(found, space, ranks)
+    return GaussianTable.of_parameters({name: column.to(ranks.device) for name, column in columns.items()})
+
+
 def gate_of(found: Gaussians, unit: float) -> LodGate | None:
     """Return the LOD gate in a header of `blitzgs export`; `unit` is a trained unit in the file's."""
     pattern = r"comment lod reference_distance (\S+) fork (\S+) levels (\d+) finest (\d+)( smooth)?"
@@ -125,8 +130,6 @@ def gate_of(found: Gaussians, unit: float) -> LodGate | None:
 
 def model_of_file(found: Gaussians, config: Config, space: Space, near: float, ranks: Ranks) -> TrainedModel:
     """Return a model to be rendered in the views of a capture; `near` is in the capture's unit."""
-    columns = trained_columns(found, space, ranks)
-    table = GaussianTable.of_parameters({name: column.to(ranks.device) for name, column in columns.items()})
     progress = Progress(step=0, sh_degree=found.degree, level_count=1, peak_gaussians=len(found), seconds=0.0)
-    near /= space.unit * space.extent
-    return TrainedModel(changed(config, "model", near=near), progress, space, table)
+    config = changed(config, "model", near=near / (space.unit * space.extent))
+    return TrainedModel(config, progress, space, trained_table(found, space, ranks))

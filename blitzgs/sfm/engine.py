@@ -10,7 +10,6 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.colmap import Float64, read_model
+from blitzgs.util.errors import warn
 
 _PAIR_IDS = 2147483647  # the id of a pair of images a < b is this number times a, plus b
 
@@ -141,9 +141,8 @@ def run_stage(stage: str, job: Job, log: Path, lock: int, report: Report) -> Non
             if "bundle_adjuster" not in command:
                 raise
             shutil.rmtree(command[command.index("--output_path") + 1])  # `adopt` keeps the model before
-            warnings.warn(
-                f"the principal point stays in the middle of the photographs, as refining it failed: {error}",
-                stacklevel=2,
+            warn(
+                f"the principal point stays in the middle of the photographs, as refining it failed: {error}"
             )
 
 

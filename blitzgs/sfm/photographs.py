@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import re
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -13,14 +12,14 @@ from pathlib import Path, PurePosixPath
 import cv2
 import numpy as np
 
-from blitzgs.capture.check_files import damaged
 from blitzgs.capture.colmap import Float64, find_incomplete_model, find_models
 from blitzgs.capture.image_files import decode_mask, read_header, read_whole
-from blitzgs.capture.masks import find_masks
+from blitzgs.capture.masks import damaged, find_masks
 from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, to_convert
 from blitzgs.capture.projects.find import find_project
 from blitzgs.capture.transforms import find_transforms
 from blitzgs.sfm.engine import MOST_IN_ALL_PAIRS
+from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 
 # Files and folders of what programs write beside photographs.
@@ -83,7 +82,7 @@ class Photographs:
             what = "has no photographs" if folder.is_dir() else "is no folder of photographs"
             raise FileNotFoundError(f"{folder} {what} ({', '.join(IMAGE_SUFFIXES)}){others}")
         if others:
-            warnings.warn(f"{folder}: only its {len(names)} photographs are used{others}", stacklevel=2)
+            warn(f"{folder}: only its {len(names)} photographs are used{others}")
         root = folder if (folder / "masks").is_dir() else folder.parent
         masks = find_masks(root, None, names, [None] * len(names))
         problems = damaged([(folder / name, mask) for name, mask in zip(names, masks, strict=True)])

@@ -6,12 +6,9 @@ The folder `sfm/` of the capture has COLMAP's database, its messages, what is fi
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +29,7 @@ from blitzgs.sfm.engine import (
 )
 from blitzgs.sfm.photographs import Photographs, judge_positions
 from blitzgs.sfm.report import Reconstruction, examine
-from blitzgs.util.output import write_file
+from blitzgs.util.output import locked, write_file
 from blitzgs.util.progress import image_progress
 
 PAIRS = ("auto", "gps", "sequence", "exhaustive")
@@ -56,6 +53,11 @@ def is_finished(capture: Path) -> bool:
     return (capture / WORK / "report.json").is_file()
 
 
+def at_work(folder: Path) -> AbstractContextManager[int]:
+    """Return what keeps others out of the folder `WORK` of a capture; COLMAP's processes hold it too."""
+    return locked(folder / "lock", f"another blitzgs sfm is at work in {folder}: wait for its end")
+
+
 def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> Reconstruction:
     """Find the poses of photographs and write a capture, whose `images` is a link to their folder.
 
@@ -74,7 +76,7 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
             f"{capture} has a model that blitzgs sfm did not make: choose another folder for the capture"
         )
     work.mkdir(parents=True, exist_ok=True)
-    with locked(work / "lock") as lock:
+    with at_work(work) as lock:
         state = _state(work, photographs, settings)
         masks = photographs.write_masks(work / "masks")
         paths = [str((work / name).absolute()) for name in ("database.db", "models", "georeference.json")]
@@ -145,22 +147,6 @@ def _state(work: Path, photographs: Photographs, settings: Settings) -> dict[str
     state = {**before, "photographs": identity, "settings": chosen}
     write_file(path, json.dumps(state))
     return state
-
-
-@contextmanager
-def locked(path: Path) -> Iterator[int]:
-    """Hold a lock, which COLMAP's processes inherit: one that outlives this process keeps others out."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BlockingIOError(
-                f"another blitzgs sfm is at work in {path.parent}: wait for its end"
-            ) from None
-        yield descriptor
-    finally:
-        os.close(descriptor)
 
 
 def _write_capture(model: Path, photographs: Photographs, capture: Path) -> None:

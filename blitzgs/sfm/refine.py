@@ -17,12 +17,13 @@ from blitzgs.capture.colmap import (
     ColmapCamera,
     ColmapModel,
     Float64,
+    complete_files,
     find_models,
     read_model,
     world_to_camera,
 )
 from blitzgs.sfm.engine import has_pycolmap, run_pycolmap
-from blitzgs.sfm.reconstruct import WORK, locked
+from blitzgs.sfm.reconstruct import WORK, at_work
 from blitzgs.sfm.report import misses
 from blitzgs.util.progress import image_progress
 
@@ -90,7 +91,7 @@ def refine(root: Path, capture: Path) -> Refined:
         raise FileExistsError(f"{capture} is not empty: choose another folder for the refined capture")
     work = capture / WORK
     work.mkdir(parents=True, exist_ok=True)
-    with locked(work / "lock") as lock, image_progress("poses", unit="rounds") as report:
+    with at_work(work) as lock, image_progress("poses", unit="rounds") as report:
         (found := work / "models").mkdir(exist_ok=True)
         job = {"model": str(folder.absolute()), "refined": str(found), "miss": float(np.nanmedian(missed))}
 
@@ -102,8 +103,7 @@ def refine(root: Path, capture: Path) -> Refined:
     refined = _compare(model, missed, read_model(found, points2d=True))
     source = found if refined.adopted else folder
     (sparse := capture / "sparse" / "0").mkdir(parents=True)
-    kinds = [[source / (name + suffix) for name in FILES] for suffix in (".bin", ".txt")]
-    for file in next(files for files in kinds if all(file.is_file() for file in files)):  # as `read_model`
+    for file in (complete_files(source) or {}).values():
         shutil.copyfile(file, sparse / file.name)
     shutil.rmtree(found)
     _link_others(root, folder, capture)

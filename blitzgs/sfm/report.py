@@ -15,7 +15,7 @@ import numpy.typing as npt
 from blitzgs.capture.cameras import SourceView, camera_centres
 from blitzgs.capture.colmap import ColmapModel, Float64, count_images, read_model, world_to_camera
 from blitzgs.capture.lengths import find_apart
-from blitzgs.capture.lens import Lens
+from blitzgs.capture.lens import lenses_of
 from blitzgs.sfm.engine import Found, Job, read_found, read_positions
 from blitzgs.sfm.photographs import Photographs
 from blitzgs.util.output import write_file
@@ -83,7 +83,7 @@ def examine(
 ) -> Reconstruction:
     """Check the largest of several models, and write report.json and cameras.png into the folder `work`."""
     model = read_model(models[0], points2d=True)
-    lenses = {c.id: Lens(c.model, c.width, c.height, tuple(c.params.tolist())) for c in model.cameras}
+    lenses = lenses_of(model.cameras)
     poses, names = world_to_camera(model.images), model.images.names
     views = [
         SourceView(name, photographs.folder / name, None, lenses[camera], pose)
@@ -132,7 +132,7 @@ def misses(model: ColmapModel) -> Float64:
 
     NaN: it has no point, or the lens does not see the point.
     """
-    lenses = {c.id: Lens(c.model, c.width, c.height, tuple(c.params.tolist())) for c in model.cameras}
+    lenses = lenses_of(model.cameras)
     order = np.argsort(model.points.ids)
     ids, positions = model.points.ids[order], model.points.positions[order]
     offsets, found = model.images.point2d_offsets.tolist(), np.full((len(model.images.points2d), 2), np.nan)

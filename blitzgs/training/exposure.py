@@ -170,10 +170,10 @@ def exposures_differ(gains: Tensor) -> bool:
 
 def _observed_points(capture: Capture) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]] | None:
     """Return the points, [M, 3] re-centred, and those that each training photograph has in its tracks."""
-    folder = colmap.find_model(Path(capture.root))
-    if folder is None:
+    models = colmap.find_models(Path(capture.root))
+    if not models:
         return None
-    model = colmap.read_model(folder, points2d=True)
+    model = colmap.read_model(models[0][0], points2d=True)
     names = {name: place for place, name in enumerate(model.images.names)}
     wanted = [capture.cameras[index].name for index in capture.train]
     ids = model.points.ids

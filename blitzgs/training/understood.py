@@ -48,7 +48,7 @@ def check_worlds(capture: Capture) -> None:
     if capture.about.blind == views:
         raise HopelessCaptureError(
             f"{views} of {views} views see none of the {len(capture.points):,} points, so there is nothing "
-            f"to train: the cameras of {capture.about.source.cameras} and the points have different worlds "
+            f"to train: the cameras of {capture.about.cameras} and the points have different worlds "
             "(give points that were reconstructed with these cameras, in the same coordinates), or the "
             "cameras look along another axis than +z (COLMAP) or -z (transforms.json)"
         )
@@ -60,7 +60,7 @@ def understood(config: Config, capture: Capture, images: ImageStore) -> list[str
     near = config.model.near * capture.extent or capture.near
     _warn_of_pictures(capture, pictures, near)
     lines = [
-        ("capture", f"{capture.root}, cameras of {capture.about.source.cameras}"),
+        ("capture", f"{capture.root}, cameras of {capture.about.cameras}"),
         ("photographs", _photographs(capture)),
         ("held out", _held_out(capture)),
         ("stray cameras", _strays(capture)),
@@ -70,7 +70,7 @@ def understood(config: Config, capture: Capture, images: ImageStore) -> list[str
         ("points", _points(capture)),
         ("exposure", _exposure(pictures)),
         ("extent", f"{capture.extent:.6g}; near plane {near:.4g} ({_why_near(config, capture)})"),
-        *(("note", note) for note in capture.about.source.notes),
+        *(("note", note) for note in capture.about.notes),
     ]
     # A name may have characters that a terminal would obey.
     return [f"{name + ':':15}{printable(text)}" for name, text in lines]
@@ -139,7 +139,7 @@ def _photographs(capture: Capture) -> str:
     about = capture.about
     parts = [f"{len(capture.cameras)} used: {len(capture.train)} to train, {len(capture.test)} held out"]
     for count, text in (
-        (about.source.without_camera, "without a camera"),
+        (about.without_camera, "without a camera"),
         (about.unused, "in no list of the capture's split"),
         (about.missing, "not on disk"),
         (about.damaged, "damaged"),
@@ -157,7 +157,7 @@ def _held_out(capture: Capture) -> str:
 
 
 def _why_split(capture: Capture) -> str:
-    source = capture.about.source.split
+    source = capture.about.split_from
     own = capture.about.split == "the capture's own split"
     return f"{capture.about.split}, {source}" if own and source else capture.about.split
 

@@ -1,21 +1,60 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors with a remedy: arguments of the wrong type, and memory that does not suffice."""
+"""What a user is told: warnings and errors at the right place, arguments of a wrong type, too little memory.
+
+Torch is imported where it is needed, as what warns may do without.
+"""
 
 from __future__ import annotations
 
 import re
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
 from numbers import Real
+from typing import TYPE_CHECKING, Any
 
 import psutil
-import torch
-from torch import Tensor
 
 from blitzgs.util.terminal import amount
+
+if TYPE_CHECKING:
+    import torch
+
+
+def warn(text: str) -> None:
+    """Warn of a user's data; the warning is that of the line that called this package."""
+    level, frame = 2, sys._getframe(1).f_back
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "blitzgs":
+        level, frame = level + 1, frame.f_back
+    warnings.warn(text, stacklevel=level + 1)
+
+
+@contextmanager
+def located(where: str) -> Iterator[None]:
+    """Put a place before the text of a ValueError that leaves the context."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+
+
+def optional_package(name: str, extra: str, what: str) -> Any:
+    """Return a package of one of the extras; `what` needs it (ImportError: it cannot be imported)."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ImportError(
+            f'{what} needs the package {name} ({error}): pip install "blitzgs[{extra}]"'
+        ) from error
 
 
 def check_tensor(name: str, value: object) -> None:
     """Raise a TypeError unless a value is a tensor."""
-    if isinstance(value, Tensor):
+    import torch
+
+    if isinstance(value, torch.Tensor):
         return
     hint = ": convert it with torch.from_numpy" if type(value).__module__ == "numpy" else ""
     raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}{hint}")
@@ -39,6 +78,8 @@ class NotEnoughMemoryError(MemoryError, RuntimeError):
 
 def is_lack_of_memory(error: BaseException) -> bool:
     """Tell whether an error is that of a failed allocation."""
+    import torch
+
     if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
         return True
     return isinstance(error, RuntimeError) and _MESSAGES.search(str(error)) is not None
@@ -62,6 +103,8 @@ def explain_memory(
 
 def _free(device: torch.device) -> int:
     """Return the bytes that are free on a device."""
+    import torch
+
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
     return int(psutil.virtual_memory().available)

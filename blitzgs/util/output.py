@@ -8,6 +8,7 @@ equal when their suffix is replaced. `OutputFolder` makes paths of them for whic
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import os
 import re
@@ -223,6 +224,24 @@ def _identity(path: Path) -> tuple[int, int] | None:
 def is_lack_of_space(error: OSError) -> bool:
     """Tell whether an error would not have happened with more space on the disk."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+@contextmanager
+def locked(path: Path, busy: str = "") -> Iterator[int]:
+    """Hold the lock of a folder, or of a file that is made for it; yields its descriptor.
+
+    Processes that inherit the descriptor hold the lock too, until they end. BlockingIOError: another process
+    has it; `busy` is the message.
+    """
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BlockingIOError(busy) from None
+        yield descriptor
+    finally:
+        os.close(descriptor)
 
 
 def sync_to_disk(path: Path) -> None:

@@ -8,8 +8,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
-from blitzgs.capture.colmap import rotation_to_quat
+from blitzgs.util.rotations import quaternions
 from blitzgs.viewer.world import Exhibit, World
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class Frustums:
                 thickness=1.5,
                 thickness_units="screen",
                 color=TEST_COLOUR if index in test else TRAIN_COLOUR,
-                wxyz=rotation_to_quat(stance.rotation),
+                wxyz=quaternions(torch.from_numpy(stance.rotation)[None])[0].numpy(),
                 position=stance.position,
                 cast_shadow=False,
                 receive_shadow=False,

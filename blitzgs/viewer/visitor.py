@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
-from blitzgs.capture.colmap import quats_to_rotations
+from blitzgs.util.rotations import quaternion_matrices
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Look, Picture
 from blitzgs.viewer import compare
@@ -101,7 +102,8 @@ class Visitor:
 
     def _read(self) -> Stance:
         camera = self.client.camera
-        rotation = quats_to_rotations(np.array([camera.wxyz], dtype=np.float64))[0]
+        wxyz = torch.tensor(tuple(camera.wxyz), dtype=torch.float64)
+        rotation = quaternion_matrices((wxyz / wxyz.norm())[None])[0].numpy()
         return Stance(np.array(camera.position, dtype=np.float64), rotation, float(camera.fov))
 
     def _on_camera(self, _: object) -> None:

@@ -5,27 +5,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from blitzgs.capture.world import GEO, GEOCENTRIC, WorldFrame, converted, pyproj_module, read_world_frame
+from blitzgs.capture.world import GEOCENTRIC, WorldFrame, converted, reference_system
 from blitzgs.config.fields import Config, ModelConfig
-from blitzgs.formats.gaussians import GaussianSource, is_antialiased
+from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased
 from blitzgs.formats.models import offset_of, open_gaussians
 from blitzgs.formats.selection import opacity_length
 from blitzgs.formats.tiles import upright
-from blitzgs.formats.web_page import WebLevels, WebScene, WebSplats, estimated_bytes, frame_bytes, web_page
+from blitzgs.formats.web_page import WebLevels, WebScene, estimated_bytes, frame_bytes, web_page
 from blitzgs.frame.render import RenderOptions
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, load_cameras
 from blitzgs.runs.clean import contributions as measured
 from blitzgs.runs.export import open_source
+from blitzgs.runs.world import load_world_frame
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import PARAMETERS, GaussianTable
+from blitzgs.util.errors import located
 from blitzgs.view.gate import ModelGate
 from blitzgs.view.views import CameraLike, Space, render_options
 from blitzgs.viewer.studio import Opened, box_of
@@ -66,7 +68,7 @@ def web_file(opened: Opened, max_bytes: int) -> WebFile:
     splats, visible = _splats(table, rows, degree, levels), len(rows)
     while degree > 0 and estimated_bytes(splats) > space:
         degree -= 1
-        splats = splats.of_degree(degree)
+        splats = _of_degree(splats, degree)
     scene = _scene(opened)
     kept = min(visible, int(0.99 * visible * space / estimated_bytes(splats)))
     if kept < visible:
@@ -111,20 +113,16 @@ def contributions(opened: Opened) -> Tensor:
     return measured(table, cameras, exhibit.space, subject.options, opened.ranks, subject.lod).score
 
 
-def _splats(table: GaussianTable, rows: Tensor, degree: int, levels: bool) -> WebSplats:
+def _splats(table: GaussianTable, rows: Tensor, degree: int, levels: bool) -> Gaussians:
     rows = rows[morton_order(table["means"][rows])]
+    names = ["means", "quats", "scales", "opacities", "sh", *(["level"] if levels else [])]
+    means, quats, scales, opacities, sh, *level = (table[name][rows].cpu() for name in names)
+    found = Gaussians(means, quats, scales, opacities, sh, levels=level[0] if level else None)
+    return _of_degree(found, degree)
 
-    def column(name: str) -> np.ndarray:
-        return table[name][rows].cpu().numpy()
 
-    return WebSplats(
-        means=column("means"),
-        quats=column("quats"),
-        scales=column("scales"),
-        opacities=table["opacities"][rows].sigmoid().cpu().numpy(),
-        sh=column("sh")[:, : (degree + 1) ** 2],
-        levels=column("level") if levels else None,
-    )
+def _of_degree(splats: Gaussians, degree: int) -> Gaussians:
+    return replace(splats, sh=splats.sh[:, : (degree + 1) ** 2])
 
 
 def _scene(opened: Opened) -> WebScene:
@@ -206,8 +204,7 @@ def open_city(path: Path, checked: bool = True) -> City:
         source, offset = run, np.array(run.space.offset)
         if (folder / CAMERAS).exists():
             cameras = load_cameras(folder).cameras
-        if (folder / GEO).is_file():
-            frame = read_world_frame(folder / GEO)
+        frame = load_world_frame(folder)
     first = next(iter(source.blocks()), None)
     if first is None or len(first) == 0:
         raise ValueError(f"{path} holds no Gaussians")
@@ -236,12 +233,8 @@ def to_globe(frame: WorldFrame, origin: Array) -> Array:
     # Central differences over this length, in the unit of the capture.
     step = 10.0
     places = origin + step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    pyproj = pyproj_module()
-    try:
-        system = pyproj.CRS.from_user_input(frame.crs).to_3d()
-        globe = converted(frame.to_world(places), system, GEOCENTRIC)
-    except (ValueError, pyproj.exceptions.CRSError) as error:
-        raise ValueError(f"{frame.source}: {error}") from error
+    with located(frame.source):
+        globe = converted(frame.to_world(places), reference_system(frame.crs).to_3d(), GEOCENTRIC)
     matrix = np.eye(4)
     matrix[:3, :3] = (globe[1:4] - globe[4:]).T / (2 * step)
     matrix[:3, 3] = globe[0]

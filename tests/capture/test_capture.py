@@ -37,7 +37,7 @@ def test_recentred_world_projects_points_where_the_original_does(tmp_path):
     far = np.array([4.5e5, 5.2e6, 120.0])  # a capture in UTM coordinates
 
     def move(m):
-        rotations = colmap.quats_to_rotations(m.images.quats)
+        rotations = colmap.world_to_camera(m.images)[:, :3, :3]
         m.images.translations = m.images.translations - np.einsum("nij,j->ni", rotations, far)
         m.points.positions = m.points.positions + far
 

@@ -5,9 +5,8 @@ import cv2
 import numpy as np
 import pytest
 
-from blitzgs.capture import check_files
+from blitzgs.capture import masks
 from blitzgs.capture.capture import load_capture
-from blitzgs.capture.check_files import read_mask_file
 from blitzgs.capture.image_files import (
     check_photograph,
     decode_mask,
@@ -17,6 +16,7 @@ from blitzgs.capture.image_files import (
     read_whole,
 )
 from blitzgs.capture.images import ImageStore
+from blitzgs.capture.masks import read_mask_file
 from tests.capture.helpers import smooth_image, tiff, write_capture, write_image
 from tests.helpers import refused
 
@@ -202,7 +202,7 @@ def test_a_photograph_that_was_read_is_not_checked_again(tmp_path, monkeypatch):
     store = ImageStore(load_capture(write_capture(tmp_path, names)))
     store.get(3), store.get(4)
     checked = []
-    monkeypatch.setattr(check_files, "check_photograph", lambda path: not checked.append(path.name))
+    monkeypatch.setattr(masks, "check_photograph", lambda path: not checked.append(path.name))
     store.check_files(range(9)).wait()
     assert checked == [names[index] for index in (0, 8, 1, 2, 5, 6, 7)]
     store.close()

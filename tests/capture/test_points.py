@@ -281,8 +281,8 @@ def test_a_colmap_model_takes_points_and_an_offset_from_files_beside_it(tmp_path
     (tmp_path / "site.prj").write_text("EPSG:32633")
     loaded = load_capture(tmp_path)
     np.testing.assert_allclose(loaded.points + loaded.offset, points, atol=1e-4)
-    assert loaded.about.source.frame.crs == "EPSG:32633"
-    np.testing.assert_array_equal(loaded.about.source.frame.to_world(np.zeros(3)), [412345.5, 5654321.25, 0])
+    assert loaded.about.frame.crs == "EPSG:32633"
+    np.testing.assert_array_equal(loaded.about.frame.to_world(np.zeros(3)), [412345.5, 5654321.25, 0])
     (tmp_path / "offset.xyz").write_text("412345.5 nan 0\n")
     refused(ValueError, "translation finite", load_capture, tmp_path)
 

@@ -132,7 +132,7 @@ def test_lists_are_followed_exactly(tmp_path, train, val, test):
     assert capture.about.unused == (0 if train is None else len(FRAMES) - len({*trained, *held_out}))
     assert len(capture.cameras) == len(FRAMES) - capture.about.unused
     own = capture.about.split == "the capture's own split"
-    assert own == bool(lists) and all(key in capture.about.source.split for key in lists)
+    assert own == bool(lists) and all(key in capture.about.split_from for key in lists)
     # A split that is asked for uses all frames.
     assert len(split_of(tmp_path, split=3)[2].cameras) == len(FRAMES)
 
@@ -173,7 +173,7 @@ def test_the_files_of_blenders_split_are_all_read(tmp_path, parts):
     assert train == names["train"] and test == [
         n for part in ("val", "test") if part in parts for n in names[part]
     ]
-    assert capture.about.source.split == " and ".join(f"transforms_{part}.json" for part in parts)
+    assert capture.about.split_from == " and ".join(f"transforms_{part}.json" for part in parts)
 
 
 def test_what_is_beside_transforms_json_is_named(tmp_path):
@@ -203,11 +203,11 @@ def test_the_largest_of_several_models_is_read(tmp_path, counts, text):
         UserWarning, match=f"of {len(counts)} COLMAP models, the largest is used: sparse/{best} "
     ):
         capture = load_capture(tmp_path)
-    assert len(capture.cameras) == max(counts) and capture.about.source.cameras == f"sparse/{best}"
+    assert len(capture.cameras) == max(counts) and capture.about.cameras == f"sparse/{best}"
     other = len(counts) - 1
     named = load_capture(tmp_path, sparse=f"sparse/{other}")
     assert len(named.cameras) == counts[other]
-    assert named.about.source.without_camera == max(counts) - counts[other]
+    assert named.about.without_camera == max(counts) - counts[other]
     everything = load_capture(tmp_path, sparse="all")
     assert len(everything.cameras) == max(counts) and len(everything.points) == 20 * len(counts)
     with pytest.raises(FileNotFoundError, match="data.sparse: .*sparse/77 has no complete COLMAP model"):
@@ -223,7 +223,7 @@ def test_a_damaged_model_is_not_the_largest(tmp_path):
 def test_a_single_model_of_another_number_is_read(tmp_path):
     write_capture(tmp_path, ["0.png", "1.png", "2.png"])
     (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "1")
-    assert load_capture(tmp_path).about.source.cameras == "sparse/1"
+    assert load_capture(tmp_path).about.cameras == "sparse/1"
 
 
 @pytest.mark.parametrize("form", ["colmap", "transforms"])
@@ -236,7 +236,7 @@ def test_photographs_without_a_camera_are_counted(tmp_path, form):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", ".*no points|.*see none")
-        assert load_capture(tmp_path).about.source.without_camera == 0
+        assert load_capture(tmp_path).about.without_camera == 0
     for extra in ("x.png", "y.PNG", "notes.txt", "z_depth_0001.png", "z_mask.png"):
         if not extra.endswith("txt"):
             write_image(tmp_path / "images" / "w.png", smooth_image(48, 64))
@@ -245,4 +245,4 @@ def test_photographs_without_a_camera_are_counted(tmp_path, form):
             (tmp_path / "images" / extra).write_text("")
     count = 4 if form == "colmap" else len(FRAMES)
     with pytest.warns(UserWarning, match=f"2 of {count + 2} photographs have no camera in .* not used"):
-        assert load_capture(tmp_path).about.source.without_camera == 2
+        assert load_capture(tmp_path).about.without_camera == 2

@@ -166,7 +166,7 @@ def test_a_wrong_survey_and_unusable_points_are_named_and_left_out(setting):
     placed = place([*points[:7], wrong, single, narrow], capture.cameras, capture.offset)
     frame = align(placed, capture.offset, "", "test")
     np.testing.assert_allclose(frame.rotation, TILT, atol=1e-9)
-    problems = {p.point.name: p.problem for p in placed if p.problem}
+    problems = {p.name: p.problem for p in placed if p.problem}
     assert problems["wrong"] == "contradicts the others and is left out"
     assert problems["single"] == "marked in fewer than 2 views (nowhere.jpg is none)"
     assert problems["narrow"].startswith("marked in fewer than 2 views")

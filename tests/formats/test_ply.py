@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from blitzgs.formats import gaussians as blocks
-from blitzgs.formats.ply import PlySource, read_ply, read_points, save_ply, write_ply
+from blitzgs.formats.ply import PlySource, read_ply, read_point_cloud, save_ply, write_ply
 from blitzgs.formats.selection import Selected, Selection, read_polygon
 from tests.helpers import refused, some_gaussians
 
@@ -182,11 +182,12 @@ def test_point_clouds_with_faces_and_without_colours(tmp_path):
     face = np.array([([0, 0, 0],)], dtype=[("vertex_indices", "i4", (3,))])
     elements = [plyfile.PlyElement.describe(rows, "vertex"), plyfile.PlyElement.describe(face, "face")]
     plyfile.PlyData(elements).write(tmp_path / "a.ply")
-    positions, colors = read_points(tmp_path / "a.ply")
+    cloud = read_point_cloud(tmp_path / "a.ply")
+    positions, colors = cloud.positions, cloud.colors
     assert positions.tolist() == [[1, 2, 3]] and colors.tolist() == [[10, 20, 30]]
     bare = np.array([(1, 2, 3)], dtype=[(axis, "f8") for axis in "xyz"])
     plyfile.PlyData([plyfile.PlyElement.describe(bare, "vertex")]).write(tmp_path / "b.ply")
-    assert read_points(tmp_path / "b.ply")[1].tolist() == [[128, 128, 128]]
+    assert read_point_cloud(tmp_path / "b.ply").colors.tolist() == [[128, 128, 128]]
 
 
 @pytest.mark.parametrize("kind", ["f4", "f8"])
@@ -199,7 +200,7 @@ def test_colours_as_floats_are_bytes_if_one_is_above_1_and_else_fractions(tmp_pa
     for row, colour in zip(rows, values, strict=True):
         row["red"], row["green"], row["blue"] = colour
     plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(tmp_path / "a.ply")
-    assert read_points(tmp_path / "a.ply")[1].tolist() == expected
+    assert read_point_cloud(tmp_path / "a.ply").colors.tolist() == expected
 
 
 @pytest.mark.parametrize(("kind", "red"), [("u2", 30_000), ("i4", -1), ("f4", float("nan")), ("f8", -0.5)])
@@ -207,7 +208,7 @@ def test_colours_that_are_no_bytes_or_fractions_are_refused(tmp_path, kind, red)
     types = [(n, "f8") for n in "xyz"] + [(c, kind) for c in ("red", "green", "blue")]
     rows = np.array([(1, 2, 3, red, 0, 0)], dtype=types)
     plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(tmp_path / "a.ply")
-    refused(ValueError, "a.ply: a point has the colour", read_points, tmp_path / "a.ply")
+    refused(ValueError, "a.ply: a point has the colour", read_point_cloud, tmp_path / "a.ply")
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):

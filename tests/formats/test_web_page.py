@@ -20,7 +20,6 @@ from blitzgs.formats.web_page import (
     BLOCK,
     HARMONIC,
     WebScene,
-    WebSplats,
     check_replaces_page,
     estimated_bytes,
     packed,
@@ -41,7 +40,9 @@ def some_splats(count=700, degree=2):
     sh = 0.2 * normal(count, (degree + 1) ** 2, 3)
     opacities = random.uniform(0, 1, count).astype(np.float32)
     levels = random.integers(0, 5, count).astype(np.uint8)
-    return WebSplats(normal(count, 3), normal(count, 4), normal(count, 3) - 4, opacities, sh, levels)
+    means, quats, scales = normal(count, 3), normal(count, 4), normal(count, 3) - 4
+    columns = [torch.from_numpy(column) for column in (means, quats, scales, opacities, sh, levels)]
+    return Gaussians(*columns[:3], columns[3].logit(), columns[4], levels=columns[5])
 
 
 def rotations(quats):
@@ -73,11 +74,12 @@ class Reader:
 def test_all_values_come_back():
     splats = some_splats()
     reader = Reader(packed(splats), len(splats))
+    scales, sh = splats.scales.numpy(), splats.sh.numpy()
     box, sizes, tints = (reader.ranges() for _ in range(3))
     low, high = reader.planes(3).astype(int), reader.planes(3).astype(int)
     means = box[..., 0] + box[..., 1] * (low + 256 * high)
-    assert np.abs(means.T - splats.means).max() <= 0.51 * box[..., 1].max()
-    for ranges, wanted in ((sizes, splats.scales), (tints, splats.sh[:, 0])):
+    assert np.abs(means.T - splats.means.numpy()).max() <= 0.51 * box[..., 1].max()
+    for ranges, wanted in ((sizes, scales), (tints, sh[:, 0])):
         found = ranges[..., 0] + ranges[..., 1] * reader.planes(3)
         assert np.abs(found.T - wanted).max() <= 0.51 * ranges[..., 1].max()
     words = np.ascontiguousarray(reader.planes(4).T).view("<u4")[:, 0]
@@ -87,12 +89,12 @@ def test_all_values_come_back():
     largest = np.sqrt(1 - (three**2).sum(1))
     for row, (others, place) in enumerate(zip(three, words >> 30, strict=True)):
         quats[row] = np.insert(others, place, largest[row])
-    unit = splats.quats / np.linalg.norm(splats.quats, axis=1, keepdims=True)
+    unit = torch.nn.functional.normalize(splats.quats).numpy()
     assert np.abs(rotations(quats) - rotations(unit)).max() < 5e-3
-    assert np.abs(reader.planes(1)[0] / 255 - splats.opacities).max() < 0.51 / 255
-    np.testing.assert_array_equal(reader.planes(1)[0], splats.levels)
+    assert np.abs(reader.planes(1)[0] / 255 - splats.opacities.sigmoid().numpy()).max() < 0.51 / 255
+    np.testing.assert_array_equal(reader.planes(1)[0], splats.levels.numpy())
     rest = reader.planes(24).view(np.int8) * HARMONIC
-    assert np.abs(rest.T.reshape(-1, 8, 3) - splats.sh[:, 1:]).max() <= 0.51 * HARMONIC
+    assert np.abs(rest.T.reshape(-1, 8, 3) - sh[:, 1:]).max() <= 0.51 * HARMONIC
     assert reader.at == len(reader.data)
 
 

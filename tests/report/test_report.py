@@ -13,7 +13,7 @@ import torch
 
 from blitzgs.capture.world import GEO, GEOCENTRIC, WorldFrame
 from blitzgs.cli import main
-from blitzgs.cli.report import kept_warnings
+from blitzgs.cli.view import kept_warnings
 from blitzgs.report.gather import MAX_POINTS
 from blitzgs.report.report import MAX_BYTES, compare, differences, labels, report
 from blitzgs.runs.evaluation import PARTS, Previews, preview_file

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from blitzgs.capture.colmap import quats_to_rotations, read_model
+from blitzgs.capture.colmap import read_model, world_to_camera
 from blitzgs_synth import add_arguments, generate_city, run
 from blitzgs_synth.city import tower_height
 from blitzgs_synth.flight import CLIMB, flight_height, plan_flight
@@ -65,7 +65,7 @@ def test_points_project_onto_their_observations(city):
     images, points = model.images, model.points
     assert len(points.ids) > 300
     assert points.track_lengths.min() >= 3
-    rotations = quats_to_rotations(images.quats)
+    rotations = world_to_camera(images)[:, :3, :3]
     errors = []
     for i in range(len(images.ids)):
         rows = slice(int(images.point2d_offsets[i]), int(images.point2d_offsets[i + 1]))

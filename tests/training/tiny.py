@@ -19,7 +19,7 @@ from torch import Tensor
 
 from blitzgs.capture.image_files import reduced, reduced_mask
 from blitzgs.capture.images import ImageMemory
-from blitzgs.capture.lengths import Sight
+from blitzgs.capture.lengths import near_plane, nearest_depths
 from blitzgs.config.fields import Config
 from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks
@@ -68,7 +68,7 @@ class Capture:
 
     @property
     def near(self) -> float:
-        return Sight.of(self.cameras, self.points).near(self.train, self.extent)
+        return near_plane(nearest_depths(self.cameras, self.points)[self.train], self.extent)
 
 
 class Images:
@@ -184,9 +184,9 @@ def write_tiny_capture(folder: Path) -> None:
         ColmapImages,
         ColmapModel,
         ColmapPoints,
-        rotation_to_quat,
         write_model,
     )
+    from blitzgs.util.rotations import quaternions
 
     capture, images = tiny_scene()
     (folder / "images").mkdir(parents=True)
@@ -200,7 +200,7 @@ def write_tiny_capture(folder: Path) -> None:
         ColmapImages(
             ids=np.arange(1, 9, dtype=np.uint32),
             camera_ids=np.ones(8, dtype=np.uint32),
-            quats=np.stack([rotation_to_quat(pose[:3, :3]) for pose in poses]),
+            quats=quaternions(torch.from_numpy(poses[:, :3, :3])).numpy(),
             translations=poses[:, :3, 3],
             names=[camera.name for camera in capture.cameras],
             point2d_offsets=np.zeros(9, dtype=np.uint64),

@@ -10,8 +10,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
-from blitzgs.capture.colmap import rotation_to_quat
+from blitzgs.util.rotations import quaternions
 from blitzgs.view.look import Picture
 from blitzgs.view.views import Space
 from blitzgs.viewer import compare, paths
@@ -60,7 +61,7 @@ def test_coordinates_go_there_and_back():
 
 def test_quaternions_turn_as_their_rotations():
     for pose in (camera_at((1, 2, 3), (0, 0, 0)), np.diag([1.0, -1.0, -1.0, 1.0]), np.eye(4)):
-        w, x, y, z = rotation_to_quat(pose[:3, :3])
+        w, x, y, z = quaternions(torch.from_numpy(pose[None, :3, :3]))[0].tolist()
         forward = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
         np.testing.assert_allclose(forward, pose[:3, 2], atol=1e-9)
 

@@ -3,23 +3,20 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
-import numpy as np
-
-from blitzgs.capture.cameras import Float64
+from blitzgs.capture.cameras import Float64, SourceView
 from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.names import IMAGE_SUFFIXES, ImageFinder, files_below, unified
+from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, find_images, unified
 from blitzgs.capture.points import SUFFIXES, SourcePoints, file_points
+from blitzgs.capture.projects import Project
 from blitzgs.capture.projects.metashape import is_metashape, read_metashape
 from blitzgs.capture.projects.opensfm import NAME, read_opensfm
 from blitzgs.capture.projects.pix4d import SUFFIX, read_opf, read_pix4d
-from blitzgs.capture.projects.project import Project
 from blitzgs.capture.projects.realitycapture import (
     is_bundler,
     is_realitycapture,
@@ -27,43 +24,36 @@ from blitzgs.capture.projects.realitycapture import (
     read_realitycapture,
 )
 from blitzgs.capture.world import WorldFrame, converted, frame_beside
+from blitzgs.util.errors import warn
 
 
-@dataclass(frozen=True)
-class _Kind:
-    """How the file of a program is found and read."""
+class FoundProject(NamedTuple):
+    """The project of a program in a folder: its file, and what reads it."""
 
     program: str
-    patterns: tuple[str, ...]
+    file: Path
     read: Callable[[Path], Project]
-    is_one: Callable[[Path], bool] = lambda _: True
 
 
-_KINDS = (
-    _Kind("Metashape", ("*.xml",), read_metashape, is_metashape),
-    _Kind("OPF", ("*.opf", "*/*.opf"), read_opf),
-    _Kind("Pix4D", tuple(f"{at}*{SUFFIX}" for at in ("", "params/", "*/params/", "*/*/params/")), read_pix4d),
-    _Kind("RealityCapture", ("*.csv",), read_realitycapture, is_realitycapture),
-    _Kind("OpenSfM", (NAME, f"opensfm/{NAME}", "reconstruction.topocentric.json"), read_opensfm),
-    _Kind("Bundler", ("*.out",), read_bundler, is_bundler),
+_PARAMS = ("", "params/", "*/params/", "*/*/params/")
+# Each program, how its files are called, what reads them, and what tells whether a file is one.
+_KINDS: tuple[tuple[str, tuple[str, ...], Callable[[Path], Project], Callable[[Path], bool]], ...] = (
+    ("Metashape", ("*.xml",), read_metashape, is_metashape),
+    ("OPF", ("*.opf", "*/*.opf"), read_opf, Path.is_file),
+    ("Pix4D", tuple(f"{at}*{SUFFIX}" for at in _PARAMS), read_pix4d, Path.is_file),
+    ("RealityCapture", ("*.csv",), read_realitycapture, is_realitycapture),
+    ("OpenSfM", (NAME, f"opensfm/{NAME}", "reconstruction.topocentric.json"), read_opensfm, Path.is_file),
+    ("Bundler", ("*.out",), read_bundler, is_bundler),
 )
 # Folders above a project's file that may be the capture's: opensfm/, or 1_initial/params/.
 _FOLDERS_ABOVE = 3
 
 
-@dataclass(frozen=True)
-class FoundProject:
-    """A project: its program and its file."""
-
-    kind: _Kind
-    file: Path
-
-
 def project_at(path: Path) -> FoundProject | None:
     """Return the project of a file; None: it is none."""
-    for kind in _KINDS:
-        if any(PurePosixPath(path.name).match(Path(p).name) for p in kind.patterns) and kind.is_one(path):
-            return FoundProject(kind, path)
+    for program, patterns, read, is_one in _KINDS:
+        if any(PurePosixPath(path.name).match(Path(p).name) for p in patterns) and is_one(path):
+            return FoundProject(program, path, read)
     return None
 
 
@@ -74,14 +64,14 @@ def find_project(root: Path) -> FoundProject | None:
     ValueError: there are several.
     """
     found = [
-        FoundProject(kind, file)
-        for kind in _KINDS
-        for file in sorted({f for pattern in kind.patterns for f in root.glob(pattern)})
-        if file.is_file() and kind.is_one(file)
+        FoundProject(program, file, read)
+        for program, patterns, read, is_one in _KINDS
+        for file in sorted({f for pattern in patterns for f in root.glob(pattern)})
+        if file.is_file() and is_one(file)
     ]
     files = {project.file for project in found}
     found = [p for p in found if p.file.name == NAME or p.file.with_name(NAME) not in files]
-    main = [project for project in found if project.kind.read is not read_bundler] or found
+    main = [project for project in found if project.read is not read_bundler] or found
     if len(main) > 1:
         shown = ", ".join(str(project.file.relative_to(root)) for project in main[:5])
         raise ValueError(f"{root} has {len(main)} projects ({shown}): name one of these files with --data")
@@ -96,30 +86,33 @@ def folder_of(file: Path, images: str) -> Path:
 
 def read_project(
     root: Path, found: FoundProject, images: str, downscale: float
-) -> tuple[list[str], list[Path], list[Lens], Project, SourcePoints]:
-    """Read a project: names, files, lenses, the project itself, and its points.
+) -> tuple[list[SourceView], SourcePoints, Project]:
+    """Read a project: its views, its points, and what else it says.
 
     FileNotFoundError: no photograph is there, so that the size of none is known. ValueError: the project is
     damaged.
     """
-    project = found.kind.read(found.file)
+    project = found.read(found.file)
     if not project.views:
         raise ValueError(
             f"{found.file} has no photograph with a pose: align the photographs, and export again"
         )
     project.frame = project.frame or frame_beside(root)
-    finder = ImageFinder(root, images)
     names = _with_suffixes(root / images, root, [_relative(view.name) for view in project.views])
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)
         raise ValueError(f"{found.file}: there are two photographs called {twice}")
-    lenses = _lenses(found, project, names, finder)
-    paths = finder.find_all(names, lenses, downscale)
+    lenses = _lenses(found, project, names, root, images)
+    paths = find_images(root, images, names, lenses, downscale)
     if project.lost:
         project.notes.append(f"{project.lost} photographs of the project have no pose and are left out")
     for note in project.notes:
-        warnings.warn(f"{found.file}: {note}", stacklevel=5)
-    return names, paths, lenses, project, _points(root, found, project, lenses)
+        warn(f"{found.file}: {note}")
+    views = [
+        SourceView(name, path, None, lens, view.world_to_camera)
+        for name, path, lens, view in zip(names, paths, lenses, project.views, strict=True)
+    ]
+    return views, _points(root, found, project, views), project
 
 
 def _relative(name: str) -> str:
@@ -147,17 +140,19 @@ def _with_suffixes(folder: Path, root: Path, names: Sequence[str]) -> list[str]:
     return [fits.get(name, name) for name in names]
 
 
-def _lenses(found: FoundProject, project: Project, names: Sequence[str], finder: ImageFinder) -> list[Lens]:
+def _lenses(
+    found: FoundProject, project: Project, names: Sequence[str], root: Path, images: str
+) -> list[Lens]:
     if all(isinstance(view.lens, Lens) for view in project.views):
         return [view.lens for view in project.views if isinstance(view.lens, Lens)]
     one = Lens("PINHOLE", 1, 1, (1.0, 1.0, 0.5, 0.5))
-    paths = finder.find_all(names, [one] * len(names), 1)
+    paths = find_images(root, images, names, [one] * len(names), 1)
     sizes = [(h.width, h.height) if p.is_file() and (h := read_header(p)) else None for p in paths]
     common = Counter(size for size in sizes if size is not None).most_common(1)
     if not common:
         raise FileNotFoundError(
             f"{found.file} gives lengths as shares of the image, and none of its {len(names)} photographs "
-            f"(first: {names[0]}) is in {finder.root / finder.images}: put them there, or name their folder "
+            f"(first: {names[0]}) is in {root / images}: put them there, or name their folder "
             "with --data.images=FOLDER"
         )
     # A photograph that is missing is refused or left out later.
@@ -167,13 +162,11 @@ def _lenses(found: FoundProject, project: Project, names: Sequence[str], finder:
     ]
 
 
-def _points(root: Path, found: FoundProject, project: Project, lenses: Sequence[Lens]) -> SourcePoints:
+def _points(root: Path, found: FoundProject, project: Project, views: Sequence[SourceView]) -> SourcePoints:
     if project.points is not None and len(project.points.positions):
         return project.points
-    poses = [view.world_to_camera for view in project.views]
     bundles = [file for file in sorted(root.glob("*.out")) if is_bundler(file) and file != found.file]
-    own = [read_bundler(file).points for file in bundles[:1]]
-    return points_beside(root, own[0] if own else None, project.frame, list(zip(lenses, poses, strict=True)))
+    return points_beside(root, read_bundler(bundles[0]).points if bundles else None, project.frame, views)
 
 
 # Points and views that are compared to find out in which coordinates points are.
@@ -181,12 +174,12 @@ _SAMPLE, _VIEWS = 2000, 100
 
 
 def points_beside(
-    root: Path, own: SourcePoints | None, frame: WorldFrame | None, cameras: Sequence[tuple[Lens, Float64]]
+    root: Path, own: SourcePoints | None, frame: WorldFrame | None, views: Sequence[SourceView]
 ) -> SourcePoints:
     """Return the project's own points, or those of a file beside it, in the world of its cameras.
 
     Programs export cameras in coordinates of their own and points in those of a reference system, or both in
-    one of the two: the coordinates in which the views (lenses and poses [4, 4]) see the points are taken.
+    one of the two: the coordinates in which the views see the points are taken.
     """
     points = own
     if points is None:
@@ -197,12 +190,11 @@ def points_beside(
         if len(named) != 1:
             if named:
                 shown = ", ".join(path.name for path in named[:5])
-                warnings.warn(
+                warn(
                     f"{root} has {len(named)} files of points ({shown}), and none is used: call one of them "
-                    f"points{named[0].suffix.lower()}",
-                    stacklevel=5,
+                    f"points{named[0].suffix.lower()}"
                 )
-            return SourcePoints(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
+            return SourcePoints.none()
         points = file_points(named[0])
     choices = {"the project's own coordinates": points.positions}
     if frame is not None:
@@ -210,24 +202,16 @@ def points_beside(
         if points.crs is not None and frame.crs:
             moved = converted(points.positions, points.crs, frame.crs)
             choices[f"coordinates of {points.crs.name}"] = frame.from_world(moved)
-    seen = {name: seen_share(positions, cameras) for name, positions in choices.items()}
+    seen = {name: seen_share(positions, views) for name, positions in choices.items()}
     best = max(seen, key=seen.__getitem__)
     if best != next(iter(choices)):
-        warnings.warn(f"{points.path}: the points are in {best}, and are moved to the cameras'", stacklevel=5)
+        warn(f"{points.path}: the points are in {best}, and are moved to the cameras'")
     points.positions = choices[best]
     return points
 
 
-def seen_share(positions: Float64, cameras: Sequence[tuple[Lens, Float64]]) -> float:
+def seen_share(positions: Float64, views: Sequence[SourceView]) -> float:
     """Return the share of views that see a point, of a sample of both."""
     sample = positions[:: max(1, len(positions) // _SAMPLE)]
-    some = cameras[:: max(1, len(cameras) // _VIEWS)]
-    return sum(_sees(lens, pose, sample) for lens, pose in some) / max(1, len(some))
-
-
-def _sees(lens: Lens, pose: Float64, positions: Float64) -> bool:
-    with np.errstate(all="ignore"):
-        x, y, depth = pose[:3, :3] @ positions.T + pose[:3, 3:]
-        front = depth > 0
-        u, v = lens.project(x[front] / depth[front], y[front] / depth[front])
-        return bool(((u >= 0) & (u < lens.width) & (v >= 0) & (v < lens.height)).any())
+    some = views[:: max(1, len(views) // _VIEWS)]
+    return sum(len(view.pixels_of(sample)) > 0 for view in some) / max(1, len(some))

@@ -20,7 +20,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.projects.project import (
+from blitzgs.capture.projects import (
     Project,
     ProjectView,
     check_rotation,
@@ -71,24 +71,20 @@ def read_metashape(path: Path) -> Project:
         matrix = numbers(camera.findtext("transform"), 16, f"{where}: transform").reshape(4, 4)
         views.append(ProjectView(label, lenses[sensor_id], pose_of(matrix[:3, :3], matrix[:3, 3], where)))
         components.append(camera.get("component_id"))
-    rigs = sum(camera.get("master_id") is not None for camera in chunk.iter("camera")) - sum(
-        camera.get("master_id") is not None for camera in cameras
-    )
-    main: str | None
+    used = set(cameras)
+    others = [camera for camera in chunk.iter("camera") if camera not in used]
+    rigs = sum(camera.get("master_id") is not None for camera in others)
     every = sorted({component for component in components if component is not None})
-    notes = []
+    notes, main = [], max(every, key=components.count, default=None)
     if len(every) > 1:
-        main = max(every, key=components.count)
         views = [view for view, component in zip(views, components, strict=True) if component == main]
         notes.append(f"of {len(every)} components, which have their own coordinates, the largest is used")
-    else:
-        main = every[0] if every else None
     if rigs:
         notes.append(f"{rigs} secondary cameras of a rig have no transform of their own and are left out")
     if any(sensor.find("rolling_shutter") is not None for sensor in sensors.values()):
         notes.append("the rolling shutter is not modelled")
-    total = sum(1 for _ in chunk.iter("camera"))
-    return Project(views, None, _frame(chunk, main, path), total - len(views), notes)
+    lost = len(others) + len(cameras) - len(views)
+    return Project(views, None, _frame(chunk, main, path), lost, notes)
 
 
 def _lens(sensor: Element, where: str) -> Lens:

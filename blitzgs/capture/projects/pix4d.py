@@ -28,7 +28,7 @@ import numpy as np
 
 from blitzgs.capture.cameras import Float64
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.projects.project import (
+from blitzgs.capture.projects import (
     Project,
     ProjectView,
     entry,

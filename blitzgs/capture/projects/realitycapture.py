@@ -31,7 +31,7 @@ import numpy as np
 from blitzgs.capture.cameras import Float64
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.points import SourcePoints
-from blitzgs.capture.projects.project import (
+from blitzgs.capture.projects import (
     Project,
     ProjectView,
     check_size,
