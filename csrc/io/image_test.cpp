@@ -26,11 +26,7 @@ std::string refusal(const F& read, const Bytes& file) {
   }
 }
 
-}  // namespace
-
 // JPEG
-
-namespace {
 
 Bytes segment(std::uint8_t marker, const Bytes& payload) {
   const std::size_t length = payload.size() + 2;

@@ -58,8 +58,7 @@ class Checker {
   }
 
   std::uint8_t next_marker() {
-    if (at_ >= file_.size()) fail("truncated JPEG: its end marker is missing");
-    if (file_[at_] != 0xff) fail("damaged JPEG: a marker is missing");
+    if (at_ < file_.size() && file_[at_] != 0xff) fail("damaged JPEG: a marker is missing");
     while (at_ < file_.size() && file_[at_] == 0xff) ++at_;
     if (at_ >= file_.size()) fail("truncated JPEG: its end marker is missing");
     return file_[at_++];

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "project/project.h"
 
-#include <algorithm>
 #include <numeric>
 #include <random>
 #include <vector>
@@ -47,7 +46,7 @@ struct World {
 
 struct Projected final : SplatMemory<double> {
   ProjectSizes sizes{};
-  std::vector<std::int64_t> totals, rank_masks;
+  std::vector<std::int64_t> totals;
   std::vector<std::int32_t> gaussian_ids, camera_ids, visible_ids, splat_offsets, radii, tiles;
   std::vector<double> means2d, conics, depths, opacities, colors;
 
@@ -55,57 +54,26 @@ struct Projected final : SplatMemory<double> {
   ProjectColumns<double> allocate(const ProjectSizes& counted) override {
     sizes = counted;
     const std::size_t U = sizes.visible, P = sizes.splats;
-    for (auto* ints : {&gaussian_ids, &camera_ids, &tiles}) ints->resize(P);
-    radii.resize(2 * P);
-    visible_ids.resize(U);
-    splat_offsets.resize(U + 1);
-    means2d.resize(2 * P);
-    conics.resize(3 * P);
-    depths.resize(P);
-    opacities.resize(P);
-    colors.resize(3 * P);
-    rank_masks.resize(P);
-    return {{gaussian_ids.data(), camera_ids.data(), visible_ids.data(), splat_offsets.data()},
-            {means2d.data(), conics.data(), depths.data(), opacities.data(), colors.data(), radii.data(),
-             tiles.data(), rank_masks.data(), nullptr, nullptr}};
+    const auto sized = [](auto& values, std::size_t size) {
+      values.resize(size);
+      return values.data();
+    };
+    return {
+        {sized(gaussian_ids, P), sized(camera_ids, P), sized(visible_ids, U), sized(splat_offsets, U + 1)},
+        {sized(means2d, 2 * P), sized(conics, 3 * P), sized(depths, P), sized(opacities, P),
+         sized(colors, 3 * P), sized(radii, 2 * P), sized(tiles, P), nullptr, nullptr, nullptr}};
   }
 };
 
-Projected project(const ProjectInputs<double>& in, const RankTiles& ranks = {}) {
+Projected project(const ProjectInputs<double>& in) {
   Projected p;
   TestWorkspace workspace;
-  p.totals.resize(project_totals(in.n_views, ranks.n_ranks));
-  cpu::project(in, ranks, p, p.totals.data(), workspace, nullptr);
+  p.totals.resize(project_totals(in.n_views, 0));
+  cpu::project(in, {}, p, p.totals.data(), workspace, nullptr);
   return p;
 }
 
 }  // namespace
-
-TEST_CASE("each splat knows the ranks that composite its tiles, and the totals count them") {
-  const World world;
-  // Views of 3 x 2 tiles. Rank 1 has none; ranks 0 and 2 overlap.
-  const RankTiles ranks{{0, 4, 4, 10}, {7, 4, 12, 18}, 4};
-  const Projected p = project(world.inputs(), ranks), alone = project(world.inputs());
-  REQUIRE(p.conics == alone.conics);
-  std::vector<std::int64_t> expected(8, 0);
-  for (std::size_t splat = 0; splat < p.rank_masks.size(); ++splat) {
-    std::int64_t mask = 0;
-    for_each_tile_row(&p.means2d[2 * splat], &p.conics[3 * splat], p.opacities[splat], 40, 30, 16,
-                      [&](int ty, int begin, int end) {
-                        const int row = 6 * p.camera_ids[splat] + 3 * ty;
-                        for (int tile = row + begin; tile < row + end; ++tile) {
-                          for (int m = 0; m < 4; ++m) {
-                            if (tile < ranks.begin[m] || tile >= ranks.end[m]) continue;
-                            mask |= std::int64_t{1} << m;
-                            ++expected[2 * m + 1];
-                          }
-                        }
-                      });
-    REQUIRE(p.rank_masks[splat] == mask);
-    for (int m = 0; m < 4; ++m) expected[2 * m] += mask >> m & 1;
-  }
-  REQUIRE(std::equal(expected.begin(), expected.end(), p.totals.begin() + kTotalViews + World::kViews));
-}
 
 TEST_CASE("the backward pass is the derivative of the splats") {
   World world;
@@ -145,11 +113,4 @@ TEST_CASE("the backward pass is the derivative of the splats") {
   REQUIRE(slope(&world.means[3 * id]) == Approx(v_means[3 * (U / 3)]).epsilon(1e-5).margin(1e-3));
   REQUIRE(slope(&world.scales[3 * id]) == Approx(v_scales[3 * (U / 3)]).epsilon(1e-5).margin(1e-3));
   REQUIRE(slope(&world.viewmats[3]) == Approx(v_viewmats[3]).epsilon(1e-4));
-}
-
-TEST_CASE("arrays are zeroed to their ends") {
-  std::vector<float> values(20, 7.f);
-  float* const v = values.data();
-  cpu::zero_arrays(ZeroedArrays<float>{{v, v + 6, v + 8, nullptr, v + 12}, {5, 1, 3, 0, 7}}, nullptr);
-  REQUIRE(values == std::vector<float>{0, 0, 0, 0, 0, 7, 0, 7, 0, 0, 0, 7, 0, 0, 0, 0, 0, 0, 0, 7});
 }
