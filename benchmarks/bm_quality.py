@@ -14,6 +14,9 @@ gsplat-default-reset (with the resets of opacities that 1.5.3 skips by mistake) 
 "partition-4x5:" before a configuration, for blocks that are trained separately and then merged
 (`benchmarks/opponents/spatial_partition.py`).
 
+--stress YAML runs the stress grid of a configuration (`benchmarks/quality_plan.py`) instead of recipes, and
+writes stress.md.
+
 Every run is a process. By default, each GPU has one run at a time. With more (--per-gpu) the models are as
 good, but times no longer compare, and the table says so. When a run ends, it writes a JSON file into
 RESULTS/runs. The same command then skips the runs that are finished and repeats those that failed.
@@ -40,7 +43,7 @@ from typing import Any, TextIO
 import quality_report
 import torch
 from harness import commit
-from quality_plan import RunSpec, parse_named, runs_of
+from quality_plan import STRESS_SEEDS, RunSpec, parse_named, runs_of, stress_markdown, stress_recipes
 from quality_run import describe, write
 
 EVALUATE_AT = (1_000, 2_000, 4_000, 7_000, 10_000, 15_000, 20_000)
@@ -217,7 +220,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")
     parser.add_argument("--capture", action="append", default=[], metavar='"NAME=DIR [--data.FIELD=VALUE]"')
     parser.add_argument("--recipe", action="append", default=[], metavar='"NAME=SOURCE [--FIELD=VALUE]"')
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of the trainings (%(default)s)")
+    parser.add_argument("--seeds", type=int, nargs="+", help="of the trainings (default: 0)")
+    parser.add_argument("--stress", metavar="YAML", help="run the stress grid of this configuration")
     parser.add_argument(
         "--evaluate-at",
         type=positive,
@@ -252,17 +256,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         captures, recipes = dict(map(parse_named, args.capture)), dict(map(parse_named, args.recipe))
+        seeds, evaluate_at = args.seeds or [0], args.evaluate_at
+        if args.stress is not None:
+            recipes |= stress_recipes(args.stress)
+            seeds, evaluate_at = args.seeds or STRESS_SEEDS, []
         quality_report.collect(args.out, args.collect or [])
         specs = []
         if captures or recipes or args.collect is None:
             device = "cuda" if args.gpus > 0 else "cpu"
-            specs = runs_of(captures, recipes, args.seeds, args.evaluate_at, args.lpips, device, args.ranks)
+            specs = runs_of(captures, recipes, seeds, evaluate_at, args.lpips, device, args.ranks)
             if args.ranks > 1 and (args.per_gpu > 1 or 0 < args.gpus < args.ranks):
                 raise ValueError(f"--ranks {args.ranks} needs as many --gpus, and --per-gpu 1")
     except (ValueError, OSError) as error:
         parser.error(str(error))
     work(specs, Pool(args.out, args.gpus, args.per_gpu, args.ranks), args.minutes)
     print(quality_report.report(args.out))
+    if args.stress is not None:
+        table = stress_markdown(quality_report.read_runs(args.out / quality_report.RUNS))
+        (args.out / "stress.md").write_text(table)
+        print(table)
     wanted = {spec.name for spec in specs}
     failed = [r for r in quality_report.read_runs(args.out / quality_report.RUNS) if r["status"] != "done"]
     return int(any(run["name"] in wanted for run in failed))

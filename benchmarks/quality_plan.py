@@ -1,10 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lists the runs of `bm_quality.py`: captures x recipes x seeds."""
+"""Lists the runs of `bm_quality.py`: captures x recipes x seeds.
+
+The stress grid says how far a recipe is from losing what it has learnt: every capture x schedule x change of
+one value x batch size; a column has one capture and one value of the grid's other axes. A cell has the
+held-out PSNR, and the largest fall of the training PSNR below its running best
+(`blitzgs.training.state.Curve.fall`).
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,6 +29,18 @@ OPPONENT = "gsplat-"
 PARTITION = "partition-"
 DEFAULTS = "defaults"
 SAFE = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-+=")
+
+SCHEDULES = (0.15, 0.25, 0.5, 1.0)
+FACTORS = (0.5, 2.0)
+BATCHES = (1, 4, 16)
+STRESS_SEEDS = (0, 1)
+# Name in the table and field; one at a time is halved and doubled.
+VALUES = {
+    "opacity": "optimiser.opacity",
+    "position": "optimiser.position",
+    "growth": "population.growth",
+    "noise": "optimiser.position_noise",
+}
 
 
 @dataclass(frozen=True)
@@ -194,3 +213,58 @@ def check(spec: RunSpec) -> None:
             spec.options()
     except ConfigError as error:
         raise ValueError(f"recipe {spec.recipe} on capture {spec.capture}: {error}") from error
+
+
+def stress_recipes(source: str) -> dict[str, str]:
+    """Return the grid's recipes, name -> source and overrides, the present values first.
+
+    Names have no dots: factors and schedules are in per cent.
+
+    Args:
+        source: configuration file whose values are changed.
+    """
+    config = load_config(source)
+    changes = [("base", "")]
+    for factor, (name, field) in itertools.product(FACTORS, VALUES.items()):
+        section, value = field.split(".")
+        changed = factor * getattr(getattr(config, section), value)
+        changes.append((f"{name}={factor:.0%}".rstrip("%"), f" --{field}={changed:.8g}"))
+    return {
+        f"{change}+schedule={round(100 * scale)}+B={batch}": (
+            f"{source} --schedule.scale={scale:g} --schedule.batch_size={batch}{override}"
+        )
+        for (change, override), scale, batch in itertools.product(changes, SCHEDULES, BATCHES)
+    }
+
+
+def stress_markdown(runs: Sequence[dict[str, Any]]) -> str:
+    """Return the stress table: worst PSNR and largest fall over the seeds, and the loss against the column.
+
+    Args:
+        runs: results of `bm_quality.py --stress`; others are left out.
+    """
+    cells: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    for run in runs:
+        change, _, column = run["recipe"].partition("+")
+        if run["status"] == "done" and column and "largest_fall" in run:
+            cells.setdefault((run["capture"], column, change), []).append(run)
+    worst = {key: min(_psnr(run) for run in group) for key, group in cells.items()}
+    lines = [
+        "| capture | schedule, batch | change | seeds | PSNR | below the column's best | largest fall |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for (capture, column, change), group in sorted(cells.items()):
+        best = max(value for key, value in worst.items() if key[:2] == (capture, column))
+        psnr = worst[capture, column, change]
+        fall = max(run["largest_fall"] for run in group)
+        lines.append(
+            f"| {capture} | {column} | {change} | {len(group)} "
+            f"| {psnr:.2f} | {best - psnr:.2f} | {fall:.2f} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _psnr(run: dict[str, Any]) -> float:
+    last = run["evaluations"][-1]
+    psnr: float = last.get("test", last.get("train"))["psnr"]
+    return psnr

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.capture.capture import Capture
-from  import Sight
+from blitzgs.capture.lengths import nearest_depths
 from blitzgs.capture.world import GEO, WorldFrame, read_world_frame
 from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
@@ -123,7 +123,7 @@ def trained_table(found: Gaussians, space: Space, ranks: Ranks) -> GaussianTable
 def check_seen(found: Gaussians, path: Path, capture: Capture) -> None:
     """Refuse a file of which no view of a capture shows a Gaussian (ValueError): its world is another."""
     positions = found.means.double().numpy() + offset_of(found.comments) - capture.offset
-    if not np.isfinite(Sight.of(capture.cameras, positions).nearest).any():
+    if not np.isfinite(nearest_depths(capture.cameras, positions)).any():
         raise ValueError(
             f"{path}: no view of {capture.root} sees one of its {len(found):,} Gaussians: the file must have "
             "the coordinates of that capture, not those of the world or of another program"

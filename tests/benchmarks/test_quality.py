@@ -1,21 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The quality benchmark: its runs, its tables, and the opponents it trains."""
+"""The quality benchmark: its runs, its tables, its stress grid, and the opponents it trains."""
 
 import json
 import math
 import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import bm_quality
 import numpy as np
 import pytest
+import quality_plan
 import quality_report
 import quality_run
 import torch
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer
 from opponents.spatial_partition import HALO, LEAST_SEEN, Grid, coverage, divide
-from quality_plan import RunSpec, runs_of
+from quality_plan import SAFE, RunSpec, runs_of
 
 from blitzgs.distributed.group import Ranks
 from tests.helpers import DEVICES, refused
@@ -151,6 +153,32 @@ def test_several_ranks_train_one_run_to_the_same_model(tmp_path, capture):
 
 def test_a_capture_without_a_view_to_measure_is_named():
     refused(ValueError, "nothing can be measured: all pixels of the", quality_run.means_of, {"views": {}})
+
+
+def test_every_recipe_of_the_grid_can_be_configured(tmp_path):
+    aerial = Path(__file__).resolve().parents[2] / "configs" / "aerial.yaml"
+    grid = quality_plan.stress_recipes(str(aerial))
+    assert len(grid) == 9 * 4 * 3 and all(set(name) <= SAFE for name in grid)
+    some = dict(list(grid.items())[::17])
+    specs = runs_of({"x": str(tmp_path)}, some, [0], [], None, "cpu")
+    assert len(specs) == len(some)
+    doubled = grid["position=200+schedule=25+B=1"]
+    assert "--optimiser.position=0.00032" in doubled and "--schedule.scale=0.25" in doubled
+
+
+def test_the_table_compares_the_worst_seed_with_its_column():
+    def run(change, psnr, fall, seed):
+        recipe = f"{change}+schedule=50+B=4"
+        evaluations = [{"test": {"psnr": psnr}}]
+        return {
+            "capture": "park", "recipe": recipe, "seed": seed, "status": "done",
+            "evaluations": evaluations, "largest_fall": fall,
+        }  # fmt: skip
+
+    runs = [run("base", 30.0, 0.1, 0), run("base", 29.5, 0.4, 1), run("position=200", 27.0, 3.5, 0)]
+    text = quality_plan.stress_markdown([*runs, {"capture": "park", "recipe": "aerial", "status": "done"}])
+    assert "| park | schedule=50+B=4 | base | 2 | 29.50 | 0.00 | 0.40 |" in text
+    assert "| park | schedule=50+B=4 | position=200 | 1 | 27.00 | 2.50 | 3.50 |" in text
 
 
 def nadir(x, y, height=1.0):
