@@ -36,8 +36,7 @@ from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.projection_types import Views
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import load_cameras
-from blitzgs.runs.lod import MOST_KEPT, level_fork
-from blitzgs.runs.run_files import TrainedModel
+from blitzgs.runs.run_files import MOST_KEPT, TrainedModel, level_fork
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.charts import line_chart
 from blitzgs.view.gate import LodGate, ModelGate, centres_of

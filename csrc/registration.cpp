@@ -31,15 +31,14 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // rows: (means, scales[, four moments of these, last_step, moment_step, table]), blitzgs/ops/blocks.py.
   m.def("update_block_bounds_(Tensor(a!) bounds, Tensor? ids, Tensor[] rows) -> ()");
   m.def(
-      "cull_blocks(Tensor bounds, Tensor[] rows, Tensor viewmats, Tensor Ks, int width, int height, "
-      "float near_plane, float far_plane, float eps2d, "
-      "Tensor? level_ranges=None, Tensor? level=None, float[] reach=[], int lod_views=0, Tensor? cull=None, "
-      "int[] columns=[], int? capacity_blocks=None) "
-      "-> (Tensor active_ids, Tensor active_views, Tensor count, Tensor n_blocks)");
+      "cull_blocks(Tensor bounds, Tensor[] rows, Tensor viewmats, Tensor Ks, int width, int height, float "
+      "near_plane, float far_plane, float eps2d, Tensor? level_ranges=None, Tensor? level=None, float[] "
+      "reach=[], int lod_views=0, Tensor? cull=None, int[] columns=[], int? capacity_blocks=None) -> "
+      "(Tensor active_ids, Tensor active_views, Tensor count, Tensor n_blocks)");
   // Clears the bits of pairs of a row and a view that the LOD gate or the cull mask drops.
   m.def(
-      "gate_views_(Tensor ids, Tensor(a!) views, Tensor? count, Tensor means, Tensor level, Tensor viewmats, "
-      "float[] reach, int lod_views, Tensor? cull, int[] columns) -> ()");
+      "gate_views_(Tensor ids, Tensor(a!) views, Tensor? count, Tensor means, Tensor level, Tensor "
+      "viewmats, float[] reach, int lod_views, Tensor? cull, int[] columns) -> ()");
 
   // Projection: parameters to screen-space splats, ordered by (Gaussian, view). gaussians: means, quats,
   // scales, opacities[, sh]. The options, from width to fade, are those of `blitzgs.ops.project.project`;
@@ -49,44 +48,42 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // the tiles of each rank. The capacities: numbers of visible Gaussians and splats for which there is
   // memory; absent: the op waits for the numbers.
   m.def(
-      "project_fwd(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, "
-      "Tensor? n_active, Tensor? n_blocks, Tensor? ids, Tensor? level, "
-      "SymInt width, SymInt height, int tile_size, int sh_degree, float near_plane, float far_plane, "
-      "float eps2d, float radius_clip, bool antialiased, bool raw, float[] fade, "
-      "int[] rank_tiles, int? visible_capacity, int? splat_capacity) -> (Tensor gaussian_ids, "
-      "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor means2d, Tensor conics, "
-      "Tensor depths, Tensor splat_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
-      "Tensor rank_masks, Tensor splat_ids, Tensor totals)");
+      "project_fwd(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? "
+      "active_views, Tensor? n_active, Tensor? n_blocks, Tensor? ids, Tensor? level, SymInt width, SymInt "
+      "height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float "
+      "radius_clip, bool antialiased, bool raw, float[] fade, int[] rank_tiles, int? visible_capacity, "
+      "int? splat_capacity) -> (Tensor gaussian_ids, Tensor camera_ids, Tensor visible_ids, Tensor "
+      "splat_offsets, Tensor means2d, Tensor conics, Tensor depths, Tensor splat_opacities, Tensor colors, "
+      "Tensor radii, Tensor tiles_touched, Tensor rank_masks, Tensor splat_ids, Tensor totals)");
   // scale_reg, opacity_reg: for each view, weights of the Gaussians' smallest axes and opacities. v_splats:
   // (v_means2d, v_conics, v_opacities[, v_colors]) or, on CUDA, one table of splat gradients.
   m.def(
       "project_bwd(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor? scale_reg, Tensor? opacity_reg, "
-      "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor? level, "
-      "SymInt width, SymInt height, int tile_size, int sh_degree, float near_plane, float far_plane, "
-      "float eps2d, float radius_clip, bool antialiased, bool raw, float[] fade, "
-      "Tensor[] v_splats, Tensor? v_depths, bool need_viewmats, bool dense=False) -> ("
-      "Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, Tensor v_sh, "
-      "Tensor v_viewmats)");
+      "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor? level, SymInt width, SymInt "
+      "height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float "
+      "radius_clip, bool antialiased, bool raw, float[] fade, Tensor[] v_splats, Tensor? v_depths, bool "
+      "need_viewmats, bool dense=False) -> (Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor "
+      "v_opacities, Tensor v_sh, Tensor v_viewmats)");
   // project_bwd, then lazy_adam_step_ of the visible Gaussians. With places, v_splats are the tables of the
   // ranks that composited the splats. Groups of the optimiser, as blitzgs/ops/lazy_adam.py names them: state
   // (params, exp_avgs, exp_avg_sqs, last_step, moment_step); tables (table, lr_table[, final_rules]).
   m.def(
       "project_bwd_step_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
-      "float beta2, float eps, Tensor viewmats, Tensor Ks, Tensor? scale_reg, Tensor? opacity_reg, "
-      "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor? level, "
-      "int width, int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, "
-      "float radius_clip, bool antialiased, bool raw, float[] fade, "
-      "Tensor[] v_splats, Tensor? places=None, Tensor(b!)? means2d_sums=None) -> ()");
+      "float beta2, float eps, Tensor viewmats, Tensor Ks, Tensor? scale_reg, Tensor? opacity_reg, Tensor "
+      "camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor? level, int width, int height, int "
+      "tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, bool "
+      "antialiased, bool raw, float[] fade, Tensor[] v_splats, Tensor? places=None, Tensor(b!)? "
+      "means2d_sums=None) -> ()");
   // The unscented projection (csrc/project/unscented.h), with the options of the projection. lenses [B, 13]:
   // k1 to k6, p1, p2, s1 to s4, the largest angle of a fisheye; shutter: 0 to 4, and viewmats_rs unless it is
   // 4 (global); transform: alpha, beta, kappa, margin, all_valid. unscented_visible finds which Gaussians
   // have splats in which views, [N, B]; splat_offsets [N + 1] counts these, which unscented_bwd alone reads.
   // v_splats: the gradients of means2d, conics, depths, splat_opacities[, colors].
   m.def(
-      "unscented_visible(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor lenses, Tensor? viewmats_rs, "
-      "bool fisheye, int shutter, float[] transform, int width, int height, int tile_size, int sh_degree, "
-      "float near_plane, float far_plane, float eps2d, float radius_clip, bool antialiased, bool raw) -> "
-      "Tensor");
+      "unscented_visible(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor lenses, Tensor? "
+      "viewmats_rs, bool fisheye, int shutter, float[] transform, int width, int height, int tile_size, "
+      "int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, bool antialiased, "
+      "bool raw) -> Tensor");
   m.def(
       "unscented_fwd(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor lenses, Tensor? viewmats_rs, "
       "bool fisheye, int shutter, float[] transform, int width, int height, int tile_size, int sh_degree, "
@@ -108,8 +105,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // and CUDA does not wait for the number.
   m.def(
       "intersect(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor depths, Tensor camera_ids, "
-      "Tensor? ids, SymInt n_cameras, SymInt width, SymInt height, int tile_size, int tile_begin, "
-      "int tile_end, int n_isects, Tensor? n_splats=None, bool unchecked=False) -> (Tensor isect_splats, "
+      "Tensor? ids, SymInt n_cameras, SymInt width, SymInt height, int tile_size, int tile_begin, int "
+      "tile_end, int n_isects, Tensor? n_splats=None, bool unchecked=False) -> (Tensor isect_splats, "
       "Tensor tile_offsets)");
 
   // The exchange of splats between ranks: packed for a collective, or written to the memory of peers (CUDA).
@@ -117,14 +114,14 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "scatter_splats(Tensor[] columns, Tensor masks, int[] group_sizes) -> (Tensor packed, Tensor places)");
   m.def("gather_splats(Tensor packed, int[] widths, int[] group_sizes) -> Tensor[] columns");
   m.def(
-      "sum_splats(Tensor values, Tensor places, int[] group_sizes, int splats, int[] widths) -> "
-      "Tensor[] columns");
+      "sum_splats(Tensor values, Tensor places, int[] group_sizes, int splats, int[] widths) -> Tensor[] "
+      "columns");
   m.def(
       "send_splats_(Tensor[] columns, Tensor rank_masks, Tensor everyone, int rank, Tensor(a!)[] buffers, "
       "int capacity) -> (Tensor places, Tensor plan)");
   m.def(
-      "device_barrier_(Tensor(a!)[] control, int rank, int number, Tensor? values, int first, "
-      "float timeout_seconds, Tensor(b!)? host=None) -> ()");
+      "device_barrier_(Tensor(a!)[] control, int rank, int number, Tensor? values, int first, float "
+      "timeout_seconds, Tensor(b!)? host=None) -> ()");
   // Writes a small tensor to pinned memory of the host, in stream order (CUDA).
   m.def("copy_to_host_(Tensor(a!) host, Tensor values) -> ()");
 
@@ -138,29 +135,27 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
 
   // Alpha compositing. composited: (transmittances, last_ids, packed_splats, tile_order) of the forward pass.
   m.def(
-      "rasterize_fwd(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
-      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, "
-      "SymInt n_cameras, SymInt width, SymInt height, int tile_size, int tile_begin, int tile_end, "
-      "bool clear_rest=True, bool backward_follows=False, Tensor? n_splats=None) -> (Tensor renders, "
-      "Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor packed_splats, Tensor tile_order, "
-      "Tensor splat_gradients)");
+      "rasterize_fwd(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, Tensor? "
+      "backgrounds, Tensor isect_splats, Tensor tile_offsets, SymInt n_cameras, SymInt width, SymInt "
+      "height, int tile_size, int tile_begin, int tile_end, bool clear_rest=True, bool "
+      "backward_follows=False, Tensor? n_splats=None) -> (Tensor renders, Tensor transmittances, Tensor "
+      "last_ids, Tensor tile_work, Tensor packed_splats, Tensor tile_order, Tensor splat_gradients)");
   // rasterize_fwd for a backward pass that sums gradients in a given table, which it sets to zero. It does
   // not write the pixels of tiles that are not owned (CUDA). An op of its own, because torch registers
   // gradients for ops without mutable arguments alone.
   m.def(
-      "rasterize_fwd_(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
-      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, "
-      "int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, "
-      "Tensor(a!) gradients, Tensor? n_splats=None) -> (Tensor renders, Tensor transmittances, "
-      "Tensor last_ids, Tensor tile_work, Tensor packed_splats, Tensor tile_order)");
+      "rasterize_fwd_(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, Tensor? "
+      "backgrounds, Tensor isect_splats, Tensor tile_offsets, int n_cameras, int width, int height, int "
+      "tile_size, int tile_begin, int tile_end, Tensor(a!) gradients, Tensor? n_splats=None) -> (Tensor "
+      "renders, Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor packed_splats, Tensor "
+      "tile_order)");
   // splats: (means2d, conics, splat_opacities, colors); lists: (isect_splats, tile_offsets). With gradients
   // (CUDA), the gradients of the splats are added to this table, and the columns returned are empty.
   m.def(
-      "rasterize_bwd(Tensor[] splats, Tensor? backgrounds, Tensor[] lists, Tensor[] composited, "
-      "Tensor v_renders, Tensor? v_alphas, "
-      "SymInt n_cameras, SymInt width, SymInt height, int tile_size, int tile_begin, int tile_end, "
-      "bool absgrad, bool deterministic, Tensor(a!)? gradients=None) -> (Tensor v_means2d, "
-      "Tensor v_conics, Tensor v_splat_opacities, Tensor v_colors, Tensor v_means2d_abs)");
+      "rasterize_bwd(Tensor[] splats, Tensor? backgrounds, Tensor[] lists, Tensor[] composited, Tensor "
+      "v_renders, Tensor? v_alphas, SymInt n_cameras, SymInt width, SymInt height, int tile_size, int "
+      "tile_begin, int tile_end, bool absgrad, bool deterministic, Tensor(a!)? gradients=None) -> (Tensor "
+      "v_means2d, Tensor v_conics, Tensor v_splat_opacities, Tensor v_colors, Tensor v_means2d_abs)");
   // What follows the projection of a call, in one op. It gives splats the colours of the visible rows of
   // `gaussians` (means, quats, scales, opacities), whose SH are in parts in `sh`; opacities, radii and
   // tiles_touched become 0 where a colour is not finite. Then it lists the splats by tile and composites the
@@ -170,52 +165,50 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // 0 to U - 1, visible_ids as int64, and the rows of the gaussians and of the joined sh.
   m.def(
       "render(Tensor means2d, Tensor conics, Tensor(a!) splat_opacities, Tensor depths, Tensor camera_ids, "
-      "Tensor visible_ids, Tensor splat_offsets, Tensor(b!) radii, Tensor(c!) tiles_touched, "
-      "Tensor? channels, bool with_depth, Tensor[] gaussians, Tensor[] sh, Tensor viewmats, Tensor Ks, "
-      "int width, int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, "
-      "float radius_clip, bool antialiased, bool raw, float[] fade, "
-      "Tensor? backgrounds, int n_isects, bool backward_follows, Tensor? totals) -> Tensor[] outputs");
+      "Tensor visible_ids, Tensor splat_offsets, Tensor(b!) radii, Tensor(c!) tiles_touched, Tensor? "
+      "channels, bool with_depth, Tensor[] gaussians, Tensor[] sh, Tensor viewmats, Tensor Ks, int width, "
+      "int height, int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float "
+      "radius_clip, bool antialiased, bool raw, float[] fade, Tensor? backgrounds, int n_isects, bool "
+      "backward_follows, Tensor? totals) -> Tensor[] outputs");
 
   // The contributions of the splats to the image, without colours: the sums of their weights alpha T, their
   // pixels and, if asked for, the sums of the squares of the weights (otherwise [0]).
   m.def(
-      "contributions(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor isect_splats, "
-      "Tensor tile_offsets, int n_cameras, int width, int height, int tile_size, int tile_begin, int "
-      "tile_end, "
+      "contributions(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor isect_splats, Tensor "
+      "tile_offsets, int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, "
       "Tensor? n_splats=None, bool squares=False) -> (Tensor weights, Tensor pixels, Tensor squares)");
 
   // For each pixel, or each row that slots name: the final T, the number of composited splats, the one in the
   // middle of the light, and the strongest with their weights alpha T.
   m.def(
-      "pixel_splats(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor isect_splats, "
-      "Tensor tile_offsets, Tensor? slots, int n_rows, int n_cameras, int width, int height, int tile_size, "
-      "int strongest) -> (Tensor transmittances, Tensor counts, Tensor medians, Tensor ids, Tensor weights)");
+      "pixel_splats(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor isect_splats, Tensor "
+      "tile_offsets, Tensor? slots, int n_rows, int n_cameras, int width, int height, int tile_size, int "
+      "strongest) -> (Tensor transmittances, Tensor counts, Tensor medians, Tensor ids, Tensor weights)");
 
   // For each segment, the fewest items that hold a share of its weight. Runs the steps `first_step` to
   // `last_step` - 1 of the search; between calls the sums may be added up over ranks.
   m.def(
       "mass_cut_(Tensor weights, Tensor segments, Tensor owners, Tensor ids, Tensor(a!) searches, "
-      "Tensor(b!) sums, Tensor(c!) listed, Tensor(d!) chosen, int numerator, int denominator, "
-      "int first_step, int last_step) -> ()");
+      "Tensor(b!) sums, Tensor(c!) listed, Tensor(d!) chosen, int numerator, int denominator, int "
+      "first_step, int last_step) -> ()");
   // The sums of the importance sweep over a batch of views.
   m.def(
-      "view_sums_(Tensor(a!)[] sums, Tensor[] splats, Tensor weights, Tensor pixels, Tensor counts, "
-      "int[] columns, int rule, float eps, float unit) -> ()");
+      "view_sums_(Tensor(a!)[] sums, Tensor[] splats, Tensor weights, Tensor pixels, Tensor counts, int[] "
+      "columns, int rule, float eps, float unit) -> ()");
 
   // L1 and SSIM of the owned tiles. fwd_bwd computes the sums and the gradient in one pass; the weights of
   // the sums must be known before.
   m.def(
-      "photometric_fwd(Tensor renders, Tensor targets, Tensor? masks, int tile_size, int tile_begin, "
-      "int tile_end) -> (Tensor l1_sums, Tensor ssim_sums)");
+      "photometric_fwd(Tensor renders, Tensor targets, Tensor? masks, int tile_size, int tile_begin, int "
+      "tile_end) -> (Tensor l1_sums, Tensor ssim_sums)");
   m.def(
       "photometric_bwd(Tensor renders, Tensor targets, Tensor? masks, Tensor l1_weights, Tensor "
-      "ssim_weights, "
-      "int tile_size, int tile_begin, int tile_end) -> Tensor v_renders");
+      "ssim_weights, int tile_size, int tile_begin, int tile_end) -> Tensor v_renders");
   m.def(
-      "photometric_fwd_bwd(Tensor renders, Tensor targets, Tensor? masks, Tensor l1_weights, "
-      "Tensor ssim_weights, int tile_size, int tile_begin, int tile_end, Tensor? samples=None, "
-      "Tensor? visible=None, float scale_weight=0.0, float opacity_weight=0.0) -> (Tensor parts, "
-      "Tensor v_renders, Tensor scale_reg, Tensor opacity_reg)");
+      "photometric_fwd_bwd(Tensor renders, Tensor targets, Tensor? masks, Tensor l1_weights, Tensor "
+      "ssim_weights, int tile_size, int tile_begin, int tile_end, Tensor? samples=None, Tensor? "
+      "visible=None, float scale_weight=0.0, float opacity_weight=0.0) -> (Tensor parts, Tensor v_renders, "
+      "Tensor scale_reg, Tensor opacity_reg)");
   m.def(
       "report_(Tensor? parts, Tensor? tile_work, int tile_begin, int tile_end, int rank, int n_ranks, "
       "Tensor(a!)[] targets) -> ()");
@@ -227,9 +220,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // The loss of whole images, and its gradient. weights and samples: of each view, for the gradient; the loss
   // is l1_factor and ssim_factor times the sums over all views, plus offset.
   m.def(
-      "l1_ssim_fwd_bwd(Tensor renders, Tensor targets, Tensor l1_weights, Tensor ssim_weights, "
-      "Tensor samples, float l1_factor, float ssim_factor, float offset) -> (Tensor loss, "
-      "Tensor v_renders)");
+      "l1_ssim_fwd_bwd(Tensor renders, Tensor targets, Tensor l1_weights, Tensor ssim_weights, Tensor "
+      "samples, float l1_factor, float ssim_factor, float offset) -> (Tensor loss, Tensor v_renders)");
 
   // The optimiser: dense Adam over a list of rows, with the arguments of project_bwd_step_; and the
   // statistics of density control. ids: int32 [U] or int64 [U] or [1, U]. current: the parameters of the
@@ -246,9 +238,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // parameters.
   m.def("lazy_adam_final_rules(Tensor table, Tensor like, int explicit_steps, float eps) -> Tensor");
   m.def(
-      "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
-      "Tensor splat_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "
-      "weight) -> ()");
+      "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor "
+      "visible_ids, Tensor splat_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int "
+      "height, float weight) -> ()");
 
   // Noise on the means of almost transparent Gaussians.
   m.def(
@@ -266,8 +258,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // exp_avg_sq.sh).
   m.def(
       "spawn_features(Tensor[] columns, Tensor rows, Tensor is_split, int time, float extent, int "
-      "level_count) "
-      "-> Tensor");
+      "level_count) -> Tensor");
   // Gradient-boosted trees: the sum of the leaves that each row of features reaches.
   m.def("tree_sums(Tensor features, Tensor roots, Tensor nodes, Tensor leaves, int depth) -> Tensor");
 
@@ -284,8 +275,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // For a table in the memory of the host with a pool of blocks on the device: the blocks that views may see,
   // and the exchange of blocks between table and pool. The first n_written columns are written back.
   m.def(
-      "seen_blocks(Tensor bounds, Tensor viewmats, Tensor Ks, Tensor sizes, float near_plane, "
-      "float far_plane, float eps2d) -> Tensor seen");
+      "seen_blocks(Tensor bounds, Tensor viewmats, Tensor Ks, Tensor sizes, float near_plane, float "
+      "far_plane, float eps2d) -> Tensor seen");
   m.def(
       "swap_blocks_(Tensor(a!)[] pool, Tensor(b!)[] table, int n_written, Tensor slots, Tensor leaving, "
       "Tensor coming) -> ()");

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any, NamedTuple, NoReturn
 
@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from blitzgs._torch import func_transforms_are_active
-from blitzgs.call.covariances import Decomposed, decompose
-from blitzgs.call.extras import NORMAL_CHANNELS, Signals, checked_signals
+from blitzgs.call.covariances import Decomposed
 from blitzgs.capture.cameras import MAX_SIDE
 from blitzgs.ops.harmonics import MAX_SH_DEGREE, colors_of_views
 from blitzgs.ops.unscented import Lenses
@@ -26,7 +25,7 @@ CAMERA_MODELS = ("pinhole", "fisheye")
 KERNEL_SH_DEGREE, KERNEL_SH_CHANNELS = 3, 3
 DEFAULT_TILE_SIZE = 16
 # What the kernels can composite (csrc/rasterize/rasterize_op.cpp).
-_MAX_CHANNELS = 4096
+MAX_CHANNELS = 4096
 # Further arguments of gsplat's calls (1.5.3 and later) and their defaults; no other values are supported.
 GSPLAT_DEFAULTS: dict[str, Any] = {
     "with_eval3d": False, "global_z_order": True, "rays": None, "ftheta_coeffs": None, "lidar_coeffs": None,
@@ -48,6 +47,19 @@ RAW_DEFAULTS: dict[str, Any] = {
     "radial_coeffs": None, "tangential_coeffs": None, "thin_prism_coeffs": None, "rolling_shutter": None,
     "viewmats_rs": None, "ut_params": None,
 }  # fmt: skip
+
+
+class Signals(NamedTuple):
+    """The extra signals of a call."""
+
+    values: Tensor  # of all scenes: [..., N, E], per view [..., C, N, E], or SH coefficients [..., N, K, E]
+    sh_degree: int | None  # degree of the SH that are evaluated; None: the values are composited
+    per_view: bool  # whether every view has its own values
+
+    @property
+    def channels(self) -> int:
+        """Number of channels E."""
+        return self.values.shape[-1]
 
 
 class Scene(NamedTuple):
@@ -253,7 +265,7 @@ def gaussians_of(
         colors = colors.expand(*batch, *colors.shape)  # gsplat main's form: the same SH in all scenes
     per_view = colors is not None and _per_view(colors, batch, C, N, sh_degree)
     colors = colors if with_colors else None
-    most = _MAX_CHANNELS - (render_mode != "RGB")  # the depth is a channel too
+    most = MAX_CHANNELS - (render_mode != "RGB")  # the depth is a channel too
     if colors is not None and not 1 <= colors.shape[-1] <= most:
         raise ValueError(f"colors must have 1 to {most} channels, got {colors.shape[-1]}")
     degree = sh_degree if with_colors else None
@@ -280,49 +292,6 @@ def _scenes(whole: Scene, batch: tuple[int, ...]) -> tuple[Scene, ...]:
         [None] * count if t is None else t.reshape(count, *t.shape[len(batch) :]).unbind(0) for t in whole[:7]
     )
     return tuple(Scene(*tensors) for tensors in zip(*columns, strict=True))
-
-
-def with_covariances(
-    gaussians: Gaussians, covars: Tensor, sparse_grad: bool, return_normals: bool
-) -> Gaussians:
-    """Return Gaussians whose quats and scales are those of covariances.
-
-    `gaussians`: with any quats and scales. `covars` and the switches: as for `blitzgs.rasterization`.
-    ValueError: the shape does not fit, or a switch is on.
-    """
-    if sparse_grad:
-        raise ValueError("sparse_grad does not support covars; leave one of them out")
-    if return_normals:
-        raise ValueError("return_normals does not support covars, whose axes have no order; leave one out")
-    batch = gaussians.lead[:-1]
-    wanted = (*batch, gaussians.count, 3, 3)
-    if covars.shape != wanted:
-        refuse_shape("covars", covars, wanted, "N, 3, 3")
-    scenes, uppers = [], []
-    for scene, own in zip(
-        gaussians.scenes, covars.reshape(len(gaussians.scenes), *covars.shape[-3:]).unbind(0), strict=True
-    ):
-        found = decompose(own)
-        uppers.append(found.upper)
-        scenes.append(scene._replace(quats=found.quats, scales=found.scales, covariances=found))
-    named = {name: given for name, given in gaussians.named.items() if name not in ("quats", "scales")}
-    named["covars"] = tuple(uppers)
-    return replace(gaussians, scenes=tuple(scenes), named=named)
-
-
-def with_signals(gaussians: Gaussians, extra_signals: Tensor, sh_degree: int | None) -> Gaussians:
-    """Return Gaussians with extra signals; the arguments and errors are those of `checked_signals`."""
-    batch = gaussians.lead[:-1]
-    colours = 0 if gaussians.colors is None else gaussians.colors.shape[-1]
-    most = _MAX_CHANNELS - NORMAL_CHANNELS - 1 - colours
-    if extra_signals.shape[-1:].numel() > most:
-        raise ValueError(f"extra_signals must have 1 to {most} channels, got {extra_signals.shape[-1]}")
-    signals = checked_signals(extra_signals, sh_degree, batch, gaussians.views, gaussians.count)
-    values, count = signals.values, len(gaussians.scenes)
-    own = values.reshape(count, *values.shape[len(batch) :]).unbind(0) if batch else (values,)
-    scenes = tuple(s._replace(extra_signals=part) for s, part in zip(gaussians.scenes, own, strict=True))
-    named = {**gaussians.named, "extra_signals": own}
-    return replace(gaussians, scenes=scenes, named=named, signals=signals)
 
 
 def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree: int | None) -> bool:

@@ -1,53 +1,174 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Optional arguments of calls: signals that are composited beside the colours, and pixels to render."""
+"""Optional arguments of calls: signals beside the colours, covariances, lenses, and pixels to render."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from blitzgs.call.arguments import MAX_CHANNELS, Gaussians, Signals, refuse_shape
+from blitzgs.call.covariances import decompose
+from blitzgs.ops.unscented import GLOBAL_SHUTTER, Lenses, largest_angles
+
 NORMAL_CHANNELS = 3
-_MAX_DEGREE = 3
+_MAX_DEGREE = 3  # of the SH of signals
+# gsplat's RollingShutterType, by number.
+_SHUTTERS = (
+    "ROLLING_TOP_TO_BOTTOM", "ROLLING_LEFT_TO_RIGHT", "ROLLING_BOTTOM_TO_TOP", "ROLLING_RIGHT_TO_LEFT",
+    "GLOBAL",
+)  # fmt: skip
+# gsplat's UnscentedTransformParameters.
+_UT_PARAMS = ("alpha", "beta", "kappa", "in_image_margin_factor", "require_all_sigma_points_valid")
 
 
-class Signals(NamedTuple):
-    """The extra signals of a call."""
-
-    values: Tensor  # of all scenes: [..., N, E], per view [..., C, N, E], or SH coefficients [..., N, K, E]
-    sh_degree: int | None  # degree of the SH that are evaluated; None: the values are composited
-    per_view: bool  # whether every view has its own values
-
-    @property
-    def channels(self) -> int:
-        """Number of channels E."""
-        return self.values.shape[-1]
-
-
-def checked_signals(values: Tensor, sh_degree: int | None, batch: tuple[int, ...], C: int, N: int) -> Signals:
-    """Check the shape of extra signals.
+def with_signals(gaussians: Gaussians, values: Tensor, sh_degree: int | None) -> Gaussians:
+    """Return Gaussians with extra signals.
 
     `values`: `extra_signals` of `blitzgs.rasterization`. `sh_degree`: its `extra_signals_sh_degree`.
-    ValueError: a shape or the degree does not fit.
+    ValueError: a shape, the degree or the number of channels does not fit.
     """
+    batch, views, count = gaussians.lead[:-1], gaussians.views, gaussians.count
     shape, per_view = tuple(values.shape), False
+    most = MAX_CHANNELS - NORMAL_CHANNELS - 1
+    most -= 0 if gaussians.colors is None else gaussians.colors.shape[-1]
+    if shape and shape[-1] > most:
+        raise ValueError(f"extra_signals must have 1 to {most} channels, got {shape[-1]}")
     if sh_degree is None:
-        per_view = shape[:-1] == (*batch, C, N)
-        wanted, fits = "[..., N, E] or [..., C, N, E]", per_view or shape[:-1] == (*batch, N)
+        per_view = shape[:-1] == (*batch, views, count)
+        wanted, fits = "[..., N, E] or [..., C, N, E]", per_view or shape[:-1] == (*batch, count)
     else:
         if isinstance(sh_degree, bool) or sh_degree not in range(_MAX_DEGREE + 1):
             raise ValueError(f"extra_signals_sh_degree must be None or 0 to {_MAX_DEGREE}, got {sh_degree!r}")
         least = (sh_degree + 1) ** 2
         wanted = f"SH coefficients [N, K, E] or [..., N, K, E] with K of at least {least}"
-        if batch and len(shape) == 3 and shape[0] == N:  # all scenes share them, as in gsplat
+        if batch and len(shape) == 3 and shape[0] == count:  # all scenes share them, as in gsplat
             values = values.expand(*batch, *shape)
-        fits = values.shape[:-2] == (*batch, N) and values.shape[-2] >= least
+        fits = values.shape[:-2] == (*batch, count) and values.shape[-2] >= least
     if not fits or shape[-1] == 0:
         raise ValueError(
-            f"extra_signals must be {wanted}, here with {[*batch]} before N = {N}, C = {C}, got {[*shape]}"
+            f"extra_signals must be {wanted}, here with {[*batch]} before N = {count}, C = {views}, got "
+            f"{[*shape]}"
         )
-    return Signals(values, sh_degree, per_view)
+    scenes_of = (len(gaussians.scenes), *values.shape[len(batch) :])
+    own = values.reshape(scenes_of).unbind(0) if batch else (values,)
+    scenes = tuple(s._replace(extra_signals=part) for s, part in zip(gaussians.scenes, own, strict=True))
+    named = {**gaussians.named, "extra_signals": own}
+    return replace(gaussians, scenes=scenes, named=named, signals=Signals(values, sh_degree, per_view))
+
+
+def with_covariances(
+    gaussians: Gaussians, covars: Tensor, sparse_grad: bool, return_normals: bool
+) -> Gaussians:
+    """Return Gaussians whose quats and scales are those of covariances.
+
+    `gaussians`: with any quats and scales. `covars` and the switches: as for `blitzgs.rasterization`.
+    ValueError: the shape does not fit, or a switch is on.
+    """
+    if sparse_grad:
+        raise ValueError("sparse_grad does not support covars; leave one of them out")
+    if return_normals:
+        raise ValueError("return_normals does not support covars, whose axes have no order; leave one out")
+    wanted = (*gaussians.lead[:-1], gaussians.count, 3, 3)
+    if covars.shape != wanted:
+        refuse_shape("covars", covars, wanted, "N, 3, 3")
+    found = [decompose(own) for own in covars.reshape(len(gaussians.scenes), *wanted[-3:]).unbind(0)]
+    scenes = tuple(
+        scene._replace(quats=own.quats, scales=own.scales, covariances=own)
+        for scene, own in zip(gaussians.scenes, found, strict=True)
+    )
+    named = {name: given for name, given in gaussians.named.items() if name not in ("quats", "scales")}
+    named["covars"] = tuple(own.upper for own in found)
+    return replace(gaussians, scenes=scenes, named=named)
+
+
+def check_without_ut(camera_model: str, rolling_shutter: Any, others: Mapping[str, object]) -> None:
+    """Check a call without with_ut: it has none of the arguments that need it.
+
+    ValueError: it has one, by name.
+    """
+    given = [name for name, value in others.items() if value is not None]
+    given += ["rolling_shutter"] if _shutter(rolling_shutter) != GLOBAL_SHUTTER else []
+    given += [f"camera_model={camera_model!r}"] if camera_model != "pinhole" else []
+    if given:
+        raise ValueError(f"{given[0]} needs with_ut=True; give both, or leave it out")
+
+
+def check_with_ut(viewmats: Tensor, refused: Mapping[str, bool]) -> None:
+    """Check that a call with with_ut has nothing that the unscented projection does not support.
+
+    `refused`: whether arguments that it does not support are given, by what to call them. ValueError: it has
+    one, by name.
+    """
+    compiled = {"torch.compile": torch.compiler.is_compiling()}
+    learned = {"a gradient of viewmats": torch.is_grad_enabled() and viewmats.requires_grad}
+    for name, given in {**refused, **compiled, **learned}.items():
+        if given:
+            raise ValueError(f"with_ut does not support {name}; leave one of them out")
+
+
+def with_lenses(
+    gaussians: Gaussians,
+    camera_model: str,
+    rolling_shutter: Any,
+    ut_params: Any,
+    radial_coeffs: Tensor | None,
+    tangential_coeffs: Tensor | None,
+    thin_prism_coeffs: Tensor | None,
+    viewmats_rs: Tensor | None,
+) -> Gaussians:
+    """Return Gaussians whose scenes have lenses; the arguments are those of `blitzgs.rasterization`.
+
+    ValueError: a shape or value is wrong, or two arguments do not go together.
+    """
+    fisheye = camera_model == "fisheye"
+    lead, first = gaussians.lead, gaussians.scenes[0].viewmats
+    given: dict[str, Tensor] = {}
+    for name, tensor, last in (
+        ("radial_coeffs", radial_coeffs, (4,) if fisheye else (6,)),
+        ("tangential_coeffs", tangential_coeffs, (2,)),
+        ("thin_prism_coeffs", thin_prism_coeffs, (4,)),
+        ("viewmats_rs", viewmats_rs, (4, 4)),
+    ):
+        if tensor is None:
+            continue
+        if tensor.shape != (*lead, *last):
+            refuse_shape(name, tensor, (*lead, *last), ", ".join(map(str, ("C", *last))))
+        if fisheye and name in ("tangential_coeffs", "thin_prism_coeffs"):
+            raise ValueError(f"a fisheye has no {name}; leave it out")
+        given[name] = tensor.detach().reshape(gaussians.images, *last)
+    shutter = _shutter(rolling_shutter)
+    if (shutter == GLOBAL_SHUTTER) != (viewmats_rs is None):
+        raise ValueError("a rolling shutter needs viewmats_rs, and a global one has none")
+    lenses = first.new_zeros(gaussians.images, 13)
+    lenses[:, 12] = math.inf
+    for name, begin in (("radial_coeffs", 0), ("tangential_coeffs", 6), ("thin_prism_coeffs", 8)):
+        if name in given:
+            lenses[:, begin : begin + given[name].shape[1]] = given[name]
+    if fisheye and radial_coeffs is not None:
+        lenses[:, 12] = largest_angles(given["radial_coeffs"])
+    whole = Lenses(lenses, given.get("viewmats_rs"), fisheye, shutter)
+    if ut_params is not None:
+        whole = whole._replace(transform=tuple(float(getattr(ut_params, name)) for name in _UT_PARAMS))
+    views = gaussians.views
+    scenes = tuple(
+        scene._replace(lenses=whole.rows(s * views, (s + 1) * views))
+        for s, scene in enumerate(gaussians.scenes)
+    )
+    named = {name: tuple(tensor.split(views)) for name, tensor in given.items()}
+    return replace(gaussians, scenes=scenes, named={**gaussians.named, **named})
+
+
+def _shutter(value: Any) -> int:
+    """Return the number of a RollingShutterType, given as gsplat's or by name; None: GLOBAL."""
+    name = "GLOBAL" if value is None else getattr(value, "name", value)
+    if name not in _SHUTTERS:
+        raise ValueError(f"rolling_shutter must be one of {', '.join(_SHUTTERS)}, got {value!r}")
+    return _SHUTTERS.index(name)
 
 
 class Pixels(NamedTuple):

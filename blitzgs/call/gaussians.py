@@ -16,6 +16,7 @@ from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_loss, pixel_counts, ssim
 from blitzgs.ops.population import MAX_COPIES, overlap, position_noise_
 from blitzgs.util.errors import check_tensor
+from blitzgs.util.rotations import quaternion_matrices
 
 _TRIANGLE = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
 
@@ -44,13 +45,7 @@ def quat_scale_to_covar_preci(
         raise ValueError(
             f"quats must be [..., 4] and scales [..., 3], got {list(quats.shape)} and {list(scales.shape)}"
         )
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(dim=-1)
-    columns = (
-        torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)), dim=-1),
-        torch.stack((2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)), dim=-1),
-        torch.stack((2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)), dim=-1),
-    )
-    rotations = torch.stack(columns, dim=-1)
+    rotations = quaternion_matrices(quats / quats.norm(dim=-1, keepdim=True))
 
     def product(lengths: Tensor) -> Tensor:
         axes = rotations * lengths.unsqueeze(-2)

@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blitzgs.call.arguments import Gaussians, Scene
+from blitzgs.call.arguments import Gaussians, Scene, Signals
 from blitzgs.call.bad_values import CamerasOnHost, check_intrinsics, watch_for_non_finite
 from blitzgs.call.channels import ImageOptions, channels_of, split_channels
-from blitzgs.call.extras import Pixels, Signals
+from blitzgs.call.extras import Pixels
 from blitzgs.call.groups import (
     Group,
     ShTables,

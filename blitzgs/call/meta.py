@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -53,13 +54,11 @@ class LazyDict(dict[str, Any]):
         """Iterate over the keys; defined so that `dict(self)` and `**self` read values by `__getitem__`."""
         return super().__iter__()
 
-    def get(self, key: str, default: Any = None) -> Any:
-        """Return the value of a key, or `default`."""
-        return self[key] if key in self else default  # noqa: SIM401
-
-    def setdefault(self, key: str, default: Any = None) -> Any:
-        """Return the value of a key, which is `default` from now on where there was none."""
-        return self[key] if key in self else super().setdefault(key, default)
+    # These read values by `__getitem__`; dict's own methods do not.
+    get = Mapping.get  # type: ignore[assignment]
+    setdefault = MutableMapping.setdefault
+    values = Mapping.values  # type: ignore[assignment]
+    items = Mapping.items  # type: ignore[assignment]
 
     def pop(self, key: str, *default: Any) -> Any:
         """Remove a key and return its value, or `default`."""
@@ -68,15 +67,8 @@ class LazyDict(dict[str, Any]):
 
     def popitem(self) -> tuple[str, Any]:
         """Remove the last key and return it and its value."""
-        return self._settled().popitem()
-
-    def values(self) -> Any:
-        """Return a view of the values."""
-        return self._settled().values()
-
-    def items(self) -> Any:
-        """Return a view of the keys and values."""
-        return self._settled().items()
+        self.get(next(reversed(self), ""))
+        return super().popitem()
 
     def copy(self) -> dict[str, Any]:
         """Return a plain dict of the same values."""
@@ -100,33 +92,25 @@ class LazyDict(dict[str, Any]):
     def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
         return dict, (dict(self),)
 
-    def _settled(self) -> Any:
-        """Compute all remaining values; return the same dict, which then is a plain one for readers."""
-        for key in self:
-            self[key]
-        return super()
-
 
 class LateMapping(Mapping[str, Any]):
     """A mapping whose keys and values are computed when it is first looked into; copies are plain dicts."""
 
     def __init__(self, compute: Callable[[], Mapping[str, Any]]) -> None:
         self._compute = compute
-        self._contents: Mapping[str, Any] | None = None
 
-    def _whole(self) -> Mapping[str, Any]:
-        if self._contents is None:
-            self._contents = self._compute()
-        return self._contents
+    @cached_property
+    def _contents(self) -> Mapping[str, Any]:
+        return self._compute()
 
     def __getitem__(self, key: str) -> Any:
-        return self._whole()[key]
+        return self._contents[key]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._whole())
+        return iter(self._contents)
 
     def __len__(self) -> int:
-        return len(self._whole())
+        return len(self._contents)
 
     def __repr__(self) -> str:
         return repr(dict(self))

@@ -19,6 +19,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from blitzgs.call.arguments import Gaussians
+from blitzgs.distributed.group import Ranks
 from blitzgs.ops.derivatives import linear_map
 from blitzgs.ops.projection_types import ProjectedSplats
 
@@ -26,8 +27,7 @@ from blitzgs.ops.projection_types import ProjectedSplats
 class CallRanks(NamedTuple):
     """The ranks of a call."""
 
-    rank: int
-    size: int  # number of ranks M
+    ranks: Ranks
     views: int  # number of views C of each rank
 
 
@@ -59,7 +59,7 @@ def gather_views(
         )
     if not dist.is_initialized() or dist.get_world_size() == 1:
         return gaussians, None
-    job = CallRanks(dist.get_rank(), dist.get_world_size(), gaussians.views)
+    job = CallRanks(Ranks(dist.get_rank(), dist.get_world_size()), gaussians.views)
     scene, recorded = gaussians.scenes[0], torch.is_grad_enabled()
     inputs = scene._replace(Ks=scene.means)  # Ks get no gradient
     need = recorded and any(t is not None and t.requires_grad for t in inputs[:8])
@@ -67,22 +67,19 @@ def gather_views(
     channels = None if gaussians.colors is None else gaussians.colors.shape[-1]
     signals = None if gaussians.signals is None else gaussians.signals.channels
     own = (gaussians.views, *same, channels, signals, need, need_poses)
-    _require_same(own, scene.viewmats.device)
+    _require_same(own, job.ranks, scene.viewmats.device)
     viewmats = _all_poses(scene.viewmats, job)
-    Ks = _gathered(scene.Ks.detach(), job)
+    Ks = torch.cat(job.ranks.all_gather(scene.Ks.detach().contiguous()))
     scene = scene._replace(viewmats=viewmats, Ks=Ks)
-    return replace(gaussians, scenes=(scene,), lead=(job.size * job.views,)), job
+    return replace(gaussians, scenes=(scene,), lead=(len(viewmats),)), job
 
 
-def _require_same(given: tuple[Any, ...], device: torch.device) -> None:
+def _require_same(given: tuple[Any, ...], ranks: Ranks, device: torch.device) -> None:
     """Compare a hash of the values over the ranks; exchange all values only if the hashes differ."""
     own = torch.tensor([zlib.crc32(repr(given).encode())], device=device)
-    sums = [torch.empty_like(own) for _ in range(dist.get_world_size())]
-    dist.all_gather(sums, own)
-    if len(set(torch.cat(sums).tolist())) == 1:
+    if len(set(torch.cat(ranks.all_gather(own)).tolist())) == 1:
         return
-    everyone: list[Any] = [None] * len(sums)
-    dist.all_gather_object(everyone, given)
+    everyone = ranks.all_gather_object(given)
     raise ValueError(
         "distributed=True: all ranks have to give the same number of views, width, height, tile size, render "
         f"mode, channels, and need of gradients of Gaussians and of poses; they gave {everyone}"
@@ -99,16 +96,14 @@ def send_splats(splats: ProjectedSplats, channels: Tensor, job: CallRanks) -> tu
     images = splats.camera_ids.long()
     ranks = images // job.views
     order = torch.argsort(ranks, stable=True)
-    sent = torch.bincount(ranks, minlength=job.size)
-    received = torch.empty_like(sent)
-    dist.all_to_all_single(received, sent)
-    sizes = sent.tolist(), received.tolist()
+    sent = torch.bincount(ranks, minlength=job.ranks.world_size)
+    sizes = sent.tolist(), job.ranks.exchange_counts(sent).tolist()
     widths = (2, 3, 1, 1, channels.shape[1])
     columns = (splats.means2d, splats.conics, splats.opacities[:, None], splats.depths[:, None], channels)
     table = torch.cat(columns, dim=1).index_select(0, order)
-    arrived = _sent(table, *sizes)
+    arrived = _sent(table, *sizes, job.ranks)
     means2d, conics, opacities, depths, own_channels = arrived.split(widths, dim=1)
-    own_views = _all_to_all((images % job.views).index_select(0, order), *sizes).int()
+    own_views = job.ranks.all_to_all((images % job.views).index_select(0, order), *sizes).int()
     return splats._replace(
         camera_ids=own_views,
         means2d=means2d.contiguous(),
@@ -118,27 +113,15 @@ def send_splats(splats: ProjectedSplats, channels: Tensor, job: CallRanks) -> tu
     ), own_channels.contiguous()
 
 
-def _all_to_all(table: Tensor, sent: list[int], received: list[int]) -> Tensor:
-    arrived = table.new_empty(sum(received), *table.shape[1:])
-    dist.all_to_all_single(arrived, table.contiguous(), received, sent)
-    return arrived
-
-
-def _gathered(values: Tensor, job: CallRanks) -> Tensor:
-    parts = [torch.empty_like(values, memory_format=torch.contiguous_format) for _ in range(job.size)]
-    dist.all_gather(parts, values.contiguous())
-    return torch.cat(parts)
-
-
-def _sent(table: Tensor, sent: list[int], received: list[int]) -> Tensor:
+def _sent(table: Tensor, sent: list[int], received: list[int], ranks: Ranks) -> Tensor:
     """Send rows to other ranks; the backward pass sends their gradients back."""
 
     def returned(_saved: Any, _needed: Any, v: Sequence[Tensor | None]) -> list[Tensor]:
         # Every rank sends, also one whose rows have no gradient.
         rows = table.new_zeros(sum(received), table.shape[1]) if v[0] is None else v[0]
-        return [_all_to_all(rows, received, sent)]
+        return [ranks.all_to_all(rows, received, sent)]
 
-    (arrived,) = linear_map(lambda rows: (_all_to_all(rows, sent, received),), returned, [table])
+    (arrived,) = linear_map(lambda rows: (ranks.all_to_all(rows, sent, received),), returned, [table])
     return arrived
 
 
@@ -147,9 +130,11 @@ def _all_poses(viewmats: Tensor, job: CallRanks) -> Tensor:
 
     def summed(_saved: Any, _needed: Any, v: Sequence[Tensor | None]) -> list[Tensor]:
         total = v[0].contiguous().clone() if v[0] is not None else viewmats.new_zeros(shape)
-        dist.all_reduce(total)
-        return [total[job.rank * job.views :][: job.views]]
+        return [job.ranks.all_reduce(total)[job.ranks.rank * job.views :][: job.views]]
 
-    shape = (job.size * job.views, 4, 4)
-    (gathered,) = linear_map(lambda poses: (_gathered(poses, job),), summed, [viewmats])
+    def gather(poses: Tensor) -> tuple[Tensor, ...]:
+        return (torch.cat(job.ranks.all_gather(poses.contiguous())),)
+
+    shape = (job.ranks.world_size * job.views, 4, 4)
+    (gathered,) = linear_map(gather, summed, [viewmats])
     return gathered

@@ -14,14 +14,18 @@ from blitzgs.call.arguments import (
     check_options,
     check_tensors,
     gaussians_of,
-    with_covariances,
-    with_signals,
 )
 from blitzgs.call.bad_values import warn_of_gradient
 from blitzgs.call.channels import ImageOptions, background_rows
-from blitzgs.call.extras import checked_pixels
+from blitzgs.call.extras import (
+    check_with_ut,
+    check_without_ut,
+    checked_pixels,
+    with_covariances,
+    with_lenses,
+    with_signals,
+)
 from blitzgs.call.images import render
-from blitzgs.call.lenses import check_with_ut, check_without_ut, with_lenses
 from blitzgs.call.ranks import gather_views
 from blitzgs.ops.projection_types import ProjectionOptions
 from blitzgs.util.errors import explain_memory
@@ -227,17 +231,9 @@ def rasterization(
         gaussians = with_covariances(gaussians, covars, sparse_grad, return_normals)
     if with_ut:
         gaussians = with_lenses(gaussians, camera_model, rolling_shutter, ut_params, **lens)
+    degree, antialiased = sh_degree or 0, rasterize_mode == "antialiased"
     projection = ProjectionOptions(
-        width,
-        height,
-        tile_size,
-        sh_degree or 0,
-        near_plane,
-        far_plane,
-        eps2d,
-        radius_clip,
-        antialiased=rasterize_mode == "antialiased",
-        raw=False,
+        width, height, tile_size, degree, near_plane, far_plane, eps2d, radius_clip, antialiased, False
     )
     background = None
     if backgrounds is not None:

@@ -19,7 +19,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import input_files, warn_of_changes
 from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
-from blitzgs.runs.lod import lod_gate, model_gate
+from blitzgs.runs.run_files import lod_gate, model_gate
 from blitzgs.runs.world import gate_of, model_of_file
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.training.understood import largest_size

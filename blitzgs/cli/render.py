@@ -29,7 +29,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, RunCameras, input_files, load_cameras
 from blitzgs.runs.evaluation import render_view
-from blitzgs.runs.lod import lod_gate, model_gate
+from blitzgs.runs.run_files import lod_gate, model_gate
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.util.output import OutputFolder

@@ -17,7 +17,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from blitzgs.config.fields import Transport
-from blitzgs.distributed.shared_memory import SharedMemory, connect
+from blitzgs.distributed.shared_memory import LEAST_WORDS, SharedMemory, control_words, symmetric_words
 from blitzgs.distributed.watchdog import BUSY_SECONDS, NoWatchdog, Watchdog, open_store
 
 T = TypeVar("T")
@@ -29,6 +29,8 @@ DEFAULT_TIMEOUT_SECONDS = 120.0
 ALLOCATOR_VARIABLES = ("PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF")
 # Start-up includes importing torch on every rank and, with NCCL, building the communicator.
 STARTUP_TIMEOUT_SECONDS = 300.0
+# Most ranks that can share memory.
+MAX_PEERS = 16
 
 
 class MismatchError(RuntimeError):
@@ -329,3 +331,46 @@ def resolve_device(
             "share GPUs (--share-gpus)"
         )
     return chosen, shared
+
+
+def connect(ranks: Ranks, timeout_seconds: float) -> SharedMemory | str:
+    """Set up shared memory between all ranks, or return why that is impossible, the same on every rank.
+
+    Collective.
+
+    `ranks`: the ranks, joined. `timeout_seconds`: longest wait in a barrier.
+    """
+    location = (socket.gethostname(), ranks.device.index if ranks.device.type == "cuda" else None)
+    locations = ranks.all_gather_object(location)
+    obstacle, control = find_obstacle(locations, ranks), None
+    if obstacle is None:
+        try:
+            words = control_words(ranks.world_size)
+            control = symmetric_words(words, torch.int64, ranks.device).zero_()
+        except RuntimeError as error:
+            obstacle = f"rank {ranks.rank}: {error}"
+    obstacles = [text for text in ranks.all_gather_object(obstacle) if text is not None]
+    if obstacles or control is None:
+        return obstacles[0]
+    memory = SharedMemory(ranks.rank, ranks.world_size, ranks.device, control, timeout_seconds)
+    memory.reserve(LEAST_WORDS)
+    ranks.barrier()
+    return memory
+
+
+def find_obstacle(locations: list[tuple[str, Any]], ranks: Ranks) -> str | None:
+    """Return why a rank cannot reach the others' memory; None if it can."""
+    hosts, devices = {host for host, _ in locations}, [device for _, device in locations]
+    mine = ranks.device.index
+    if None in devices:
+        return "not every rank computes on a GPU"
+    if len(hosts) > 1:
+        return f"the ranks are on {len(hosts)} hosts"
+    if len(set(devices)) < len(devices) and not ranks.shares_gpu:
+        return "some ranks see their GPU under the same number"
+    if len(devices) > MAX_PEERS:
+        return f"at most {MAX_PEERS} ranks can share memory, not {len(devices)}"
+    for other in devices:
+        if other != mine and not torch.cuda.can_device_access_peer(mine, other):
+            return f"cuda:{mine} has no access to the memory of cuda:{other}"
+    return None

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,18 +16,17 @@ from blitzgs.ops.host import PinnedNumbers, current_stream
 from blitzgs.ops.photometric import report_
 
 
-class _Side:
+class _Side(NamedTuple):
     """A second stream of a device, for work that the step does not wait for.
 
     Only one thread at a time may use it: a second thread could record `ready` again before the first one has
     made the stream wait for it.
     """
 
-    def __init__(self, device: torch.device) -> None:
-        self.stream = torch.cuda.Stream(device)  # the second stream
-        # Event by which the second stream waits for the step's stream. It is recorded on the step's stream
-        # before each use of the second one; a new record does not change waits that are queued.
-        self.ready = torch.cuda.Event()
+    stream: torch.cuda.Stream  # the second stream
+    # Event by which the second stream waits for the step's stream. It is recorded on the step's stream before
+    # each use of the second one; a new record does not change waits that are queued.
+    ready: torch.cuda.Event
 
 
 class _Queued:
@@ -154,4 +154,4 @@ class HostSum:
 @lru_cache(maxsize=16)
 def _side_of(device: torch.device) -> _Side | None:
     """Return the second stream of a device; None on the CPU."""
-    return _Side(device) if device.type == "cuda" else None
+    return _Side(torch.cuda.Stream(device), torch.cuda.Event()) if device.type == "cuda" else None

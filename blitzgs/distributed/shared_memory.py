@@ -19,8 +19,7 @@ overwrites them.
 
 from __future__ import annotations
 
-import socket
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 import torch.distributed as dist
@@ -29,28 +28,11 @@ from torch._C._distributed_c10d import _SymmetricMemory
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-T = TypeVar("T")
-MAX_PEERS = 16
 # Largest number of values that a rank may write for a barrier; there is memory for two barriers, and for
 # their sums.
 MAX_VALUES = 256
-_LEAST_WORDS = 1 << 20
+LEAST_WORDS = 1 << 20
 LEAST_BOARD = 1 << 16
-
-
-class Job(Protocol):
-    """The methods of `blitzgs.distributed.group.Ranks` that shared memory needs."""
-
-    rank: int
-    world_size: int
-    device: torch.device
-    shares_gpu: bool
-
-    def all_gather_object(self, value: T) -> list[T]:
-        """Gather an object from all ranks."""
-
-    def barrier(self) -> None:
-        """Wait for all ranks, on the host."""
 
 
 class Shared(NamedTuple):
@@ -186,46 +168,3 @@ def symmetric_words(count: int, dtype: torch.dtype, device: torch.device) -> Ten
     `torch.distributed._symmetric_memory.empty` would load SymPy, for seconds, to find the stride.
     """
     return _SymmetricMemory.empty_strided_p2p((count,), (1,), dtype, device)
-
-
-def connect(job: Job, timeout_seconds: float) -> SharedMemory | str:
-    """Set up shared memory between all ranks, or return why that is impossible, the same on every rank.
-
-    Collective.
-
-    `job`: the ranks, joined. `timeout_seconds`: longest wait in a barrier.
-    """
-    location = (socket.gethostname(), job.device.index if job.device.type == "cuda" else None)
-    locations = job.all_gather_object(location)
-    obstacle, control = find_obstacle(locations, job), None
-    if obstacle is None:
-        try:
-            words = control_words(job.world_size)
-            control = symmetric_words(words, torch.int64, job.device).zero_()
-        except RuntimeError as error:
-            obstacle = f"rank {job.rank}: {error}"
-    obstacles = [text for text in job.all_gather_object(obstacle) if text is not None]
-    if obstacles or control is None:
-        return obstacles[0]
-    memory = SharedMemory(job.rank, job.world_size, job.device, control, timeout_seconds)
-    memory.reserve(_LEAST_WORDS)
-    job.barrier()
-    return memory
-
-
-def find_obstacle(locations: list[tuple[str, Any]], job: Job) -> str | None:
-    """Return why a rank cannot reach the others' memory; None if it can."""
-    hosts, devices = {host for host, _ in locations}, [device for _, device in locations]
-    mine = job.device.index
-    if None in devices:
-        return "not every rank computes on a GPU"
-    if len(hosts) > 1:
-        return f"the ranks are on {len(hosts)} hosts"
-    if len(set(devices)) < len(devices) and not job.shares_gpu:
-        return "some ranks see their GPU under the same number"
-    if len(devices) > MAX_PEERS:
-        return f"at most {MAX_PEERS} ranks can share memory, not {len(devices)}"
-    for other in devices:
-        if other != mine and not torch.cuda.can_device_access_peer(mine, other):
-            return f"cuda:{mine} has no access to the memory of cuda:{other}"
-    return None

@@ -17,18 +17,10 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs._library import below_autograd
 
 BLOCK_ROWS = 256
-
-
-class PendingSteps(NamedTuple):
-    """Optimiser state that bounds how far rows may move when their pending steps are applied."""
-
-    exp_avg_means: Tensor  # first moment of the means, float32 [N, 3]
-    exp_avg_sq_means: Tensor  # second moment of the means, float32 [N, 3]
-    exp_avg_scales: Tensor  # first moment of the log scales, float32 [N, 3]
-    exp_avg_sq_scales: Tensor  # second moment of the log scales, float32 [N, 3]
-    last_step: Tensor  # int32 [N], step up to which each row's parameters are current
-    moment_step: Tensor  # int32 [N], step up to which each row's moments are current
-    table: Tensor  # float64 [S + 1, 30], from `AdamSchedule.table`
+# Optimiser state that bounds how far rows may move when their pending steps are applied: first and second
+# moments of the means, then of the log scales, float32 [N, 3]; `last_step` and `moment_step`, int32 [N], as
+# `AdamState` has them; and `AdamSchedule.table`.
+PendingSteps = Sequence[Tensor]
 
 
 class GateRules(NamedTuple):
@@ -230,20 +222,8 @@ def seen_blocks(
 
     A block without the bit of a view has no row that `blitzgs.ops.blocks.cull_blocks` lists for that view.
 
-    Args:
-        bounds: float32 [N, 8], from `blitzgs.ops.blocks.update_block_bounds_`.
-        viewmats: float32 [V, 4, 4], world to camera, V <= 32.
-        Ks: float32 [V, 3, 3], pixels.
-        sizes: int32 [V, 2], width and height of each view, pixels.
-        near_plane: rows at z <= near_plane are not seen.
-        far_plane: rows at z > far_plane are not seen.
-        eps2d: screen-space blur, pixels squared.
-
-    Returns:
-        int32 [N], bit v set when view v may see a part of the block.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes, or more than 32 views.
+    Arguments and errors are those of `cull_blocks`, but for `sizes`, int32 [V, 2]: width and height of each
+    of the V views, pixels. Returns int32 [blocks], bit v set when view v may see a part of the block.
     """
     return torch.ops.blitzgs.seen_blocks(bounds, viewmats, Ks, sizes, near_plane, far_plane, eps2d)
 

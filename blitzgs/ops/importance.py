@@ -37,17 +37,7 @@ def splat_contributions(
     they do not depend on the order of addition, and the sums of disjoint tile ranges add up to the sum of all
     tiles.
 
-    Args:
-        means2d: [P, 2], pixels, float32 or (CPU) float64.
-        conics: inverse 2D covariances (a, b, c) [P, 3].
-        splat_opacities: [P].
-        isect_splats: int32 [I], from `blitzgs.ops.intersect.intersect`.
-        tile_offsets: int64 [B * T + 1], likewise.
-        width: of every view, pixels.
-        height: of every view, pixels.
-        tile_size: edge of a tile in pixels, as given to ``intersect``; 16 on CUDA.
-        tile_begin: first tile to composite.
-        tile_end: end of the tiles to composite, -1 for all.
+    Args: those of `blitzgs.ops.rasterize.rasterize` (tiles of 16 px on CUDA), and
         n_splats: int64 [1] on the device of the splats: only the first `n_splats` splats are valid. None:
             all.
         squares: sum (alpha T)^2 too.
@@ -149,15 +139,7 @@ def pixel_splats(
     Alpha and T have the same bits as in :func:`blitzgs.ops.rasterize.rasterize`. Of equal alpha T, the splats
     in front are the strongest.
 
-    Args:
-        means2d: [P, 2], pixels, float32 or (CPU) float64.
-        conics: inverse 2D covariances (a, b, c) [P, 3].
-        splat_opacities: [P].
-        isect_splats: int32 [I], from :func:`blitzgs.ops.intersect.intersect`.
-        tile_offsets: int64 [B * T + 1], likewise.
-        width: of every view, pixels.
-        height: of every view, pixels.
-        tile_size: edge of a tile in pixels, as given to ``intersect``; 16 on CUDA.
+    Args: those of :func:`blitzgs.ops.rasterize.rasterize` (tiles of 16 px on CUDA), and
         strongest: number k of splats of each pixel to return.
         pixels: int64 [R], numbers (b H + y) W + x of the pixels to return, each in range; None: all, in this
             order.

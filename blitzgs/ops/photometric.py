@@ -71,19 +71,9 @@ def photometric_sums(
     gradient is that of the sums over ALL tiles, returned for the owned pixels and zero elsewhere, so
     gradients over a partition add up as well; `renders` must be valid within 10 pixels of the owned tiles.
 
-    Args:
-        renders: x [B, H, W, 3], float32 (CPU also float64).
-        targets: y [B, H, W, 3], uint8 (value / 255) or the dtype of `renders`.
-        masks: [B, H, W], bool or uint8, 0 = excluded from the sums.
-        tile_size: edge of a tile in pixels.
-        tile_begin: first owned tile.
-        tile_end: one past the last owned tile; -1 = all.
-
-    Returns:
-        (l1 sums [B], SSIM sums [B]), dtype of `renders`.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
+    `tile_size` is the edge of a tile in pixels, and `tile_end` one past the last owned tile, -1 for all.
+    Other arguments and the errors are those of `photometric_loss`. Returns (l1 sums [B], SSIM sums [B]),
+    dtype of `renders`.
     """
     return torch.ops.blitzgs.photometric_fwd(
         renders, targets, _as_bytes(masks), tile_size, tile_begin, tile_end

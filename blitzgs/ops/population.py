@@ -50,19 +50,9 @@ def density_stats_(
         RuntimeError: wrong shapes or dtypes.
     """
     with below_autograd():
-        torch.ops.blitzgs.density_stats_(
-            grad_sum,
-            grad_count,
-            max_radii,
-            visible_ids,
-            splat_offsets,
-            v_means2d,
-            conics,
-            phi,
-            width,
-            height,
-            weight,
-        )
+        statistics = grad_sum, grad_count, max_radii
+        splats = visible_ids, splat_offsets, v_means2d, conics
+        torch.ops.blitzgs.density_stats_(*statistics, *splats, phi, width, height, weight)
 
 
 def position_noise_(

@@ -91,51 +91,39 @@ def _gradients(
         v: gradients of the splats; None: zero.
     """
     saved = _Saved.of(ctx)
-    return first_only(
-        "project",
-        lambda: _first_gradients(ctx, saved, needed, need_viewmats, sparse, v),
-        (*(ctx.tables or saved.gaussians), saved.cameras[0], *v),
-    )
 
+    def compute() -> Sequence[Tensor | None]:
+        _, visible_ids, _ = saved.splats
+        gathered = ctx.tables is not None
+        all_dense = not gathered and not any(sparse)
+        # If all Gaussians are visible, the rows of these are all rows. While torch traces the backward pass,
+        # the number of rows is unknown, and tensors are of another type.
+        complete = (
+            all_dense and type(visible_ids) is Tensor and visible_ids.shape[0] == saved.gaussians[0].shape[0]
+        )
+        # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
+        dense = all_dense and not complete and all(needed)
+        *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
+            saved.gaussians, *saved.cameras, None, None, *saved.splats, saved.level, *ctx.options,
+            _splat_gradients(saved, v), v.depths, need_viewmats, dense,
+        )  # fmt: skip
+        found: list[Tensor | None] = gradients[: len(saved.gaussians)]
+        if len(ctx.parts) > 1:
+            # Autograd would copy a gradient that is not contiguous, and its indices with it. Torch adds to an
+            # empty sparse gradient in place, so parts share no memory.
+            found[4:] = [
+                part.clone(memory_format=torch.contiguous_format)
+                for part in gradients[4].split_with_sizes(ctx.parts, 1)
+            ]
+        if not dense:
+            found = [gradient if wanted else None for gradient, wanted in zip(found, needed, strict=True)]
+        if not dense and not complete:
+            ids = visible_ids if saved.ids is None else saved.ids
+            shapes = [table.shape for table in ctx.tables or saved.gaussians]
+            found = full_gradients(ids, found, shapes, sparse)
+        return (v_viewmats if need_viewmats else None, *found)
 
-def _first_gradients(
-    ctx: Any,
-    saved: _Saved,
-    needed: Sequence[bool],
-    need_viewmats: bool,
-    sparse: Sequence[bool],
-    v: _Differentiable,
-) -> tuple[Tensor | None, ...]:
-    """Compute what `_gradients` returns; `saved` has the tensors of `ctx`."""
-    _, visible_ids, _ = saved.splats
-    gathered = ctx.tables is not None
-    all_dense = not gathered and not any(sparse)
-    # If all Gaussians are visible, the rows of these are all rows. While torch traces the backward pass, the
-    # number of rows is unknown, and tensors are of another type.
-    complete = (
-        all_dense and type(visible_ids) is Tensor and visible_ids.shape[0] == saved.gaussians[0].shape[0]
-    )
-    # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
-    dense = all_dense and not complete and all(needed)
-    *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
-        saved.gaussians, *saved.cameras, None, None, *saved.splats, saved.level, *ctx.options,
-        _splat_gradients(saved, v), v.depths, need_viewmats, dense,
-    )  # fmt: skip
-    found: list[Tensor | None] = gradients[: len(saved.gaussians)]
-    if len(ctx.parts) > 1:
-        # Autograd would copy a gradient that is not contiguous, and its indices with it. Torch adds to an
-        # empty sparse gradient in place, so parts share no memory.
-        found[4:] = [
-            part.clone(memory_format=torch.contiguous_format)
-            for part in gradients[4].split_with_sizes(ctx.parts, 1)
-        ]
-    if not dense:
-        found = [gradient if wanted else None for gradient, wanted in zip(found, needed, strict=True)]
-    if not dense and not complete:
-        ids = visible_ids if saved.ids is None else saved.ids
-        shapes = [table.shape for table in ctx.tables or saved.gaussians]
-        found = full_gradients(ids, found, shapes, sparse)
-    return (v_viewmats if need_viewmats else None, *found)
+    return first_only("project", compute, (*(ctx.tables or saved.gaussians), saved.cameras[0], *v))
 
 
 def _splat_gradients(saved: _Saved, v: _Differentiable) -> list[Tensor]:

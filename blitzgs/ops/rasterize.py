@@ -180,39 +180,29 @@ def _gradients(
     if v_renders is None and v_alphas is None:
         return (None,) * 6
     saved = _saved(ctx)
-    return first_only(
-        "rasterize",
-        lambda: _first_gradients(ctx, saved, v_renders, v_alphas, absgrad, may_be_table),
-        (*saved.splats, saved.backgrounds, v_renders, v_alphas),
-    )
 
+    def compute() -> Sequence[Tensor | None]:
+        (means2d, _, _, colors), (transmittances, *_) = saved.splats, saved.composited
+        v_image = v_renders
+        if v_image is None:
+            v_image = transmittances.new_zeros(*transmittances.shape, colors.shape[1])
+        deterministic = torch.are_deterministic_algorithms_enabled()
+        v_abs = v_backgrounds = None
+        v_splats: Sequence[Tensor]
+        if may_be_table and colors.is_cuda and colors.shape[1] == 3 and v_alphas is None and not absgrad:
+            table = ctx.gradients.take(means2d)
+            torch.ops.blitzgs.rasterize_bwd(*saved, v_image, None, *ctx.grid, False, deterministic, table)
+            v_splats = gradient_columns(table)
+        else:
+            *v_splats, v_abs = torch.ops.blitzgs.rasterize_bwd(
+                *saved, v_image, v_alphas, *ctx.grid, absgrad, deterministic
+            )
+        if ctx.needs_input_grad[4]:
+            # A matrix product would be of less precision under autocast.
+            v_backgrounds = (v_image * transmittances[..., None]).sum(dim=(1, 2))
+        return (*v_splats, v_backgrounds, v_abs if absgrad else None)
 
-def _first_gradients(
-    ctx: Any,
-    saved: RasterizeSaved,
-    v_renders: Tensor | None,
-    v_alphas: Tensor | None,
-    absgrad: bool,
-    may_be_table: bool,
-) -> tuple[Tensor | None, ...]:
-    (means2d, _, _, colors), (transmittances, *_) = saved.splats, saved.composited
-    if v_renders is None:
-        v_renders = transmittances.new_zeros(*transmittances.shape, colors.shape[1])
-    deterministic = torch.are_deterministic_algorithms_enabled()
-    v_abs = v_backgrounds = None
-    v_splats: Sequence[Tensor]
-    if may_be_table and colors.is_cuda and colors.shape[1] == 3 and v_alphas is None and not absgrad:
-        table = ctx.gradients.take(means2d)
-        torch.ops.blitzgs.rasterize_bwd(*saved, v_renders, None, *ctx.grid, False, deterministic, table)
-        v_splats = gradient_columns(table)
-    else:
-        *v_splats, v_abs = torch.ops.blitzgs.rasterize_bwd(
-            *saved, v_renders, v_alphas, *ctx.grid, absgrad, deterministic
-        )
-    if ctx.needs_input_grad[4]:
-        # A matrix product would be of less precision under autocast.
-        v_backgrounds = (v_renders * transmittances[..., None]).sum(dim=(1, 2))
-    return (*v_splats, v_backgrounds, v_abs if absgrad else None)
+    return first_only("rasterize", compute, (*saved.splats, saved.backgrounds, v_renders, v_alphas))
 
 
 class _Call(NamedTuple):

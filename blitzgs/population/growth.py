@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from blitzgs.config.fields import PopulationConfig
 from blitzgs.distributed.group import Ranks
 from blitzgs.table.host_table import available_bytes
 from blitzgs.table.table import GaussianTable
@@ -26,32 +27,22 @@ class GrowthLimit:
 
 
 def growth_limit(
-    max_gaussians: int,
-    pixels: int,
-    pixels_per_gaussian: float,
-    points: int,
-    gaussians_per_point: float,
-    memory_count: int | None,
+    config: PopulationConfig, pixels: int, points: int, memory_count: int | None
 ) -> GrowthLimit | None:
     """Return the tightest of the limits on a population; None when there is none.
 
-    Args:
-        max_gaussians: a fixed limit; 0: none.
-        pixels: number of pixels of all training photographs.
-        pixels_per_gaussian: number of pixels for each Gaussian; 0: no such limit.
-        points: number of points of the reconstruction, which has more points where there is more detail; 0:
-            no such limit.
-        gaussians_per_point: number of Gaussians for each point; 0: no such limit.
-        memory_count: from `memory_limit`; None: no such limit.
+    `pixels`: number of pixels of all training photographs. `points`: number of points of the reconstruction,
+    which has more points where there is more detail; 0: they limit nothing. `memory_count`: from
+    `memory_limit`; None: no such limit.
     """
     limits = []
-    if max_gaussians > 0:
-        limits.append(GrowthLimit(max_gaussians, "population.max_gaussians"))
-    if pixels_per_gaussian > 0:
-        count = max(1, int(pixels / pixels_per_gaussian))
+    if config.max_gaussians > 0:
+        limits.append(GrowthLimit(config.max_gaussians, "population.max_gaussians"))
+    if config.pixels_per_gaussian > 0:
+        count = max(1, int(pixels / config.pixels_per_gaussian))
         limits.append(GrowthLimit(count, "population.pixels_per_gaussian"))
-    if gaussians_per_point > 0 and points > 0:
-        count = max(1, int(points * gaussians_per_point))
+    if config.gaussians_per_point > 0 and points > 0:
+        count = max(1, int(points * config.gaussians_per_point))
         limits.append(GrowthLimit(count, "population.gaussians_per_point"))
     if memory_count is not None:
         limits.append(GrowthLimit(memory_count, "memory"))

@@ -26,16 +26,14 @@ from blitzgs.config.fields import ScoreRule
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import decimal_share, integer_mass_prefix, mass_prefix, smallest
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import RenderOptions
-from blitzgs.frame.survey import Survey, survey
+from blitzgs.frame.render import RenderOptions, Survey, survey
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import open_transport
 from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.counter_random import sampling_keys
 from blitzgs.ops.importance import ViewSums, view_sums_
 from blitzgs.ops.projection_types import Views
-from blitzgs.table.layouts import CULL
-from blitzgs.table.table import GaussianTable
+from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.view.gate import ModelGate
 from blitzgs.view.visible import TableOrPool, VisibleFinder, VisibleRows, table_of
 

@@ -25,8 +25,9 @@ def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = MAX_
     """
     if ranks.world_size == 1:
         return False
-    sizes = shard_sizes(len(table), ranks)
-    if imbalance(sizes) <= max_imbalance:
+    counts = ranks.all_gather(torch.tensor([len(table)], device=ranks.device))
+    sizes = torch.cat(counts).tolist()
+    if max(sizes) <= max_imbalance * min(sizes):
         return False
     mine = global_positions(sizes, ranks.rank) % ranks.world_size
     table.move_rows(mine.to(table.device), ranks)
@@ -53,16 +54,3 @@ def global_positions(sizes: Sequence[int], rank: int) -> Tensor:
         # Rows of `other` in the rounds before this one, plus its row of this round if it comes first.
         positions += (rows + 1 if other < rank else rows).clamp(max=size)
     return positions
-
-
-def shard_sizes(rows: int, ranks: Ranks) -> list[int]:
-    """Return the present number of rows on each rank. Collective."""
-    counts = ranks.all_gather(torch.tensor([rows], dtype=torch.int64, device=ranks.device))
-    return [int(count) for count in torch.cat(counts).tolist()]
-
-
-def imbalance(sizes: Sequence[int]) -> float:
-    """Return largest over smallest shard; infinite if only some shards are empty, 1 if all are."""
-    if max(sizes) == 0:
-        return 1.0
-    return max(sizes) / min(sizes) if min(sizes) else float("inf")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -197,36 +198,12 @@ def render(
         antialiased: compensate the opacity for that addition.
         tolerance: see `composite`.
     """
-    means, quats, scales, opacities, colors, viewmat, K = (
-        tensor.double() for tensor in (means, quats, scales, opacities, colors, viewmat, K)
-    )
-    splats = project_splats(
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        viewmat,
-        K,
-        width,
-        height,
-        sh_degree=sh_degree,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        eps2d=eps2d,
-        antialiased=antialiased,
-    )
-    channels = torch.cat([splats.colors, splats.depths[:, None]], dim=1)
-    result = composite(
-        splats.means2d,
-        splats.conics,
-        splats.opacities,
-        channels,
-        splats.depths,
-        width,
-        height,
-        tolerance=tolerance,
-    )
+    tensors: Any = (tensor.double() for tensor in (means, quats, scales, opacities, colors, viewmat, K))
+    view: dict[str, Any] = dict(width=width, height=height, near_plane=near_plane, far_plane=far_plane)
+    splats = project_splats(*tensors, **view, sh_degree=sh_degree, eps2d=eps2d, antialiased=antialiased)
+    geometry, depths = (splats.means2d, splats.conics, splats.opacities), splats.depths
+    channels = torch.cat([splats.colors, depths[:, None]], dim=1)
+    result = composite(*geometry, channels, depths, width, height, tolerance=tolerance)
     alpha = 1 - result.transmittances
     rgb, depth = result.values[..., :-1], result.values[..., -1:]
     if background is not None:
@@ -263,9 +240,7 @@ def contributions(
     antialiased: bool = False,
 ) -> Contributions:
     """Compute what activated Gaussians contribute to views; arguments as for `blitzgs.contributions`."""
-    means, quats, scales, opacities, viewmats, Ks = (
-        tensor.double() for tensor in (means, quats, scales, opacities, viewmats, Ks)
-    )
+    view: dict[str, Any] = dict(width=width, height=height, near_plane=near_plane, far_plane=far_plane)
     shape = (len(viewmats), len(means))
     result = Contributions(
         torch.zeros(shape, dtype=torch.float64),
@@ -273,23 +248,9 @@ def contributions(
         torch.zeros(shape, dtype=torch.bool),
         torch.zeros(shape, dtype=torch.int64),
     )
-    for v, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
-        splats = project_splats(
-            means,
-            quats,
-            scales,
-            opacities,
-            means,
-            viewmat,
-            K,
-            width,
-            height,
-            sh_degree=None,
-            near_plane=near_plane,
-            far_plane=far_plane,
-            eps2d=eps2d,
-            antialiased=antialiased,
-        )
+    for v, camera in enumerate(zip(viewmats, Ks, strict=True)):
+        tensors: Any = (tensor.double() for tensor in (means, quats, scales, opacities, means, *camera))
+        splats = project_splats(*tensors, **view, sh_degree=None, eps2d=eps2d, antialiased=antialiased)
         weights, cut = composited_weights(
             splats.means2d, splats.conics, splats.opacities, splats.depths, width, height
         )

@@ -13,21 +13,19 @@ import os
 import re
 import shutil
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
 import torch
-from safetensors import safe_open
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.redistribution import global_positions
-from blitzgs.runs.checkpoint_files import DAMAGE, Shard, finish, header_of, verified, write_shard
+from blitzgs.runs.checkpoint_files import DAMAGE, Shard, finish, opened, verified, write_shard
 from blitzgs.util.output import check_space, explain, is_lack_of_space
 
 SHARED = "shared.safetensors"
@@ -54,7 +52,6 @@ class Saving:
         ranks: Ranks,
         keep: int = 3,
         shared: Mapping[str, Tensor] | None = None,
-        reached: Callable[[str], None] = lambda point: None,
     ) -> None:
         """Begin to write a checkpoint. Collective.
 
@@ -65,8 +62,6 @@ class Saving:
             state: the rest of what a resumed run needs, as JSON values; rank 0's is stored.
             keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
             shared: tensors that are the same on all ranks; rank 0's are stored, in a separate file.
-            reached: called at each point at which the save may be interrupted, with the point's name; the
-                tests of crashes stop the process there.
 
         Raises:
             CheckpointError: rank 0 cannot read the folder.
@@ -76,7 +71,6 @@ class Saving:
             raise ValueError(f"checkpoint: keep must be at least 1, got {keep}")
         self._rows = _common_length(columns)
         self._directory, self._state, self._ranks, self._keep = Path(directory), state, ranks, keep
-        self._reached = reached
         name, problem = "", None
         if ranks.rank == 0:
             try:
@@ -114,21 +108,19 @@ class Saving:
         ready: torch.cuda.Event | None,
     ) -> tuple[Shard | None, Shard | None, str | None, bool]:
         """Write this rank's files; return what they are, or why there are none and whether space lacks."""
-        ranks, reached = self._ranks, self._reached
+        ranks = self._ranks
         try:
-            reached("begin")
             self._folder.mkdir(parents=True, exist_ok=True)
             check_space(self._folder, columns)
-            reached("folder made")
             file = f"shard_{ranks.rank:04d}_of_{ranks.world_size:04d}.safetensors"
             # On a stream of its own, copies to the host wait for no later work.
             with torch.cuda.stream(None if ready is None else torch.cuda.Stream(device)):
                 if ready is not None:
                     ready.wait()
-                mine = Shard(file, self._rows, *write_shard(self._folder / file, columns, reached))
+                mine = Shard(file, self._rows, *write_shard(self._folder / file, columns))
                 common = None
                 if shared:
-                    written = write_shard(self._folder / SHARED, shared, lambda point: None)
+                    written = write_shard(self._folder / SHARED, shared)
                     common = Shard(SHARED, 0, *written)
             return mine, common, None, True
         except OSError as error:
@@ -152,7 +144,7 @@ class Saving:
             try:
                 with ranks.watchdog.working("finishing a checkpoint"):
                     shards = [shard for shard, _, _ in results if shard]
-                    finish(self._folder, path, shards, common, self._state, ranks.world_size, self._reached)
+                    finish(self._folder, path, shards, common, self._state, ranks.world_size)
             except OSError as error:
                 problems.append(f"rank 0 could not write: {explain(error)}")
                 lacks_space = is_lack_of_space(error)
@@ -166,7 +158,7 @@ class Saving:
             )
         if ranks.rank == 0:
             try:
-                self.deleting = _delete_old(self._directory, self._keep, self._reached)
+                self.deleting = _delete_old(self._directory, self._keep)
             except OSError as error:
                 # The new checkpoint is complete; the next save tries to delete the old ones again.
                 warnings.warn(f"an older checkpoint could not be deleted: {error}", stacklevel=2)
@@ -245,7 +237,7 @@ def load(
         raise CheckpointError(f"checkpoint {path} is damaged: {'; '.join(sorted(set(problems)))}")
     shared = {}
     if manifest.shared is not None:
-        with _opened(path / manifest.shared.file) as file:
+        with opened(path / manifest.shared.file) as file:
             shared = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     return read_share(path, manifest.shards, ranks, torch.device(device)), manifest.state, shared
 
@@ -254,41 +246,30 @@ def read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.devi
     """Read this rank's share of the columns in a folder's shards, as `load` does, without verifying files."""
     sizes = [shard.rows for shard in shards]
     if len(shards) == ranks.world_size:
-        with _opened(path / shards[ranks.rank].file) as file:
+        with opened(path / shards[ranks.rank].file) as file:
             return {name: file.get_tensor(name).to(device) for name in file.keys()}  # noqa: SIM118
-    positions = [global_positions(sizes, index) for index in range(len(shards))]
-    count = len(range(ranks.rank, sum(sizes), ranks.world_size))
-    columns = {
-        name: torch.empty((count, *spec.shape[1:]), dtype=spec.dtype, device=device)
-        for name, spec in header_of(path / shards[0].file).items()
-    }
-    for shard, order in zip(shards, positions, strict=True):
-        chosen = (order % ranks.world_size == ranks.rank).nonzero().squeeze(1)
-        if len(chosen) == 0:
-            continue
-        target = (order[chosen] // ranks.world_size).to(device)
-        with _opened(path / shard.file) as file:
-            for name, column in columns.items():
-                column[target] = file.get_tensor(name)[chosen].to(device)
+    parts = []
+    for index, shard in enumerate(shards):
+        order = global_positions(sizes, index)
+        rows = (order % ranks.world_size == ranks.rank).nonzero().squeeze(1)
+        if len(rows):
+            parts.append((shard, rows, order[rows] // ranks.world_size))
+    count, none = sum(len(rows) for _, rows, _ in parts), torch.empty(0, dtype=torch.int64)
+    columns: dict[str, Tensor] = {}
+    for shard, rows, target in parts or [(shards[0], none, none)]:
+        with opened(path / shard.file) as file:
+            for name in file.keys():  # noqa: SIM118
+                part = file.get_tensor(name)[rows].to(device)
+                column = columns.setdefault(name, part.new_empty((count, *part.shape[1:])))
+                column[target.to(device)] = part
     return columns
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """Open a safetensors file, also if its path is not valid UTF-8."""
-    with open(path, "rb") as file:
-        is_text = os.fsencode(path).decode(errors="replace") == str(path)
-        # The package accepts only UTF-8 paths.
-        with safe_open(path if is_text else f"/proc/self/fd/{file.fileno()}", "pt") as shard:
-            yield shard
-
-
-def _delete_old(directory: Path, keep: int, reached: Callable[[str], None]) -> Thread:
+def _delete_old(directory: Path, keep: int) -> Thread:
     """Start to delete all but the newest `keep`: deleting gigabytes takes seconds."""
     for name in names_of(directory)[:-keep]:
         # Rename first: an interrupted deletion must not leave half a checkpoint under a final name.
         (directory / name).rename(directory / (_UNFINISHED + name))
-        reached("old one renamed")
     # The next save makes a folder that is not among these.
     deleting = Thread(target=_delete, args=(list(directory.glob(_UNFINISHED + "*")),))
     deleting.start()

@@ -11,13 +11,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import safe_open
 from torch import Tensor
 
 from blitzgs.util.output import sync_to_disk
@@ -95,7 +97,6 @@ def finish(
     shared: Shard | None,
     state: Mapping[str, Any],
     world_size: int,
-    reached: Callable[[str], None],
 ) -> None:
     """Write the manifest beside the shards and give the folder its final name, each step synced."""
     missing = [shard.file for shard in shards if not (unfinished / shard.file).exists()]
@@ -111,15 +112,11 @@ def finish(
     content = json.loads(json.dumps(content))  # tuples become lists: what is read back has the same digest
     with open(unfinished / MANIFEST, "w") as file:
         json.dump(content | {"sha256": _digest(content)}, file, indent=1)
-        reached("manifest written")
         file.flush()
         os.fsync(file.fileno())
     sync_to_disk(unfinished)
-    reached("manifest synced")
     unfinished.rename(path)
-    reached("renamed")
     sync_to_disk(path.parent)
-    reached("finished")
 
 
 _DTYPES = {
@@ -134,23 +131,13 @@ _DTYPES = {
     torch.uint8: "U8",
     torch.bool: "BOOL",
 }
-_BY_NAME = {name: dtype for dtype, name in _DTYPES.items()}
 _CHUNK_BYTES = 64 << 20
 
 
-@dataclass
-class ColumnSpec:
-    """Dtype, shape and first byte of one column of a shard file."""
-
-    dtype: torch.dtype
-    shape: tuple[int, ...]
-    start: int
-
-
-def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[str], None]) -> tuple[int, str]:
+def write_shard(path: Path, columns: Mapping[str, Tensor]) -> tuple[int, str]:
     """Write and sync columns, on any device; return the size in bytes and the SHA-256 in hexadecimal.
 
-    `reached` is called at labelled points. ValueError: a column has a dtype that the format lacks.
+    ValueError: a column has a dtype that the format lacks.
     """
     # Widest elements first, so that every column starts at a multiple of its element size.
     names = sorted(columns, key=lambda name: (-columns[name].element_size(), name))
@@ -182,47 +169,23 @@ def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[st
 
         put(len(head).to_bytes(8, "little"))
         put(head)
-        for index, name in enumerate(names):
+        for name in names:
             flat = columns[name].detach().contiguous().view(-1).view(torch.uint8)
             for part in flat.split(_CHUNK_BYTES):
                 put(memoryview(part.cpu().numpy()))
-            if index == len(names) // 2:
-                file.flush()
-                reached("shard half written")
         file.flush()
-        reached("shard written")
         os.fsync(file.fileno())
         size = file.tell()
-    # The end of the block has waited for the thread.
-    reached("shard synced")
     return size, digest.hexdigest()
 
 
-def header_of(path: Path) -> dict[str, ColumnSpec]:
-    """Read the names, dtypes, shapes and places of the columns in a safetensors file."""
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """Open a safetensors file as its package does, also if the path is not valid UTF-8."""
     with open(path, "rb") as file:
-        head = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-        body = file.tell()
-    return {
-        name: ColumnSpec(_BY_NAME[entry["dtype"]], tuple(entry["shape"]), body + entry["data_offsets"][0])
-        for name, entry in head.items()
-        if name != "__metadata__"
-    }
-
-
-def read_rows(path: Path, first: int, last: int) -> dict[str, Tensor]:
-    """Read the rows from `first` to before `last` of all columns in a safetensors file."""
-    columns = {}
-    with open(path, "rb") as file:
-        for name, spec in header_of(path).items():
-            shape = (min(last, spec.shape[0]) - first, *spec.shape[1:])
-            column = torch.empty(shape, dtype=spec.dtype)
-            data = column.view(-1).view(torch.uint8).numpy()
-            file.seek(spec.start + first * (len(data) // shape[0]))
-            if file.readinto(data.data) != len(data):
-                raise ValueError(f"{path} is cut off")
-            columns[name] = column
-    return columns
+        is_text = os.fsencode(path).decode(errors="replace") == str(path)
+        with safe_open(path if is_text else f"/proc/self/fd/{file.fileno()}", "pt") as columns:
+            yield columns
 
 
 def file_digest(path: Path) -> str:

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,13 +27,13 @@ from blitzgs.formats.models import Format, check_replaces, offset_of
 from blitzgs.formats.selection import Selected, Selection
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint, run_files
+from blitzgs.runs.cameras import SHARED_EXPOSURES
 from blitzgs.runs.checkpoint import CheckpointError
-from blitzgs.runs.checkpoint_files import DAMAGE, Shard, header_of, read_rows, verified
-from blitzgs.runs.folder import Model
+from blitzgs.runs.checkpoint_files import DAMAGE, Shard, opened, verified
+from blitzgs.runs.folder import Model, model_of
 from blitzgs.runs.folder_checks import check_own
-from blitzgs.runs.lod import lod_gate, model_gate
-from blitzgs.runs.run_files import Progress
-from blitzgs.runs.world import trained_columns
+from blitzgs.runs.run_files import Progress, TrainedModel, lod_gate
+from blitzgs.runs.world import trained_table
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import Report
@@ -251,14 +252,8 @@ class RunSource(Changed):
 
 def source_of(model: Model) -> RunSource:
     """Return the source of a model in memory."""
-    found = Gaussians(
-        means=model.means.cpu(),
-        quats=model.quats.cpu(),
-        scales=model.scales.cpu(),
-        opacities=model.opacities.cpu(),
-        sh=model.sh.cpu(),
-        levels=None if model.lod is None else model.level.cpu().float(),
-    )
+    columns: dict[str, Any] = {name: getattr(model, name).cpu() for name in PARAMETERS}
+    found = Gaussians(**columns, levels=None if model.lod is None else model.level.cpu().float())
     gate = None if model.lod is None else model.lod.gate
     lines = _comments(model.config, model.space, gate, model.exposures is not None)
     return RunSource(found, model.space, lines, model.config)
@@ -273,18 +268,9 @@ def largest_of_run(source: RunSource, most: int, device: torch.device) -> Model:
     chosen = joined(list(Selected(source, Selection(most=most, sh_degree=0)).blocks()))
     x, y, z = source.space.offset
     found = replace(chosen, comments=[f"comment offset {x!r} {y!r} {z!r}"])
-    columns = trained_columns(found, source.space, Ranks())
-    table = GaussianTable.of_parameters({name: column.to(device) for name, column in columns.items()})
-    return Model(
-        **{name: table[name] for name in (*PARAMETERS, "level")},
-        lod=model_gate(source.config, source.progress, table, Ranks()),
-        space=source.space,
-        sh_degree=0,
-        config=source.config,
-        images_seen=source.progress.step * source.config.schedule.batch_size,
-        exposures=None,
-        run=None,
-    )
+    table = trained_table(found, source.space, Ranks())
+    progress = replace(source.progress, sh_degree=0)
+    return model_of(TrainedModel(source.config, progress, source.space, table), device)
 
 
 def open_source(folder: Path, only: str | None = None) -> RunSource:
@@ -310,7 +296,10 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
         run_files.compare_with_file(config, folder / run_files.CONFIG)
         gate = lod_gate(config, progress)
         trained = _Shards(path, manifest.shards, config, progress.step, space.extent, gate is not None)
-        exposed = manifest.shared is not None and "exposures" in header_of(path / manifest.shared.file)
+        exposed = False
+        if manifest.shared is not None:
+            with opened(path / manifest.shared.file) as shared:
+                exposed = SHARED_EXPOSURES in shared.keys()  # noqa: SIM118
         return RunSource(trained, space, _comments(config, space, gate, exposed), config, progress)
     if refused:
         raise CheckpointError(f"no sound checkpoint in {folder}: {'; '.join(refused)}")
@@ -334,24 +323,21 @@ class _Shards:
 
     @property
     def degree(self) -> int:
-        return int(header_of(self.path / self.shards[0].file)["sh"].shape[1] ** 0.5) - 1
+        with opened(self.path / self.shards[0].file) as file:
+            return math.isqrt(file.get_slice("sh").get_shape()[1]) - 1
 
     def blocks(self) -> Iterator[Gaussians]:
         optimiser = TableAdam(self.config.optimiser, Schedule(self.config.schedule), self.extent, "cpu")
         for shard in self.shards:
             for first in range(0, shard.rows, gaussians.BLOCK):
                 last = min(first + gaussians.BLOCK, shard.rows)
-                table = GaussianTable(read_rows(self.path / shard.file, first, last))
+                with opened(self.path / shard.file) as file:
+                    rows = {name: file.get_slice(name)[first:last] for name in file.keys()}  # noqa: SIM118
+                table = GaussianTable(rows)
                 with torch.no_grad():
                     optimiser.catch_up(table, None, self.step)
-                yield Gaussians(
-                    means=table["means"],
-                    quats=table["quats"],
-                    scales=table["scales"],
-                    opacities=table["opacities"],
-                    sh=table["sh"],
-                    levels=table["level"].float() if self.has_levels else None,
-                )
+                columns: dict[str, Any] = {name: table[name] for name in PARAMETERS}
+                yield Gaussians(**columns, levels=table["level"].float() if self.has_levels else None)
 
 
 def _comments(config: Config, space: Space, gate: LodGate | None, exposed: bool) -> list[str]:

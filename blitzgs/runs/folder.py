@@ -24,8 +24,8 @@ from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks, resolve_device
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import RunCamera, RunCameras, checked_camera, load_cameras
-from blitzgs.runs.lod import model_gate
 from blitzgs.runs.log import LOG, records
+from blitzgs.runs.run_files import TrainedModel, model_gate
 from blitzgs.table.table import PARAMETERS
 from blitzgs.view.gate import ModelGate, centres_of
 from blitzgs.view.views import CameraLike, Space, render_options, viewmat
@@ -232,17 +232,7 @@ class RunFolder:
         """
         chosen, _ = resolve_device(str(device), local_rank=0, local_world_size=1, share_gpus=False)
         found = run_files.open_model(self.path, Ranks(), only=checkpoint)
-        columns = {name: found.table[name].to(chosen) for name in (*PARAMETERS, "level")}
-        return Model(
-            **columns,
-            lod=model_gate(found.config, found.progress, found.table, Ranks()),
-            space=found.space,
-            sh_degree=found.progress.sh_degree,
-            config=found.config,
-            images_seen=found.progress.step * found.config.schedule.batch_size,
-            exposures=found.exposures,
-            run=self,
-        )
+        return dataclasses.replace(model_of(found, chosen), run=self)
 
     @staticmethod
     def _json(path: Path) -> dict[str, Any]:
@@ -253,6 +243,20 @@ class RunFolder:
         except ValueError as error:
             raise ValueError(f"{path} is damaged: {error}") from error
         return content
+
+
+def model_of(found: TrainedModel, device: torch.device) -> Model:
+    """Return a trained model, whose rows have no pending steps, on a device."""
+    columns: dict[str, Any] = {name: found.table[name].to(device) for name in (*PARAMETERS, "level")}
+    return Model(
+        **columns,
+        lod=model_gate(found.config, found.progress, found.table, Ranks()),
+        space=found.space,
+        sh_degree=found.progress.sh_degree,
+        config=found.config,
+        images_seen=found.progress.step * found.config.schedule.batch_size,
+        exposures=found.exposures,
+    )
 
 
 def open_run(path: Path | str) -> RunFolder:

@@ -19,7 +19,7 @@ from pathlib import Path
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.cameras import CAMERAS
 from blitzgs.runs.checkpoint import CheckpointError
-from blitzgs.runs.log import LOG
+from blitzgs.runs.log import LOG, records
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.terminal import amount
 
@@ -156,10 +156,6 @@ def check_room(folder: Path, table: GaussianTable, ranks: Ranks, most_gaussians:
         )
 
 
-# The last records of a log are within this number of bytes.
-_TAIL_BYTES = 1 << 16
-
-
 def check_own(folder: Path, checkpoint: Path, run_id: str, ranks: Ranks) -> None:
     """Check that a checkpoint was written by the run whose cameras and log are in `folder`. Collective.
 
@@ -183,22 +179,7 @@ def known_id(folder: Path) -> str:
         found = ""
     if isinstance(found, str) and found:
         return found
-    for line in reversed(_tail(folder / LOG)):
-        try:
-            found = json.loads(line).get("run", "")
-        except (ValueError, AttributeError, RecursionError):
-            continue  # an incomplete line
-        if isinstance(found, str) and found:
-            return found
+    with contextlib.suppress(OSError):
+        found = [record["run"] for record in records(folder / LOG) if isinstance(record.get("run"), str)]
+        return found[-1] if found else ""
     return ""
-
-
-def _tail(path: Path) -> list[str]:
-    """Return the last lines of a file."""
-    try:
-        with open(path, "rb") as file:
-            size = file.seek(0, os.SEEK_END)
-            file.seek(max(0, size - _TAIL_BYTES))
-            return file.read().decode(errors="replace").splitlines()
-    except OSError:
-        return []

@@ -281,16 +281,9 @@ def _drop_repeated(path: Path, run_id: str, done: int, total: int) -> None:
     if not run_id or not path.exists():
         return
     kept = []
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    for line in lines:
-        try:
-            record = json.loads(line)
-            repeated = record.get("run") == run_id and (
-                record["t"] > done or (record["t"] == total and record.get("event") in _AT_THE_END)
-            )
-        except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-            repeated = True  # an incomplete line, from a crash
-        if not repeated:
-            kept.append(line + "\n")
-    if len(kept) < len(lines):
-        write_file(path, "".join(kept))
+    for record in records(path):
+        own, t = record.get("run") == run_id, record.get("t")
+        is_at_the_end = t == total and record.get("event") in _AT_THE_END
+        if not own or (isinstance(t, int) and t <= done and not is_at_the_end):
+            kept.append(json.dumps(record) + "\n")
+    write_file(path, "".join(kept))

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a run: the names of its files, and functions that save and open its checkpoints."""
+"""The folder of a run: names of its files, functions that save and open its checkpoints, and the LOD gate."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Any
 
 import torch
 
-from blitzgs.config.fields import Config
+from blitzgs.config.fields import FORK, Config
 from blitzgs.config.files import ConfigError, changed, flat, from_dict, load_config, to_dict
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
@@ -26,6 +27,8 @@ from blitzgs.table.blocks import sort_rows
 from blitzgs.table.host_table import HostTable, available_bytes
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
+from blitzgs.view.gate import LodGate, ModelGate
+from blitzgs.view.levels import FOOTPRINT_STEPS
 from blitzgs.view.views import Space
 from blitzgs.view.visible import TableOrPool
 
@@ -90,16 +93,23 @@ class Progress:
 
 @dataclass
 class TrainedModel:
-    """A model read from a run's checkpoint, without pending optimiser steps, ready to render."""
+    """A model read from a run's checkpoint, with its pending optimiser steps (`restore`) or without."""
 
     config: Config
     progress: Progress  # progress of the run at the checkpoint
     space: Space  # maps between the trained world and the capture's world
     table: GaussianTable  # this rank's Gaussians
+    run_id: str = ""  # identifies the run in its log
+    source: str = ""  # name of the checkpoint and why it was chosen, as text
+    # Tensors that are the same on all ranks: `TileOwners.columns`, and those of the exposures.
+    shared: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
     # Bytes of a device that the Gaussians may take, if the run trained with a pool; else 0.
     pool_bytes: int = 0
-    # Gain and bias of each training photograph, [T, 2, 3]; None if the run has none.
-    exposures: torch.Tensor | None = None
+
+    @property
+    def exposures(self) -> torch.Tensor | None:
+        """Gain and bias of each training photograph, [T, 2, 3]; None if the run has none."""
+        return stored_exposures(self.shared)
 
     def gaussians_on(self, device: torch.device) -> TableOrPool:
         """Return the Gaussians that views are rendered from on a device.
@@ -115,38 +125,29 @@ class TrainedModel:
         return Pool(self.table, device, self.pool_bytes, None)
 
 
-def save(
-    folder: Path,
-    table: GaussianTable,
-    progress: Progress,
-    space: Space,
-    config: Config,
-    ranks: Ranks,
-    run_id: str = "",
-    shared: Mapping[str, torch.Tensor] | None = None,
-    in_background: bool = False,
-) -> checkpoint.Saving:
+def save(folder: Path, model: TrainedModel, ranks: Ranks, in_background: bool = False) -> checkpoint.Saving:
     """Begin to write a checkpoint of a run; pending optimiser steps stay pending: saving changes nothing.
 
     With `in_background`, the table may change before `Saving.finish`: a copy of it is written, or, if memory
     lacks for that, the call returns when the files are written. Earlier checkpoints are kept if a value is
     not finite (NonFiniteError: nothing is written) or a rank could not write (CheckpointError).
     """
-    check_before_saving(table, progress.step, ranks)
+    table = model.table
+    check_before_saving(table, model.progress.step, ranks)
     state = {
-        "progress": dataclasses.asdict(progress),
-        "space": dataclasses.asdict(space),
-        "config": to_dict(config),
-        "run": run_id,
+        "progress": dataclasses.asdict(model.progress),
+        "space": dataclasses.asdict(model.space),
+        "config": to_dict(model.config),
+        "run": model.run_id,
     }
-    keep = config.log.keep_checkpoints
+    keep = model.config.log.keep_checkpoints
     columns = {name: table[name] for name in table}
     # Ranks that share a memory all copy their parts into it.
     sharing = ranks.world_size if table.device.type == "cpu" or ranks.shares_gpu else 1
     has_room = in_background and 2 * sharing * table.memory_bytes < _memory_left(table.device)
     if has_room:
         columns = {name: column.clone() for name, column in columns.items()}
-    saving = checkpoint.Saving(folder / CHECKPOINTS, columns, state, ranks, keep, shared)
+    saving = checkpoint.Saving(folder / CHECKPOINTS, columns, state, ranks, keep, model.shared)
     if in_background and not has_room:
         with ranks.watchdog.working("writing a checkpoint"):
             saving.wait()
@@ -157,23 +158,9 @@ def _memory_left(device: torch.device) -> int:
     return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else available_bytes() or 0
 
 
-@dataclass
-class Restored:
-    """The content of a run's checkpoint."""
-
-    table: GaussianTable  # this rank's Gaussians
-    progress: Progress  # progress of the run at the checkpoint
-    space: Space  # maps between the trained world and the capture's world
-    config: Config
-    run_id: str  # identifies the run in its log
-    source: str  # name of the checkpoint and why it was chosen, as text
-    # Tensors that are the same on all ranks: `TileOwners.columns`, and those of the exposures.
-    shared: dict[str, torch.Tensor]
-
-
 def restore(
     folder: Path, ranks: Ranks, device: torch.device | None = None, only: str | None = None
-) -> Restored | None:
+) -> TrainedModel | None:
     """Read a run's newest undamaged checkpoint, or the one named `only`; None: the run has no checkpoint.
 
     The Gaussians go to `device`, else to the ranks' device. CheckpointError: all checkpoints are damaged, or
@@ -194,9 +181,8 @@ def restore(
         # Each rank had an order of its own, and the spread is of another number of blocks.
         sort_rows(table)
         progress.sorted_spread = 0
-    return Restored(
-        table, progress, space, config, state.get("run", ""), f"{loaded.name} ({why}{skipped})", loaded.shared
-    )
+    source = f"{loaded.name} ({why}{skipped})"
+    return TrainedModel(config, progress, space, table, state.get("run", ""), source, loaded.shared)
 
 
 def parsed(state: Mapping[str, Any], path: Path) -> tuple[Progress, Space, Config]:
@@ -239,19 +225,17 @@ def open_model(
     check_is_run(folder)
     pool_bytes = int((_resident_gb(folder / CONFIG) if resident_gb is None else resident_gb) * 1e9)
     home = torch.device("cpu") if pool_bytes > 0 else ranks.device
-    restored = restore(folder, ranks, home, only)
-    if restored is None:
+    model = restore(folder, ranks, home, only)
+    if model is None:
         raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
-    config, progress, table = restored.config, restored.progress, restored.table
+    config, model.pool_bytes = model.config, pool_bytes
     if ranks.rank == 0:
         compare_with_file(config, folder / CONFIG)
     if data is not None:
-        config = changed(config, "data", path=str(data))
-    optimiser = TableAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
-    optimiser.catch_up(table, None, progress.step)
-    return TrainedModel(
-        config, progress, restored.space, table, pool_bytes, stored_exposures(restored.shared)
-    )
+        model.config = changed(config, "data", path=str(data))
+    optimiser = TableAdam(config.optimiser, Schedule(config.schedule), model.space.extent, home)
+    optimiser.catch_up(model.table, None, model.progress.step)
+    return model
 
 
 def _resident_gb(path: Path) -> float:
@@ -311,3 +295,46 @@ def _differences(saved: Config, found: Config) -> list[tuple[str, Any, Any]]:
     """Return the name and both values of the fields that differ."""
     old, new = flat(to_dict(saved)), flat(to_dict(found))
     return [(name, old[name], new[name]) for name in old if old[name] != new[name]]
+
+
+# Views that would keep at least this share of all Gaussians are rendered with all of them.
+MOST_KEPT = 0.8
+# Gaussians move after the training views were chosen, and held-out views see a little more or less.
+_SLACK = 0.9
+
+
+def lod_gate(config: Config, progress: Progress) -> LodGate | None:
+    """Return the LOD gate at a point of a run; None if it is not open, or no training view has it.
+
+    If every training view is rendered with all Gaussians (`MOST_KEPT`), the coarse levels have never
+    been trained to stand alone. A view from farther away would then show holes where it leaves out the fine
+    ones. Smooth levels fade in every training view.
+    """
+    if progress.finest_level is None:
+        return None
+    if progress.gated_views and "1" not in progress.gated_views:
+        return None
+    return LodGate(
+        progress.reference_distance,
+        level_fork(config),
+        progress.level_count,
+        progress.finest_level,
+        config.view.lod == "smooth",
+    )
+
+
+def level_fork(config: Config) -> float:
+    """Return the ratio of the distances of neighbouring levels of the LOD gate."""
+    return FORK ** (1 / FOOTPRINT_STEPS) if config.view.footprint > 0 else FORK
+
+
+def model_gate(config: Config, progress: Progress, table: GaussianTable, ranks: Ranks) -> ModelGate | None:
+    """Return a model's LOD gate for any camera; None: it is not open. No step may be pending. Collective."""
+    gate = lod_gate(config, progress)
+    if gate is None:
+        return None
+    # With smooth levels every view has the gate: a change from a view with it to one without would be a
+    # visible jump.
+    if gate.smooth:
+        return ModelGate(gate, math.inf, table, ranks)
+    return ModelGate(gate, MOST_KEPT, table, ranks, _SLACK * progress.least_kept)

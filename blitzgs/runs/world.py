@@ -112,6 +112,12 @@ def trained_columns(found: Gaussians, space: Space, ranks: Ranks) -> dict[str, T
     return {name: column.contiguous() for name, column in columns.items()}
 
 
+def trained_table(found: Gaussians, space: Space, ranks: Ranks) -> GaussianTable:
+    """Return this rank's Gaussians on its device, in the order of `trained_columns`, for rendering only."""
+    columns = trained_columns(found, space, ranks)
+    return GaussianTable.of_parameters({name: column.to(ranks.device) for name, column in columns.items()})
+
+
 def gate_of(found: Gaussians, unit: float) -> LodGate | None:
     """Return the LOD gate in a header of `blitzgs export`; `unit` is a trained unit in the file's."""
     pattern = r"comment lod reference_distance (\S+) fork (\S+) levels (\d+) finest (\d+)( smooth)?"
@@ -124,8 +130,6 @@ def gate_of(found: Gaussians, unit: float) -> LodGate | None:
 
 def model_of_file(found: Gaussians, config: Config, space: Space, near: float, ranks: Ranks) -> TrainedModel:
     """Return a model to be rendered in the views of a capture; `near` is in the capture's unit."""
-    columns = trained_columns(found, space, ranks)
-    table = GaussianTable.of_parameters({name: column.to(ranks.device) for name, column in columns.items()})
     progress = Progress(step=0, sh_degree=found.degree, level_count=1, peak_gaussians=len(found), seconds=0.0)
-    near /= space.unit * space.extent
-    return TrainedModel(changed(config, "model", near=near), progress, space, table)
+    config = changed(config, "model", near=near / (space.unit * space.extent))
+    return TrainedModel(config, progress, space, trained_table(found, space, ranks))

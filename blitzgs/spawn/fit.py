@@ -21,6 +21,7 @@ from blitzgs.spawn.gate import GateInfo, SpawnGate, check_no_other, write_info
 from blitzgs.spawn.lineage import ABOUT
 from blitzgs.spawn.lineage_parts import read_lineage
 from blitzgs.util.charts import line_chart, maps
+from blitzgs.util.errors import optional_package
 from blitzgs.util.output import OutputFolder, write_file
 
 # Largest number of births that a fit takes from a scene, drawn evenly.
@@ -170,7 +171,7 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0) -> dict[str,
     held out. ValueError: the runs are of different schedules, or a run has too few spawns. FileExistsError:
     one of the two files exists and belongs to no gate.
     """
-    xgboost = _xgboost()
+    xgboost = optional_package("xgboost", "gate", "fitting a gate")
     check_no_other(path)
     runs = with_distinct_names(runs)
     _check_same_schedule(runs)
@@ -252,15 +253,6 @@ def _hash_uniform(ids: NDArray[np.int64]) -> NDArray[np.float64]:
     """Map the ids of parents [K] to numbers in [0, 1); the children of a parent have the same number."""
     mixed = (ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(11)
     return mixed / 2.0**53
-
-
-def _xgboost() -> ModuleType:
-    try:
-        import xgboost
-    except ImportError as error:
-        raise ImportError("fitting a gate needs xgboost: pip install xgboost") from error
-    module: ModuleType = xgboost
-    return module
 
 
 SURVIVAL = "survival.svg"

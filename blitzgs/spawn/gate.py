@@ -16,6 +16,7 @@ import json
 import math
 import warnings
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -152,49 +153,31 @@ class SpawnGate:
         return tree_sums(features, trees.roots, trees.nodes, trees.leaves, trees.depth)
 
 
-@dataclass(frozen=True)
-class RankVeto:
-    """Vetoes the share of clones, and of splits, with the lowest scores over all ranks."""
-
-    gate: SpawnGate
-    rate: float  # in [0, 1]
-
-    def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
-        """Tell which candidates are vetoed, bool [M]; ties go to the smaller id. Collective."""
-        return veto_lowest(self.gate.scores(candidates.features).float(), candidates, self.rate, ranks)
+# The following three are vetoes once the arguments before `candidates` are given (`functools.partial`). Each
+# withholds a share `rate`, in [0, 1], of the clones and of the splits, the same ones at every world size.
 
 
-@dataclass(frozen=True)
-class SampledVeto:
-    """Vetoes a share of clones, and of splits, at random, the likelier the lower a gate's scores.
+def rank_veto(gate: SpawnGate, rate: float, candidates: Candidates, ranks: Ranks) -> Tensor:
+    """Veto those with the lowest scores over all ranks, bool [M]; ties go to the smaller id. Collective."""
+    return veto_lowest(gate.scores(candidates.features).float(), candidates, rate, ranks)
+
+
+def sampled_veto(gate: SpawnGate, rate: float, seed: int, candidates: Candidates, ranks: Ranks) -> Tensor:
+    """Veto at random, the likelier the lower a gate's scores, bool [M]. Collective.
 
     The kept candidates are drawn without replacement, in proportion to the odds that the gate gives them. A
-    candidate of low rank, which `RankVeto` would withhold at event after event, is thus kept now and then.
+    candidate of low rank, which `rank_veto` would withhold at event after event, is thus kept now and then.
     """
-
-    gate: SpawnGate
-    rate: float  # in [0, 1]
-    seed: int
-
-    def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
-        """Tell which candidates are vetoed, bool [M], the same ones at every world size. Collective."""
-        log_odds = self.gate.scores(candidates.features).double() * 2.0**-_LEAF_BITS
-        # The order of exponential races, whose keys are -log(u) / odds, by the logarithms of the keys: the
-        # odds themselves may exceed the range of numbers.
-        races = (-veto_draws(candidates, self.seed).log()).log() - log_odds
-        return veto_lowest((-races).float(), candidates, self.rate, ranks)
+    log_odds = gate.scores(candidates.features).double() * 2.0**-_LEAF_BITS
+    # The order of exponential races, whose keys are -log(u) / odds, by the logarithms of the keys: the odds
+    # themselves may exceed the range of numbers.
+    races = (-veto_draws(candidates, seed).log()).log() - log_odds
+    return veto_lowest((-races).float(), candidates, rate, ranks)
 
 
-@dataclass(frozen=True)
-class RandomVeto:
-    """Vetoes a share of clones, and of splits, at random, the same ones at every world size."""
-
-    rate: float  # in [0, 1]
-    seed: int
-
-    def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
-        """Tell which candidates are vetoed, bool [M]. Collective."""
-        return veto_lowest(veto_draws(candidates, self.seed).float(), candidates, self.rate, ranks)
+def random_veto(rate: float, seed: int, candidates: Candidates, ranks: Ranks) -> Tensor:
+    """Veto at random, bool [M]. Collective."""
+    return veto_lowest(veto_draws(candidates, seed).float(), candidates, rate, ranks)
 
 
 def veto_draws(candidates: Candidates, seed: int) -> Tensor:
@@ -325,7 +308,7 @@ def open_spawn_gate(config: Config, capture: Capture, ranks: Ranks, known: str) 
     if population.gate is None:
         return None, ""
     if population.gate == RANDOM:
-        return RandomVeto(population.gate_rate, config.seed), ""
+        return partial(random_veto, population.gate_rate, config.seed), ""
     path = gate_file(population.gate)
     gate = SpawnGate(path)
     digest = hashlib.sha256(path.read_bytes() + info_path(path).read_bytes()).hexdigest()
@@ -339,8 +322,8 @@ def open_spawn_gate(config: Config, capture: Capture, ranks: Ranks, known: str) 
         for problem in reasons_against(gate, config, capture):
             warnings.warn(f"spawn gate {path}: {problem}", stacklevel=2)
     if population.gate_rule == "sample":
-        return SampledVeto(gate, population.gate_rate, config.seed), digest
-    return RankVeto(gate, population.gate_rate), digest
+        return partial(sampled_veto, gate, population.gate_rate, config.seed), digest
+    return partial(rank_veto, gate, population.gate_rate), digest
 
 
 def reasons_against(gate: SpawnGate, config: Config, capture: Capture) -> list[str]:

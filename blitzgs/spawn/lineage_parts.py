@@ -19,6 +19,7 @@ from torch import Tensor
 
 from blitzgs.ops.host import current_stream
 from blitzgs.spawn.candidates import FEATURES
+from blitzgs.util.errors import optional_package
 from blitzgs.util.output import new_file
 
 PART_NAME = re.compile(r"(births|deaths)_(\d{8})_(\d{4})_(\d{4,})\.parquet")
@@ -189,9 +190,5 @@ def check_columns(table: Any, needed: Iterable[str], path: Path) -> None:
 
 def import_pyarrow() -> tuple[ModuleType, ModuleType]:
     """Return pyarrow and pyarrow.parquet; raise ImportError with the remedy if they are not installed."""
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise ImportError("lineage is logged as Parquet: install pyarrow (pip install pyarrow)") from error
-    return pyarrow, pyarrow.parquet
+    what = "logging lineage as Parquet"
+    return optional_package("pyarrow", "lineage", what), optional_package("pyarrow.parquet", "lineage", what)

@@ -143,7 +143,7 @@ class BlockIndex:
     def _pending(self, table: GaussianTable) -> PendingSteps | None:
         if self._pending_table is None:
             return None
-        return PendingSteps._make((*_PENDING_OF(table.columns), self._pending_table))
+        return (*_PENDING_OF(table.columns), self._pending_table)
 
 
 def spread(bounds: Tensor, limit: float) -> Tensor:

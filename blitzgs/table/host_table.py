@@ -42,25 +42,52 @@ class HostTable(GaussianTable):
             self._store_raw(name, self.columns[name])
 
     def _store_raw(self, name: str, tensor: Tensor) -> None:
-        memory = self._memory.get(name)
-        if not (
-            memory is not None
-            and memory.dtype == tensor.dtype
-            and memory.shape[1:] == tensor.shape[1:]
-            and len(memory) >= len(tensor)
-        ):
+        if not fits(self._memory.get(name), tensor, len(tensor)):
             # Free the old memory first, so that the host never holds both.
             self._memory.pop(name, None)
             self.columns[name] = tensor
-            del memory
-            memory = self._memory[name] = self._allocate(tensor, int(GROWTH * len(tensor)))
-        self.columns[name] = memory[: len(tensor)].copy_(tensor)
+            self._memory[name] = self._allocate(tensor, int(GROWTH * len(tensor)))
+        self.columns[name] = self._memory[name][: len(tensor)].copy_(tensor)
 
     def _allocate(self, like: Tensor, rows: int) -> Tensor:
-        return _allocate(like, rows, self._pinned)
+        """Allocate memory for rows like those of a tensor, on separate pages."""
+        rows = max(1, rows)
+        size = rows * like.element_size() * math.prod(like.shape[1:])
+        available = available_bytes()
+        if available is not None and size > available:
+            raise HostMemoryError(
+                f"a column of {len(like):,} Gaussians needs {amount(size)} in the memory of the host, which "
+                f"has {amount(available)} left: use more memory or hosts, or cap population.max_gaussians"
+            )
+        pages = mmap.mmap(-1, max(1, size), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        for advice in ("MADV_HUGEPAGE", "MADV_DONTFORK"):  # fewer pages to pin; a fork must not copy them
+            with contextlib.suppress(AttributeError, OSError):
+                pages.madvise(getattr(mmap, advice))
+        view = memoryview(pages)
+        memory = torch.frombuffer(view, dtype=torch.uint8, count=max(1, size))[:size]
+        if self._pinned and size:
+            address = memory.data_ptr()
+            error = int(torch.cuda.cudart().cudaHostRegister(address, size, 0))
+            if error:
+                raise HostMemoryError(
+                    f"{amount(size)} of the host's memory cannot be pinned (CUDA error {error}): use a host "
+                    "with more memory, or cap population.max_gaussians"
+                )
+            weakref.finalize(view, _unpin, address, pages)
+        return memory.view(like.dtype).view(rows, *like.shape[1:])
 
     def _reorder(self, name: str, order: Tensor) -> None:
         self._store(name, *take_rows([self[name]], order))
+
+
+def fits(memory: Tensor | None, like: Tensor, rows: int) -> bool:
+    """Tell whether memory can hold some rows of a column."""
+    return (
+        memory is not None
+        and memory.dtype == like.dtype
+        and memory.shape[1:] == like.shape[1:]
+        and len(memory) >= rows
+    )
 
 
 def available_bytes() -> int | None:
@@ -70,34 +97,6 @@ def available_bytes() -> int | None:
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
     return None
-
-
-def _allocate(like: Tensor, rows: int, pinned: bool) -> Tensor:
-    """Allocate memory for rows like those of a tensor, on separate pages."""
-    rows = max(1, rows)
-    size = rows * like.element_size() * math.prod(like.shape[1:])
-    available = available_bytes()
-    if available is not None and size > available:
-        raise HostMemoryError(
-            f"a column of {len(like):,} Gaussians needs {amount(size)} in the memory of the host, which "
-            f"has {amount(available)} left: use more memory or hosts, or cap population.max_gaussians"
-        )
-    pages = mmap.mmap(-1, max(1, size), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    for advice in ("MADV_HUGEPAGE", "MADV_DONTFORK"):  # fewer pages to pin; a fork must not copy them
-        with contextlib.suppress(AttributeError, OSError):
-            pages.madvise(getattr(mmap, advice))
-    view = memoryview(pages)
-    memory = torch.frombuffer(view, dtype=torch.uint8, count=max(1, size))[:size]
-    if pinned and size:
-        address = memory.data_ptr()
-        error = int(torch.cuda.cudart().cudaHostRegister(address, size, 0))
-        if error:
-            raise HostMemoryError(
-                f"{amount(size)} of the host's memory cannot be pinned (CUDA error {error}): use a host "
-                "with more memory, or cap population.max_gaussians"
-            )
-        weakref.finalize(view, _unpin, address, pages)
-    return memory.view(like.dtype).view(rows, *like.shape[1:])
 
 
 def _unpin(address: int, _pages: mmap.mmap) -> None:

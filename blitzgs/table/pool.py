@@ -21,9 +21,16 @@ from torch import Tensor
 from blitzgs.ops.blocks import BLOCK_ROWS, swap_blocks_
 from blitzgs.ops.host import to_device
 from blitzgs.table.blocks import UNSEEN, BlockIndex, BlockVisibility, Cameras, culled_blocks
-from blitzgs.table.host_table import HostTable
-from blitzgs.table.layouts import CULL, LAYOUTS, sectors_in
-from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
+from blitzgs.table.host_table import HostTable, fits
+from blitzgs.table.table import (
+    CULL,
+    EXP_AVG_SQS,
+    EXP_AVGS,
+    PARAMETERS,
+    GaussianTable,
+    sectors_in,
+    stored_rows,
+)
 from blitzgs.util.terminal import amount
 
 # Columns that steps change and that are therefore written back to the host.
@@ -133,7 +140,7 @@ class Pool:
             )
         rows = slots * BLOCK_ROWS + self._rest
         allocated_rows = (slots + has_rest) * BLOCK_ROWS
-        if any(not _fits(self._storage.get(name), table.columns[name], allocated_rows) for name in names):
+        if any(not fits(self._storage.get(name), table.columns[name], allocated_rows) for name in names):
             # Free the old pool before allocating the new one.
             self.held.columns.clear()
             self._storage.clear()
@@ -153,16 +160,16 @@ class Pool:
     @staticmethod
     def _held_of(columns: Mapping[str, Tensor], rows: int) -> GaussianTable:
         """Return a table of the first `rows` rows of columns in their stored form."""
-        held = GaussianTable({name: column[:rows] for name, column in columns.items() if name not in LAYOUTS})
-        for name in LAYOUTS.keys() & columns.keys():
-            held.columns[name] = columns[name][: LAYOUTS[name].length(rows)]
+        held = GaussianTable({name: column[:rows] for name, column in columns.items() if name != CULL})
+        if CULL in columns:
+            held.columns[CULL] = columns[CULL][: stored_rows(CULL, rows)]
         return held
 
     def _open(self) -> None:
         """Begin to use the pool: load the last, partial block, which stays."""
         if not self._is_open and self._rest:
             for name, column in self.held.columns.items():
-                count = LAYOUTS[name].length(self._rest) if name in LAYOUTS else self._rest
+                count = stored_rows(name, self._rest)
                 column[-count:].copy_(self.table.columns[name][-count:])
         self._is_open = True
 
@@ -381,13 +388,3 @@ class Pool:
         """Make the current stream wait for the swaps."""
         if self._stream is not None:
             torch.cuda.current_stream(self._device).wait_stream(self._stream)
-
-
-def _fits(storage: Tensor | None, column: Tensor, rows: int) -> bool:
-    """Tell whether memory of the pool can hold some rows of a column."""
-    return (
-        storage is not None
-        and len(storage) >= rows
-        and storage.shape[1:] == column.shape[1:]
-        and storage.dtype == column.dtype
-    )

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.ops.blocks import BLOCK_ROWS, SECTOR_WORDS, WORD_BITS, rows_of_sectors, sectors_of_rows
 from blitzgs.ops.rows import put_rows_, take_rows
-from blitzgs.table.layouts import LAYOUTS
 
 # A column that has to be moved to become longer gets memory for this many times its rows.
 GROWTH = 1.25
@@ -34,6 +34,9 @@ _PARAMETERS_OF, _EXP_AVGS_OF, _EXP_AVG_SQS_OF = (
     itemgetter(*names) for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)
 )
 NO_PARENT = -1
+# The cull matrix, from the first importance pass on: which views leave a row out, bits [N, words]. It is
+# stored by blocks of rows (`blitzgs.ops.blocks.sectors_of_rows`), as kernels read it; all others row by row.
+CULL = "cull"
 
 
 @dataclass(frozen=True)
@@ -93,8 +96,18 @@ def opacity_logit(opacity: float) -> float:
 
 
 def as_stored(name: str, column: Tensor) -> Tensor:
-    """Return a column [N, ...] as `GaussianTable.columns` stores it: unchanged, unless it has a layout."""
-    return LAYOUTS[name].stored(column) if name in LAYOUTS else column
+    """Return a column [N, ...] as `GaussianTable.columns` stores it: unchanged, or `CULL` by blocks."""
+    return sectors_of_rows(column).view(-1, column.shape[1]) if name == CULL else column
+
+
+def sectors_in(stored: Tensor) -> Tensor:
+    """View the stored form of `CULL` as the kernels take it, int32 [ceil(N / 256), columns, 8]."""
+    return stored.view(-1, WORD_BITS * stored.shape[1], SECTOR_WORDS)
+
+
+def stored_rows(name: str, count: int) -> int:
+    """Return the length of the stored form of a column with `count` rows."""
+    return -(-count // BLOCK_ROWS) * BLOCK_ROWS if name == CULL else count
 
 
 class GaussianTable:
@@ -104,7 +117,7 @@ class GaussianTable:
     time, so that peak memory exceeds the table by one column and not by a second table. `replace` touches
     only the rows that change; for that, columns that grow have memory for more rows than they hold.
 
-    A column of `LAYOUTS` is converted whenever it is set, read or moved.
+    The column `CULL` is converted whenever it is set, read or moved.
     """
 
     def __init__(self, columns: Mapping[str, Tensor]) -> None:
@@ -128,7 +141,7 @@ class GaussianTable:
                     f"GaussianTable: column '{name}' must be {column.dtype} {list(wanted)} on {sh.device}, "
                     f"got {tensor.dtype} {list(tensor.shape)} on {tensor.device}"
                 )
-        # The columns by name, those of `LAYOUTS` in their stored form.
+        # The columns by name, `CULL` in its stored form.
         self.columns: dict[str, Tensor] = {name: as_stored(name, column) for name, column in columns.items()}
         # The memory of columns that have more of it than rows; they are its first rows.
         self._memory: dict[str, Tensor] = {}
@@ -174,7 +187,7 @@ class GaussianTable:
 
     def __getitem__(self, name: str) -> Tensor:
         column = self.columns[name]
-        return LAYOUTS[name].rows(column, len(self)) if name in LAYOUTS else column
+        return rows_of_sectors(sectors_in(column), len(self)) if name == CULL else column
 
     def __delitem__(self, name: str) -> None:
         """Drop a column and free its memory."""
@@ -194,8 +207,8 @@ class GaussianTable:
         self._store_raw(name, as_stored(name, tensor))
 
     def _to_change(self) -> list[str]:
-        """Return the columns in the order in which they change: those of `LAYOUTS` while others tell N."""
-        return sorted(self, key=lambda name: name not in LAYOUTS)
+        """Return the columns in the order in which they change: `CULL` while others tell N."""
+        return sorted(self, key=lambda name: name != CULL)
 
     def release(self) -> dict[str, Tensor]:
         """Return all columns, [N, ...], and leave the table without any."""
@@ -214,9 +227,9 @@ class GaussianTable:
     def _lengthen(self, name: str, count: int, most: int | None) -> Tensor:
         """Return a column of `count` rows that begins with the present ones, as many as fit.
 
-        Columns of `LAYOUTS` are returned row by row, and have to be stored.
+        `CULL` is returned row by row, and has to be stored.
         """
-        if name in LAYOUTS:
+        if name == CULL:
             old = self[name]
             return torch.cat((old, old.new_empty((max(0, count - len(old)), *old.shape[1:]))))
         old = self.columns[name]
@@ -326,7 +339,7 @@ class GaussianTable:
         """Permute a column, which keeps the room that it has for more rows, as far as `GROWTH` gives it."""
         old = self.columns[name]
         room = min(len(self._memory.get(name, old)), int(GROWTH * len(old)))
-        if name in LAYOUTS or room == len(old):
+        if name == CULL or room == len(old):
             self._store(name, *take_rows([self[name]], order))
         else:
             memory = self._allocate(old, room)
@@ -347,7 +360,7 @@ class GaussianTable:
         put_rows_([columns[name] for name in new], placement.new, list(new.values()))
         put_rows_([column for name, column in columns.items() if name not in new], placement.new)
         for name, column in columns.items():
-            if name in LAYOUTS:
+            if name == CULL:
                 self._store(name, column[: placement.total])
             elif placement.total != len(self.columns[name]):
                 self._memory.setdefault(name, column)

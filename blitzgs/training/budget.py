@@ -203,14 +203,7 @@ def estimate(config: Config, capture: Capture, on_gpu: bool, cores: int) -> Esti
     """
     sizes = [capture.cameras[i].width * capture.cameras[i].height for i in capture.train]
     population, coefficients = config.population, (config.model.sh_degree + 1) ** 2
-    limit = growth_limit(
-        population.max_gaussians,
-        sum(sizes),
-        population.pixels_per_gaussian,
-        len(capture.points),
-        population.gaussians_per_point,
-        None,
-    )
+    limit = growth_limit(population, sum(sizes), len(capture.points), None)
     first = int(_FIRST_PER_POINT * len(capture.points))
     if population.max_gaussians > 0:
         first = min(first, population.max_gaussians)

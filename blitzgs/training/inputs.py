@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import os
 import socket
@@ -83,20 +84,9 @@ def open_capture(
 
 def load_configured(data: DataConfig, find_damage: FindDamage = damaged) -> Capture:
     """Call `load_capture` with the fields of a configuration."""
-    return load_capture(
-        data.path,
-        images=data.images,
-        downscale=data.downscale,
-        split=data.split,
-        masks=data.masks,
-        undistort=data.undistort,
-        exif=data.exif,
-        allow_missing=data.allow_missing,
-        inside_only=data.inside_only,
-        sparse=data.sparse,
-        stray_cameras=data.stray_cameras,
-        find_damage=find_damage,
-    )
+    fields = dataclasses.asdict(data)
+    del fields["cache_bytes"]
+    return load_capture(fields.pop("path"), **fields, find_damage=find_damage)
 
 
 def _damaged_of_share(ranks: Ranks, files: Sequence[tuple[Path, Path | None]]) -> dict[int, str]:

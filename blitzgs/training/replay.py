@@ -25,6 +25,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ from blitzgs.runs import run_files
 from blitzgs.runs.checkpoint_files import MANIFEST
 from blitzgs.runs.folder_checks import locked
 from blitzgs.spawn.candidates import Candidates, Veto
-from blitzgs.spawn.gate import RandomVeto, RankVeto, SampledVeto, SpawnGate, veto_draws
+from blitzgs.spawn.gate import SpawnGate, random_veto, rank_veto, sampled_veto, veto_draws
 from blitzgs.spawn.lineage_parts import read_lineage
 from blitzgs.training.trainer import Trainer
 
@@ -215,9 +216,9 @@ def replay(
         counts = torch.tensor([oracle.matched, oracle.seen], device=ranks.device)
         matched, seen = ranks.all_reduce(counts).tolist()
         yield result | {"matched": matched / max(1, seen)}
-    yield train("gate", RankVeto(gate, rate))
-    yield train("gate_sampled", SampledVeto(gate, rate, config.seed))
-    yield train("random", RandomVeto(rate, config.seed))
+    yield train("gate", partial(rank_veto, gate, rate))
+    yield train("gate_sampled", partial(sampled_veto, gate, rate, config.seed))
+    yield train("random", partial(random_veto, rate, config.seed))
 
 
 def _held_back(known: Tensor, spawned: Tensor, ranks: Ranks) -> float:

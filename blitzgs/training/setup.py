@@ -163,7 +163,7 @@ def _describe(folder: Path, config: Config, capture: Capture, run_id: str, is_ne
         save_world_frame(folder, capture.about.frame)
 
 
-def _resolved(config: Config, capture: Capture, restored: run_files.Restored | None) -> Config:
+def _resolved(config: Config, capture: Capture, restored: run_files.TrainedModel | None) -> Config:
     """Return `config` with the values that depend on the training views and on what the run has measured.
 
     The depths of what the views see decide on the near plane (`model.near`). The number of views decides the
@@ -190,7 +190,7 @@ def _resolved(config: Config, capture: Capture, restored: run_files.Restored | N
 
 
 def _continued(
-    config: Config, restored: run_files.Restored | None, extend: float | None, folder: Path
+    config: Config, restored: run_files.TrainedModel | None, extend: float | None, folder: Path
 ) -> Config:
     """Return the configuration to begin or continue a run with: `config`, or one with a longer schedule."""
     if restored is None:
@@ -204,7 +204,7 @@ def _continued(
     return config if extend is None else extended(config, restored.progress.step, extend)
 
 
-def _tile_owners(ranks: Ranks, progress: Progress, restored: run_files.Restored | None) -> TileOwners:
+def _tile_owners(ranks: Ranks, progress: Progress, restored: run_files.TrainedModel | None) -> TileOwners:
     """Return the division of tiles, with the costs that the checkpoint has if they can be used."""
     owners = TileOwners(ranks)
     if restored is None or "bounds" not in restored.shared or ranks.world_size == 1:
@@ -220,7 +220,7 @@ def _exposures(
     images: ImageStore,
     ranks: Ranks,
     progress: Progress,
-    restored: run_files.Restored | None,
+    restored: run_files.TrainedModel | None,
 ) -> Exposures | None:
     """Return the photographs' exposures, from the checkpoint or the tracks; None if they are equal."""
     exposures = Exposures(capture.train, ranks)
@@ -280,7 +280,7 @@ def _start_lineage(
     return lineage
 
 
-def _origin(restored: run_files.Restored | None, resume: bool, folder: Path, schedule: Schedule) -> str:
+def _origin(restored: run_files.TrainedModel | None, resume: bool, folder: Path, schedule: Schedule) -> str:
     """Describe where the run begins, for the log."""
     if restored is not None:
         more = ""

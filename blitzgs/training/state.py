@@ -21,9 +21,8 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.render import RenderOptions
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.log import RunLog
-from blitzgs.runs.run_files import Progress
+from blitzgs.runs.run_files import Progress, lod_gate
 from blitzgs.spawn.candidates import Veto
 from blitzgs.spawn.lineage import Lineage
 from blitzgs.table.table import GaussianTable

@@ -26,8 +26,8 @@ from blitzgs.ops.population import density_stats_
 from blitzgs.population.importance import PHI
 from blitzgs.runs import run_files
 from blitzgs.runs.guard import LossGuard, ModelLostError
-from blitzgs.runs.lod import lod_gate
 from blitzgs.runs.log import RunLog
+from blitzgs.runs.run_files import lod_gate
 from blitzgs.spawn.gate import lineage_subject
 from blitzgs.table.pool import PoolError
 from blitzgs.training import view_level
@@ -90,7 +90,7 @@ class Trainer:
         # On CUDA a record is written one step later, so that the host does not wait for its figures.
         self._writes_late = ranks.device.type == "cuda"
         self._warned_of_masks = False
-        self._watching: Watching | None = None
+        self._watching = Watching(state, None)
         self.memory: list[int] = []  # samples of what this rank's GPU has allocated
 
     def watch(self, watcher: Watcher | None) -> None:
@@ -112,13 +112,11 @@ class Trainer:
         folder = state.folder if state.ranks.rank == 0 else None
         board = state.config.log.tensorboard
         state.log = RunLog(folder, state.schedule.iterations, state.images_seen, board, state.run_id)
-        wants = never
-        if self._watching is not None:
-            state.log.listener, wants = self._watching.told, self._watching.wants
+        state.log.listener = self._watching.told
         state.start_clock()
         try:
             with StopRequest() as stop:
-                agreement = Agreement(state.ranks, stop, state.save_clock, wants)
+                agreement = Agreement(state.ranks, stop, state.save_clock, self._watching.wants)
                 state.stops = lambda: agreement.now(state.progress.step).signal is not None
                 if not self._take_steps(agreement):
                     return None
@@ -183,7 +181,7 @@ class Trainer:
         if decision.written:
             with state.stage("checkpoint"):
                 save.finish_checkpoint(state)
-        if decision.watched and self._watching is not None:
+        if decision.watched:
             self._write_record()
             self._watching.serve(state.stops)
 
@@ -222,8 +220,7 @@ class Trainer:
     def close(self) -> None:
         """Stop loading batches and close the log."""
         state = self.state
-        if self._watching is not None:
-            self._watching.close()
+        self._watching.close()
         for text in dict.fromkeys(self.warned):
             state.log.event(state.images_seen, "warned", {"warning": text})
         self.loader.close()
@@ -305,19 +302,11 @@ class Trainer:
         Radii are counted in pixels of the whole photograph, and gradients do not depend on the resolution.
         """
         splats, views, table = frame.projected, frame.views, self.state.stepper.table
-        density_stats_(
-            table["grad_sum"],
-            table["grad_count"],
-            table["max_radii"],
-            splats.visible_ids,
-            splats.splat_offsets,
-            v_means2d,
-            splats.conics if reduction == 1 else splats.conics / reduction**2,
-            views.width,
-            views.height,
-            float(len(views)),
-            table[PHI] if self.state.config.population.phi and PHI in table else None,
-        )
+        conics = splats.conics if reduction == 1 else splats.conics / reduction**2
+        of_splats = splats.visible_ids, splats.splat_offsets, v_means2d, conics
+        phi = table[PHI] if self.state.config.population.phi and PHI in table else None
+        statistics = table["grad_sum"], table["grad_count"], table["max_radii"]
+        density_stats_(*statistics, *of_splats, views.width, views.height, float(len(views)), phi)
 
     def _announce(self) -> None:
         """Log the start of the training: origin, population, views and ranks."""

@@ -10,10 +10,8 @@ import warnings
 from blitzgs.capture.capture import Capture, train_views_fingerprint
 from blitzgs.config.schedule import Event
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.lod import level_fork, lod_gate, model_gate
-from blitzgs.runs.run_files import Progress
-from blitzgs.table.layouts import CULL
-from blitzgs.table.table import GaussianTable
+from blitzgs.runs.run_files import Progress, level_fork, lod_gate, model_gate
+from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.training.state import TrainingState
 from blitzgs.view.gate import ViewGate, lod_bits
 from blitzgs.view.levels import FOOTPRINT_LEVELS, footprint_levels, footprint_sizes

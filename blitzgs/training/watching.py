@@ -7,17 +7,16 @@ import contextlib
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import Any
 
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs.lod import model_gate
+from blitzgs.runs.run_files import model_gate
 from blitzgs.table.pool import Pool
 from blitzgs.training.events import save
 from blitzgs.training.state import TrainingState
 from blitzgs.view.draw import Drawer, DrawingError, Subject
 from blitzgs.view.look import Look, Picture, Watcher, Wish
 
-T = TypeVar("T")
 # Seconds between two questions to the watcher while the training is paused and nothing is to be drawn.
 _PAUSE_SECONDS = 0.03
 
@@ -31,11 +30,11 @@ class Watching:
 
     def wants(self) -> bool:
         """Tell whether this rank's watcher has a wish."""
-        return self._watcher is not None and bool(self._asked(lambda watcher: watcher.wants(), False))
+        return self._watcher is not None and bool(self._asked("wants"))
 
     def told(self, t: int, values: Mapping[str, Any]) -> None:
         """Pass a record of the log on."""
-        self._asked(lambda watcher: watcher.told(t, values), None)
+        self._asked("told", t, values)
 
     def serve(self, stops: Callable[[], bool]) -> None:
         """Fulfil what the watcher wants between two steps, until `stops`; every rank calls this together."""
@@ -53,12 +52,11 @@ class Watching:
 
     def close(self) -> None:
         """Tell the watcher that the training has ended."""
-        self._asked(lambda watcher: watcher.close(), None)
+        self._asked("close")
         self._watcher = None
 
     def _next(self) -> Wish:
-        wish = self._asked(lambda watcher: watcher.wish(), Wish())
-        return self._state.ranks.broadcast_object(wish)
+        return self._state.ranks.broadcast_object(self._asked("wish") or Wish())
 
     def _fulfil(self, wish: Wish) -> None:
         if wish.save:
@@ -73,12 +71,10 @@ class Watching:
         except Exception as error:
             if self._state.ranks.world_size > 1 and not isinstance(error, DrawingError):
                 raise  # the other ranks are in the middle of the picture
-            reason = str(error)
-            self._asked(lambda watcher: watcher.failed(reason), None)
+            self._asked("failed", str(error))
             return
         if picture is not None:
-            shown, seconds = picture, time.perf_counter() - begin
-            self._asked(lambda watcher: watcher.show(shown, seconds), None)
+            self._asked("show", picture, time.perf_counter() - begin)
 
     def _drawn(self, look: Look) -> Picture | None:
         state = self._state
@@ -90,12 +86,12 @@ class Watching:
         subject = Subject(gaussians, state.render_options, state.space.unit, lod)
         return Drawer(subject, TileOwners(state.ranks)).draw(look)
 
-    def _asked(self, call: Callable[[Watcher], T], otherwise: T) -> T:
-        """Call the watcher; without one, or if it fails, return `otherwise`. After an error it is gone."""
+    def _asked(self, method: str, *arguments: Any) -> Any:
+        """Call a method of the watcher; None without one, or if it fails. After an error it is gone."""
         if self._watcher is None:
-            return otherwise
+            return None
         try:
-            return call(self._watcher)
+            return getattr(self._watcher, method)(*arguments)
         except Exception as error:
             watcher, self._watcher = self._watcher, None
             warnings.warn(
@@ -104,4 +100,4 @@ class Watching:
             )
             with contextlib.suppress(Exception):
                 watcher.close()
-            return otherwise
+            return None

@@ -8,14 +8,14 @@ from torch import Tensor
 
 
 def quaternion_matrices(quats: Tensor) -> Tensor:
-    """Return the matrices [M, 3, 3] of quaternions [M, 4], rotations if the quaternions have length 1."""
-    w, x, y, z = quats.unbind(1)
+    """Return the matrices [..., 3, 3] of quaternions [..., 4], rotations if these have length 1."""
+    w, x, y, z = quats.unbind(-1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
 def quaternions(rotations: Tensor) -> Tensor:

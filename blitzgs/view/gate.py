@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,8 +18,7 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.blocks import ActiveRows, GateRules, gate_views_
 from blitzgs.ops.counter_random import uniform
-from blitzgs.table.layouts import CULL, sectors_in
-from blitzgs.table.table import GaussianTable
+from blitzgs.table.table import CULL, GaussianTable, sectors_in
 from blitzgs.view.levels import farthest
 
 # Number of sampled Gaussians that predict the share that a view keeps; the standard error is at most 0.4 %.
@@ -134,19 +133,24 @@ class ModelGate:
         """Tell whether a view that keeps this share of all Gaussians has the gate."""
         return self.least_kept <= share < self.most_kept
 
-    def active(self, table: GaussianTable, viewmats: Tensor) -> ActiveRows | None:
+    def active(self, table: GaussianTable | Mapping[str, Tensor], viewmats: Tensor) -> ActiveRows | None:
         """Return the rows that each of B views keeps; None if every view keeps every row. Collective.
 
-        `table`: this rank's Gaussians, caught up. `viewmats`: float32 [B, 4, 4], B <= 32.
+        `table`: means and levels of this rank's Gaussians, caught up. `viewmats`: float32 [B, 4, 4], B <= 32.
         """
-        return self._gated(table["means"], table["level"], viewmats)
+        means, rules = table["means"], self.rules(table["level"], viewmats)
+        if rules is None:
+            return None
+        active = _all_rows(len(means), len(viewmats), means.device)
+        gate_views_(active, means, viewmats, rules)
+        return active
 
     def rows(self, means: Tensor, level: Tensor, viewmat: Tensor) -> Tensor:
         """Return which Gaussians a view keeps, bool [N]; only for a single process.
 
         `means`: float32 [N, 3]. `level`: uint8 [N]. `viewmat`: float32 [1, 4, 4].
         """
-        active = self._gated(means, level, viewmat)
+        active = self.active({"means": means, "level": level}, viewmat)
         return torch.ones_like(level, dtype=torch.bool) if active is None else active.views != 0
 
     def rules(self, level: Tensor, viewmats: Tensor) -> GateRules | None:
@@ -154,14 +158,6 @@ class ModelGate:
         shares = self.kept(centres_of(viewmats))
         lod_views = lod_bits([self.applies(share) for share in shares])
         return None if lod_views == 0 else GateRules(level, self.gate.reach(), lod_views)
-
-    def _gated(self, means: Tensor, level: Tensor, viewmats: Tensor) -> ActiveRows | None:
-        rules = self.rules(level, viewmats)
-        if rules is None:
-            return None
-        active = _all_rows(len(means), len(viewmats), means.device)
-        gate_views_(active, means, viewmats, rules)
-        return active
 
 
 def lod_bits(gated: Sequence[bool]) -> int:

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.runs.cameras import RunCamera, checked_camera
+from blitzgs.util.errors import optional_package
 from blitzgs.util.output import check_replaceable, new_file
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import MAX_PIXELS
@@ -56,13 +57,8 @@ def tour(kind: Tour, world: World, fovs: list[float]) -> CameraPath:
     else:
         chosen = np.unique(np.linspace(0, len(world.poses) - 1, _STATIONS).round().astype(int))
         stances = [world.stance(world.poses[index], fovs[index]) for index in chosen]
-    return CameraPath([_key(world, stance) for stance in stances], seconds=10.0, is_cycle=kind == "orbit")
-
-
-def _key(world: World, stance: Stance) -> Keyframe:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = stance.rotation, world.capture_position(stance.position)
-    return Keyframe(pose, math.degrees(stance.fov), 16 / 9)
+    keys = [Keyframe(world.capture_pose(stance), math.degrees(stance.fov), 16 / 9) for stance in stances]
+    return CameraPath(keys, seconds=10.0, is_cycle=kind == "orbit")
 
 
 def _centres(world: World) -> Array:
@@ -217,15 +213,8 @@ _QUALITY = "17"
 
 
 def require_av() -> ModuleType:
-    """Import the optional package that encodes films.
-
-    ImportError: it is not installed; the message says how to install it.
-    """
-    try:
-        import av
-    except ImportError as error:
-        raise ImportError(f'films need the package av: pip install "blitzgs[film]" ({error})') from error
-    return av
+    """Import the optional package that encodes films (ImportError: says how to install it)."""
+    return optional_package("av", "film", "making a film")
 
 
 def check_film(path: Path, width: int, height: int) -> None:

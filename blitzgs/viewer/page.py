@@ -11,8 +11,10 @@ import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from blitzgs.util.errors import optional_package
 from blitzgs.view.look import Picture
 from blitzgs.viewer.door import Door, is_loopback
 from blitzgs.viewer.frustums import Frustums
@@ -24,22 +26,15 @@ from blitzgs.viewer.world import Exhibit, World
 if TYPE_CHECKING:
     import viser
 
-MISSING = 'the viewer needs the package viser: pip install "blitzgs[view]"'
 # Seconds that a picture waits to be sent: a photograph to compare with may come from a slow disk.
 _SEND_SECONDS = 1.0
 # Seconds between two updates of the figures on the page.
 _FIGURES_SECONDS = 0.2
 
 
-def require_viser() -> None:
-    """Check that the optional package of the viewer is installed.
-
-    ImportError: it is not; the message says how to install it.
-    """
-    try:
-        import viser  # noqa: F401
-    except ImportError as error:
-        raise ImportError(f"{MISSING} ({error})") from error
+def require_viser() -> ModuleType:
+    """Import the optional package of the viewer (ImportError: says how to install it)."""
+    return optional_package("viser", "view", "the viewer")
 
 
 class Page:
@@ -67,9 +62,7 @@ class Page:
             ImportError: viser is not installed.
             OSError: the address is not this machine's, or the port is in use.
         """
-        require_viser()
-        import viser
-
+        viser = require_viser()
         self.exhibit, self.folders, self.memory = exhibit, folders, memory
         self.woken = threading.Event()  # set when a picture may be needed
         self.visitors: dict[int, Visitor] = {}  # those who look at present, by viser's numbers

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from html import escape
 from typing import Any
 
@@ -17,7 +18,7 @@ from blitzgs.view.draw import LEVEL_COLOURS
 from blitzgs.view.look import MODES
 from blitzgs.viewer import compare
 from blitzgs.viewer.frustums import Frustums
-from blitzgs.viewer.route import Route, note, safe_name, save_beside
+from blitzgs.viewer.paths import Route, note, safe_name, save_beside
 from blitzgs.viewer.settings import Triple
 from blitzgs.viewer.visitor import Shown, Visitor
 from blitzgs.viewer.world import SCALE
@@ -57,15 +58,17 @@ class Panel:
         with self._gui.add_folder("Viewpoints and path", expand_by_default=False):
             Route(self._visitor, self._gui).build()
 
+    def _bind(self, control: Any, choice: str, convert: Callable[[Any], Any] = lambda value: value) -> None:
+        """Change a field of the visitor's settings whenever a control is used."""
+        control.on_update(lambda _: self._visitor.change(**{choice: convert(control.value)}))
+
     def _show(self) -> None:
-        visitor, gui = self._visitor, self._gui
+        gui = self._gui
         modes = [mode for mode in MODES if mode != "level" or self._exhibit.levels]
-        mode = gui.add_dropdown("Mode", modes, initial_value="RGB")
-        mode.on_update(lambda _: visitor.change(mode=mode.value))
-        quality = gui.add_slider("Longest side", min=320, max=3840, step=160, initial_value=1920)
-        quality.on_update(lambda _: visitor.change(most_side=int(quality.value)))
-        adapts = gui.add_checkbox("Coarse while moving", True)
-        adapts.on_update(lambda _: visitor.change(adapts=adapts.value))
+        self._bind(gui.add_dropdown("Mode", modes, initial_value="RGB"), "mode")
+        sides = gui.add_slider("Longest side", min=320, max=3840, step=160, initial_value=1920)
+        self._bind(sides, "most_side", int)
+        self._bind(gui.add_checkbox("Coarse while moving", True), "adapts")
         gui.add_button("Screenshot").on_click(lambda _: self._screenshot())
 
     def _photographs(self) -> None:
@@ -88,7 +91,7 @@ class Panel:
             "Exposure", False, disabled=not exhibit.exposures,
             hint="Where a photograph was trained on, show the render with its exposure",
         )  # fmt: skip
-        exposure.on_update(lambda _: visitor.change(exposure=exposure.value))
+        self._bind(exposure, "exposure")
         wipe = gui.add_slider("Wipe", min=0.0, max=1.0, step=0.01, initial_value=0.5, disabled=True)
 
         def stand(_: Any) -> None:
@@ -109,7 +112,7 @@ class Panel:
 
         gui.add_button("Stand there").on_click(stand)
         choice.on_update(chosen)
-        wipe.on_update(lambda _: visitor.change(wipe=float(wipe.value)))
+        self._bind(wipe, "wipe", float)
         visitor.listeners.append(tell)
         tell()
 
@@ -144,28 +147,20 @@ class Panel:
         self._visitor.go(start, float(np.linalg.norm(start.position - world.middle)))
 
     def _model(self) -> None:
-        visitor, gui, exhibit = self._visitor, self._gui, self._exhibit
-        lod = gui.add_checkbox("LOD gate", exhibit.lod, disabled=not exhibit.lod)
-        lod.on_update(lambda _: visitor.change(lod=lod.value))
-        smooth = gui.add_checkbox("Smooth levels", exhibit.smooth, disabled=not exhibit.lod)
-        smooth.on_update(lambda _: visitor.change(smooth=smooth.value))
+        gui, exhibit = self._gui, self._exhibit
+        self._bind(gui.add_checkbox("LOD gate", exhibit.lod, disabled=not exhibit.lod), "lod")
+        self._bind(gui.add_checkbox("Smooth levels", exhibit.smooth, disabled=not exhibit.lod), "smooth")
         degree = gui.add_slider("SH degree", min=0, max=max(1, exhibit.sh_degree), step=1,
                                 initial_value=exhibit.sh_degree, disabled=exhibit.sh_degree == 0)  # fmt: skip
-        degree.on_update(lambda _: visitor.change(sh_degree=int(degree.value)))
+        self._bind(degree, "sh_degree", int)
         colour = tuple(round(255 * value) for value in exhibit.background)
         background = gui.add_rgb("Background", initial_value=colour)
-        background.on_update(
-            lambda _: visitor.change(background=tuple(value / 255 for value in background.value))
-        )
+        self._bind(background, "background", lambda channels: tuple(value / 255 for value in channels))
         unit = exhibit.space.unit
-        near = gui.add_number(
-            "Near", 0.0, min=0.0, step=0.01 * unit * exhibit.space.extent, hint="0: the model's"
-        )
-        far = gui.add_number(
-            "Far", 0.0, min=0.0, step=0.1 * unit * exhibit.space.extent, hint="0: the model's"
-        )
-        near.on_update(lambda _: visitor.change(near=near.value / unit or None))
-        far.on_update(lambda _: visitor.change(far=far.value / unit or None))
+        for name, share in (("Near", 0.01), ("Far", 0.1)):
+            step = share * unit * exhibit.space.extent
+            plane = gui.add_number(name, 0.0, min=0.0, step=step, hint="0: the model's")
+            self._bind(plane, name.lower(), lambda value: value / unit or None)
 
     def _crop(self) -> None:
         visitor, gui, exhibit = self._visitor, self._gui, self._exhibit

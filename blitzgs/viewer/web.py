@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from blitzgs.capture.world import GEO, GEOCENTRIC, WorldFrame, converted, read_world_frame, reference_system
+from blitzgs.capture.world import GEOCENTRIC, WorldFrame, converted, reference_system
 from blitzgs.config.fields import Config, ModelConfig
 from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased
 from blitzgs.formats.models import offset_of, open_gaussians
@@ -24,6 +24,7 @@ from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, load_cameras
 from blitzgs.runs.clean import contributions as measured
 from blitzgs.runs.export import open_source
+from blitzgs.runs.world import load_world_frame
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.util.errors import located
@@ -203,8 +204,7 @@ def open_city(path: Path, checked: bool = True) -> City:
         source, offset = run, np.array(run.space.offset)
         if (folder / CAMERAS).exists():
             cameras = load_cameras(folder).cameras
-        if (folder / GEO).is_file():
-            frame = read_world_frame(folder / GEO)
+        frame = load_world_frame(folder)
     first = next(iter(source.blocks()), None)
     if first is None or len(first) == 0:
         raise ValueError(f"{path} holds no Gaussians")

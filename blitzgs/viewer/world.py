@@ -72,6 +72,12 @@ class World:
         """Return a position of the page in the capture's coordinates."""
         return position / SCALE * self.space.unit + np.array(self.space.offset)
 
+    def capture_pose(self, stance: Stance) -> Array:
+        """Return the pose of a stance in the capture's coordinates, camera to world [4, 4]."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = stance.rotation, self.capture_position(stance.position)
+        return pose
+
     def page_position(self, position: Array) -> Array:
         """Return a position of the capture in the page's coordinates."""
         return (position - np.array(self.space.offset)) / self.space.unit * SCALE

@@ -71,40 +71,7 @@ __global__ void __launch_bounds__(kThreads) move_blocks(const SwapBlocks swap, i
   }
 }
 
-}  // namespace
-
-void seen_blocks(const SeenBlocks& args, Workspace&, CudaStream stream) {
-  if (args.n == 0) return;
-  see_blocks<<<blocks_for(args.n, kThreads), kThreads, 0, stream>>>(args);
-  check_launch("seen_blocks");
-}
-
-void swap_blocks(const SwapBlocks& given, Workspace&, CudaStream stream) {
-  if (given.n == 0 || given.n_columns == 0) return;
-  SwapBlocks swap = given;
-  std::int64_t units = 0;
-  for (int c = 0; c < swap.n_columns; ++c) {
-    SwapColumn& column = swap.columns[c];
-    column.table =
-        reinterpret_cast<std::byte*>(device_address(reinterpret_cast<std::int64_t*>(column.table)));
-    const auto places =
-        reinterpret_cast<std::uintptr_t>(column.pool) | reinterpret_cast<std::uintptr_t>(column.table);
-    if (places % sizeof(uint4) != 0) {
-      throw std::runtime_error(
-          "blitzgs: columns that blocks move between must begin at multiples of 16 bytes");
-    }
-    const std::int64_t words = column.bytes / static_cast<std::int64_t>(sizeof(uint4));
-    units += (words + kUnit - 1) / kUnit;
-  }
-  const std::int64_t wanted = (swap.n * units + kWarps - 1) / kWarps;
-  move_blocks<<<static_cast<unsigned>(std::min<std::int64_t>(wanted, kBlocks)), kThreads, 0, stream>>>(
-      swap, static_cast<int>(units));
-  check_launch("swap_blocks");
-}
-
 // The view gate (view_gate.h).
-
-namespace {
 
 // Transposes the 32 x 32 bits of a warp: bit i of the result of lane l is bit l of the argument of lane i.
 __device__ std::uint32_t transpose_bits(std::uint32_t word, int lane) {
@@ -144,13 +111,6 @@ void transpose(const CullMask& mask, CudaStream stream) {
   check_launch("cull mask");
 }
 
-}  // namespace
-
-void sectors_of_rows(const CullMask& mask, CudaStream stream) { transpose<true>(mask, stream); }
-void rows_of_sectors(const CullMask& mask, CudaStream stream) { transpose<false>(mask, stream); }
-
-namespace {
-
 constexpr int kResident = 6;  // CUDA blocks that fit a multiprocessor of every supported GPU
 
 // Applies the gate (view_gate.h) to the list, one thread per entry in a grid-stride loop.
@@ -168,6 +128,38 @@ __global__ void __launch_bounds__(kThreads, kResident) gate_views_kernel(const V
 }
 
 }  // namespace
+
+void seen_blocks(const SeenBlocks& args, Workspace&, CudaStream stream) {
+  if (args.n == 0) return;
+  see_blocks<<<blocks_for(args.n, kThreads), kThreads, 0, stream>>>(args);
+  check_launch("seen_blocks");
+}
+
+void swap_blocks(const SwapBlocks& given, Workspace&, CudaStream stream) {
+  if (given.n == 0 || given.n_columns == 0) return;
+  SwapBlocks swap = given;
+  std::int64_t units = 0;
+  for (int c = 0; c < swap.n_columns; ++c) {
+    SwapColumn& column = swap.columns[c];
+    column.table =
+        reinterpret_cast<std::byte*>(device_address(reinterpret_cast<std::int64_t*>(column.table)));
+    const auto places =
+        reinterpret_cast<std::uintptr_t>(column.pool) | reinterpret_cast<std::uintptr_t>(column.table);
+    if (places % sizeof(uint4) != 0) {
+      throw std::runtime_error(
+          "blitzgs: columns that blocks move between must begin at multiples of 16 bytes");
+    }
+    const std::int64_t words = column.bytes / static_cast<std::int64_t>(sizeof(uint4));
+    units += (words + kUnit - 1) / kUnit;
+  }
+  const std::int64_t wanted = (swap.n * units + kWarps - 1) / kWarps;
+  move_blocks<<<static_cast<unsigned>(std::min<std::int64_t>(wanted, kBlocks)), kThreads, 0, stream>>>(
+      swap, static_cast<int>(units));
+  check_launch("swap_blocks");
+}
+
+void sectors_of_rows(const CullMask& mask, CudaStream stream) { transpose<true>(mask, stream); }
+void rows_of_sectors(const CullMask& mask, CudaStream stream) { transpose<false>(mask, stream); }
 
 void gate_views(const ViewGateArgs& args, Workspace&, CudaStream stream) {
   if (args.capacity == 0) return;

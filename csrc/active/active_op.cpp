@@ -1,10 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "active/blocks.h"
 
-#include <algorithm>
-#include <optional>
 #include <tuple>
-#include <vector>
 
 #include "active/pool.h"
 #include "active/view_gate.h"
@@ -15,8 +12,8 @@ namespace {
 
 // The checked rules, and the tensors that they point to, which must live during the call.
 struct HeldRules {
-  Tensor level;
-  std::optional<Tensor> cull;
+  Values<const std::uint8_t> level;
+  OptionalValues<const std::int32_t> cull;
   GateRules rules{};
 };
 
@@ -47,11 +44,11 @@ void set_columns(const char* op, const std::vector<std::int64_t>& columns, bool 
 HeldRules hold_rules(const char* op, std::int64_t rows, int views, const Tensor& level,
                      const std::vector<double>& reach, std::int64_t lod_views,
                      const std::optional<Tensor>& cull, const std::vector<std::int64_t>& columns) {
-  HeldRules held{checked(op, "level", level, ScalarType::Byte, {rows}),
-                 checked(op, "cull", cull, ScalarType::Int, {blocks_of(rows), -1, kSectorWords})};
+  HeldRules held{checked<std::uint8_t>(op, "level", level, {rows}),
+                 checked<std::int32_t>(op, "cull", cull, {blocks_of(rows), -1, kSectorWords})};
   if (held.cull) held.rules.cull_columns = held.cull->size(1);
-  held.rules.level = data<std::uint8_t>(held.level);
-  held.rules.cull = data_or_null<std::int32_t>(held.cull);
+  held.rules.level = held.level;
+  held.rules.cull = held.cull;
   held.rules.n_rows = rows;
   held.rules.n_views = views;
   held.rules.lod_views = static_cast<std::uint32_t>(lod_views);
@@ -77,150 +74,141 @@ HeldRows hold_rows(const char* op, const std::vector<Tensor>& rows) {
   BLITZGS_CHECK(n < (std::int64_t{1} << 31) - kBlockRows, op, "fewer than 2^31 - ", kBlockRows,
                 " rows are supported, got ", n);
   HeldRows held;
-  const auto hold = [&]<class T>(const T*& column, const char* name, std::size_t at, ScalarType dtype,
+  BlockRows& b = held.rows;
+  const auto hold = [&]<class T>(const T*& column, const char* name, std::size_t at,
                                  std::initializer_list<std::int64_t> shape) {
-    column = data<T>(held.held.emplace_back(checked(op, name, rows[at], dtype, shape)));
+    column = data<T>(held.held.emplace_back(checked<T>(op, name, rows[at], shape)));
   };
-  held.rows.n = n;
-  hold(held.rows.means, "means", 0, ScalarType::Float, {n, 3});
-  hold(held.rows.scales, "scales", 1, ScalarType::Float, {n, 3});
+  b.n = n;
+  hold(b.means, "means", 0, {n, 3});
+  hold(b.scales, "scales", 1, {n, 3});
   if (rows.size() == 2) return held;
-  hold(held.rows.exp_avg_means, "exp_avg of means", 2, ScalarType::Float, {n, 3});
-  hold(held.rows.exp_avg_sq_means, "exp_avg_sq of means", 3, ScalarType::Float, {n, 3});
-  hold(held.rows.exp_avg_scales, "exp_avg of scales", 4, ScalarType::Float, {n, 3});
-  hold(held.rows.exp_avg_sq_scales, "exp_avg_sq of scales", 5, ScalarType::Float, {n, 3});
-  hold(held.rows.last_step, "last_step", 6, ScalarType::Int, {n});
-  hold(held.rows.moment_step, "moment_step", 7, ScalarType::Int, {n});
-  hold(held.rows.table, "table", 8, ScalarType::Double, {-1, kAdamTable});
+  hold(b.exp_avg_means, "exp_avg of means", 2, {n, 3});
+  hold(b.exp_avg_sq_means, "exp_avg_sq of means", 3, {n, 3});
+  hold(b.exp_avg_scales, "exp_avg of scales", 4, {n, 3});
+  hold(b.exp_avg_sq_scales, "exp_avg_sq of scales", 5, {n, 3});
+  hold(b.last_step, "last_step", 6, {n});
+  hold(b.moment_step, "moment_step", 7, {n});
+  hold(b.table, "table", 8, {-1, kAdamTable});
   return held;
 }
 
-Tensor checked_viewmats(const char* op, const Tensor& viewmats) {
-  const Tensor found = checked(op, "viewmats", viewmats, ScalarType::Float, {-1, 4, 4});
+Values<const float> checked_viewmats(const char* op, const Tensor& viewmats) {
+  const auto found = checked<float>(op, "viewmats", viewmats, {-1, 4, 4});
   BLITZGS_CHECK(found.size(0) <= kMaxViews, op, "at most ", kMaxViews, " views at once, got ", found.size(0));
   return found;
 }
 
-void check_bounds(const char* op, const Tensor& bounds, std::int64_t rows) {
-  check_in_place(op, "bounds", bounds, ScalarType::Float, {blocks_of(rows), kBlockBounds});
-}
-
-void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in,
+void update_block_bounds_(const Tensor& bounds_in, const std::optional<Tensor>& ids_in,
                           const std::vector<Tensor>& rows) {
-  const char* op = "update_block_bounds_";
-  const HeldRows held = hold_rows(op, rows);
-  check_bounds(op, bounds, held.rows.n);
-  const std::optional<Tensor> ids = checked(op, "ids", ids_in, ScalarType::Int, {-1});
+  constexpr const char* kOp = "update_block_bounds_";
+  const HeldRows held = hold_rows(kOp, rows);
+  const auto bounds =
+      checked_in_place<float>(kOp, "bounds", bounds_in, {blocks_of(held.rows.n), kBlockBounds});
+  const auto ids = checked<std::int32_t>(kOp, "ids", ids_in, {-1});
   // An empty tensor may have a null pointer, which would mean all rows.
   if (ids && ids->size(0) == 0) return;
   DeviceScope scope(bounds);
-  backend::update_block_bounds(held.rows, data_or_null<std::int32_t>(ids), ids ? ids->size(0) : 0,
-                               mutable_data<float>(bounds), scope.workspace, scope.stream);
+  backend::update_block_bounds(held.rows, ids, ids ? ids->size(0) : 0, bounds, scope.workspace, scope.stream);
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
-    const Tensor& bounds, const std::vector<Tensor>& rows, const Tensor& viewmats_in, const Tensor& Ks_in,
+    const Tensor& bounds_in, const std::vector<Tensor>& rows, const Tensor& viewmats_in, const Tensor& Ks_in,
     std::int64_t width, std::int64_t height, double near_plane, double far_plane, double eps2d,
     const std::optional<Tensor>& level_ranges_in, const std::optional<Tensor>& level,
     const std::vector<double>& reach, std::int64_t lod_views, const std::optional<Tensor>& cull,
     const std::vector<std::int64_t>& columns, std::optional<std::int64_t> capacity_in) {
-  const char* op = "cull_blocks";
-  const HeldRows held = hold_rows(op, rows);
-  check_bounds(op, bounds, held.rows.n);
-  const Tensor viewmats = checked_viewmats(op, viewmats_in);
-  const std::int64_t views = viewmats.size(0);
-  const Tensor Ks = checked(op, "Ks", Ks_in, ScalarType::Float, {views, 3, 3});
-  const CullCamera camera{data<float>(viewmats),          data<float>(Ks),
-                          static_cast<int>(width),        static_cast<int>(height),
-                          static_cast<float>(near_plane), static_cast<float>(far_plane),
+  constexpr const char* kOp = "cull_blocks";
+  const HeldRows held = hold_rows(kOp, rows);
+  const std::int64_t blocks = blocks_of(held.rows.n);
+  const auto bounds = checked_in_place<float>(kOp, "bounds", bounds_in, {blocks, kBlockBounds});
+  const auto viewmats = checked_viewmats(kOp, viewmats_in);
+  const auto views = static_cast<int>(viewmats.size(0));
+  const auto Ks = checked<float>(kOp, "Ks", Ks_in, {views, 3, 3});
+  const CullCamera camera{viewmats,
+                          Ks,
+                          static_cast<int>(width),
+                          static_cast<int>(height),
+                          static_cast<float>(near_plane),
+                          static_cast<float>(far_plane),
                           static_cast<float>(eps2d)};
-  BLITZGS_CHECK(level_ranges_in.has_value() == level.has_value(), op, "a gate needs level_ranges and level");
+  BLITZGS_CHECK(level_ranges_in.has_value() == level.has_value(), kOp, "a gate needs level_ranges and level");
   BlockGate gate{};
   std::optional<HeldRules> rules;
-  const std::optional<Tensor> level_ranges =
-      checked(op, "level_ranges", level_ranges_in, ScalarType::Byte, {blocks_of(held.rows.n), 2});
+  const auto level_ranges = checked<std::uint8_t>(kOp, "level_ranges", level_ranges_in, {blocks, 2});
   if (level) {
-    rules = hold_rules(op, held.rows.n, static_cast<int>(views), *level, reach, lod_views, cull, columns);
-    gate = {rules->rules, data<std::uint8_t>(*level_ranges)};
+    rules = hold_rules(kOp, held.rows.n, views, *level, reach, lod_views, cull, columns);
+    gate = {rules->rules, level_ranges};
   }
   DeviceScope scope(bounds);
-  const CullInputs in{held.rows, data<float>(bounds), camera, static_cast<int>(views), gate};
-  BLITZGS_CHECK(!capacity_in || *capacity_in > 0, op, "capacity_blocks must be for 1 block or more, got ",
+  const CullInputs in{held.rows, bounds, camera, views, gate};
+  BLITZGS_CHECK(!capacity_in || *capacity_in > 0, kOp, "capacity_blocks must be for 1 block or more, got ",
                 *capacity_in);
-  const std::int64_t capacity = capacity_in ? std::min(*capacity_in, blocks_of(held.rows.n))
+  const std::int64_t capacity = capacity_in ? std::min(*capacity_in, blocks)
                                             : backend::count_active_blocks(in, scope.workspace, scope.stream);
-  Tensor active_ids = make_empty(bounds, {capacity * kBlockRows}, ScalarType::Int);
-  Tensor active_views = make_empty(bounds, {capacity * kBlockRows}, ScalarType::Int);
-  Tensor count = make_empty(bounds, {1}, ScalarType::Int),
-         n_blocks = make_empty(bounds, {1}, ScalarType::Int);
-  const ActiveList list{mutable_data<std::int32_t>(active_ids), mutable_data<std::int32_t>(active_views),
-                        mutable_data<std::int32_t>(count), mutable_data<std::int32_t>(n_blocks), capacity};
-  backend::cull_blocks(in, list, scope.workspace, scope.stream);
-  return {active_ids, active_views, count, n_blocks};
+  const auto ids = make<std::int32_t>(bounds, {capacity * kBlockRows}),
+             active_views = make<std::int32_t>(bounds, {capacity * kBlockRows}),
+             count = make<std::int32_t>(bounds, {1}), n_blocks = make<std::int32_t>(bounds, {1});
+  backend::cull_blocks(in, {ids, active_views, count, n_blocks, capacity}, scope.workspace, scope.stream);
+  return {ids, active_views, count, n_blocks};
 }
 
+// Kernels read one of the two layouts and write the other.
+std::int32_t* words_of(const Tensor& layout) { return static_cast<std::int32_t*>(layout.mutable_data_ptr()); }
+
 Tensor sectors_of_rows(const Tensor& rows_in) {
-  Tensor rows = checked("sectors_of_rows", "rows", rows_in, ScalarType::Int, {-1, -1});
+  const auto rows = checked<std::int32_t>("sectors_of_rows", "rows", rows_in, {-1, -1});
   const std::int64_t n = rows.size(0), words = rows.size(1);
-  Tensor sectors = make_empty(rows, {blocks_of(n), 32 * words, kSectorWords});
+  const auto sectors = make<std::int32_t>(rows, {blocks_of(n), 32 * words, kSectorWords});
   DeviceScope scope(rows);
-  backend::sectors_of_rows({mutable_data<std::int32_t>(rows), mutable_data<std::int32_t>(sectors), n, words},
-                           scope.stream);
+  backend::sectors_of_rows({words_of(rows), sectors, n, words}, scope.stream);
   return sectors;
 }
 
 Tensor rows_of_sectors(const Tensor& sectors_in, std::int64_t n) {
   constexpr const char* kOp = "rows_of_sectors";
-  Tensor sectors = checked(kOp, "sectors", sectors_in, ScalarType::Int, {blocks_of(n), -1, kSectorWords});
+  const auto sectors = checked<std::int32_t>(kOp, "sectors", sectors_in, {blocks_of(n), -1, kSectorWords});
   BLITZGS_CHECK(sectors.size(1) % 32 == 0, kOp, "sectors must be of a multiple of 32 columns, got ",
                 sectors.size(1));
   const std::int64_t words = sectors.size(1) / 32;
-  Tensor rows = make_empty(sectors, {n, words});
+  const auto rows = make<std::int32_t>(sectors, {n, words});
   DeviceScope scope(sectors);
-  backend::rows_of_sectors({mutable_data<std::int32_t>(rows), mutable_data<std::int32_t>(sectors), n, words},
-                           scope.stream);
+  backend::rows_of_sectors({rows, words_of(sectors), n, words}, scope.stream);
   return rows;
 }
 
-constexpr const char* kGateViews = "gate_views_";
-
-void gate_views_(const Tensor& ids_in, Tensor views, const std::optional<Tensor>& count,
+void gate_views_(const Tensor& ids_in, const Tensor& views_in, const std::optional<Tensor>& count,
                  const Tensor& means_in, const Tensor& level_in, const Tensor& viewmats_in,
                  const std::vector<double>& reach, std::int64_t lod_views,
                  const std::optional<Tensor>& cull_in, const std::vector<std::int64_t>& columns) {
-  const Tensor ids = checked(kGateViews, "ids", ids_in, ScalarType::Int, {-1});
+  constexpr const char* kOp = "gate_views_";
+  const auto ids = checked<std::int32_t>(kOp, "ids", ids_in, {-1});
   const std::int64_t capacity = ids.size(0);
-  check_in_place(kGateViews, "views", views, ScalarType::Int, {capacity});
-  const Tensor means = checked(kGateViews, "means", means_in, ScalarType::Float, {-1, 3});
-  const Tensor viewmats = checked_viewmats(kGateViews, viewmats_in);
-  const HeldRules held = hold_rules(kGateViews, means.size(0), static_cast<int>(viewmats.size(0)), level_in,
-                                    reach, lod_views, cull_in, columns);
+  const auto views = checked_in_place<std::int32_t>(kOp, "views", views_in, {capacity});
+  const auto means = checked<float>(kOp, "means", means_in, {-1, 3});
+  const auto viewmats = checked_viewmats(kOp, viewmats_in);
+  const HeldRules held = hold_rules(kOp, means.size(0), static_cast<int>(viewmats.size(0)), level_in, reach,
+                                    lod_views, cull_in, columns);
   if (!leaves_out_any(held.rules)) return;
-  const ViewGateArgs args{data<std::int32_t>(ids),
-                          mutable_data<std::int32_t>(views),
-                          max_listed(kGateViews, count, capacity),
-                          data_or_null<std::int32_t>(count),
-                          data<float>(means),
-                          data<float>(viewmats),
-                          held.rules};
   DeviceScope scope(views);
-  backend::gate_views(args, scope.workspace, scope.stream);
+  backend::gate_views({ids, views, max_listed(kOp, count, capacity), data_or_null<std::int32_t>(count), means,
+                       viewmats, held.rules},
+                      scope.workspace, scope.stream);
 }
 
-Tensor seen_blocks(const Tensor& bounds, const Tensor& viewmats_in, const Tensor& Ks_in,
+Tensor seen_blocks(const Tensor& bounds_in, const Tensor& viewmats_in, const Tensor& Ks_in,
                    const Tensor& sizes_in, double near_plane, double far_plane, double eps2d) {
   constexpr const char* kOp = "seen_blocks";
-  const Tensor boxes = checked(kOp, "bounds", bounds, ScalarType::Float, {-1, kBlockBounds}),
-               viewmats = checked_viewmats(kOp, viewmats_in);
+  const auto bounds = checked<float>(kOp, "bounds", bounds_in, {-1, kBlockBounds}),
+             viewmats = checked_viewmats(kOp, viewmats_in);
   const std::int64_t views = viewmats.size(0);
-  const Tensor Ks = checked(kOp, "Ks", Ks_in, ScalarType::Float, {views, 3, 3}),
-               sizes = checked(kOp, "sizes", sizes_in, ScalarType::Int, {views, 2});
-  Tensor seen = make_empty(boxes, {boxes.size(0)}, ScalarType::Int);
-  DeviceScope scope(boxes);
+  const auto Ks = checked<float>(kOp, "Ks", Ks_in, {views, 3, 3});
+  const auto sizes = checked<std::int32_t>(kOp, "sizes", sizes_in, {views, 2});
+  const auto seen = make<std::int32_t>(bounds, {bounds.size(0)});
+  DeviceScope scope(bounds);
   backend::seen_blocks(
-      {data<float>(boxes), boxes.size(0), data<float>(viewmats), data<float>(Ks), data<std::int32_t>(sizes),
-       static_cast<int>(views), static_cast<float>(near_plane), static_cast<float>(far_plane),
-       static_cast<float>(eps2d), mutable_data<std::int32_t>(seen)},
+      {bounds, bounds.size(0), viewmats, Ks, sizes, static_cast<int>(views), static_cast<float>(near_plane),
+       static_cast<float>(far_plane), static_cast<float>(eps2d), seen},
       scope.workspace, scope.stream);
   return seen;
 }
@@ -231,18 +219,16 @@ std::int64_t check_pair(const char* op, const Tensor& pool, const Tensor& table)
                 "columns must have rows, and as many axes in pool and table; got ", shape_of(pool), " and ",
                 shape_of(table));
   check_dtype(op, "a column of the pool", pool, table.scalar_type());
-  std::int64_t elements = 1;
   for (std::int64_t axis = 1; axis < pool.dim(); ++axis) {
     BLITZGS_CHECK(pool.size(axis) == table.size(axis), op, "rows of pool and table must be alike, got ",
                   shape_of(pool), " and ", shape_of(table));
-    elements *= pool.size(axis);
   }
   for (const Tensor* column : {&pool, &table}) check_contiguous(op, "columns", *column);
   BLITZGS_CHECK(table.is_cpu(), op, "the table must be in the memory of the host");
-  return kBlockRows * elements * static_cast<std::int64_t>(pool.element_size());
+  return kBlockRows * elements_behind(pool) * static_cast<std::int64_t>(pool.element_size());
 }
 
-void swap_blocks_(std::vector<Tensor> pool, std::vector<Tensor> table, std::int64_t n_written,
+void swap_blocks_(const std::vector<Tensor>& pool, const std::vector<Tensor>& table, std::int64_t n_written,
                   const Tensor& slots, const Tensor& leaving, const Tensor& coming) {
   constexpr const char* kOp = "swap_blocks_";
   const auto n_columns = static_cast<std::int64_t>(pool.size());
@@ -251,10 +237,9 @@ void swap_blocks_(std::vector<Tensor> pool, std::vector<Tensor> table, std::int6
                 " and ", table.size());
   SwapBlocks swap{};
   swap.n = slots.size(0);
-  for (const auto& [name, list] :
-       {std::pair{"slots", &slots}, std::pair{"leaving", &leaving}, std::pair{"coming", &coming}}) {
-    check_in_place(kOp, name, *list, ScalarType::Int, {swap.n});
-  }
+  swap.slots = checked_in_place<std::int32_t>(kOp, "slots", slots, {swap.n});
+  swap.leaving = checked_in_place<std::int32_t>(kOp, "leaving", leaving, {swap.n});
+  swap.coming = checked_in_place<std::int32_t>(kOp, "coming", coming, {swap.n});
   for (std::int64_t c = 0; c < n_columns; ++c) {
     const std::int64_t bytes = check_pair(kOp, pool[c], table[c]);
     if (bytes == 0) continue;
@@ -262,20 +247,16 @@ void swap_blocks_(std::vector<Tensor> pool, std::vector<Tensor> table, std::int6
                                       static_cast<std::byte*>(table[c].mutable_data_ptr()), bytes,
                                       c < n_written};
   }
-  swap.slots = data<std::int32_t>(slots);
-  swap.leaving = data<std::int32_t>(leaving);
-  swap.coming = data<std::int32_t>(coming);
   if (swap.n == 0 || n_columns == 0) return;
   DeviceScope scope(slots);
   backend::swap_blocks(swap, scope.workspace, scope.stream);
 }
 
 Tensor morton_keys(const Tensor& points) {
-  const Tensor rows = checked("morton_keys", "points", points, ScalarType::Float, {-1, 3});
-  Tensor keys = make_empty(rows, {rows.size(0)}, ScalarType::Long);
+  const auto rows = checked<float>("morton_keys", "points", points, {-1, 3});
+  const auto keys = make<std::int64_t>(rows, {rows.size(0)});
   DeviceScope scope(rows);
-  backend::morton_keys(data<float>(rows), rows.size(0), mutable_data<std::int64_t>(keys), scope.workspace,
-                       scope.stream);
+  backend::morton_keys(rows, rows.size(0), keys, scope.workspace, scope.stream);
   return keys;
 }
 

@@ -221,26 +221,6 @@ unsigned persistent_blocks(std::int64_t blocks) {
   return static_cast<unsigned>(std::min<std::int64_t>(blocks, kResident * multiprocessors()));
 }
 
-}  // namespace
-
-void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
-                         Workspace& workspace, CudaStream stream) {
-  const std::int64_t blocks = blocks_of(rows.n);
-  if (blocks == 0 || (ids && n_ids == 0)) return;
-  std::int32_t *list = nullptr, *length = nullptr;
-  if (ids) {
-    length = workspace.allocate<std::int32_t>(1 + n_ids);
-    list = length + 1;
-    zero("update_block_bounds", length, 1, stream);
-    launch_early("update_block_bounds", list_blocks, {blocks_for(n_ids, 256), 256, stream}, ids, n_ids, list,
-                 length);
-  }
-  launch_early("update_block_bounds", update_bounds, {persistent_blocks(blocks), kBlockRows, stream}, rows,
-               list, length, bounds);
-}
-
-namespace {
-
 // Finds the blocks that some view may see. If the capacity is not 0, also lists their active rows.
 void cull(const CullInputs& in, const ActiveList& out, Workspace& workspace, CudaStream stream) {
   const CullPlan plan(out.capacity_blocks, workspace);
@@ -263,7 +243,30 @@ void cull(const CullInputs& in, const ActiveList& out, Workspace& workspace, Cud
                in.rows.n, plan, groups, out);
 }
 
+// keys [n] of points [n, 3], one thread per point.
+__global__ void make_keys(const float* points, std::int64_t n, const MortonBounds* bounds,
+                          std::int64_t* keys) {
+  const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
+  if (i < n) keys[i] = static_cast<std::int64_t>(morton_code(points + 3 * i, frame_of(*bounds)) >> 1);
+}
+
 }  // namespace
+
+void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
+                         Workspace& workspace, CudaStream stream) {
+  const std::int64_t blocks = blocks_of(rows.n);
+  if (blocks == 0 || (ids && n_ids == 0)) return;
+  std::int32_t *list = nullptr, *length = nullptr;
+  if (ids) {
+    length = workspace.allocate<std::int32_t>(1 + n_ids);
+    list = length + 1;
+    zero("update_block_bounds", length, 1, stream);
+    launch_early("update_block_bounds", list_blocks, {blocks_for(n_ids, 256), 256, stream}, ids, n_ids, list,
+                 length);
+  }
+  launch_early("update_block_bounds", update_bounds, {persistent_blocks(blocks), kBlockRows, stream}, rows,
+               list, length, bounds);
+}
 
 std::int64_t count_active_blocks(const CullInputs& in, Workspace& workspace, CudaStream stream) {
   if (in.rows.n == 0) return 0;
@@ -282,17 +285,6 @@ void cull_blocks(const CullInputs& in, const ActiveList& out, Workspace& workspa
   }
   if (in.rows.n > 0) cull(in, out, workspace, stream);
 }
-
-namespace {
-
-// keys [n] of points [n, 3], one thread per point.
-__global__ void make_keys(const float* points, std::int64_t n, const MortonBounds* bounds,
-                          std::int64_t* keys) {
-  const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
-  if (i < n) keys[i] = static_cast<std::int64_t>(morton_code(points + 3 * i, frame_of(*bounds)) >> 1);
-}
-
-}  // namespace
 
 void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace& workspace,
                  CudaStream stream) {

@@ -11,15 +11,13 @@ namespace {
 void lazy_adam_step(const std::vector<Tensor>& state, const std::vector<Tensor>& tables, std::int64_t step,
                     std::int64_t explicit_steps, double beta1, double beta2, double eps,
                     const std::vector<Tensor>& grads, const std::optional<Tensor>& ids, bool current,
-                    const std::vector<double>& rates, std::optional<Tensor> taken) {
+                    const std::vector<double>& rates, const std::optional<Tensor>& taken) {
   constexpr const char* kOp = "lazy_adam_step_";
   AdamTensors adam(kOp, state, tables, {step, explicit_steps, beta1, beta2, eps});
-  if (taken) {
-    check_in_place(kOp, "taken", *taken, ScalarType::Float, {});
-    BLITZGS_CHECK(taken->is_cpu(), kOp, "taken must be on the CPU");
-  }
+  float* count = taken ? checked_in_place<float>(kOp, "taken", *taken, {}).data() : nullptr;
+  BLITZGS_CHECK(!taken || taken->is_cpu(), kOp, "taken must be on the CPU");
   adam.step_rows(grads, ids, current, rates);
-  if (taken) ++*mutable_data<float>(*taken);
+  if (count) ++*count;
 }
 
 void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<Tensor>& tables,
@@ -42,54 +40,39 @@ void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<T
 Tensor lazy_adam_final_rules(const Tensor& table, const Tensor& like, std::int64_t explicit_steps,
                              double eps) {
   constexpr const char* kOp = "lazy_adam_final_rules";
-  const Tensor contiguous = checked(kOp, "table", table, ScalarType::Double, {-1, kAdamTable});
+  const auto values = checked<double>(kOp, "table", table, {-1, kAdamTable});
   check_floating(kOp, "like", like);
   BLITZGS_CHECK(explicit_steps >= 1, kOp, "explicit_steps must be 1 or more, got ", explicit_steps);
   const std::int64_t n = final_rules_of(table.size(0), explicit_steps);
-  std::optional<Tensor> rules;
-  DeviceScope scope(contiguous);
-  dispatch_floating(like, [&]<class T>() {
+  DeviceScope scope(values);
+  return dispatch_floating(like, [&]<class T>() -> Tensor {
     AdamArgs<T> args{};
-    args.table = data<double>(contiguous);
+    args.table = values;
     args.explicit_steps = static_cast<std::int32_t>(explicit_steps);
     args.eps = eps;
-    rules = make_empty(contiguous, {n, static_cast<std::int64_t>(sizeof(PendingSteps<T>))}, ScalarType::Byte);
-    backend::final_rules(args, n, static_cast<PendingSteps<T>*>(rules->mutable_data_ptr()), scope.stream);
+    const auto rules = make<std::uint8_t>(values, {n, sizeof(PendingSteps<T>)});
+    backend::final_rules(args, n, reinterpret_cast<PendingSteps<T>*>(rules.data()), scope.stream);
+    return rules;
   });
-  return *rules;
 }
 
-constexpr const char* kPositionNoise = "position_noise_";
-
-void position_noise_(Tensor means, const Tensor& quats_in, const Tensor& scales_in,
-                     const Tensor& opacities_in, const Tensor& ids_in, const Tensor& visible_ids_in,
-                     std::int64_t seed, std::int64_t step, double threshold, double strength) {
-  check_floating(kPositionNoise, "means", means);
-  const ScalarType dtype = means.scalar_type();
-  check_in_place(kPositionNoise, "means", means, dtype, {-1, 3});
-  const std::int64_t rows = means.size(0);
-  const Tensor quats = checked(kPositionNoise, "quats", quats_in, dtype, {rows, 4}),
-               scales = checked(kPositionNoise, "scales", scales_in, dtype, {rows, 3}),
-               opacities = checked(kPositionNoise, "opacities", opacities_in, dtype, {rows}),
-               ids = checked(kPositionNoise, "ids", ids_in, ScalarType::Long, {rows}),
-               visible_ids = checked(kPositionNoise, "visible_ids", visible_ids_in, ScalarType::Int, {-1});
-  const std::int64_t visible = visible_ids.size(0);
-  if (visible == 0 || strength == 0) return;
-
+void position_noise_(const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
+                     const Tensor& ids_in, const Tensor& visible_ids_in, std::int64_t seed, std::int64_t step,
+                     double threshold, double strength) {
+  constexpr const char* kOp = "position_noise_";
+  check_floating(kOp, "means", means);
+  const std::int64_t n = means.size(0);
+  const auto ids = checked<std::int64_t>(kOp, "ids", ids_in, {n});
+  const auto visible_ids = checked<std::int32_t>(kOp, "visible_ids", visible_ids_in, {-1});
   DeviceScope scope(means);
   dispatch_floating(means, [&]<class T>() {
-    const PositionNoise<T> args{mutable_data<T>(means),
-                                data<T>(quats),
-                                data<T>(scales),
-                                data<T>(opacities),
-                                data<std::int64_t>(ids),
-                                data<std::int32_t>(visible_ids),
-                                visible,
-                                seed,
-                                step,
-                                threshold,
-                                strength};
-    backend::for_each_row(args, scope.stream);
+    const auto moved = checked_in_place<T>(kOp, "means", means, {n, 3});
+    const auto q = checked<T>(kOp, "quats", quats, {n, 4}), s = checked<T>(kOp, "scales", scales, {n, 3}),
+               o = checked<T>(kOp, "opacities", opacities, {n});
+    if (strength == 0) return;
+    backend::for_each_row(PositionNoise<T>{moved, q, s, o, ids, visible_ids, visible_ids.size(0), seed, step,
+                                           threshold, strength},
+                          scope.stream);
   });
 }
 

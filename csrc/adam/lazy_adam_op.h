@@ -2,9 +2,7 @@
 // The checked tensors of the optimiser's state and schedule, for all ops that move parameters.
 #pragma once
 #include <cmath>
-#include <optional>
 #include <utility>
-#include <vector>
 
 #include "adam/lazy_adam.h"
 #include "common/op.h"
@@ -91,10 +89,10 @@ struct AdamTensors {
     args.table = data<double>(table);
     args.lr_table = data<float>(lr_table);
     if (final_rules) {
-      check_in_place(op, "final_rules", *final_rules, ScalarType::Byte,
-                     {final_rules_of(table.size(0), constants.explicit_steps),
-                      static_cast<std::int64_t>(sizeof(PendingSteps<T>))});
-      args.final_rules = static_cast<const PendingSteps<T>*>(final_rules->const_data_ptr());
+      const auto bytes = checked_in_place<std::uint8_t>(
+          op, "final_rules", *final_rules,
+          {final_rules_of(table.size(0), constants.explicit_steps), sizeof(PendingSteps<T>)});
+      args.final_rules = reinterpret_cast<const PendingSteps<T>*>(bytes.data());
     }
     args.step = static_cast<std::int32_t>(constants.step);
     args.explicit_steps = static_cast<std::int32_t>(constants.explicit_steps);

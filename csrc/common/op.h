@@ -15,6 +15,7 @@
 #include <sstream>
 #include <stdexcept>
 #include <string>
+#include <type_traits>
 #include <vector>
 
 #include "common/kernel.h"
@@ -45,6 +46,13 @@ inline std::string shape_of(const Tensor& tensor) {
   for (std::int64_t i = 0; i < tensor.dim(); ++i) text << (i ? ", " : "") << tensor.size(i);
   text << ']';
   return text.str();
+}
+
+// The number of elements of a row behind its first `axis` dimensions.
+inline std::int64_t elements_behind(const Tensor& column, std::int64_t axis = 1) {
+  std::int64_t elements = 1;
+  for (; axis < column.dim(); ++axis) elements *= column.size(axis);
+  return elements;
 }
 
 template <typename... Parts>
@@ -138,6 +146,64 @@ inline std::optional<Tensor> checked(const char* op, const char* name, const std
   return tensor ? std::optional(checked(op, name, *tensor, dtype, shape)) : std::nullopt;
 }
 
+template <class T>
+const T* data(const Tensor& tensor) {
+  return static_cast<const T*>(tensor.const_data_ptr());
+}
+template <class T>
+T* mutable_data(const Tensor& tensor) {
+  return static_cast<T*>(tensor.mutable_data_ptr());
+}
+// Null for an absent optional tensor.
+template <class T>
+const T* data_or_null(const std::optional<Tensor>& tensor) {
+  return tensor ? static_cast<const T*>(tensor->const_data_ptr()) : nullptr;
+}
+
+// A tensor whose values are of type T, and which converts to their address. const T: they are only read.
+template <class T>
+struct Values : Tensor {
+  explicit Values(const Tensor& tensor) : Tensor(tensor) {}
+  T* data() const {
+    if constexpr (std::is_const_v<T>) return static_cast<T*>(const_data_ptr());
+    return static_cast<T*>(mutable_data_ptr());
+  }
+  T* data_if(bool wanted) const { return wanted ? data() : nullptr; }
+  operator T*() const { return data(); }
+};
+
+// Null for an absent tensor.
+template <class T>
+struct OptionalValues : std::optional<Values<T>> {
+  operator T*() const { return this->has_value() ? (*this)->data() : nullptr; }
+};
+
+template <class T>
+using dtype_of = torch::headeronly::CppTypeToScalarType<T>;
+
+// checked() of values of type T.
+template <class T>
+Values<const T> checked(const char* op, const char* name, const Tensor& tensor,
+                        std::initializer_list<std::int64_t> shape) {
+  return Values<const T>(checked(op, name, tensor, dtype_of<T>::value, shape));
+}
+
+template <class T>
+OptionalValues<const T> checked(const char* op, const char* name, const std::optional<Tensor>& tensor,
+                                std::initializer_list<std::int64_t> shape) {
+  OptionalValues<const T> values;
+  if (tensor) values.emplace(checked<T>(op, name, *tensor, shape));
+  return values;
+}
+
+// Checks a tensor that kernels read or write in its own memory, so that it must be contiguous.
+template <class T>
+Values<T> checked_in_place(const char* op, const char* name, const Tensor& tensor,
+                           std::initializer_list<std::int64_t> shape) {
+  check_in_place(op, name, tensor, dtype_of<T>::value, shape);
+  return Values<T>(tensor);
+}
+
 // Calls the C functions of torch directly, because a step allocates some sixty tensors.
 inline Tensor make_empty(const Tensor& like, const std::vector<std::int64_t>& shape,
                          std::optional<ScalarType> dtype = std::nullopt) {
@@ -154,6 +220,11 @@ inline Tensor make_empty(const Tensor& like, const std::vector<std::int64_t>& sh
   return Tensor(handle);
 }
 
+template <class T>
+Values<T> make(const Tensor& like, const std::vector<std::int64_t>& shape) {
+  return Values<T>(make_empty(like, shape, dtype_of<T>::value));
+}
+
 // A tensor in the memory of another one, `offset` elements after its begin. Autograd does not see that it is
 // a view.
 inline Tensor view_of(const Tensor& tensor, const std::vector<std::int64_t>& shape,
@@ -163,20 +234,6 @@ inline Tensor view_of(const Tensor& tensor, const std::vector<std::int64_t>& sha
   TORCH_ERROR_CODE_CHECK(aoti_torch__reinterpret_tensor(tensor.get(), static_cast<std::int64_t>(shape.size()),
                                                         shape.data(), strides.data(), offset, &handle));
   return Tensor(handle);
-}
-
-template <class T>
-const T* data(const Tensor& tensor) {
-  return static_cast<const T*>(tensor.const_data_ptr());
-}
-template <class T>
-T* mutable_data(Tensor& tensor) {
-  return static_cast<T*>(tensor.mutable_data_ptr());
-}
-// Null for an absent optional tensor.
-template <class T>
-const T* data_or_null(const std::optional<Tensor>& tensor) {
-  return tensor ? static_cast<const T*>(tensor->const_data_ptr()) : nullptr;
 }
 
 // An upper bound on the number of valid entries of a list that can have `capacity` of them. The first count
@@ -233,16 +290,13 @@ struct DeviceScope {
 #endif
 };
 
-// Calls f<T>() with T = float or double by the tensor's dtype (CUDA: float only).
+// Returns f<T>() with T = float or double by the tensor's dtype (CUDA: float only).
 template <class F>
-void dispatch_floating([[maybe_unused]] const Tensor& tensor, const F& f) {
+auto dispatch_floating([[maybe_unused]] const Tensor& tensor, const F& f) {
 #ifndef BLITZGS_BACKEND_CUDA
-  if (tensor.scalar_type() == ScalarType::Double) {
-    f.template operator()<double>();
-    return;
-  }
+  if (tensor.scalar_type() == ScalarType::Double) return f.template operator()<double>();
 #endif
-  f.template operator()<float>();
+  return f.template operator()<float>();
 }
 
 // The optional argument n_splats of an op, int64 [1]: how many splats of its columns are valid (kernel.h).

@@ -1,13 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <limits>
 #include <tuple>
-#include <vector>
 
 #include "common/op.h"
-#include "exchange/places_op.h"
 #include "exchange/scatter.h"
 #include "exchange/tile_costs.h"
 #include "exchange/transport.h"
+#include "project/project_op.h"
 
 namespace blitzgs {
 namespace {
@@ -46,29 +44,25 @@ void add_column(const char* op, SplatColumns<Word>& columns, Word* data, std::in
 // Columns int32 [P, w] and masks int64 [P]; keeps the contiguous forms alive.
 struct HeldSplats {
   HeldSplats(const char* op, const std::vector<Tensor>& columns, const Tensor& masks_in)
-      : masks(checked(op, "masks", masks_in, ScalarType::Long, {-1})) {
-    splats.masks = data<std::int64_t>(masks);
+      : masks(checked<std::int64_t>(op, "masks", masks_in, {-1})) {
+    splats.masks = masks;
     splats.count = masks.size(0);
     BLITZGS_CHECK(splats.count <= std::numeric_limits<std::int32_t>::max(), op, splats.count,
                   " splats exceed 2^31 - 1; project fewer views at a time");
     for (const Tensor& column : columns) {
-      held.push_back(checked(op, "a column", column, ScalarType::Int, {splats.count, -1}));
-      add_column(op, splats.columns, data<std::int32_t>(held.back()), column.size(1));
+      held.push_back(checked<std::int32_t>(op, "a column", column, {splats.count, -1}));
+      add_column(op, splats.columns, held.back().data(), column.size(1));
     }
   }
 
-  Tensor masks;
-  std::vector<Tensor> held;
+  Values<const std::int64_t> masks;
+  std::vector<Values<const std::int32_t>> held;
   ScatterSplats splats{};
 };
 
-Tensor make_places(const Tensor& like, std::int64_t splats, std::int64_t n_ranks) {
-  return make_empty(like, {place_runs(splats), n_ranks}, ScalarType::Long);
-}
-
-SplatPlace* places_of(Tensor& places) {
+SplatPlace* places_of(const Values<std::int64_t>& places) {
   static_assert(sizeof(SplatPlace) == sizeof(std::int64_t));
-  return reinterpret_cast<SplatPlace*>(mutable_data<std::int64_t>(places));
+  return reinterpret_cast<SplatPlace*>(places.data());
 }
 
 std::tuple<Tensor, Tensor> scatter_splats(const std::vector<Tensor>& columns, const Tensor& masks,
@@ -78,13 +72,12 @@ std::tuple<Tensor, Tensor> scatter_splats(const std::vector<Tensor>& columns, co
   const SplatGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
   const auto& columns_in = held.splats.columns;
   const std::int64_t words = columns_in.begin[columns_in.count];
-  Tensor packed = make_empty(held.masks, {total_splats(groups) * words}, ScalarType::Int);
-  Tensor places = make_places(held.masks, held.splats.count, groups.count);
+  const auto packed = make<std::int32_t>(held.masks, {total_splats(groups) * words});
+  const auto places = make<std::int64_t>(held.masks, {place_runs(held.splats.count), groups.count});
   ScatterTargets targets{};
   for (int m = 0; m < groups.count; ++m) {
     for (int c = 0; c < columns_in.count; ++c) {
-      targets.words[m][c] =
-          mutable_data<std::int32_t>(packed) + groups.start[m] * words + groups.size[m] * columns_in.begin[c];
+      targets.words[m][c] = packed + groups.start[m] * words + groups.size[m] * columns_in.begin[c];
     }
   }
   DeviceScope scope(held.masks);
@@ -96,54 +89,48 @@ std::vector<Tensor> gather_splats(const Tensor& packed, const std::vector<std::i
                                   const std::vector<std::int64_t>& group_sizes) {
   constexpr const char* kOp = "gather_splats";
   const SplatGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
-  const Tensor words = as_contiguous(packed);
   const std::int64_t n_splats = total_splats(groups);
-  std::vector<Tensor> held;
+  std::vector<Tensor> found;
   SplatColumns<std::int32_t> columns{};
   for (const std::int64_t width : widths) {
-    BLITZGS_CHECK(width >= 0, "gather_splats", "widths must not be negative, got ", width);
-    held.push_back(make_empty(words, {n_splats, width}, ScalarType::Int));
-    add_column(kOp, columns, mutable_data<std::int32_t>(held.back()), width);
+    BLITZGS_CHECK(width >= 0, kOp, "widths must not be negative, got ", width);
+    const auto column = make<std::int32_t>(packed, {n_splats, width});
+    found.push_back(column);
+    add_column(kOp, columns, column.data(), width);
   }
-  check_shape(kOp, "packed", packed, {n_splats * columns.begin[columns.count]});
-  check_dtype(kOp, "packed", packed, ScalarType::Int);
+  const auto words = checked<std::int32_t>(kOp, "packed", packed, {n_splats * columns.begin[columns.count]});
   DeviceScope scope(words);
-  if (columns.count > 0) {
-    backend::gather(data<std::int32_t>(words), groups, columns, scope.workspace, scope.stream);
-  }
-  return held;
+  if (columns.count > 0) backend::gather(words, groups, columns, scope.workspace, scope.stream);
+  return found;
 }
 
 std::vector<Tensor> sum_splats(const Tensor& values, const Tensor& places,
                                const std::vector<std::int64_t>& group_sizes, std::int64_t splats,
                                const std::vector<std::int64_t>& widths) {
   constexpr const char* kOp = "sum_splats";
-  BLITZGS_CHECK(splats >= 0, "sum_splats", "splats must not be negative, got ", splats);
+  BLITZGS_CHECK(splats >= 0, kOp, "splats must not be negative, got ", splats);
   check_floating(kOp, "values", values);
   const SplatGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
-  const Tensor held = checked_places(kOp, places, splats, groups.count);
-  const Tensor values_c = as_contiguous(values);
-  std::vector<Tensor> sums;
-  for (const std::int64_t width : widths) {
-    BLITZGS_CHECK(width >= 0, "sum_splats", "widths must not be negative, got ", width);
-    sums.push_back(make_empty(values_c, {splats, width}));
-  }
-  DeviceScope scope(values_c);
-  dispatch_floating(values_c, [&]<class T>() {
+  const auto held = checked_places(kOp, places, splats, groups.count);
+  DeviceScope scope(values);
+  return dispatch_floating(values, [&]<class T>() {
+    std::vector<Tensor> sums;
     SplatColumns<T> columns{};
-    for (Tensor& sum : sums) add_column(kOp, columns, mutable_data<T>(sum), sum.size(1));
+    for (const std::int64_t width : widths) {
+      BLITZGS_CHECK(width >= 0, kOp, "widths must not be negative, got ", width);
+      const auto sum = make<T>(values, {splats, width});
+      sums.push_back(sum);
+      add_column(kOp, columns, sum.data(), width);
+    }
     const int width = columns.begin[columns.count];
-    check_shape(kOp, "values", values, {total_splats(groups), width});
-    const SplatValues<T> returned{data<T>(values_c), width, splats, places_in(held), groups};
-    backend::sum(returned, columns, scope.workspace, scope.stream);
+    const auto contiguous = checked<T>(kOp, "values", values, {total_splats(groups), width});
+    backend::sum(SplatValues<T>{contiguous, width, splats, places_in(held), groups}, columns, scope.workspace,
+                 scope.stream);
+    return sums;
   });
-  return sums;
 }
 
-}  // namespace
-
 #ifdef BLITZGS_BACKEND_CUDA
-namespace {
 
 // Checks that there is one buffer for each rank and that all have the same length and dtype.
 void check_peers(const char* op, const std::vector<Tensor>& buffers, ScalarType dtype) {
@@ -157,8 +144,8 @@ void check_peers(const char* op, const std::vector<Tensor>& buffers, ScalarType 
 
 // The addresses of the columns in each rank's buffer, for columns with a capacity of `capacity` splats.
 template <class Word>
-ScatterTargets peer_targets(const char* op, std::vector<Tensor>& buffers, const SplatColumns<Word>& columns,
-                            std::int64_t capacity, int n_ranks) {
+ScatterTargets peer_targets(const char* op, const std::vector<Tensor>& buffers,
+                            const SplatColumns<Word>& columns, std::int64_t capacity, int n_ranks) {
   check_peers(op, buffers, ScalarType::Int);
   BLITZGS_CHECK(static_cast<int>(buffers.size()) == n_ranks, op, n_ranks, " ranks need as many buffers, got ",
                 buffers.size());
@@ -174,18 +161,15 @@ ScatterTargets peer_targets(const char* op, std::vector<Tensor>& buffers, const 
   return targets;
 }
 
-void device_barrier(std::vector<Tensor> control, std::int64_t rank, std::int64_t number,
+void device_barrier(const std::vector<Tensor>& control, std::int64_t rank, std::int64_t number,
                     const std::optional<Tensor>& values, std::int64_t first, double timeout_seconds,
-                    std::optional<Tensor> host) {
+                    const std::optional<Tensor>& host) {
   constexpr const char* kOp = "device_barrier_";
   check_peers(kOp, control, ScalarType::Long);
   const auto count = static_cast<std::int64_t>(control.size());
   BLITZGS_CHECK(rank >= 0 && rank < count, kOp, "rank must be in [0, ", count, "), got ", rank);
-  std::int64_t n_values = 0;
-  if (values) {
-    check_in_place(kOp, "values", *values, ScalarType::Long, {-1});
-    n_values = values->size(0);
-  }
+  if (values) check_in_place(kOp, "values", *values, ScalarType::Long, {-1});
+  const std::int64_t n_values = values ? values->size(0) : 0;
   BLITZGS_CHECK(first >= count && first + (count + 1) * n_values <= control[0].size(0), kOp, n_values,
                 " values of ", count, " ranks and their sums from word ", first, " on do not fit behind ",
                 count, " words into ", control[0].size(0));
@@ -200,20 +184,19 @@ void device_barrier(std::vector<Tensor> control, std::int64_t rank, std::int64_t
                        scope.stream);
 }
 
-void copy_to_host(Tensor host, const Tensor& values) {
+void copy_to_host(const Tensor& host, const Tensor& values_in) {
   constexpr const char* kOp = "copy_to_host_";
-  check_in_place(kOp, "values", values, ScalarType::Long, {-1});
+  const auto values = checked_in_place<std::int64_t>(kOp, "values", values_in, {-1});
   BLITZGS_CHECK(!values.is_cpu(), kOp, "values must be on the GPU");
   check_host_values(kOp, host, {values.size(0)});
   DeviceScope scope(values);
-  cuda::copy_to_host(data<std::int64_t>(values), values.size(0), mutable_data<std::int64_t>(host),
-                     scope.stream);
+  cuda::copy_to_host(values, values.size(0), mutable_data<std::int64_t>(host), scope.stream);
 }
 
 // Returns the places and the SendPlan, whose first word is the number of splats that this rank receives.
 std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const Tensor& rank_masks,
-                                       const Tensor& everyone, std::int64_t rank, std::vector<Tensor> buffers,
-                                       std::int64_t capacity) {
+                                       const Tensor& everyone, std::int64_t rank,
+                                       const std::vector<Tensor>& buffers, std::int64_t capacity) {
   constexpr const char* kOp = "send_splats_";
   const auto n_ranks = static_cast<std::int64_t>(buffers.size());
   BLITZGS_CHECK(columns.size() == static_cast<std::size_t>(kSentColumns.count), kOp,
@@ -234,19 +217,18 @@ std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const
         kOp, "column ", c, " must be contiguous, of ", words, " words a splat");
     arguments.splats.columns.data[c] = static_cast<const std::int32_t*>(column.const_data_ptr());
   }
-  check_in_place(kOp, "rank_masks", rank_masks, ScalarType::Long, {columns[0].size(0)});
-  arguments.splats.masks = data<std::int64_t>(rank_masks);
-  check_in_place(kOp, "everyone", everyone, ScalarType::Long, {n_ranks, -1});
+  arguments.splats.masks =
+      checked_in_place<std::int64_t>(kOp, "rank_masks", rank_masks, {columns[0].size(0)});
+  arguments.everyone = checked_in_place<std::int64_t>(kOp, "everyone", everyone, {n_ranks, -1});
   const std::int64_t n_views = everyone.size(1) - project_totals(0, n_ranks);
   BLITZGS_CHECK(!everyone.is_cpu() && n_views >= 0 && rank >= 0 && rank < n_ranks, kOp,
                 "everyone must be on the GPU and the totals of ", n_ranks,
                 " ranks, and rank one of them, got ", rank);
   DeviceScope scope(columns[0]);
-  Tensor places = make_places(columns[0], capacity, n_ranks);
-  Tensor plan = make_empty(columns[0], {(sizeof(SendPlan) + 7) / 8}, ScalarType::Long);
-  arguments.plan = reinterpret_cast<SendPlan*>(mutable_data<std::int64_t>(plan));
+  const auto places = make<std::int64_t>(columns[0], {place_runs(capacity), n_ranks}),
+             plan = make<std::int64_t>(columns[0], {(sizeof(SendPlan) + 7) / 8});
+  arguments.plan = reinterpret_cast<SendPlan*>(plan.data());
   arguments.places = places_of(places);
-  arguments.everyone = data<std::int64_t>(everyone);
   arguments.n_views = static_cast<int>(n_views);
   arguments.n_ranks = static_cast<int>(n_ranks);
   arguments.rank = static_cast<int>(rank);
@@ -254,17 +236,14 @@ std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const
   return {places, plan};
 }
 
-}  // namespace
-#endif
+#else
 
 // The costs are in the memory of the host for every device that renders.
-#ifndef BLITZGS_BACKEND_CUDA
-namespace {
 
-std::vector<Tensor> tile_costs(const Tensor& sums, std::int64_t first, std::int64_t views,
+std::vector<Tensor> tile_costs(const Tensor& sums_in, std::int64_t first, std::int64_t views,
                                std::int64_t grain) {
   constexpr const char* kOp = "tile_costs";
-  check_in_place(kOp, "sums", sums, ScalarType::Float, {-1});
+  const auto sums = checked_in_place<float>(kOp, "sums", sums_in, {-1});
   BLITZGS_CHECK(first >= 0 && first <= sums.size(0), kOp, "first must be in [0, ", sums.size(0), "], got ",
                 first);
   const std::int64_t costs = sums.size(0) - first;
@@ -275,7 +254,7 @@ std::vector<Tensor> tile_costs(const Tensor& sums, std::int64_t first, std::int6
   std::vector<Tensor> stored;
   for (std::int64_t view = 0; view < views; ++view) {
     stored.push_back(make_empty(sums, {pieces}, ScalarType::Half));
-    cpu::store_tile_costs(data<float>(sums) + first + view * tiles, tiles, grain,
+    cpu::store_tile_costs(sums + first + view * tiles, tiles, grain,
                           mutable_data<std::uint16_t>(stored.back()));
   }
   return stored;
@@ -314,8 +293,9 @@ std::vector<std::int64_t> divide_tiles(const std::vector<Tensor>& costs, const s
   return bounds;
 }
 
-}  // namespace
 #endif
+
+}  // namespace
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {

@@ -3,7 +3,6 @@
 
 #include "common/catch.h"
 #include "exchange/scatter.h"
-#include "exchange/tile_costs.h"
 
 using namespace blitzgs;
 
@@ -82,34 +81,4 @@ TEST_CASE("splats beyond a group's size are dropped", "[scatter]") {
   cpu::scatter({{{column}, {0, 1}, 1}, masks, 4}, make_groups({2}), targets, &place, workspace, nullptr);
   REQUIRE((packed[0] == 1 && packed[1] == 2 && packed[2] == -1));
   REQUIRE((place.first == 0 && place.bits == 15));
-}
-
-namespace {
-
-using Halves = std::vector<std::uint16_t>;
-using Bounds = std::vector<std::int64_t>;
-
-// The bounds of views of `tiles` tiles with a tile cost of 8; a view without pieces has no cost of its own.
-Bounds bounds_of(const std::vector<Halves>& views, const std::vector<Halves>& similar, std::int64_t tiles,
-                 std::int64_t grain, std::int64_t parts) {
-  std::vector<const std::uint16_t*> costs, alike;
-  for (const Halves& view : views) costs.push_back(view.empty() ? nullptr : view.data());
-  for (const Halves& view : similar) alike.push_back(view.data());
-  Bounds bounds(parts + 1, -1);
-  TestWorkspace workspace;
-  cpu::divide_tiles({costs.data(), static_cast<std::int64_t>(costs.size()), alike.data(),
-                     static_cast<std::int64_t>(alike.size()), tiles, grain, 8},
-                    parts, workspace, bounds.data());
-  return bounds;
-}
-
-}  // namespace
-
-TEST_CASE("pieces spread over their tiles", "[tile_costs]") {
-  // Two views of five tiles in pieces of two: costs 8 + 8 twice, 8 + 0 twice and 8 + 1016 once.
-  const Halves coarse{0x4800, 0, 0x63f0}, fine{0x4800, 0x4800, 0, 0, 0x63f0};
-  for (std::int64_t parts = 1; parts < 12; ++parts) {
-    REQUIRE(bounds_of({coarse, coarse}, {}, 5, 2, parts) == bounds_of({fine, fine}, {}, 5, 1, parts));
-    REQUIRE(bounds_of({{}, coarse}, {coarse}, 5, 2, parts) == bounds_of({fine, fine}, {}, 5, 1, parts));
-  }
 }

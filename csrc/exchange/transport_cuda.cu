@@ -18,25 +18,6 @@ __global__ void copy_kernel(const std::int64_t* values, std::int64_t n, std::int
   if (i < n) host[i] = values[i];
 }
 
-}  // namespace
-
-std::int64_t* device_address(std::int64_t* pinned) {
-  cudaPointerAttributes found{};
-  check(cudaPointerGetAttributes(&found, pinned), "pinned memory");
-  if (found.type != cudaMemoryTypeHost || !found.devicePointer) {
-    throw std::runtime_error("blitzgs: what the GPU is to write for the host must be pinned memory");
-  }
-  return static_cast<std::int64_t*>(found.devicePointer);
-}
-
-void copy_to_host(const std::int64_t* values, std::int64_t n, std::int64_t* host, CudaStream stream) {
-  if (n == 0) return;
-  launch_early("copy_to_host", copy_kernel, {blocks_for(n, kThreads), kThreads, stream}, values, n,
-               device_address(host));
-}
-
-namespace {
-
 constexpr int kBarrierThreads = 128;
 
 __device__ std::uint64_t nanoseconds() {
@@ -88,19 +69,6 @@ __global__ void __launch_bounds__(kBarrierThreads)
     brought[control.count * n_values + k] = sum;
   }
 }
-
-}  // namespace
-
-void device_barrier(const ControlWords& control, std::int64_t number, const std::int64_t* values,
-                    int n_values, std::int64_t first, double timeout_seconds, std::int64_t* host, Workspace&,
-                    CudaStream stream) {
-  const auto timeout = static_cast<std::uint64_t>(1e9 * timeout_seconds);
-  barrier_kernel<<<1, kBarrierThreads, 0, stream>>>(control, number, values, n_values, first, timeout,
-                                                    host ? device_address(host) : nullptr);
-  check_launch("device_barrier");
-}
-
-namespace {
 
 constexpr int kSendBlocks = 2;  // blocks per multiprocessor: enough to fill the links
 constexpr int kSendPlaces = 6;  // blocks per multiprocessor for which the compiler limits the registers
@@ -211,6 +179,30 @@ __global__ void __launch_bounds__(kScatterBlock, kSendPlaces)
 }
 
 }  // namespace
+
+std::int64_t* device_address(std::int64_t* pinned) {
+  cudaPointerAttributes found{};
+  check(cudaPointerGetAttributes(&found, pinned), "pinned memory");
+  if (found.type != cudaMemoryTypeHost || !found.devicePointer) {
+    throw std::runtime_error("blitzgs: what the GPU is to write for the host must be pinned memory");
+  }
+  return static_cast<std::int64_t*>(found.devicePointer);
+}
+
+void copy_to_host(const std::int64_t* values, std::int64_t n, std::int64_t* host, CudaStream stream) {
+  if (n == 0) return;
+  launch_early("copy_to_host", copy_kernel, {blocks_for(n, kThreads), kThreads, stream}, values, n,
+               device_address(host));
+}
+
+void device_barrier(const ControlWords& control, std::int64_t number, const std::int64_t* values,
+                    int n_values, std::int64_t first, double timeout_seconds, std::int64_t* host, Workspace&,
+                    CudaStream stream) {
+  const auto timeout = static_cast<std::uint64_t>(1e9 * timeout_seconds);
+  barrier_kernel<<<1, kBarrierThreads, 0, stream>>>(control, number, values, n_values, first, timeout,
+                                                    host ? device_address(host) : nullptr);
+  check_launch("device_barrier");
+}
 
 void send_splats(const SendArguments& args, CudaStream stream) {
   plan_kernel<<<1, 32, 0, stream>>>(args);

@@ -19,23 +19,11 @@
 #include <cstdint>
 
 #include "common/kernel.h"
-#include "math/tiles.h"
+#include "rasterize/rasterize.h"
 
 namespace blitzgs {
 
 inline constexpr std::int64_t kContributionScale = std::int64_t{1} << 32;  // the number of units in 1
-
-template <class T>
-struct ContributionInput {
-  const T* means2d;
-  const T* conics;
-  const T* opacities;
-  const std::int32_t* isect_splats;
-  const std::int64_t* tile_offsets;
-  std::int64_t n_splats;
-  TileGrid grid;
-  const std::int64_t* known_splats = nullptr;  // null, or the number of splats (common/kernel.h; CUDA only)
-};
 
 struct ContributionSums {
   std::int64_t* weights;
@@ -45,7 +33,7 @@ struct ContributionSums {
 
 namespace BLITZGS_BACKEND {
 template <class T>
-void contributions(const ContributionInput<T>& in, const ContributionSums& sums, Workspace&, CudaStream);
+void contributions(const RasterizeInput<T>& in, const ContributionSums& sums, Workspace&, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 // The sums of the importance sweep (BlitzGS, section 3.2: the score s, c_rad, c_vis and the cull matrix) for

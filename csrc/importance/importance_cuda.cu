@@ -176,8 +176,8 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const 
 }  // namespace
 
 template <>
-void contributions<float>(const ContributionInput<float>& in, const ContributionSums& sums,
-                          Workspace& workspace, CudaStream stream) {
+void contributions<float>(const RasterizeInput<float>& in, const ContributionSums& sums, Workspace& workspace,
+                          CudaStream stream) {
   check_tile_size("contributions", in.grid);
   check(cudaMemsetAsync(sums.weights, 0, in.n_splats * sizeof(*sums.weights), stream), "contributions");
   check(cudaMemsetAsync(sums.pixels, 0, in.n_splats * sizeof(*sums.pixels), stream), "contributions");
@@ -186,12 +186,9 @@ void contributions<float>(const ContributionInput<float>& in, const Contribution
   }
   const std::int64_t owned = in.grid.tile_end - in.grid.tile_begin;
   if (owned == 0 || in.n_splats == 0) return;
-  const RasterizeInput<float> input{in.means2d, in.conics,       in.opacities,    nullptr,
-                                    nullptr,    in.isect_splats, in.tile_offsets, in.n_splats,
-                                    0,          in.grid,         in.known_splats};
   auto* packed = static_cast<PackedSplat*>(workspace.allocate_bytes(in.n_splats * sizeof(PackedSplat)));
   const TileOrder order(in.grid, owned, workspace.allocate<std::int32_t>(TileOrder::words(in.grid, owned)));
-  prepare("contributions", input, packed, nullptr, order, stream);
+  prepare("contributions", in, packed, nullptr, order, stream);
   const ContributionArguments args{packed, in.isect_splats, in.tile_offsets, in.grid, order, sums};
   launch_early("contributions", sums.squares ? contributions_kernel<true> : contributions_kernel<false>,
                {static_cast<unsigned>(order.n_tiles), Tile::kThreads, stream, sizeof(ContributionShared)},

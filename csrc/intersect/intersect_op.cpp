@@ -2,7 +2,6 @@
 #include "intersect/intersect.h"
 
 #include <exception>
-#include <limits>
 #include <tuple>
 
 #include "rasterize/rasterize_op.h"
@@ -35,28 +34,25 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
   constexpr const char* kOp = "intersect";
   check_floating(kOp, "means2d", means2d);
   const std::int64_t n_splats = means2d.size(0);
-  const ScalarType dtype = means2d.scalar_type();
-  const Tensor means = checked(kOp, "means2d", means2d, dtype, {n_splats, 2}),
-               shapes = checked(kOp, "conics", conics, dtype, {n_splats, 3}),
-               opacities = checked(kOp, "splat_opacities", splat_opacities, dtype, {n_splats}),
-               order = checked(kOp, "depths", depths, dtype, {n_splats}),
-               cameras = checked(kOp, "camera_ids", camera_ids, ScalarType::Int, {n_splats});
-  const std::optional<Tensor> id_splats = checked(kOp, "ids", ids, ScalarType::Long, {n_splats});
+  const auto cameras = checked<std::int32_t>(kOp, "camera_ids", camera_ids, {n_splats});
+  const auto id_splats = checked<std::int64_t>(kOp, "ids", ids, {n_splats});
   const SplatCount splat_count = checked_splat_count(kOp, known_splats, means2d);
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
-  BLITZGS_CHECK(grid.count() <= std::numeric_limits<std::int32_t>::max(), "intersect",
+  BLITZGS_CHECK(grid.count() <= std::numeric_limits<std::int32_t>::max(), kOp,
                 "tile numbers are 32-bit, got ", grid.count(),
                 " tiles; use larger tiles or render fewer views at once");
-  Tensor offsets = make_empty(means, {grid.count() + 1}, ScalarType::Long);
-  Tensor splats;
-  DeviceScope scope(means);
-  dispatch_floating(means, [&]<class T>() {
-    const IntersectInput<T> in{data<T>(means),
-                               data<T>(shapes),
-                               data<T>(opacities),
-                               data<T>(order),
-                               data<std::int32_t>(cameras),
-                               data_or_null<std::int64_t>(id_splats),
+  DeviceScope scope(means2d);
+  return dispatch_floating(means2d, [&]<class T>() -> std::tuple<Tensor, Tensor> {
+    const auto means = checked<T>(kOp, "means2d", means2d, {n_splats, 2}),
+               shapes = checked<T>(kOp, "conics", conics, {n_splats, 3}),
+               opacities = checked<T>(kOp, "splat_opacities", splat_opacities, {n_splats}),
+               order = checked<T>(kOp, "depths", depths, {n_splats});
+    const IntersectInput<T> in{means,
+                               shapes,
+                               opacities,
+                               order,
+                               cameras,
+                               id_splats,
                                splat_count.n_splats,
                                grid,
                                splat_count.known_splats};
@@ -66,21 +62,23 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
       if (n_isects < 0) capacity = needed;
       check_capacity(capacity, needed);
     }
+    const auto offsets = make<std::int64_t>(means, {grid.count() + 1});
+    Tensor splats;
     std::int64_t count = 0;
     try {
-      splats = make_empty(means, {capacity}, ScalarType::Int);
-      count = backend::intersect(in, capacity, mutable_data<std::int32_t>(splats),
-                                 mutable_data<std::int64_t>(offsets), scope.workspace, scope.stream);
+      splats = make<std::int32_t>(means, {capacity});
+      count = backend::intersect(in, capacity, mutable_data<std::int32_t>(splats), offsets, scope.workspace,
+                                 scope.stream);
     } catch (const std::exception& error) {
       // An error here means that memory ran out. The message states the length of the lists, because it
       // depends on the splats and the caller may not know it.
-      BLITZGS_CHECK(false, "intersect", "listing ", capacity, " intersections of ", n_splats,
+      BLITZGS_CHECK(false, kOp, "listing ", capacity, " intersections of ", n_splats,
                     " splats failed; it takes about ", capacity * 20 / 1000000, " MB. Render fewer views at ",
                     "once, in smaller images, or with a larger radius_clip. Cause: ", error.what());
     }
     check_capacity(capacity, count);
+    return {splats, offsets};
   });
-  return {splats, offsets};
 }
 
 }  // namespace blitzgs

@@ -58,19 +58,7 @@ void ByteReader::read_bytes(void* destination, std::uint64_t n, const char* what
   while (n > 0) {
     if (buffer_at_ == buffer_end_) fill();
     const std::uint64_t step = std::min<std::uint64_t>(n, buffer_end_ - buffer_at_);
-    std::memcpy(out, buffer_.data() + buffer_at_, step);
-    out += step;
-    n -= step;
-    buffer_at_ += step;
-    offset_ += step;
-  }
-}
-
-void ByteReader::skip(std::uint64_t n, const char* what) {
-  require(n, what);
-  while (n > 0) {
-    if (buffer_at_ == buffer_end_) fill();
-    const std::uint64_t step = std::min<std::uint64_t>(n, buffer_end_ - buffer_at_);
+    if (out) out = std::copy_n(buffer_.data() + buffer_at_, step, out);
     n -= step;
     buffer_at_ += step;
     offset_ += step;
@@ -114,11 +102,8 @@ void ByteReader::expect_end() const {
   if (remaining() > 0) fail(std::to_string(remaining()) + " bytes are left after the last record");
 }
 
-namespace {
-constexpr std::string_view kByteOrderMark = "\xef\xbb\xbf";
-}  // namespace
-
 bool TextReader::next_line() {
+  constexpr std::string_view kByteOrderMark = "\xef\xbb\xbf";
   if (!std::getline(in_, line_)) return false;
   ++line_number_;
   left_ = line_;

@@ -46,8 +46,8 @@ class ByteReader {
     read_bytes(&value, sizeof value, what);
     return value;
   }
-  void read_bytes(void* destination, std::uint64_t n, const char* what);
-  void skip(std::uint64_t n, const char* what);
+  void read_bytes(void* destination, std::uint64_t n, const char* what);  // null: skips them
+  void skip(std::uint64_t n, const char* what) { read_bytes(nullptr, n, what); }
   std::string read_c_string(const char* what);
 
   // Reads a uint64 count of records of at least `min_bytes` bytes each. Throws if the file has fewer bytes

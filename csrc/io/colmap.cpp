@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
+#include <iterator>
 #include <limits>
 
 #include "io/byte_reader.h"
@@ -32,16 +32,15 @@ const std::vector<CameraModel>& camera_models() {
 }
 
 const CameraModel* find_camera_model(int id) {
-  const auto& models = camera_models();
-  const auto found = std::find_if(models.begin(), models.end(), [&](const auto& m) { return m.id == id; });
-  return found == models.end() ? nullptr : &*found;
+  const auto& models = camera_models();  // ordered by id
+  return id >= 0 && id < std::ssize(models) ? &models[static_cast<std::size_t>(id)] : nullptr;
 }
 
 const CameraModel* find_camera_model(std::string_view name) {
-  const auto& models = camera_models();
-  const auto found =
-      std::find_if(models.begin(), models.end(), [&](const auto& m) { return m.name == name; });
-  return found == models.end() ? nullptr : &*found;
+  for (const CameraModel& model : camera_models()) {
+    if (model.name == name) return &model;
+  }
+  return nullptr;
 }
 
 std::string camera_problem(const ColmapCamera& camera) {
@@ -67,6 +66,18 @@ constexpr std::uint64_t kImageBytes = 4 + 7 * 8 + 4 + 1 + 8;  // with an empty n
 constexpr std::uint64_t kPoint2dBytes = 2 * 8 + 8;
 constexpr std::uint64_t kPointBytes = 8 + 3 * 8 + 3 + 8 + 8;  // with an empty track
 constexpr std::uint64_t kTrackBytes = 4 + 4;
+
+// Without the empty line of an image that has no observations, the next image stands here and would be lost.
+void skip_observations(TextReader& reader) {
+  std::uint64_t tokens = 0;
+  std::string_view last;
+  for (; reader.has_token(); ++tokens) last = reader.token("an observation");
+  std::int64_t id = 0;
+  if (tokens % 3 != 0 || (tokens > 0 && !parse_number(last, id))) {
+    reader.fail(
+        "expected the observations of an image (x, y and point id of each), which may be an empty line");
+  }
+}
 
 }  // namespace
 
@@ -152,22 +163,6 @@ ColmapPoints read_points_binary(std::istream& in, const std::string& name, bool 
   reader.expect_end();
   return points;
 }
-
-namespace {
-
-// Without the empty line of an image that has no observations, the next image stands here and would be lost.
-void skip_observations(TextReader& reader) {
-  std::uint64_t tokens = 0;
-  std::string_view last;
-  for (; reader.has_token(); ++tokens) last = reader.token("an observation");
-  std::int64_t id = 0;
-  if (tokens % 3 != 0 || (tokens > 0 && !parse_number(last, id))) {
-    reader.fail(
-        "expected the observations of an image (x, y and point id of each), which may be an empty line");
-  }
-}
-
-}  // namespace
 
 std::vector<ColmapCamera> read_cameras_text(std::istream& in, const std::string& name) {
   TextReader reader(in, name);

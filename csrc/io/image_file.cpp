@@ -17,12 +17,9 @@ namespace blitzgs::io {
 namespace {
 
 using namespace std::string_view_literals;
-using Bytes = std::span<const std::uint8_t>;
 
 constexpr std::string_view kPngStart = "\x89PNG\r\n\x1a\n"sv;
 constexpr std::size_t kReadAhead = 1 << 16;
-
-std::string_view text(Bytes bytes) { return {reinterpret_cast<const char*>(bytes.data()), bytes.size()}; }
 
 // Tables of the checksum of a byte that k zero bytes follow, for the polynomial of PNG (ISO/IEC 15948, D).
 constexpr auto kChecksums = [] {
@@ -42,7 +39,7 @@ constexpr auto kChecksums = [] {
 }();
 
 // Eight bytes at a time, because a step of one byte waits for the one before.
-std::uint32_t checksum(Bytes bytes) {
+std::uint32_t checksum(ImageBytes bytes) {
   std::uint32_t value = ~0u;
   for (; bytes.size() >= 8; bytes = bytes.subspan(8)) {
     std::uint64_t word = 0;
@@ -55,26 +52,21 @@ std::uint32_t checksum(Bytes bytes) {
   return ~value;
 }
 
-std::uint32_t big_endian(Bytes bytes) {
-  return std::uint32_t{bytes[0]} << 24 | std::uint32_t{bytes[1]} << 16 | std::uint32_t{bytes[2]} << 8 |
-         bytes[3];
-}
-
-void check_png(Bytes file, const std::string& name) {
+void check_png(ImageBytes file, const std::string& name) {
   bool has_pixels = false;
   for (std::size_t at = kPngStart.size();;) {
     const auto fail = [&](const char* reason) {
       throw FormatError(name + ": at byte " + std::to_string(at), reason);
     };
-    const Bytes rest = file.subspan(at);
-    if (rest.size() < 12 || rest.size() - 12 < big_endian(rest)) {
+    const ImageBytes rest = file.subspan(at);
+    if (rest.size() < 12 || rest.size() - 12 < big_endian(rest, 0, 4)) {
       fail("truncated PNG: it ends before its last chunk");
     }
-    const Bytes chunk = rest.subspan(4, 4 + std::size_t{big_endian(rest)});
-    const std::string_view kind = text(chunk.first(4));
+    const ImageBytes chunk = rest.subspan(4, 4 + big_endian(rest, 0, 4));
+    const std::string_view kind = text_of(chunk.first(4));
     // The names of chunks that a picture needs begin with a capital letter. Others may be damaged.
     const bool is_needed = !(chunk[0] & 0x20) || kind == "tRNS";
-    if (is_needed && checksum(chunk) != big_endian(rest.subspan(4 + chunk.size()))) {
+    if (is_needed && checksum(chunk) != big_endian(rest, 4 + chunk.size(), 4)) {
       fail("damaged PNG: the checksum of a chunk is wrong");
     }
     has_pixels |= kind == "IDAT";
@@ -111,9 +103,9 @@ std::vector<std::uint8_t> read_file(const std::string& path) {
 
 }  // namespace
 
-void check_image(Bytes file, const std::string& name) {
-  if (text(file).starts_with("\xff\xd8"sv)) check_jpeg(file, name);
-  if (text(file).starts_with(kPngStart)) check_png(file, name);
+void check_image(ImageBytes file, const std::string& name) {
+  if (text_of(file).starts_with("\xff\xd8"sv)) check_jpeg(file, name);
+  if (text_of(file).starts_with(kPngStart)) check_png(file, name);
 }
 
 std::vector<std::uint8_t> read_image_file(const std::string& path) {

@@ -7,11 +7,25 @@
 #include <span>
 #include <stdexcept>
 #include <string>
+#include <string_view>
 #include <vector>
 
 #include "io/byte_reader.h"
 
 namespace blitzgs::io {
+
+using ImageBytes = std::span<const std::uint8_t>;
+
+inline std::string_view text_of(ImageBytes bytes) {
+  return {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
+}
+
+// The number of `bytes` bytes from `at` on, which must be there.
+inline std::uint64_t big_endian(ImageBytes file, std::size_t at, unsigned bytes) {
+  std::uint64_t value = 0;
+  for (unsigned k = 0; k < bytes; ++k) value = value << 8 | file[at + k];
+  return value;
+}
 
 // A file cannot be read; the message is the number of the system's error, a space and the path.
 class SystemError : public std::runtime_error {
@@ -23,7 +37,7 @@ class SystemError : public std::runtime_error {
 // Throws FormatError with the name, the byte offset and the reason for a damaged JPEG or PNG; other
 // formats are not checked. A PNG must have all of its chunks, and the right checksum of each that a picture
 // needs. O(bytes).
-void check_image(std::span<const std::uint8_t> file, const std::string& name);
+void check_image(ImageBytes file, const std::string& name);
 
 // The bytes of a file that passes `check_image`.
 std::vector<std::uint8_t> read_image_file(const std::string& path);
@@ -40,7 +54,7 @@ std::vector<std::uint8_t> read_image_file(const std::string& path);
 // valid sequence of codes. O(bytes), about 150 MB/s.
 //
 // Throws FormatError with the name, the byte offset and the reason.
-void check_jpeg(std::span<const std::uint8_t> file, const std::string& name);
+void check_jpeg(ImageBytes file, const std::string& name);
 
 // The QOI image format (qoiformat.org), RGB only: lossless, about the size of PNG, decoded several times
 // faster.
@@ -58,16 +72,14 @@ std::vector<std::uint8_t> encode_qoi(const std::uint8_t* rgb, QoiSize size);
 
 // The size in the header; throws FormatError when the header is damaged, has an alpha channel, or claims more
 // pixels than the bytes after it can hold.
-QoiSize qoi_size(std::span<const std::uint8_t> file);
+QoiSize qoi_size(ImageBytes file);
 
 // Fills rgb [height, width, 3] of qoi_size(file); throws FormatError when the codes end early or run over.
-void decode_qoi(std::span<const std::uint8_t> file, std::uint8_t* rgb);
+void decode_qoi(ImageBytes file, std::uint8_t* rgb);
 
 // What the header of an image file says, without its pixels: format, size, EXIF orientation, bands, and which
 // of them is alpha. Decoders guess where a file does not say (a fourth band of an aerial camera becomes
 // alpha), so the file is asked here.
-
-using ImageBytes = std::span<const std::uint8_t>;
 
 enum class Alpha : std::uint8_t {
   kNone,
@@ -87,10 +99,10 @@ struct ImageHeader {
   unsigned extras = 0;  // bands that are neither colours nor the alpha band
   Samples samples = Samples::kUnsigned;
   Alpha alpha = Alpha::kNone;
-  std::optional<unsigned> transparent_grey;  // pixels of this value are transparent (PNG)
-  bool is_planar = false;                    // each band is stored on its own (TIFF)
-  bool is_white_zero = false;                // 0 is white (TIFF)
-  bool is_lossy = false;                     // its compression changes pixels: black is only nearly black
+  std::optional<unsigned> transparent_grey = {};  // pixels of this value are transparent (PNG)
+  bool is_planar = false;                         // each band is stored on its own (TIFF)
+  bool is_white_zero = false;                     // 0 is white (TIFF)
+  bool is_lossy = false;  // its compression changes pixels: black is only nearly black
 };
 
 // Throws FormatError if the file ends inside its header or its header is damaged. `file` may be the beginning

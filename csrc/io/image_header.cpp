@@ -10,25 +10,10 @@ namespace {
 
 using namespace std::string_view_literals;
 
-std::string_view text(ImageBytes file) { return {reinterpret_cast<const char*>(file.data()), file.size()}; }
-
-std::uint64_t big_endian(ImageBytes file, std::size_t at, unsigned bytes) {
-  std::uint64_t value = 0;
-  for (unsigned k = 0; k < bytes; ++k) value = value << 8 | file[at + k];
-  return value;
-}
-
-ImageHeader not_supported(std::string format) {
-  ImageHeader header;
-  header.format = std::move(format);
-  header.supported = false;
-  return header;
-}
+ImageHeader not_supported(std::string format) { return {.format = std::move(format), .supported = false}; }
 
 ImageHeader read_jpeg(ImageBytes file, const std::string& name) {
-  ImageHeader header;
-  header.format = "JPEG";
-  header.is_lossy = true;
+  ImageHeader header{.format = "JPEG", .is_lossy = true};
   const auto need = [&](std::size_t end) {
     if (end > file.size()) throw FormatError(name, "truncated JPEG: the file ends inside its header");
   };
@@ -49,7 +34,7 @@ ImageHeader read_jpeg(ImageBytes file, const std::string& name) {
     need(at + 2 + length);
     if (length < 2 || marker == 0xda || marker == 0xd9) break;
     const ImageBytes payload = file.subspan(at + 4, length - 2);
-    if (marker == 0xe1 && text(payload).starts_with("Exif\0\0"sv)) {
+    if (marker == 0xe1 && text_of(payload).starts_with("Exif\0\0"sv)) {
       header.orientation = exif_orientation(payload.subspan(6));
     }
     if (marker >= 0xc0 && marker <= 0xcf && marker != 0xc4 && marker != 0xc8 && marker != 0xcc) {
@@ -66,14 +51,13 @@ ImageHeader read_jpeg(ImageBytes file, const std::string& name) {
 }
 
 ImageHeader read_png(ImageBytes file, const std::string& name) {
-  ImageHeader header;
-  header.format = "PNG";
+  ImageHeader header{.format = "PNG"};
   std::size_t at = 8;
   unsigned kind = 0;
   while (true) {
     if (file.size() < at + 8) throw FormatError(name, "truncated PNG: the file ends inside its header");
     const std::uint64_t length = big_endian(file, at, 4);
-    const std::string_view chunk = text(file).substr(at + 4, 4);
+    const std::string_view chunk = text_of(file).substr(at + 4, 4);
     if (chunk == "IDAT" || chunk == "IEND") break;
     if (length > file.size() - at - 8)
       throw FormatError(name, "truncated PNG: the file ends inside its header");
@@ -107,22 +91,19 @@ void each_box(ImageBytes bytes, Visit visit) {
     }
     if (length == 0 || length > bytes.size()) length = bytes.size();
     if (length < header) return;
-    visit(text(bytes).substr(4, 4),
+    visit(text_of(bytes).substr(4, 4),
           bytes.subspan(static_cast<std::size_t>(header), static_cast<std::size_t>(length - header)));
     bytes = bytes.subspan(static_cast<std::size_t>(length));
   }
 }
 
 ImageHeader read_jpeg_2000(ImageBytes file) {
-  ImageHeader header;
-  header.format = "JPEG 2000";
-  header.is_lossy = true;  // not always, but its header does not say so
+  ImageHeader header{.format = "JPEG 2000", .is_lossy = true};  // not always, but its header does not say so
   unsigned bands = 3;
-  if (file[0] == 0xff) {  // a bare codestream, whose first segment has the size and the number of bands
-    if (file.size() >= 43) {
-      bands = static_cast<unsigned>(big_endian(file, 40, 2));
-      header.bits = (file[42] & 0x7fu) + 1;
-    }
+  // The first segment of a bare codestream has the size and the number of bands.
+  if (file[0] == 0xff && file.size() >= 43) {
+    bands = static_cast<unsigned>(big_endian(file, 40, 2));
+    header.bits = (file[42] & 0x7fu) + 1;
   }
   each_box(file[0] == 0xff ? ImageBytes{} : file, [&](std::string_view kind, ImageBytes payload) {
     if (kind != "jp2h") return;
@@ -148,10 +129,10 @@ ImageHeader read_jpeg_2000(ImageBytes file) {
 
 // HEIF files: AVIF, and those that need another decoder.
 ImageHeader read_heif(ImageBytes file) {
-  ImageHeader header;
-  std::string_view brands = text(file).substr(8, 4);
+  ImageHeader header{.format = "AVIF", .is_lossy = true};
+  std::string_view brands = text_of(file).substr(8, 4);
   each_box(file, [&](std::string_view kind, ImageBytes payload) {
-    if (kind == "ftyp") brands = text(payload);
+    if (kind == "ftyp") brands = text_of(payload);
     if (kind != "meta" || payload.size() < 4) return;
     each_box(payload.subspan(4), [&](std::string_view inner, ImageBytes p) {
       if (inner != "iprp") return;
@@ -162,7 +143,7 @@ ImageHeader read_heif(ImageBytes file) {
             header.bits = std::max(header.bits, values[2] & 0x20 ? 12u : 10u);
           }
           // The decoder divides colours that are multiplied by alpha.
-          if (property == "auxC" && text(values).find("alpha") != std::string_view::npos) {
+          if (property == "auxC" && text_of(values).find("alpha") != std::string_view::npos) {
             header.alpha = Alpha::kStraight;
           }
         });
@@ -173,25 +154,20 @@ ImageHeader read_heif(ImageBytes file) {
   if (brands.find("avif") == std::string_view::npos && brands.find("avis") == std::string_view::npos) {
     return not_supported("HEIC");
   }
-  header.format = "AVIF";
-  header.is_lossy = true;
   return header;
 }
 
 ImageHeader read_webp(ImageBytes file) {
-  ImageHeader header;
-  header.format = "WebP";
-  const std::string_view kind = text(file).substr(12, 4);
-  header.is_lossy = kind != "VP8L" && text(file).find("VP8L") == std::string_view::npos;
+  const std::string_view kind = text_of(file).substr(12, 4);
   const bool says_so = (kind == "VP8X" && file.size() > 20 && (file[20] & 0x10)) ||
                        (kind == "VP8L" && file.size() > 24 && (file[24] & 0x10));
-  if (says_so) header.alpha = Alpha::kStraight;
-  return header;
+  return {.format = "WebP",
+          .alpha = says_so ? Alpha::kStraight : Alpha::kNone,
+          .is_lossy = kind != "VP8L" && text_of(file).find("VP8L") == std::string_view::npos};
 }
 
 ImageHeader read_gif(ImageBytes file) {
-  ImageHeader header;
-  header.format = "GIF";
+  ImageHeader header{.format = "GIF"};
   std::size_t at = 13;
   if (file.size() > 10 && (file[10] & 0x80)) at += std::size_t{3} << ((file[10] & 7) + 1);
   while (at + 4 < file.size() && file[at] == 0x21) {  // extensions before the first picture
@@ -204,27 +180,22 @@ ImageHeader read_gif(ImageBytes file) {
 }
 
 ImageHeader read_bmp(ImageBytes file) {
-  ImageHeader header;
-  header.format = "BMP";
   // Only longer headers with masks of the colours have a mask of alpha.
   const bool has_masks = file.size() >= 70 && (file[30] == 3 || file[30] == 6) && file[14] >= 56;
-  if (has_masks && big_endian(file, 66, 4) != 0) header.alpha = Alpha::kStraight;
-  return header;
+  const bool has_alpha = has_masks && big_endian(file, 66, 4) != 0;
+  return {.format = "BMP", .alpha = has_alpha ? Alpha::kStraight : Alpha::kNone};
 }
 
 ImageHeader read_pam(ImageBytes file) {
-  ImageHeader header;
-  header.format = "PAM";
-  const std::string_view start = text(file).substr(0, 1024);
-  const std::string_view head = start.substr(0, start.find("ENDHDR"));
-  if (head.find("_ALPHA") != std::string_view::npos) header.alpha = Alpha::kStraight;
-  return header;
+  const std::string_view start = text_of(file).substr(0, 1024);
+  const bool has_alpha = start.substr(0, start.find("ENDHDR")).find("_ALPHA") != std::string_view::npos;
+  return {.format = "PAM", .alpha = has_alpha ? Alpha::kStraight : Alpha::kNone};
 }
 
 }  // namespace
 
 ImageHeader read_image_header(ImageBytes file, const std::string& name) {
-  const std::string_view start = text(file);
+  const std::string_view start = text_of(file);
   if (start.starts_with("\xff\xd8"sv)) return read_jpeg(file, name);
   if (start.starts_with("\x89PNG\r\n\x1a\n"sv)) return read_png(file, name);
   if (is_tiff(file)) return read_tiff_header(file, name);

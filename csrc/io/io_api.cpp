@@ -120,11 +120,15 @@ struct blitzgs_io_reply {
   std::vector<blitzgs_io_column> columns;
   std::vector<std::shared_ptr<const void>> held;
 
-  template <class T>
-  void add(std::vector<T>&& values) {
-    const auto owner = std::make_shared<const std::vector<T>>(std::move(values));
-    columns.push_back({owner->data(), owner->size(), type_of<T>()});
-    held.push_back(owner);
+  // A column for each.
+  template <class... T>
+  void add(std::vector<T>&&... values) {
+    const auto add_one = [&]<class V>(std::vector<V>&& one) {
+      const auto owner = std::make_shared<const std::vector<V>>(std::move(one));
+      columns.push_back({owner->data(), owner->size(), type_of<V>()});
+      held.push_back(owner);
+    };
+    (add_one(std::move(values)), ...);
   }
   template <class T = std::uint64_t>
   void add_number(T value) {
@@ -139,8 +143,7 @@ struct blitzgs_io_reply {
       bytes.insert(bytes.end(), text.begin(), text.end());
       ends.push_back(bytes.size());
     }
-    add(std::move(bytes));
-    add(std::move(ends));
+    add(std::move(bytes), std::move(ends));
   }
   std::uint8_t* add_uninitialised(std::size_t size) {
     const auto owner = std::make_shared_for_overwrite<std::uint8_t[]>(size);
@@ -193,41 +196,26 @@ void read_cameras(Arguments& arguments, Reply& reply) {
   }
   reply.add(std::move(ids));
   reply.add_texts(models);
-  reply.add(std::move(widths));
-  reply.add(std::move(heights));
-  reply.add(std::move(params));
-  reply.add(std::move(ends));
+  reply.add(std::move(widths), std::move(heights), std::move(params), std::move(ends));
 }
 
 void read_images(Arguments& arguments, Reply& reply) {
   const std::string path = arguments.text();
   const bool with_points2d = arguments.number() != 0;
   std::ifstream in = opened(path);
-  auto images = is_text(path) ? io::read_images_text(in, path, with_points2d)
-                              : io::read_images_binary(in, path, with_points2d);
-  reply.add(std::move(images.ids));
-  reply.add(std::move(images.quats));
-  reply.add(std::move(images.translations));
-  reply.add(std::move(images.camera_ids));
-  reply.add_texts(images.names);
-  reply.add(std::move(images.point2d_offsets));
-  reply.add(std::move(images.points2d));
-  reply.add(std::move(images.point3d_ids));
+  auto i = (is_text(path) ? io::read_images_text : io::read_images_binary)(in, path, with_points2d);
+  reply.add(std::move(i.ids), std::move(i.quats), std::move(i.translations), std::move(i.camera_ids));
+  reply.add_texts(i.names);
+  reply.add(std::move(i.point2d_offsets), std::move(i.points2d), std::move(i.point3d_ids));
 }
 
 void read_points(Arguments& arguments, Reply& reply) {
   const std::string path = arguments.text();
   const bool with_tracks = arguments.number() != 0;
   std::ifstream in = opened(path);
-  auto points = is_text(path) ? io::read_points_text(in, path, with_tracks)
-                              : io::read_points_binary(in, path, with_tracks);
-  reply.add(std::move(points.ids));
-  reply.add(std::move(points.positions));
-  reply.add(std::move(points.colors));
-  reply.add(std::move(points.errors));
-  reply.add(std::move(points.track_offsets));
-  reply.add(std::move(points.track_image_ids));
-  reply.add(std::move(points.track_point2d_ids));
+  auto p = (is_text(path) ? io::read_points_text : io::read_points_binary)(in, path, with_tracks);
+  reply.add(std::move(p.ids), std::move(p.positions), std::move(p.colors), std::move(p.errors),
+            std::move(p.track_offsets), std::move(p.track_image_ids), std::move(p.track_point2d_ids));
 }
 
 constexpr std::string_view kNumpyTypes[] = {"i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"};

@@ -29,7 +29,7 @@ constexpr std::size_t kMaxForeignBytes = 4096;
 // The check of one file (image_file.h).
 class Checker {
  public:
-  Checker(std::span<const std::uint8_t> file, const std::string& name) : file_(file), name_(name) {}
+  Checker(ImageBytes file, const std::string& name) : file_(file), name_(name) {}
 
   void run() {
     if (file_.size() < 2 || file_[0] != 0xff || file_[1] != kSoi) fail("not a JPEG: no start marker");
@@ -42,7 +42,7 @@ class Checker {
         return;
       }
       if (marker >= kRst0 && marker < kRst0 + 8) continue;
-      const std::span<const std::uint8_t> payload = next_payload();
+      const ImageBytes payload = next_payload();
       if (marker == kDht) read_tables(payload);
       if (marker == kDri && payload.size() >= 2) restart_interval_ = payload[0] * 256u + payload[1];
       if (marker >= kSof0 && marker <= 0xcf && marker != kDht && marker != 0xc8 && marker != 0xcc) {
@@ -65,16 +65,16 @@ class Checker {
     return file_[at_++];
   }
 
-  std::span<const std::uint8_t> next_payload() {
+  ImageBytes next_payload() {
     if (file_.size() - at_ < 2) fail("truncated JPEG: it ends inside a header");
-    const std::size_t length = file_[at_] * 256u + file_[at_ + 1];
+    const std::size_t length = big_endian(file_, at_, 2);
     if (length < 2 || file_.size() - at_ < length) fail("truncated JPEG: it ends inside a header");
     const auto payload = file_.subspan(at_ + 2, length - 2);
     at_ += length;
     return payload;
   }
 
-  void read_tables(std::span<const std::uint8_t> payload) {
+  void read_tables(ImageBytes payload) {
     while (!payload.empty()) {
       if (payload.size() < 17) fail("damaged JPEG: a Huffman table is cut off");
       const unsigned kind = payload[0] >> 4, id = payload[0] & 15;
@@ -85,7 +85,7 @@ class Checker {
     }
   }
 
-  void read_frame(std::uint8_t marker, std::span<const std::uint8_t> payload) {
+  void read_frame(std::uint8_t marker, ImageBytes payload) {
     if (payload.size() < 6 || payload.size() < 6 + 3u * payload[5]) fail("damaged JPEG: its size is cut off");
     walked_ = marker >= kSof0 && marker <= kSof2 && payload[0] == 8;
     progressive_ = marker == kSof2;
@@ -119,7 +119,7 @@ class Checker {
            ceil_div(ceil_div(height_ * component.v, v_max_), 8);
   }
 
-  void read_scan(std::span<const std::uint8_t> payload) {
+  void read_scan(ImageBytes payload) {
     ++scans_;
     if (components_.empty()) fail("damaged JPEG: image data come before the size");
     if (payload.empty() || payload.size() < 1 + 2u * payload[0])
@@ -160,7 +160,7 @@ class Checker {
     bool refines = false;
   };
 
-  Band read_band(std::span<const std::uint8_t> payload) {
+  Band read_band(ImageBytes payload) {
     if (!progressive_) return {};
     const std::size_t at = 1 + 2u * payload[0];
     if (payload.size() < at + 3) fail("damaged JPEG: a scan header is cut off");
@@ -376,7 +376,7 @@ class Checker {
     at_ = file_.size();
   }
 
-  std::span<const std::uint8_t> file_;
+  ImageBytes file_;
   const std::string& name_;
   std::size_t at_ = 0;
   std::array<std::array<CodeTable, 4>, 2> tables_;
@@ -396,6 +396,6 @@ class Checker {
 
 }  // namespace
 
-void check_jpeg(std::span<const std::uint8_t> file, const std::string& name) { Checker(file, name).run(); }
+void check_jpeg(ImageBytes file, const std::string& name) { Checker(file, name).run(); }
 
 }  // namespace blitzgs::io

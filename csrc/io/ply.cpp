@@ -2,8 +2,8 @@
 #include "io/ply.h"
 
 #include <algorithm>
-#include <array>
 #include <charconv>
+#include <iterator>
 #include <optional>
 #include <sstream>
 #include <string>
@@ -14,19 +14,50 @@ namespace blitzgs::io {
 
 namespace {
 
+std::string read_token(ByteReader& reader) {
+  const auto blank = [](char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\n'; };
+  std::string token;
+  while (reader.remaining() > 0) {
+    const char c = reader.read<char>("a value");
+    if (!blank(c)) {
+      token.push_back(c);
+      if (token.size() > 400) reader.fail("a value of more than 400 characters");
+    } else if (!token.empty()) {
+      return token;
+    }
+  }
+  if (token.empty()) reader.fail("the file ends before its last value");
+  return token;
+}
+
+template <class T>
+void parse_value(ByteReader& reader, std::uint8_t* out) {
+  const std::string token = read_token(reader);
+  T value{};
+  if (!parse_number(token, value)) reader.fail("'" + token.substr(0, 40) + "' is not a valid value");
+  std::memcpy(out, &value, sizeof value);
+}
+
 struct TypeInfo {
-  std::string_view name;
-  std::string_view alias;
+  std::string_view name, alias;
   int bytes;
+  void (*parse)(ByteReader&, std::uint8_t* out);  // a value in text
 };
-constexpr std::array<TypeInfo, 8> kTypes = {{{"char", "int8", 1},
-                                             {"uchar", "uint8", 1},
-                                             {"short", "int16", 2},
-                                             {"ushort", "uint16", 2},
-                                             {"int", "int32", 4},
-                                             {"uint", "uint32", 4},
-                                             {"float", "float32", 4},
-                                             {"double", "float64", 8}}};
+// In the order of PlyType.
+constexpr TypeInfo kTypes[] = {
+    {"char", "int8", 1, parse_value<std::int8_t>},    {"uchar", "uint8", 1, parse_value<std::uint8_t>},
+    {"short", "int16", 2, parse_value<std::int16_t>}, {"ushort", "uint16", 2, parse_value<std::uint16_t>},
+    {"int", "int32", 4, parse_value<std::int32_t>},   {"uint", "uint32", 4, parse_value<std::uint32_t>},
+    {"float", "float32", 4, parse_value<float>},      {"double", "float64", 8, parse_value<double>}};
+const TypeInfo& info_of(PlyType type) { return kTypes[static_cast<std::size_t>(type)]; }
+
+std::optional<PlyType> find_type(std::string_view name) {
+  for (std::size_t i = 0; i < std::size(kTypes); ++i) {
+    if (name == kTypes[i].name || name == kTypes[i].alias) return static_cast<PlyType>(i);
+  }
+  return std::nullopt;
+}
+
 constexpr std::size_t kMaxLine = 1 << 16;
 constexpr std::size_t kMaxProperties = 1 << 12;
 
@@ -38,19 +69,8 @@ struct Element {
   std::vector<PlyProperty> properties;
   bool has_list = false;
 
-  std::uint64_t row_bytes() const {
-    std::uint64_t bytes = 0;
-    for (const PlyProperty& p : properties) bytes += ply_type_bytes(p.type);
-    return bytes;
-  }
+  std::uint64_t row_bytes() const { return io::row_bytes(properties); }
 };
-
-std::optional<PlyType> find_type(std::string_view name) {
-  for (std::size_t i = 0; i < kTypes.size(); ++i) {
-    if (name == kTypes[i].name || name == kTypes[i].alias) return static_cast<PlyType>(i);
-  }
-  return std::nullopt;
-}
 
 std::string read_line(ByteReader& reader) {
   std::string line;
@@ -140,51 +160,6 @@ Header read_header(ByteReader& reader) {
   }
 }
 
-std::string read_token(ByteReader& reader) {
-  const auto blank = [](char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\n'; };
-  std::string token;
-  while (reader.remaining() > 0) {
-    const char c = reader.read<char>("a value");
-    if (!blank(c)) {
-      token.push_back(c);
-      if (token.size() > 400) reader.fail("a value of more than 400 characters");
-    } else if (!token.empty()) {
-      return token;
-    }
-  }
-  if (token.empty()) reader.fail("the file ends before its last value");
-  return token;
-}
-
-template <class T>
-void parse_value(ByteReader& reader, std::uint8_t* out) {
-  const std::string token = read_token(reader);
-  T value{};
-  if (!parse_number(token, value)) reader.fail("'" + token.substr(0, 40) + "' is not a valid value");
-  std::memcpy(out, &value, sizeof value);
-}
-
-void parse_value(ByteReader& reader, PlyType type, std::uint8_t* out) {
-  switch (type) {
-    case PlyType::kInt8:
-      return parse_value<std::int8_t>(reader, out);
-    case PlyType::kUint8:
-      return parse_value<std::uint8_t>(reader, out);
-    case PlyType::kInt16:
-      return parse_value<std::int16_t>(reader, out);
-    case PlyType::kUint16:
-      return parse_value<std::uint16_t>(reader, out);
-    case PlyType::kInt32:
-      return parse_value<std::int32_t>(reader, out);
-    case PlyType::kUint32:
-      return parse_value<std::uint32_t>(reader, out);
-    case PlyType::kFloat32:
-      return parse_value<float>(reader, out);
-    case PlyType::kFloat64:
-      return parse_value<double>(reader, out);
-  }
-}
-
 void skip_element(ByteReader& reader, const Element& element, Encoding encoding) {
   if (element.has_list) reader.fail("element " + element.name + " has lists and comes before the vertices");
   if (encoding == Encoding::kAscii) {
@@ -200,20 +175,19 @@ void skip_element(ByteReader& reader, const Element& element, Encoding encoding)
 void swap_bytes(const Element& vertex, std::vector<std::uint8_t>& rows) {
   for (auto at = rows.begin(); at != rows.end();) {
     for (const PlyProperty& property : vertex.properties) {
-      const int bytes = ply_type_bytes(property.type);
-      std::reverse(at, at + bytes);
-      at += bytes;
+      std::reverse(at, at + property.bytes());
+      at += property.bytes();
     }
   }
 }
 
 }  // namespace
 
-int ply_type_bytes(PlyType type) { return kTypes[static_cast<std::size_t>(type)].bytes; }
+int PlyProperty::bytes() const { return info_of(type).bytes; }
 
-std::uint64_t PlyTable::row_bytes() const {
+std::uint64_t row_bytes(const std::vector<PlyProperty>& properties) {
   std::uint64_t bytes = 0;
-  for (const PlyProperty& p : properties) bytes += ply_type_bytes(p.type);
+  for (const PlyProperty& property : properties) bytes += property.bytes();
   return bytes;
 }
 
@@ -244,8 +218,8 @@ PlyTable read_ply(std::istream& in, const std::string& name, std::uint64_t first
     std::uint8_t* out = table.rows.data();
     for (std::uint64_t i = 0; i < table.count; ++i) {
       for (const PlyProperty& property : table.properties) {
-        parse_value(reader, property.type, out);
-        out += ply_type_bytes(property.type);
+        info_of(property.type).parse(reader, out);
+        out += property.bytes();
       }
     }
     return table;

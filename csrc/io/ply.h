@@ -16,12 +16,14 @@
 namespace blitzgs::io {
 
 enum class PlyType : std::uint8_t { kInt8, kUint8, kInt16, kUint16, kInt32, kUint32, kFloat32, kFloat64 };
-int ply_type_bytes(PlyType type);
 
 struct PlyProperty {
   std::string name;
   PlyType type;
+
+  int bytes() const;
 };
+std::uint64_t row_bytes(const std::vector<PlyProperty>& properties);
 
 struct PlyTable {
   std::vector<std::string> comments;  // whole header lines: "comment ..." and "obj_info ..."
@@ -29,8 +31,6 @@ struct PlyTable {
   std::uint64_t count = 0;
   std::vector<std::uint8_t> rows;  // count x row_bytes
   std::uint64_t total = 0;         // rows of the file, of which `rows` may hold some
-
-  std::uint64_t row_bytes() const;
 };
 
 // Reads `most` rows from row `first` on, or as many as there are. Throws FormatError with the file, byte

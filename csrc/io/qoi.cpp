@@ -2,7 +2,6 @@
 #include "io/image_file.h"
 
 #include <array>
-#include <cstring>
 
 namespace blitzgs::io {
 
@@ -29,10 +28,6 @@ struct Recent {
 
 [[noreturn]] void fail(std::size_t offset, const char* reason) {
   throw FormatError("QOI: at byte " + std::to_string(offset), reason);
-}
-
-std::uint32_t big_endian(const std::uint8_t* p) {
-  return std::uint32_t{p[0]} << 24 | std::uint32_t{p[1]} << 16 | std::uint32_t{p[2]} << 8 | p[3];
 }
 
 void put_pixel(std::vector<std::uint8_t>& out, Pixel pixel, Pixel before, Recent& recent) {
@@ -89,17 +84,17 @@ std::vector<std::uint8_t> encode_qoi(const std::uint8_t* rgb, QoiSize size) {
   return out;
 }
 
-QoiSize qoi_size(std::span<const std::uint8_t> file) {
-  if (file.size() < kHeader + kEnd.size() || std::memcmp(file.data(), "qoif", 4) != 0)
-    fail(0, "not a QOI file");
+QoiSize qoi_size(ImageBytes file) {
+  if (file.size() < kHeader + kEnd.size() || !text_of(file).starts_with("qoif")) fail(0, "not a QOI file");
   if (file[12] != 3) fail(12, "only RGB is supported");
-  const QoiSize size{big_endian(file.data() + 4), big_endian(file.data() + 8)};
+  const QoiSize size{static_cast<std::uint32_t>(big_endian(file, 4, 4)),
+                     static_cast<std::uint32_t>(big_endian(file, 8, 4))};
   const std::uint64_t most = kMaxRun * static_cast<std::uint64_t>(file.size() - kHeader - kEnd.size());
   if (std::uint64_t{size.width} * size.height > most) fail(4, "more pixels than the file can hold");
   return size;
 }
 
-void decode_qoi(std::span<const std::uint8_t> file, std::uint8_t* rgb) {
+void decode_qoi(ImageBytes file, std::uint8_t* rgb) {
   const QoiSize size = qoi_size(file);
   const std::uint8_t* const begin = file.data();
   const std::uint8_t* at = begin + kHeader;

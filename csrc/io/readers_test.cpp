@@ -93,38 +93,6 @@ std::uint64_t next_random(std::uint64_t& state) {
 
 }  // namespace
 
-TEST_CASE("both formats of COLMAP have the same values") {
-  std::istringstream cameras(kCameras), cameras_text(kCamerasText), images(kImages), images_text(kImagesText);
-  std::istringstream points(kPoints), points_text(kPointsText);
-  const auto camera = read_cameras_binary(cameras, "f")[1], of_text = read_cameras_text(cameras_text, "f")[1];
-  REQUIRE(camera.params == std::vector<double>{50, 32, 24, 1e-17, -0.1});
-  REQUIRE((camera.id == 6 && of_text.id == 6 && camera.model == 3 && of_text.model == 3));
-  REQUIRE((camera.width == 64 && of_text.height == 48 && camera.params == of_text.params));
-  const auto found = read_images_binary(images, "f", true),
-             written = read_images_text(images_text, "f", true);
-  REQUIRE(found.ids == written.ids);
-  REQUIRE(found.camera_ids == std::vector<u32>{5, 6});
-  REQUIRE(found.camera_ids == written.camera_ids);
-  REQUIRE(found.quats == written.quats);
-  REQUIRE(found.translations == std::vector<double>{1, 2, 3, -4, 5e-300, 6});
-  REQUIRE(found.translations == written.translations);
-  REQUIRE(found.names == written.names);
-  REQUIRE(found.point2d_offsets == written.point2d_offsets);
-  REQUIRE(found.points2d == written.points2d);
-  REQUIRE(found.point3d_ids == std::vector<i64>{-1, 7});
-  REQUIRE(found.point3d_ids == written.point3d_ids);
-  const auto cloud = read_points_binary(points, "f", true), lines = read_points_text(points_text, "f", true);
-  REQUIRE(cloud.ids == lines.ids);
-  REQUIRE(cloud.positions == lines.positions);
-  REQUIRE(cloud.colors == std::vector<std::uint8_t>{255, 0, 1, 2, 3, 4});
-  REQUIRE(cloud.colors == lines.colors);
-  REQUIRE(cloud.errors == lines.errors);
-  REQUIRE(cloud.track_offsets == std::vector<u64>{0, 1, 3});
-  REQUIRE(cloud.track_offsets == lines.track_offsets);
-  REQUIRE(cloud.track_image_ids == lines.track_image_ids);
-  REQUIRE(cloud.track_point2d_ids == lines.track_point2d_ids);
-}
-
 TEST_CASE("every truncation of a binary COLMAP file is refused") {
   for (const Format& format : binary_formats()) {
     INFO(format.name);
@@ -249,24 +217,6 @@ bool refused(const std::string& bytes) {
 }
 
 }  // namespace
-
-TEST_CASE("a PLY table is its rows, properties and comments") {
-  const PlyTable found = parsed(kTable);
-  REQUIRE(found.count == 3);
-  REQUIRE(found.rows == std::vector<std::uint8_t>{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14});
-  REQUIRE(found.comments == std::vector<std::string>{"comment by hand"});
-  REQUIRE((found.properties[0].type == PlyType::kFloat32 && found.properties[1].name == "n"));
-}
-
-TEST_CASE("ASCII and big-endian PLY give the rows of the little-endian one") {
-  const std::string header = "element vertex 2\r\nproperty short a\r\nproperty float64 b\r\nend_header\r\n";
-  const PlyTable text = parsed("ply\r\nformat ascii 1.0\r\n" + header + "1 -2.5\r\n-3 1e10");
-  std::string big = "ply\r\nformat binary_big_endian 1.0\r\n" + header;
-  big += std::string("\x00\x01\xc0\x04\x00\x00\x00\x00\x00\x00", 10);
-  big += std::string("\xff\xfd\x42\x02\xa0\x5f\x20\x00\x00\x00", 10);
-  REQUIRE(parsed(big).rows == text.rows);
-  REQUIRE(text.rows.size() == 20);
-}
 
 TEST_CASE("ASCII PLY may have signs, and numbers that its types do not hold") {
   const PlyTable table = parsed(

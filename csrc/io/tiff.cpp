@@ -74,23 +74,8 @@ class Directory {
  private:
   // Of the types of whole numbers; 0: another type.
   static unsigned value_bytes(unsigned type) {
-    switch (type) {
-      case 1:
-      case 6:
-        return 1;
-      case 3:
-      case 8:
-        return 2;
-      case 4:
-      case 9:
-      case 13:
-        return 4;
-      case 16:
-      case 18:
-        return 8;
-      default:
-        return 0;
-    }
+    constexpr std::uint8_t kBytes[] = {0, 1, 0, 2, 4, 0, 1, 0, 2, 4, 0, 0, 0, 4, 0, 0, 8, 0, 8};
+    return type < std::size(kBytes) ? kBytes[type] : 0;
   }
 
   bool has(std::uint64_t at, std::uint64_t bytes) const {
@@ -118,10 +103,10 @@ bool is_raw(ImageBytes file, const Directory& directory) {
 }  // namespace
 
 bool is_tiff(ImageBytes file) {
-  if (file.size() < 10) return false;
-  const std::string start(file.begin(), file.begin() + 4);
-  using namespace std::string_literals;
-  return start == "II*\0"s || start == "MM\0*"s || start == "II+\0"s || start == "MM\0+"s;
+  using namespace std::string_view_literals;
+  const std::string_view start = text_of(file).substr(0, 4);
+  return file.size() >= 10 &&
+         (start == "II*\0"sv || start == "MM\0*"sv || start == "II+\0"sv || start == "MM\0+"sv);
 }
 
 unsigned exif_orientation(ImageBytes tiff) {
@@ -133,15 +118,11 @@ unsigned exif_orientation(ImageBytes tiff) {
 ImageHeader read_tiff_header(ImageBytes file, const std::string& name) {
   const Directory directory(file);
   if (!directory.complete()) throw FormatError(name, "truncated TIFF: its directory is not in the file");
-  ImageHeader header;
-  header.format = "TIFF";
-  header.width = directory.value(kWidth, 0);
-  header.height = directory.value(kHeight, 0);
+  ImageHeader header{
+      .format = "TIFF", .width = directory.value(kWidth, 0), .height = directory.value(kHeight, 0)};
   if (header.width == 0 || header.height == 0) throw FormatError(name, "damaged TIFF: it has no size");
   if (is_raw(file, directory)) {
-    header.format = "camera raw";
-    header.supported = false;
-    return header;
+    return {.format = "camera raw", .supported = false, .width = header.width, .height = header.height};
   }
   header.orientation = exif_orientation(file);
   header.bits = static_cast<unsigned>(std::min<std::uint64_t>(directory.value(kBits, 1), 64));

@@ -2,9 +2,7 @@
 #include "loss/photometric.h"
 
 #include <cmath>
-#include <optional>
 #include <tuple>
-#include <vector>
 
 #include "common/op.h"
 
@@ -22,7 +20,7 @@ void fill_window(T (&window)[kSsimTaps]) {
 }
 
 struct PhotometricOutputs {
-  std::optional<Tensor> parts, v_renders, scale_reg, opacity_reg;
+  Tensor parts, v_renders, scale_reg, opacity_reg;
 };
 
 // The weights of the sums in the loss whose gradient is computed.
@@ -33,58 +31,54 @@ struct PhotometricWeights {
   double scale = 0, opacity = 0;
 };
 
+// weights null: no gradient. sums: whether the sums are wanted.
 PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, const Tensor& targets_in,
                                    const std::optional<Tensor>& masks_in, const PhotometricWeights* weights,
                                    bool sums, std::int64_t tile_size, std::int64_t tile_begin,
                                    std::int64_t tile_end) {
   check_floating(op, "renders", renders_in);
-  const ScalarType dtype = renders_in.scalar_type();
-  const Tensor renders = checked(op, "renders", renders_in, dtype, {-1, -1, -1, 3});
-  const std::int64_t views = renders.size(0), height = renders.size(1), width = renders.size(2);
+  check_shape(op, "renders", renders_in, {-1, -1, -1, 3});
+  const std::int64_t views = renders_in.size(0), height = renders_in.size(1), width = renders_in.size(2);
   check_shape(op, "targets", targets_in, {views, height, width, 3});
   const bool bytes = targets_in.scalar_type() == ScalarType::Byte;
-  if (!bytes) check_dtype(op, "targets (if not uint8)", targets_in, dtype);
+  if (!bytes) check_dtype(op, "targets (if not uint8)", targets_in, renders_in.scalar_type());
   const Tensor targets = as_contiguous(targets_in);
   BLITZGS_CHECK(tile_size > 0 && tile_size <= 4096, op, "tile_size must be in [1, 4096], got ", tile_size);
   BLITZGS_CHECK(height < (1 << 24) && width < (1 << 24), op, "images of ", width, " x ", height,
                 " pixels are beyond the limit of 2^24 a side");
-  const auto masks = checked(op, "masks", masks_in, ScalarType::Byte, {views, height, width});
-  std::optional<Tensor> l1_weights, ssim_weights, samples, visible;
-  PhotometricOutputs outputs;
-  if (weights) {
-    l1_weights = checked(op, "l1_weights", weights->l1, dtype, {views});
-    ssim_weights = checked(op, "ssim_weights", weights->ssim, dtype, {views});
-    samples = checked(op, "samples", weights->samples, dtype, {views});
-    visible = checked(op, "visible", weights->visible, ScalarType::Long, {views});
-    outputs.v_renders = make_empty(renders, {views, height, width, 3});
-    outputs.scale_reg = make_empty(renders, {visible ? views : 0});
-    outputs.opacity_reg = make_empty(renders, {visible ? views : 0});
-  }
-  if (renders.numel() == 0) {
-    if (visible) {
-      torch::stable::zero_(*outputs.scale_reg);
-      torch::stable::zero_(*outputs.opacity_reg);
+  const auto masks = checked<std::uint8_t>(op, "masks", masks_in, {views, height, width});
+  DeviceScope scope(renders_in);
+  return dispatch_floating(renders_in, [&]<class T>() {
+    const auto renders = checked<T>(op, "renders", renders_in, {views, height, width, 3});
+    OptionalValues<const T> l1_weights, ssim_weights, samples;
+    OptionalValues<const std::int64_t> visible;
+    if (weights) {
+      l1_weights.emplace(checked<T>(op, "l1_weights", weights->l1, {views}));
+      ssim_weights.emplace(checked<T>(op, "ssim_weights", weights->ssim, {views}));
+      samples = checked<T>(op, "samples", weights->samples, {views});
+      visible = checked<std::int64_t>(op, "visible", weights->visible, {views});
     }
-    if (sums) outputs.parts = make_empty(renders, {views, 0, 2}, ScalarType::Double);
-    return outputs;
-  }
-
-  DeviceScope scope(renders);
-  dispatch_floating(renders, [&]<class T>() {
+    const auto v_renders = make<T>(renders, {weights ? views : 0, height, width, 3});
+    auto scale_reg = make<T>(renders, {visible ? views : 0}),
+         opacity_reg = make<T>(renders, {visible ? views : 0});
+    if (renders.numel() == 0) {
+      torch::stable::zero_(scale_reg);
+      torch::stable::zero_(opacity_reg);
+      return PhotometricOutputs{make<double>(renders, {views, 0, 2}), v_renders, scale_reg, opacity_reg};
+    }
     PhotometricArgs<T> args{};
-    args.renders = data<T>(renders);
+    args.renders = renders;
     args.targets = bytes ? nullptr : data<T>(targets);
     args.targets_u8 = bytes ? data<std::uint8_t>(targets) : nullptr;
-    args.masks = data_or_null<std::uint8_t>(masks);
-    args.l1_weights = data_or_null<T>(l1_weights);
-    args.ssim_weights = data_or_null<T>(ssim_weights);
-    args.samples = data_or_null<T>(samples);
+    args.masks = masks;
+    args.l1_weights = l1_weights;
+    args.ssim_weights = ssim_weights;
+    args.samples = samples;
     if (visible) {
-      args.means = {data<std::int64_t>(*visible), static_cast<T>(weights->scale),
-                    static_cast<T>(weights->opacity), mutable_data<T>(*outputs.scale_reg),
-                    mutable_data<T>(*outputs.opacity_reg)};
+      args.means = {visible, static_cast<T>(weights->scale), static_cast<T>(weights->opacity), scale_reg,
+                    opacity_reg};
     }
-    args.v_renders = outputs.v_renders ? mutable_data<T>(*outputs.v_renders) : nullptr;
+    args.v_renders = v_renders.data_if(weights != nullptr);
     args.clear_rest = !sums;
     args.views = views;
     args.width = static_cast<int>(width);
@@ -97,39 +91,37 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
     args.tile_end = tile_end < 0 ? tiles : tile_end;
     check_tile_range(op, tile_begin, args.tile_end, tiles);
     fill_window(args.window);
-    if (sums) {
-      outputs.parts = make_empty(renders, {views, backend::photometric_parts(args), 2}, ScalarType::Double);
-      args.parts = mutable_data<double>(*outputs.parts);
-    }
+    const auto parts = make<double>(renders, {views, sums ? backend::photometric_parts(args) : 0, 2});
+    args.parts = parts.data_if(sums);
     backend::photometric(args, scope.workspace, scope.stream);
+    return PhotometricOutputs{parts, v_renders, scale_reg, opacity_reg};
   });
-  return outputs;
 }
 
 std::tuple<Tensor, Tensor> photometric_fwd(const Tensor& renders, const Tensor& targets,
                                            const std::optional<Tensor>& masks, std::int64_t tile_size,
                                            std::int64_t tile_begin, std::int64_t tile_end) {
-  const Tensor parts = *run_photometric("photometric_fwd", renders, targets, masks, nullptr, true, tile_size,
-                                        tile_begin, tile_end)
-                            .parts;
+  const Tensor parts = run_photometric("photometric_fwd", renders, targets, masks, nullptr, true, tile_size,
+                                       tile_begin, tile_end)
+                           .parts;
   const std::int64_t views = parts.size(0);
-  Tensor l1_sums = make_empty(renders, {views}), ssim_sums = make_empty(renders, {views});
   DeviceScope scope(renders);
-  dispatch_floating(renders, [&]<class T>() {
-    Report<T> report{data<double>(parts), views, parts.size(1), nullptr, 0, 0, {}, 1};
-    report.targets[0] = {mutable_data<T>(l1_sums), mutable_data<T>(ssim_sums), nullptr};
+  return dispatch_floating(renders, [&]<class T>() -> std::tuple<Tensor, Tensor> {
+    const auto l1_sums = make<T>(renders, {views}), ssim_sums = make<T>(renders, {views});
+    const Report<T> report{
+        data<double>(parts), views, parts.size(1), nullptr, 0, 0, {{l1_sums, ssim_sums, nullptr}}, 1};
     backend::report(report, scope.workspace, scope.stream);
+    return {l1_sums, ssim_sums};
   });
-  return {l1_sums, ssim_sums};
 }
 
 Tensor photometric_bwd(const Tensor& renders, const Tensor& targets, const std::optional<Tensor>& masks,
                        const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size,
                        std::int64_t tile_begin, std::int64_t tile_end) {
   const PhotometricWeights weights{l1_weights, ssim_weights, {}, {}};
-  return *run_photometric("photometric_bwd", renders, targets, masks, &weights, false, tile_size, tile_begin,
-                          tile_end)
-              .v_renders;
+  return run_photometric("photometric_bwd", renders, targets, masks, &weights, false, tile_size, tile_begin,
+                         tile_end)
+      .v_renders;
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> photometric_fwd_bwd(
@@ -138,53 +130,44 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> photometric_fwd_bwd(
     std::int64_t tile_end, const std::optional<Tensor>& samples, const std::optional<Tensor>& visible,
     double scale_weight, double opacity_weight) {
   const PhotometricWeights weights{l1_weights, ssim_weights, samples, visible, scale_weight, opacity_weight};
-  PhotometricOutputs out = run_photometric("photometric_fwd_bwd", renders, targets, masks, &weights, true,
-                                           tile_size, tile_begin, tile_end);
-  return {*out.parts, *out.v_renders, *out.scale_reg, *out.opacity_reg};
+  const PhotometricOutputs out = run_photometric("photometric_fwd_bwd", renders, targets, masks, &weights,
+                                                 true, tile_size, tile_begin, tile_end);
+  return {out.parts, out.v_renders, out.scale_reg, out.opacity_reg};
 }
 
 std::tuple<Tensor, Tensor> l1_ssim_fwd_bwd(const Tensor& renders, const Tensor& targets,
                                            const Tensor& l1_weights, const Tensor& ssim_weights,
                                            const Tensor& samples, double l1_factor, double ssim_factor,
                                            double offset) {
-  const auto outputs = photometric_fwd_bwd(renders, targets, std::nullopt, l1_weights, ssim_weights, 16, 0,
-                                           -1, samples, std::nullopt, 0, 0);
-  const Tensor &parts = std::get<0>(outputs), &v_renders = std::get<1>(outputs);
-  const double* sums = data<double>(parts);
-  const std::int64_t n = parts.size(0) * parts.size(1);
-  Tensor loss = make_empty(renders, {});
+  const PhotometricWeights weights{l1_weights, ssim_weights, samples, {}};
+  const PhotometricOutputs out =
+      run_photometric("l1_ssim_fwd_bwd", renders, targets, std::nullopt, &weights, true, 16, 0, -1);
+  const std::int64_t n = out.parts.size(0) * out.parts.size(1);
   DeviceScope scope(renders);
-  dispatch_floating(renders, [&]<class T>() {
-    const LossOfSums<T> args{sums, n, l1_factor, ssim_factor, offset, mutable_data<T>(loss)};
-    backend::loss_of_sums(args, scope.workspace, scope.stream);
+  return dispatch_floating(renders, [&]<class T>() -> std::tuple<Tensor, Tensor> {
+    const auto loss = make<T>(renders, {});
+    backend::loss_of_sums(LossOfSums<T>{data<double>(out.parts), n, l1_factor, ssim_factor, offset, loss},
+                          scope.workspace, scope.stream);
+    return {loss, out.v_renders};
   });
-  return {loss, v_renders};
 }
 
 void report_(const std::optional<Tensor>& parts_in, const std::optional<Tensor>& tile_work_in,
              std::int64_t tile_begin, std::int64_t tile_end, std::int64_t rank, std::int64_t n_ranks,
-             std::vector<Tensor> targets) {
+             const std::vector<Tensor>& targets) {
   constexpr const char* kOp = "report_";
-  Report<float> report{};
-  const auto parts = checked(kOp, "parts", parts_in, ScalarType::Double, {-1, -1, 2});
-  if (parts) {
-    report.views = parts->size(0);
-    report.n_parts = parts->size(1);
-    report.parts = data<double>(*parts);
-  }
-  const auto tile_work = checked(kOp, "tile_work", tile_work_in, ScalarType::Int, {-1});
-  report.tile_work = data_or_null<std::int32_t>(tile_work);
+  const auto parts = checked<double>(kOp, "parts", parts_in, {-1, -1, 2});
+  const auto tile_work = checked<std::int32_t>(kOp, "tile_work", tile_work_in, {-1});
   const std::int64_t tiles = tile_work ? tile_work->size(0) : 0;
+  Report<float> report{
+      parts, parts ? parts->size(0) : 0, parts ? parts->size(1) : 0, tile_work, tile_begin, tile_end, {}, 0};
   check_tile_range(kOp, tile_begin, tile_end, tiles);
-  report.tile_begin = tile_begin;
-  report.tile_end = tile_end;
   BLITZGS_CHECK(rank >= 0 && rank < n_ranks, kOp, "rank must be in [0, ", n_ranks, "), got ", rank);
   const auto count = static_cast<std::int64_t>(targets.size());
   BLITZGS_CHECK(count > 0 && count <= kMaxReportTargets, kOp, "1 to ", kMaxReportTargets,
                 " targets are supported, got ", count);
-  for (Tensor& target : targets) {
-    check_in_place(kOp, "a target", target, ScalarType::Float, {2 * report.views * n_ranks + tiles});
-    float* sums = mutable_data<float>(target);
+  for (const Tensor& target : targets) {
+    float* sums = checked_in_place<float>(kOp, "a target", target, {2 * report.views * n_ranks + tiles});
     float* mine = sums + 2 * report.views * rank;
     report.targets[report.n_targets++] = {mine, mine + report.views, sums + 2 * report.views * n_ranks};
   }

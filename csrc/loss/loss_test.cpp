@@ -23,7 +23,7 @@ Run run(int width, int height, float l1_weight, float ssim_weight, int nudge = -
   }
   if (nudge >= 0) r.x[static_cast<std::size_t>(nudge)] += step;
   r.gradient.assign(r.x.size(), NAN);
-  blitzgs::PhotometricArgs<float> args{};
+  PhotometricArgs<float> args{};
   args.renders = r.x.data();
   args.targets = r.y.data();
   args.l1_weights = &l1_weight;
@@ -37,28 +37,19 @@ Run run(int width, int height, float l1_weight, float ssim_weight, int nudge = -
   args.tiles_y = (height + 15) / 16;
   args.tile_end = args.tiles_x * args.tiles_y;
   double total = 0;
-  for (int k = 0; k < blitzgs::kSsimTaps; ++k) total += std::exp(-(k - 5) * (k - 5) / 4.5);
-  for (int k = 0; k < blitzgs::kSsimTaps; ++k) {
+  for (int k = 0; k < kSsimTaps; ++k) total += std::exp(-(k - 5) * (k - 5) / 4.5);
+  for (int k = 0; k < kSsimTaps; ++k) {
     args.window[k] = static_cast<float>(std::exp(-(k - 5) * (k - 5) / 4.5) / total);
   }
-  std::vector<double> parts(2 * static_cast<std::size_t>(blitzgs::cpu::photometric_parts(args)));
+  std::vector<double> parts(2 * static_cast<std::size_t>(cpu::photometric_parts(args)));
   args.parts = parts.data();
-  blitzgs::TestWorkspace workspace;
-  blitzgs::cpu::photometric(args, workspace, nullptr);
+  TestWorkspace workspace;
+  cpu::photometric(args, workspace, nullptr);
   for (std::size_t i = 0; i < parts.size(); i += 2) r.l1 += parts[i], r.ssim += parts[i + 1];
   return r;
 }
 
 }  // namespace
-
-TEST_CASE("one window has the textbook SSIM") {
-  const double mx = 0.4, my = 0.5, xx = 0.2, yy = 0.3, xy = 0.23;
-  const double c1 = 0.0001, c2 = 0.0009;
-  const double expected = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2) /
-                          ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2));
-  REQUIRE(blitzgs::ssim_terms(mx, mx - my, xx + yy, xx + yy - 2 * xy).value ==
-          Approx(expected).epsilon(1e-12));
-}
 
 TEST_CASE("the gradient is that of the sums, for images smaller and larger than a strip") {
   for (const int height : {3, 70}) {
@@ -74,32 +65,4 @@ TEST_CASE("the gradient is that of the sums, for images smaller and larger than 
     for (std::size_t i = 0; i < exact.x.size(); ++i) l1 += std::fabs(exact.x[i] - exact.y[i]);
     REQUIRE(exact.l1 == Approx(l1).epsilon(1e-6));
   }
-}
-
-TEST_CASE("owned columns are the interval of a contiguous tile range") {
-  blitzgs::PhotometricArgs<float> args{};
-  args.width = 50;
-  args.height = 40;
-  args.tile_size = 16;
-  args.tiles_x = 4;
-  args.tiles_y = 3;
-  args.tile_begin = 5;  // second tile of the second tile row
-  args.tile_end = 9;    // first tile of the third
-  REQUIRE(blitzgs::owned_columns(args, 0, 0).begin == blitzgs::owned_columns(args, 0, 0).end);
-  REQUIRE(blitzgs::owned_columns(args, 0, 16).begin == 16);
-  REQUIRE(blitzgs::owned_columns(args, 0, 31).end == 50);
-  REQUIRE(blitzgs::owned_columns(args, 0, 32).begin == 0);
-  REQUIRE(blitzgs::owned_columns(args, 0, 39).end == 16);
-  REQUIRE(blitzgs::owned_columns(args, 1, 0).begin == blitzgs::owned_columns(args, 1, 0).end);
-}
-
-TEST_CASE("a report is the sums of the parts and the cost of the rank's own tiles", "[report]") {
-  const std::vector<double> parts{1, 10, 2, 20, 3, 30, 4, 40};  // two views, two parts
-  const std::vector<std::int32_t> work{7, 8, 9};
-  std::vector<double> out(7, -1);
-  Report<double> report{parts.data(), 2, 2, work.data(), 1, 2, {}, 1};
-  report.targets[0] = {out.data(), out.data() + 2, out.data() + 4};
-  TestWorkspace workspace;
-  cpu::report(report, workspace, nullptr);
-  REQUIRE(out == std::vector<double>{3, 7, 30, 70, -1, 8, -1});
 }

@@ -33,19 +33,6 @@ __global__ void __launch_bounds__(kReportThreads)
   }
 }
 
-}  // namespace
-
-template <>
-void report<float>(const Report<float>& report, Workspace&, CudaStream stream) {
-  const auto blocks =
-      static_cast<unsigned>(report.views) + blocks_for(report.tile_end - report.tile_begin, kReportThreads);
-  if (blocks == 0) return;
-  report_kernel<<<blocks, kReportThreads, 0, stream>>>(report);
-  check_launch("report");
-}
-
-namespace {
-
 constexpr int kLossThreads = 512;
 
 // The loss (photometric.h), by one block.
@@ -60,6 +47,15 @@ __global__ void __launch_bounds__(kLossThreads) loss_of_sums_kernel(const LossOf
 }
 
 }  // namespace
+
+template <>
+void report<float>(const Report<float>& report, Workspace&, CudaStream stream) {
+  const auto blocks =
+      static_cast<unsigned>(report.views) + blocks_for(report.tile_end - report.tile_begin, kReportThreads);
+  if (blocks == 0) return;
+  report_kernel<<<blocks, kReportThreads, 0, stream>>>(report);
+  check_launch("report");
+}
 
 template <>
 void loss_of_sums<float>(const LossOfSums<float>& args, Workspace&, CudaStream stream) {

@@ -29,21 +29,6 @@ __global__ void __launch_bounds__(kThreads)
   if (bad) *checked.bad = 1;
 }
 
-}  // namespace
-
-void clear_flag(std::int32_t* bad, CudaStream stream) {
-  check(cudaMemsetAsync(bad, 0, sizeof(*bad), stream), "find_non_finite");
-}
-
-template <>
-void check_columns<float>(const CheckedColumns<float>& checked, CudaStream stream) {
-  if (checked.n == 0) return;
-  check_columns_kernel<<<dim3(kBlocks, static_cast<unsigned>(checked.n)), kThreads, 0, stream>>>(checked);
-  check_launch("find_non_finite");
-}
-
-namespace {
-
 // A row of features in shared memory. Feature i of all threads is contiguous, so lanes have no bank
 // conflicts.
 struct StridedRow {
@@ -63,23 +48,6 @@ __global__ void __launch_bounds__(kThreads) tree_sums_kernel(const TreeSumsArgs 
   for (int i = 0; i < args.n_features; ++i) row_features[i * kThreads] = features[i];
   args.sums[row] = tree_sum_of(args, StridedRow{row_features});
 }
-
-}  // namespace
-
-void tree_sums(const TreeSumsArgs& args, CudaStream stream) {
-  if (args.n_rows == 0) return;
-  const std::size_t bytes = args.n_features * kThreads * sizeof(float);
-  launch_early("tree_sums", tree_sums_kernel, {blocks_for(args.n_rows, kThreads), kThreads, stream, bytes},
-               args);
-}
-
-template void for_each_row(const DensityStats<float>&, CudaStream);
-template void for_each_row(const SpawnFeatures&, CudaStream);
-template void for_each_row(const HashKey&, CudaStream);
-template void for_each_row(const Overlap&, CudaStream);
-template void for_each_row(const ShareRows&, CudaStream);
-
-namespace {
 
 // out (columns.h). A block copies kThreads rows, a thread one word at a time. units: the words in a row.
 template <class Word>
@@ -115,17 +83,6 @@ bool launch_if_whole(const CopyRows& copy, CudaStream stream) {
   return true;
 }
 
-}  // namespace
-
-void copy_rows(const CopyRows& copy, CudaStream stream) {
-  if (copy.n == 0 || copy.row_bytes == 0) return;
-  if (launch_if_whole<uint4>(copy, stream) || launch_if_whole<uint2>(copy, stream)) return;
-  if (launch_if_whole<std::uint32_t>(copy, stream)) return;
-  launch_if_whole<std::uint8_t>(copy, stream);
-}
-
-namespace {
-
 constexpr int kKeyThreads = 512, kResident = 4;  // blocks per multiprocessor
 
 // keys [n] (columns.h), one thread per item.
@@ -152,26 +109,7 @@ __global__ void __launch_bounds__(kKeyThreads) key_histogram_kernel(const KeyHis
   }
 }
 
-}  // namespace
-
-void sampling_keys(const SamplingKeys& args, CudaStream stream) {
-  if (args.n == 0) return;
-  sampling_keys_kernel<<<blocks_for(args.n, kKeyThreads), kKeyThreads, 0, stream>>>(args);
-  check_launch("sampling_keys");
-}
-
-void key_histogram(const KeyHistogram& args, CudaStream stream) {
-  check(cudaMemsetAsync(args.counts, 0, sizeof(*args.counts) << args.width, stream), "key_histogram");
-  if (args.n == 0) return;
-  const auto blocks =
-      std::min(blocks_for(args.n, kKeyThreads), static_cast<unsigned>(kResident * multiprocessors()));
-  key_histogram_kernel<<<blocks, kKeyThreads, 0, stream>>>(args);
-  check_launch("key_histogram");
-}
-
 // Nearest neighbours (knn.h).
-
-namespace {
 
 constexpr int kQueryThreads = 128;
 
@@ -221,11 +159,11 @@ std::int32_t sort_along_curve(const float* points, std::int32_t n, std::int32_t*
   std::int32_t* rows = workspace.allocate<std::int32_t>(n);
   make_codes<<<blocks_for(n, 256), 256, 0, stream>>>(points, n, bounds, codes, rows);
   std::size_t bytes = 0;
-  check(cub::DeviceRadixSort::SortPairs(nullptr, bytes, codes, codes + n, rows, order, n, 0, 64, stream),
-        "knn");
-  void* scratch = workspace.allocate_bytes(bytes);
-  check(cub::DeviceRadixSort::SortPairs(scratch, bytes, codes, codes + n, rows, order, n, 0, 64, stream),
-        "knn");
+  const auto sort = [&](void* scratch) {  // null: sets the bytes of scratch memory that it needs
+    return cub::DeviceRadixSort::SortPairs(scratch, bytes, codes, codes + n, rows, order, n, 0, 64, stream);
+  };
+  check(sort(nullptr), "knn");
+  check(sort(workspace.allocate_bytes(bytes)), "knn");
   std::int32_t finite = 0;
   check(cudaMemcpyAsync(&finite, &bounds->finite, sizeof(finite), cudaMemcpyDeviceToHost, stream), "knn");
   check(cudaStreamSynchronize(stream), "knn");
@@ -233,6 +171,52 @@ std::int32_t sort_along_curve(const float* points, std::int32_t n, std::int32_t*
 }
 
 }  // namespace
+
+void clear_flag(std::int32_t* bad, CudaStream stream) {
+  check(cudaMemsetAsync(bad, 0, sizeof(*bad), stream), "find_non_finite");
+}
+
+template <>
+void check_columns<float>(const CheckedColumns<float>& checked, CudaStream stream) {
+  if (checked.n == 0) return;
+  check_columns_kernel<<<dim3(kBlocks, static_cast<unsigned>(checked.n)), kThreads, 0, stream>>>(checked);
+  check_launch("find_non_finite");
+}
+
+void tree_sums(const TreeSumsArgs& args, CudaStream stream) {
+  if (args.n_rows == 0) return;
+  const std::size_t bytes = args.n_features * kThreads * sizeof(float);
+  launch_early("tree_sums", tree_sums_kernel, {blocks_for(args.n_rows, kThreads), kThreads, stream, bytes},
+               args);
+}
+
+template void for_each_row(const DensityStats<float>&, CudaStream);
+template void for_each_row(const SpawnFeatures&, CudaStream);
+template void for_each_row(const HashKey&, CudaStream);
+template void for_each_row(const Overlap&, CudaStream);
+template void for_each_row(const ShareRows&, CudaStream);
+
+void copy_rows(const CopyRows& copy, CudaStream stream) {
+  if (copy.n == 0 || copy.row_bytes == 0) return;
+  if (launch_if_whole<uint4>(copy, stream) || launch_if_whole<uint2>(copy, stream)) return;
+  if (launch_if_whole<std::uint32_t>(copy, stream)) return;
+  launch_if_whole<std::uint8_t>(copy, stream);
+}
+
+void sampling_keys(const SamplingKeys& args, CudaStream stream) {
+  if (args.n == 0) return;
+  sampling_keys_kernel<<<blocks_for(args.n, kKeyThreads), kKeyThreads, 0, stream>>>(args);
+  check_launch("sampling_keys");
+}
+
+void key_histogram(const KeyHistogram& args, CudaStream stream) {
+  check(cudaMemsetAsync(args.counts, 0, sizeof(*args.counts) << args.width, stream), "key_histogram");
+  if (args.n == 0) return;
+  const auto blocks =
+      std::min(blocks_for(args.n, kKeyThreads), static_cast<unsigned>(kResident * multiprocessors()));
+  key_histogram_kernel<<<blocks, kKeyThreads, 0, stream>>>(args);
+  check_launch("key_histogram");
+}
 
 template <class T>
 void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspace& workspace,

@@ -128,23 +128,6 @@ __global__ void __launch_bounds__(kPrefilterThreads, kBlocksPerMultiprocessor)
   }
 }
 
-}  // namespace
-
-void prefilter(const Inputs& in, const Prefiltered& kept, Workspace& workspace, CudaStream stream) {
-  const std::int64_t turns = in.n_views > 0 ? most_prefilter_turns(in.n_candidates) : 0;
-  if (turns == 0) {
-    check(cudaMemsetAsync(kept.count, 0, sizeof(*kept.count), stream), "project");
-    return;
-  }
-  const std::int64_t blocks = std::min<std::int64_t>(turns, kBlocksPerMultiprocessor * multiprocessors());
-  auto* zeros = turn_zeros(turns, workspace, stream);
-  prefilter_kernel<<<static_cast<unsigned>(blocks), kPrefilterThreads, 0, stream>>>(in, kept,
-                                                                                    RunningSum(zeros));
-  check_launch("project");
-}
-
-namespace {
-
 constexpr int kColorThreads = 128, kColorBlocks = 5;  // kColorBlocks: the blocks that fit a multiprocessor
 constexpr int kSplatsOfBlock = 2 * kColorThreads;
 
@@ -205,6 +188,19 @@ __global__ void __launch_bounds__(kColorThreads, kColorBlocks)
 }
 
 }  // namespace
+
+void prefilter(const Inputs& in, const Prefiltered& kept, Workspace& workspace, CudaStream stream) {
+  const std::int64_t turns = in.n_views > 0 ? most_prefilter_turns(in.n_candidates) : 0;
+  if (turns == 0) {
+    check(cudaMemsetAsync(kept.count, 0, sizeof(*kept.count), stream), "project");
+    return;
+  }
+  const std::int64_t blocks = std::min<std::int64_t>(turns, kBlocksPerMultiprocessor * multiprocessors());
+  auto* zeros = turn_zeros(turns, workspace, stream);
+  prefilter_kernel<<<static_cast<unsigned>(blocks), kPrefilterThreads, 0, stream>>>(in, kept,
+                                                                                    RunningSum(zeros));
+  check_launch("project");
+}
 
 void write_colors(const Inputs& in, const ProjectCapacity& capacity, const ProjectColumns<float>& columns,
                   CudaStream stream) {

@@ -1,14 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "project/project.h"
 
-#include <algorithm>
-#include <optional>
 #include <tuple>
-#include <vector>
 
 #include "adam/lazy_adam_op.h"
 #include "common/op.h"
-#include "exchange/places_op.h"
 #include "project/project_op.h"
 
 namespace blitzgs {
@@ -17,7 +13,8 @@ namespace {
 // The candidates of a projection: ids, the views that may see each, the number of valid ids, and the number
 // of blocks of the table to which they belong. Without ids, all Gaussians in all views are candidates.
 struct Candidates {
-  OptionalTensor ids, views, listed, blocks;
+  OptionalValues<const std::int32_t> ids, views, blocks;
+  OptionalTensor listed;
   std::int64_t count;
 
   Candidates(const char* op, const OptionalTensor& active_ids, const OptionalTensor& active_views,
@@ -26,11 +23,11 @@ struct Candidates {
     BLITZGS_CHECK(active_ids || (!active_views && !n_active && !n_blocks), op,
                   "active_views, n_active and n_blocks need active_ids");
     if (!active_ids) return;
-    ids = checked(op, "active_ids", active_ids, ScalarType::Int, {-1});
+    ids = checked<std::int32_t>(op, "active_ids", active_ids, {-1});
     const std::int64_t length = ids->numel();
-    views = checked(op, "active_views", active_views, ScalarType::Int, {length});
+    views = checked<std::int32_t>(op, "active_views", active_views, {length});
     listed = n_active;
-    blocks = checked(op, "n_blocks", n_blocks, ScalarType::Int, {1});
+    blocks = checked<std::int32_t>(op, "n_blocks", n_blocks, {1});
     count = max_listed(op, listed, length);
   }
 };
@@ -59,7 +56,7 @@ template <class T>
 class TorchSplats final : public SplatMemory<T> {
  public:
   // ids: the persistent ids of the Gaussians; none: the ids of the splats are not wanted.
-  TorchSplats(const Tensor& like, bool with_colors, bool with_masks, const OptionalTensor& ids,
+  TorchSplats(const Tensor& like, bool with_colors, bool with_masks, const std::int64_t* ids,
               const std::optional<ProjectSizes>& capacity, SplatTensors* tensors)
       : like_(like),
         with_colors_(with_colors),
@@ -76,33 +73,28 @@ class TorchSplats final : public SplatMemory<T> {
         P <= std::numeric_limits<std::int32_t>::max(), "project_fwd", "", P,
         " splats (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
     // The braces guarantee that memory is allocated in this order.
-    return {{ints(t_.gaussian_ids, {P}), ints(t_.camera_ids, {P}), ints(t_.visible_ids, {U}),
-             ints(t_.splat_offsets, {U + 1})},
-            {floats(t_.means2d, {P, 2}), floats(t_.conics, {P, 3}), floats(t_.depths, {P}),
-             floats(t_.opacities, {P}), floats(t_.colors, {with_colors_ ? P : 0, 3}), ints(t_.radii, {P, 2}),
-             ints(t_.tiles_touched, {P}), longs_if(with_masks_, t_.rank_masks, P),
-             longs_if(ids_.has_value(), t_.splat_ids, P), data_or_null<std::int64_t>(ids_)}};
+    using Int = std::int32_t;
+    using Long = std::int64_t;
+    return {{add<Int>(t_.gaussian_ids, {P}), add<Int>(t_.camera_ids, {P}), add<Int>(t_.visible_ids, {U}),
+             add<Int>(t_.splat_offsets, {U + 1})},
+            {add<T>(t_.means2d, {P, 2}), add<T>(t_.conics, {P, 3}), add<T>(t_.depths, {P}),
+             add<T>(t_.opacities, {P}), add<T>(t_.colors, {with_colors_ ? P : 0, 3}),
+             add<Int>(t_.radii, {P, 2}), add<Int>(t_.tiles_touched, {P}),
+             add<Long>(t_.rank_masks, {with_masks_ ? P : 0}).data_if(with_masks_),
+             add<Long>(t_.splat_ids, {ids_ ? P : 0}).data_if(ids_ != nullptr), ids_}};
   }
 
  private:
-  // Each makes a column and returns its memory.
-  T* floats(Tensor& column, const std::vector<std::int64_t>& shape) {
-    column = make_empty(like_, shape);
-    return mutable_data<T>(column);
-  }
-  std::int32_t* ints(Tensor& column, const std::vector<std::int64_t>& shape) {
-    column = make_empty(like_, shape, ScalarType::Int);
-    return mutable_data<std::int32_t>(column);
-  }
-  // Null, and an empty column, if it is not wanted.
-  std::int64_t* longs_if(bool wanted, Tensor& column, std::int64_t length) {
-    column = make_empty(like_, {wanted ? length : 0}, ScalarType::Long);
-    return wanted ? mutable_data<std::int64_t>(column) : nullptr;
+  template <class V>
+  Values<V> add(Tensor& column, const std::vector<std::int64_t>& shape) {
+    const auto values = make<V>(like_, shape);
+    column = values;
+    return values;
   }
 
   const Tensor& like_;
   bool with_colors_, with_masks_;
-  const OptionalTensor& ids_;
+  const std::int64_t* ids_;
   std::optional<ProjectSizes> capacity_;
   SplatTensors& t_;
 };
@@ -122,39 +114,33 @@ using Projected = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Ten
 Projected project_fwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
                       const OptionalTensor& active_ids, const OptionalTensor& active_views,
                       const OptionalTensor& n_active, const OptionalTensor& n_blocks,
-                      const OptionalTensor& ids, const OptionalTensor& level, std::int64_t width,
-                      std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
-                      double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
+                      const OptionalTensor& ids, const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS,
                       const FloatList& fade, const IntList& rank_tiles,
                       std::optional<std::int64_t> visible_capacity,
                       std::optional<std::int64_t> splat_capacity) {
   constexpr const char* kOp = "project_fwd";
   const ProjectArguments p(kOp, gaussians, viewmats, Ks,
-                           checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
-                                           eps2d, radius_clip, antialiased, raw, fade),
-                           fade, level);
+                           checked_options(kOp, BLITZGS_PROJECT_OPTION_NAMES, fade), fade, level);
   const Candidates candidates(kOp, active_ids, active_views, n_active, n_blocks, p.count);
   const RankTiles ranks = checked_rank_tiles(kOp, rank_tiles);
   const std::optional<ProjectSizes> sizes = checked_capacity(kOp, visible_capacity, splat_capacity);
-  const OptionalTensor persistent = checked(kOp, "ids", ids, ScalarType::Long, {p.count});
-  Tensor totals = make_empty(p.means, {project_totals(p.n_views, ranks.n_ranks)}, ScalarType::Long);
+  const auto persistent = checked<std::int64_t>(kOp, "ids", ids, {p.count});
+  const auto totals = make<std::int64_t>(p.means, {project_totals(p.n_views, ranks.n_ranks)});
   SplatTensors t;
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&]<class T>() {
     ProjectInputs<T> in = p.inputs<T>();
-    in.active_ids = data_or_null<std::int32_t>(candidates.ids);
-    in.active_views = data_or_null<std::int32_t>(candidates.views);
+    in.active_ids = candidates.ids;
+    in.active_views = candidates.views;
     in.n_candidates = candidates.count;
     in.n_active = data_or_null<std::int32_t>(candidates.listed);
-    in.n_blocks = data_or_null<std::int32_t>(candidates.blocks);
+    in.n_blocks = candidates.blocks;
     TorchSplats<T> splats(p.means, p.sh.has_value(), ranks.n_ranks > 0, persistent, sizes, &t);
-    backend::project(in, ranks, splats, mutable_data<std::int64_t>(totals), scope.workspace, scope.stream);
+    backend::project(in, ranks, splats, totals, scope.workspace, scope.stream);
   });
   return {t.gaussian_ids, t.camera_ids, t.visible_ids, t.splat_offsets, t.means2d,    t.conics,    t.depths,
           t.opacities,    t.colors,     t.radii,       t.tiles_touched, t.rank_masks, t.splat_ids, totals};
 }
-
-}  // namespace
 
 class HeldSplatGradients {
  public:
@@ -219,8 +205,7 @@ class HeldSplatGradients {
       ranks_.sizes[m] = static_cast<std::int32_t>(held_[m].size(0));
     }
     if (!sums) return;
-    check_in_place(op, "means2d_sums", *sums, ScalarType::Float, {splats, 2});
-    ranks_.means2d = const_cast<float*>(data<float>(*sums));
+    ranks_.means2d = checked_in_place<float>(op, "means2d_sums", *sums, {splats, 2});
   }
 
   std::vector<Tensor> held_;
@@ -229,20 +214,18 @@ class HeldSplatGradients {
   RankSplatGradients ranks_{};
 };
 
-namespace {
-
 // The outputs of the forward pass that both ops read, and the weights of the regularisers for each view. The
 // object holds the tensors, so that the raw pointers stay valid.
 struct BackwardSplats {
-  Tensor camera_ids, visible_ids, splat_offsets;
+  Values<const std::int32_t> camera_ids, visible_ids, splat_offsets;
   OptionalTensor scale_reg, opacity_reg;
 
   BackwardSplats(const char* op, const ProjectArguments& p, const Tensor& camera_ids_in,
                  const Tensor& visible_ids_in, const Tensor& splat_offsets_in,
-                 const OptionalTensor& scale_reg_in, const OptionalTensor& opacity_reg_in) {
-    camera_ids = checked(op, "camera_ids", camera_ids_in, ScalarType::Int, {-1});
-    visible_ids = checked(op, "visible_ids", visible_ids_in, ScalarType::Int, {-1});
-    splat_offsets = checked(op, "splat_offsets", splat_offsets_in, ScalarType::Int, {visible() + 1});
+                 const OptionalTensor& scale_reg_in, const OptionalTensor& opacity_reg_in)
+      : camera_ids(checked<std::int32_t>(op, "camera_ids", camera_ids_in, {-1})),
+        visible_ids(checked<std::int32_t>(op, "visible_ids", visible_ids_in, {-1})),
+        splat_offsets(checked<std::int32_t>(op, "splat_offsets", splat_offsets_in, {visible() + 1})) {
     const ScalarType dtype = p.means.scalar_type();
     scale_reg = checked(op, "scale_reg", scale_reg_in, dtype, {p.n_views});
     opacity_reg = checked(op, "opacity_reg", opacity_reg_in, dtype, {p.n_views});
@@ -250,10 +233,7 @@ struct BackwardSplats {
 
   std::int64_t visible() const { return visible_ids.numel(); }
   std::int64_t count() const { return camera_ids.numel(); }
-  SplatIndex pointers() const {
-    return {data<std::int32_t>(camera_ids), data<std::int32_t>(visible_ids),
-            data<std::int32_t>(splat_offsets), visible()};
-  }
+  SplatIndex pointers() const { return {camera_ids, visible_ids, splat_offsets, visible()}; }
   template <class T>
   Regularisers<T> regularisers() const {
     return {data_or_null<T>(scale_reg), data_or_null<T>(opacity_reg)};
@@ -265,59 +245,49 @@ using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
 BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
                             const OptionalTensor& scale_reg, const OptionalTensor& opacity_reg,
                             const Tensor& camera_ids, const Tensor& visible_ids, const Tensor& splat_offsets,
-                            const OptionalTensor& level, std::int64_t width, std::int64_t height,
-                            std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
-                            double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
-                            const FloatList& fade, const TensorList& v_splats, const OptionalTensor& v_depths,
-                            bool need_viewmats, bool dense) {
+                            const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS, const FloatList& fade,
+                            const TensorList& v_splats, const OptionalTensor& v_depths, bool need_viewmats,
+                            bool dense) {
   constexpr const char* kOp = "project_bwd";
   const ProjectArguments p(kOp, gaussians, viewmats, Ks,
-                           checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
-                                           eps2d, radius_clip, antialiased, raw, fade),
-                           fade, level);
+                           checked_options(kOp, BLITZGS_PROJECT_OPTION_NAMES, fade), fade, level);
   const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
                              std::nullopt);
   const std::int64_t length = dense ? p.count : b.visible();
-  Tensor v_means = make_empty(p.means, {length, 3}), v_quats = make_empty(p.means, {length, 4}),
-         v_scales = make_empty(p.means, {length, 3}), v_opacities = make_empty(p.means, {length}),
-         v_sh = make_empty(p.means, {length, p.sh_stride, 3}),
-         v_viewmats = make_empty(p.means, {need_viewmats ? p.n_views : 0, 4, 4});
   DeviceScope scope(p.means);
-  dispatch_floating(p.means, [&]<class T>() {
+  return dispatch_floating(p.means, [&]<class T>() -> BackwardTensors {
+    const auto v_means = make<T>(p.means, {length, 3}), v_quats = make<T>(p.means, {length, 4}),
+               v_scales = make<T>(p.means, {length, 3}), v_opacities = make<T>(p.means, {length}),
+               v_sh = make<T>(p.means, {length, p.sh_stride, 3}),
+               v_viewmats = make<T>(p.means, {need_viewmats ? p.n_views : 0, 4, 4});
     if (dense) {
       backend::zero_arrays(
-          ZeroedArrays<T>{{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),
-                           mutable_data<T>(v_opacities), mutable_data<T>(v_sh)},
+          ZeroedArrays<T>{{v_means, v_quats, v_scales, v_opacities, v_sh},
                           {3 * length, 4 * length, 3 * length, length, 3 * p.sh_stride * length}},
           scope.stream);
     }
     backend::project_bwd(
         p.inputs<T>(), b.pointers(), v.source<T>(), b.regularisers<T>(),
-        ProjectGradients<T>{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),
-                            mutable_data<T>(v_opacities), p.sh ? mutable_data<T>(v_sh) : nullptr,
-                            need_viewmats ? mutable_data<T>(v_viewmats) : nullptr, dense},
+        ProjectGradients<T>{v_means, v_quats, v_scales, v_opacities, v_sh.data_if(p.sh.has_value()),
+                            v_viewmats.data_if(need_viewmats), dense},
         scope.workspace, scope.stream);
+    return {v_means, v_quats, v_scales, v_opacities, v_sh, v_viewmats};
   });
-  return {v_means, v_quats, v_scales, v_opacities, v_sh, v_viewmats};
 }
 
 void project_bwd_step(const TensorList& state_in, const TensorList& tables, std::int64_t step,
                       std::int64_t explicit_steps, double beta1, double beta2, double eps,
                       const Tensor& viewmats, const Tensor& Ks, const OptionalTensor& scale_reg,
                       const OptionalTensor& opacity_reg, const Tensor& camera_ids, const Tensor& visible_ids,
-                      const Tensor& splat_offsets, const OptionalTensor& level, std::int64_t width,
-                      std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
-                      double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
+                      const Tensor& splat_offsets, const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS,
                       const FloatList& fade, const TensorList& v_splats, const OptionalTensor& places,
                       const OptionalTensor& means2d_sums) {
   constexpr const char* kOp = "project_bwd_step_";
   AdamTensors state(kOp, state_in, tables, {step, explicit_steps, beta1, beta2, eps});
   state.check_takes_step();
   const ProjectArguments p(kOp, state.params, viewmats, Ks,
-                           checked_options(kOp, width, height, tile_size, sh_degree, near_plane, far_plane,
-                                           eps2d, radius_clip, antialiased, raw, fade),
-                           fade, level);
+                           checked_options(kOp, BLITZGS_PROJECT_OPTION_NAMES, fade), fade, level);
   const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt, places,
                              means2d_sums);

@@ -3,9 +3,6 @@
 // blitzgs/ops/projection_types.py builds these groups.
 #pragma once
 #include <cfloat>
-#include <limits>
-#include <optional>
-#include <vector>
 
 #include "common/op.h"
 #include "project/project.h"
@@ -24,11 +21,25 @@ void check_group(const char* op, const char* names, const List& list, std::size_
                 " entries");
 }
 
+// The places [runs, n_ranks] that scatter_splats returned, checked and contiguous.
+inline Values<const std::int64_t> checked_places(const char* op, const Tensor& places, std::int64_t splats,
+                                                 std::int64_t n_ranks) {
+  return checked<std::int64_t>(op, "places", places, {place_runs(splats), n_ranks});
+}
+
+inline const SplatPlace* places_in(const Tensor& places) {
+  return reinterpret_cast<const SplatPlace*>(data<std::int64_t>(places));
+}
+
+// The options of the projection as the ops take them, and as arguments of checked_options.
+#define BLITZGS_PROJECT_OPTIONS                                                            \
+  std::int64_t width, std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, \
+      double near_plane, double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw
+#define BLITZGS_PROJECT_OPTION_NAMES \
+  width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw
+
 // fade: empty, or the floats of set_fade.
-inline ProjectOptions<double> checked_options(const char* op, std::int64_t width, std::int64_t height,
-                                              std::int64_t tile_size, std::int64_t sh_degree,
-                                              double near_plane, double far_plane, double eps2d,
-                                              double radius_clip, bool antialiased, bool raw,
+inline ProjectOptions<double> checked_options(const char* op, BLITZGS_PROJECT_OPTIONS,
                                               const FloatList& fade) {
   BLITZGS_CHECK(width > 0 && height > 0 && width < (1 << 24) && height < (1 << 24), op,
                 "width and height must be in [1, 2^24), got ", width, " x ", height);
@@ -41,19 +52,18 @@ inline ProjectOptions<double> checked_options(const char* op, std::int64_t width
                 "eps2d must be finite, and eps2d and radius_clip at least 0, got ", eps2d, " and ",
                 radius_clip);
   check_group(op, "(fade_slope, reach of each level)", fade, 0, 1 + kMaxLevels);
-  ProjectOptions<double> options{};
-  options.width = static_cast<int>(width);
-  options.height = static_cast<int>(height);
-  options.tile_size = static_cast<int>(tile_size);
-  options.sh_degree = static_cast<int>(sh_degree);
-  options.antialiased = antialiased;
-  options.raw = raw;
-  options.near_plane = near_plane;
-  options.far_plane = far_plane;
-  options.eps2d = eps2d;
-  options.radius_clip = radius_clip;
-  options.fade_slope = fade.empty() ? 0.0 : fade[0];
-  return options;
+  return {static_cast<int>(width),
+          static_cast<int>(height),
+          static_cast<int>(tile_size),
+          static_cast<int>(sh_degree),
+          /*sh_stride=*/0,
+          near_plane,
+          far_plane,
+          eps2d,
+          radius_clip,
+          antialiased,
+          raw,
+          fade.empty() ? 0.0 : fade[0]};
 }
 
 // Sets the parameters of smooth levels. The numbers are f / (f - 1), then for each level the distance from

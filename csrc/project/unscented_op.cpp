@@ -2,7 +2,6 @@
 #include "project/unscented.h"
 
 #include <cmath>
-#include <optional>
 #include <tuple>
 
 #include "common/op.h"
@@ -52,55 +51,42 @@ struct UnscentedArguments {
 #define BLITZGS_UNSCENTED                                                                                \
   const TensorList &gaussians, const Tensor &viewmats, const Tensor &Ks, const Tensor &lenses,           \
       const OptionalTensor &viewmats_rs, bool fisheye, std::int64_t shutter, const FloatList &transform, \
-      std::int64_t width, std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree,           \
-      double near_plane, double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw
-#define BLITZGS_UNSCENTED_CHECKED(op)                                                                     \
-  op, gaussians, viewmats, Ks, lenses, viewmats_rs, fisheye, shutter, transform,                          \
-      checked_options(op, width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, \
-                      antialiased, raw, {})
+      BLITZGS_PROJECT_OPTIONS
+#define BLITZGS_UNSCENTED_CHECKED(op)                                            \
+  op, gaussians, viewmats, Ks, lenses, viewmats_rs, fisheye, shutter, transform, \
+      checked_options(op, BLITZGS_PROJECT_OPTION_NAMES, {})
 
 Tensor unscented_visible(BLITZGS_UNSCENTED) {
   const UnscentedArguments a(BLITZGS_UNSCENTED_CHECKED("unscented_visible"));
   const std::int64_t rows = a.p.count * a.p.n_views;
-  Tensor seen = make_empty(a.p.means, {a.p.count, a.p.n_views}, ScalarType::Bool);
+  const auto seen = make<bool>(a.p.means, {a.p.count, a.p.n_views});
   DeviceScope scope(a.p.means);
   dispatch_floating(a.p.means, [&]<class T>() {
-    backend::for_each_row(UnscentedVisible<T>{a.inputs<T>(), mutable_data<bool>(seen), rows}, scope.stream);
+    backend::for_each_row(UnscentedVisible<T>{a.inputs<T>(), seen, rows}, scope.stream);
   });
   return seen;
 }
 
-using Values = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using SplatValuesTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-Values unscented_fwd(BLITZGS_UNSCENTED, const Tensor& gaussian_ids_in, const Tensor& camera_ids_in,
-                     const Tensor&) {
+SplatValuesTensors unscented_fwd(BLITZGS_UNSCENTED, const Tensor& gaussian_ids_in,
+                                 const Tensor& camera_ids_in, const Tensor&) {
   constexpr const char* kOp = "unscented_fwd";
   const UnscentedArguments a(BLITZGS_UNSCENTED_CHECKED(kOp));
-  const Tensor gaussian_ids = checked(kOp, "gaussian_ids", gaussian_ids_in, ScalarType::Int, {-1});
+  const auto gaussian_ids = checked<std::int32_t>(kOp, "gaussian_ids", gaussian_ids_in, {-1});
   const std::int64_t P = gaussian_ids.numel();
-  const Tensor camera_ids = checked(kOp, "camera_ids", camera_ids_in, ScalarType::Int, {P});
+  const auto camera_ids = checked<std::int32_t>(kOp, "camera_ids", camera_ids_in, {P});
   const Tensor& like = a.p.means;
-  Tensor means2d = make_empty(like, {P, 2}), conics = make_empty(like, {P, 3}),
-         depths = make_empty(like, {P}), opacities = make_empty(like, {P}),
-         colors = make_empty(like, {a.p.sh ? P : 0, 3}), radii = make_empty(like, {P, 2}, ScalarType::Int),
-         tiles = make_empty(like, {P}, ScalarType::Int);
+  const auto radii = make<std::int32_t>(like, {P, 2}), tiles = make<std::int32_t>(like, {P});
   DeviceScope scope(like);
-  dispatch_floating(like, [&]<class T>() {
-    const ProjectOutputs<T> out{mutable_data<T>(means2d),
-                                mutable_data<T>(conics),
-                                mutable_data<T>(depths),
-                                mutable_data<T>(opacities),
-                                mutable_data<T>(colors),
-                                mutable_data<std::int32_t>(radii),
-                                mutable_data<std::int32_t>(tiles),
-                                nullptr,
-                                nullptr,
-                                nullptr};
-    backend::for_each_row(UnscentedSplats<T>{a.inputs<T>(), data<std::int32_t>(gaussian_ids),
-                                             data<std::int32_t>(camera_ids), out, P},
-                          scope.stream);
+  return dispatch_floating(like, [&]<class T>() -> SplatValuesTensors {
+    const auto means2d = make<T>(like, {P, 2}), conics = make<T>(like, {P, 3}), depths = make<T>(like, {P}),
+               opacities = make<T>(like, {P}), colors = make<T>(like, {a.p.sh ? P : 0, 3});
+    const ProjectOutputs<T> out{means2d, conics, depths,  opacities, colors,
+                                radii,   tiles,  nullptr, nullptr,   nullptr};
+    backend::for_each_row(UnscentedSplats<T>{a.inputs<T>(), gaussian_ids, camera_ids, out, P}, scope.stream);
+    return {means2d, conics, depths, opacities, colors, radii, tiles};
   });
-  return {means2d, conics, depths, opacities, colors, radii, tiles};
 }
 
 using Gradients = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
@@ -111,33 +97,27 @@ Gradients unscented_bwd(BLITZGS_UNSCENTED, const Tensor& camera_ids_in, const Te
   constexpr const char* kOp = "unscented_bwd";
   const UnscentedArguments a(BLITZGS_UNSCENTED_CHECKED(kOp));
   const std::int64_t N = a.p.count;
-  const Tensor camera_ids = checked(kOp, "camera_ids", camera_ids_in, ScalarType::Int, {-1});
-  const Tensor offsets = checked(kOp, "splat_offsets", offsets_in, ScalarType::Int, {N + 1});
+  const auto camera_ids = checked<std::int32_t>(kOp, "camera_ids", camera_ids_in, {-1}),
+             offsets = checked<std::int32_t>(kOp, "splat_offsets", offsets_in, {N + 1});
   const std::int64_t P = camera_ids.numel();
   const Tensor& like = a.p.means;
-  const ScalarType dtype = like.scalar_type();
   const std::size_t columns = a.p.sh ? 5 : 4;
   check_group(kOp, "(v_means2d, v_conics, v_depths, v_opacities[, v_colors])", v_splats, columns, columns);
-  const Tensor v_means2d = checked(kOp, "v_means2d", v_splats[0], dtype, {P, 2}),
-               v_conics = checked(kOp, "v_conics", v_splats[1], dtype, {P, 3}),
-               v_depths = checked(kOp, "v_depths", v_splats[2], dtype, {P}),
-               v_opacities = checked(kOp, "v_opacities", v_splats[3], dtype, {P});
-  OptionalTensor v_colors;
-  if (a.p.sh) v_colors = checked(kOp, "v_colors", v_splats[4], dtype, {P, 3});
-  Tensor means = make_empty(like, {N, 3}), quats = make_empty(like, {N, 4}),
-         scales = make_empty(like, {N, 3}), opacities = make_empty(like, {N}),
-         sh = make_empty(like, {N, a.p.sh_stride, 3});
   DeviceScope scope(like);
-  dispatch_floating(like, [&]<class T>() {
-    const SplatGradientColumns<T> v{data<T>(v_means2d), data<T>(v_conics), data<T>(v_depths),
-                                    data<T>(v_opacities), data_or_null<T>(v_colors)};
-    const ProjectGradients<T> out{mutable_data<T>(means),     mutable_data<T>(quats), mutable_data<T>(scales),
-                                  mutable_data<T>(opacities), mutable_data<T>(sh),    nullptr};
-    backend::for_each_row(UnscentedGradients<T>{a.inputs<T>(), data<std::int32_t>(camera_ids),
-                                                data<std::int32_t>(offsets), v, out, N},
-                          scope.stream);
+  return dispatch_floating(like, [&]<class T>() -> Gradients {
+    const auto v_means2d = checked<T>(kOp, "v_means2d", v_splats[0], {P, 2}),
+               v_conics = checked<T>(kOp, "v_conics", v_splats[1], {P, 3}),
+               v_depths = checked<T>(kOp, "v_depths", v_splats[2], {P}),
+               v_opacities = checked<T>(kOp, "v_opacities", v_splats[3], {P});
+    const auto v_colors =
+        checked<T>(kOp, "v_colors", a.p.sh ? OptionalTensor(v_splats[4]) : std::nullopt, {P, 3});
+    const auto means = make<T>(like, {N, 3}), quats = make<T>(like, {N, 4}), scales = make<T>(like, {N, 3}),
+               opacities = make<T>(like, {N}), sh = make<T>(like, {N, a.p.sh_stride, 3});
+    const SplatGradientColumns<T> v{v_means2d, v_conics, v_depths, v_opacities, v_colors};
+    const ProjectGradients<T> out{means, quats, scales, opacities, sh, nullptr};
+    backend::for_each_row(UnscentedGradients<T>{a.inputs<T>(), camera_ids, offsets, v, out, N}, scope.stream);
+    return {means, quats, scales, opacities, sh};
   });
-  return {means, quats, scales, opacities, sh};
 }
 
 }  // namespace

@@ -206,13 +206,12 @@ inline EntriesBySplat sort_entries(const std::int32_t* isect_splats, std::int64_
   iota_kernel<<<blocks_for(n, 256), 256, 0, stream>>>(order, n);
   check_launch("rasterize_bwd");
   std::size_t bytes = 0;
-  check(cub::DeviceRadixSort::SortPairs(nullptr, bytes, isect_splats, sorted.splats, order, sorted.entries, n,
-                                        0, bits, stream),
-        "rasterize_bwd");
-  void* scratch = workspace.allocate_bytes(bytes);
-  check(cub::DeviceRadixSort::SortPairs(scratch, bytes, isect_splats, sorted.splats, order, sorted.entries, n,
-                                        0, bits, stream),
-        "rasterize_bwd");
+  const auto sort = [&](void* scratch) {  // null: sets the bytes of scratch memory that it needs
+    return cub::DeviceRadixSort::SortPairs(scratch, bytes, isect_splats, sorted.splats, order, sorted.entries,
+                                           n, 0, bits, stream);
+  };
+  check(sort(nullptr), "rasterize_bwd");
+  check(sort(workspace.allocate_bytes(bytes)), "rasterize_bwd");
   return sorted;
 }
 

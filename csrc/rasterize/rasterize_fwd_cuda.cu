@@ -163,33 +163,7 @@ void launch_forward(ForwardArguments args, CudaStream stream) {
                args);
 }
 
-}  // namespace
-
-std::int64_t rasterize_splat_bytes(int n_channels) {
-  return sizeof(PackedSplat) + (n_channels <= kChunkChannels ? sizeof(float4) : 0);
-}
-
-bool rasterize_orders_tiles(const TileGrid& grid) { return grid.tile_end - grid.tile_begin != grid.count(); }
-
-template <>
-void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput<float>& out,
-                          const RasterizeAux& aux, Workspace&, CudaStream stream) {
-  check_tile_size("rasterize_fwd", in.grid);
-  const std::int64_t zero_splats = out.splat_gradients ? in.n_splats : 0;
-  if (in.grid.count() == 0) {
-    zero_gradients(out, zero_splats, stream);
-    return;
-  }
-  prepare("rasterize_fwd", in, packed_splats(aux), packed_colors(aux, in.n_channels),
-          TileOrder(in.grid, aux.composited, aux.order), stream);
-  for (int first = 0; first < in.n_channels; first += kChunkChannels) {
-    launch_forward({{in, aux, first}, out, zero_splats, 0, in.known_splats}, stream);
-  }
-}
-
 // Which splats each pixel composites (rasterize.h).
-
-namespace {
 
 struct PixelArguments {
   const PackedSplat* splats;
@@ -273,6 +247,28 @@ __global__ void __launch_bounds__(Tile::kThreads) pixel_splats_kernel(const Pixe
 }
 
 }  // namespace
+
+std::int64_t rasterize_splat_bytes(int n_channels) {
+  return sizeof(PackedSplat) + (n_channels <= kChunkChannels ? sizeof(float4) : 0);
+}
+
+bool rasterize_orders_tiles(const TileGrid& grid) { return grid.tile_end - grid.tile_begin != grid.count(); }
+
+template <>
+void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput<float>& out,
+                          const RasterizeAux& aux, Workspace&, CudaStream stream) {
+  check_tile_size("rasterize_fwd", in.grid);
+  const std::int64_t zero_splats = out.splat_gradients ? in.n_splats : 0;
+  if (in.grid.count() == 0) {
+    zero_gradients(out, zero_splats, stream);
+    return;
+  }
+  prepare("rasterize_fwd", in, packed_splats(aux), packed_colors(aux, in.n_channels),
+          TileOrder(in.grid, aux.composited, aux.order), stream);
+  for (int first = 0; first < in.n_channels; first += kChunkChannels) {
+    launch_forward({{in, aux, first}, out, zero_splats, 0, in.known_splats}, stream);
+  }
+}
 
 template <>
 void pixel_splats<float>(const RasterizeInput<float>& in, const PixelSplats<float>& out, Workspace& workspace,

@@ -46,32 +46,32 @@ struct Splats : ListedSplats {
 using CompositedTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 // Runs the forward pass. It sets splat_gradients to zero if they are given.
-CompositedTensors composite(const Splats& splats, std::optional<Tensor> splat_gradients, bool clear_rest) {
+CompositedTensors composite(const Splats& splats, const std::optional<Tensor>& splat_gradients,
+                            bool clear_rest) {
   const TileGrid& grid = splats.grid;
-  Tensor renders = make_empty(splats.means2d, {grid.n_cameras, grid.height, grid.width, splats.n_channels});
-  Tensor transmittances = make_empty(splats.means2d, {grid.n_cameras, grid.height, grid.width});
-  Tensor last_ids = make_empty(splats.means2d, {grid.n_cameras, grid.height, grid.width}, ScalarType::Int);
-  Tensor tile_work = make_empty(splats.means2d, {grid.count()}, ScalarType::Int);
+  const Tensor& like = splats.means2d;
   const std::int64_t composited = grid.tile_end - grid.tile_begin;
-  Tensor packed = make_empty(
-      splats.means2d, {splats.n_splats, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))},
-      ScalarType::Byte);
-  Tensor order = make_empty(splats.means2d,
-                            {backend::rasterize_orders_tiles(grid) ? 1 + composited : 0, kTileOrderClasses},
-                            ScalarType::Int);
-  const RasterizeAux aux{mutable_data<void>(packed), splats.n_splats,
-                         order.size(0) > 0 ? mutable_data<std::int32_t>(order) : nullptr, composited};
-  DeviceScope scope(splats.means2d);
-  dispatch_floating(splats.means2d, [&]<class T>() {
-    const RasterizeOutput<T> out{mutable_data<T>(renders),
-                                 mutable_data<T>(transmittances),
-                                 mutable_data<std::int32_t>(last_ids),
-                                 mutable_data<std::int32_t>(tile_work),
+  const bool orders = backend::rasterize_orders_tiles(grid);
+  const auto last_ids = make<std::int32_t>(like, {grid.n_cameras, grid.height, grid.width}),
+             tile_work = make<std::int32_t>(like, {grid.count()}),
+             order = make<std::int32_t>(like, {orders ? 1 + composited : 0, kTileOrderClasses});
+  const auto packed = make<std::uint8_t>(
+      like, {splats.n_splats, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
+  DeviceScope scope(like);
+  return dispatch_floating(like, [&]<class T>() -> CompositedTensors {
+    const auto renders = make<T>(like, {grid.n_cameras, grid.height, grid.width, splats.n_channels}),
+               transmittances = make<T>(like, {grid.n_cameras, grid.height, grid.width});
+    const RasterizeOutput<T> out{renders,
+                                 transmittances,
+                                 last_ids,
+                                 tile_work,
                                  splat_gradients ? mutable_data<T>(*splat_gradients) : nullptr,
                                  clear_rest};
-    backend::rasterize_fwd(splats.input<T>(), out, aux, scope.workspace, scope.stream);
+    backend::rasterize_fwd(splats.input<T>(), out,
+                           {packed, splats.n_splats, order.data_if(orders), composited}, scope.workspace,
+                           scope.stream);
+    return {renders, transmittances, last_ids, tile_work, packed, order};
   });
-  return {renders, transmittances, last_ids, tile_work, packed, order};
 }
 
 }  // namespace
@@ -94,66 +94,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd
 
 namespace {
 
-// Makes a Splats of the groups of arguments of the backward ops: splats (means2d, conics, splat_opacities,
-// colors) and lists (isect_splats, tile_offsets).
-Splats backward_splats(const char* op, const std::vector<Tensor>& splats,
-                       const std::optional<Tensor>& backgrounds, const std::vector<Tensor>& lists,
-                       const TileGrid& grid) {
-  BLITZGS_CHECK(splats.size() == 4 && lists.size() == 2, op,
-                "splats must be (means2d, conics, splat_opacities, colors) and lists (isect_splats, "
-                "tile_offsets), got ",
-                splats.size(), " and ", lists.size(), " tensors");
-  return {op, splats[0], splats[1], splats[2], splats[3], backgrounds, lists[0], lists[1], grid};
-}
-
-// The outputs of the forward pass that the backward ops read, (transmittances, last_ids, packed_splats,
-// tile_order), and the gradients of the images, checked and contiguous.
-struct Composited {
-  Composited(const char* op, const Splats& splats, const std::vector<Tensor>& composited,
-             const Tensor& v_renders_in, const std::optional<Tensor>& v_alphas_in)
-      : grid_count(splats.grid.count()) {
-    BLITZGS_CHECK(composited.size() == 4, op,
-                  "composited must be (transmittances, last_ids, packed_splats, tile_order), got ",
-                  composited.size(), " tensors");
-    packed = composited[2];
-    order = composited[3];
-    const TileGrid& grid = splats.grid;
-    const std::int64_t B = grid.n_cameras, height = grid.height, width = grid.width;
-    const ScalarType dtype = splats.means2d.scalar_type();
-    v_renders = checked(op, "v_renders", v_renders_in, dtype, {B, height, width, splats.n_channels});
-    transmittances = checked(op, "transmittances", composited[0], dtype, {B, height, width});
-    last_ids = checked(op, "last_ids", composited[1], ScalarType::Int, {B, height, width});
-    v_alphas = checked(op, "v_alphas", v_alphas_in, dtype, {B, height, width});
-    check_in_place(op, "packed_splats", packed, ScalarType::Byte,
-                   {-1, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
-    check_in_place(op, "tile_order", order, ScalarType::Int, {-1, kTileOrderClasses});
-    BLITZGS_CHECK(packed.size(0) >= splats.n_splats && tiles() >= grid.tile_end - grid.tile_begin &&
-                      reinterpret_cast<std::uintptr_t>(packed.const_data_ptr()) % 64 == 0,
-                  op, "packed_splats and tile_order must be as rasterize_fwd returned them, ", "for ",
-                  splats.n_splats, " splats and ", grid.tile_end - grid.tile_begin, " tiles or more, got ",
-                  packed.size(0), " and ", tiles());
-  }
-
-  RasterizeAux aux() const {
-    return {const_cast<void*>(packed.const_data_ptr()), packed.size(0),
-            order.size(0) > 0 ? const_cast<std::int32_t*>(data<std::int32_t>(order)) : nullptr, tiles()};
-  }
-
-  template <class T>
-  RasterizeSaved<T> saved() const {
-    return {data<T>(transmittances), data<std::int32_t>(last_ids), data<T>(v_renders),
-            data_or_null<T>(v_alphas)};
-  }
-
-  Tensor transmittances, last_ids, v_renders, packed, order;
-  std::optional<Tensor> v_alphas;
-  std::int64_t grid_count;
-
- private:
-  // The number of tiles that the forward pass composited.
-  std::int64_t tiles() const { return order.size(0) > 0 ? order.size(0) - 1 : grid_count; }
-};
-
 // Checks a table of splat gradients that a caller gives (CUDA).
 void check_gradients(const char* op, const Splats& splats, const Tensor& gradients) {
   BLITZGS_CHECK(kPacked, op, "tables of gradients need CUDA");
@@ -165,39 +105,63 @@ void check_gradients(const char* op, const Splats& splats, const Tensor& gradien
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
     const std::vector<Tensor>& splats_in, const std::optional<Tensor>& backgrounds,
-    const std::vector<Tensor>& lists, const std::vector<Tensor>& composited_in, const Tensor& v_renders,
-    const std::optional<Tensor>& v_alphas, std::int64_t n_cameras, std::int64_t width, std::int64_t height,
+    const std::vector<Tensor>& lists, const std::vector<Tensor>& composited, const Tensor& v_renders_in,
+    const std::optional<Tensor>& v_alphas_in, std::int64_t n_cameras, std::int64_t width, std::int64_t height,
     std::int64_t tile_size, std::int64_t tile_begin, std::int64_t tile_end, bool absgrad, bool deterministic,
-    std::optional<Tensor> gradients) {
+    const std::optional<Tensor>& gradients) {
   constexpr const char* kOp = "rasterize_bwd";
+  BLITZGS_CHECK(splats_in.size() == 4 && lists.size() == 2, kOp,
+                "splats must be (means2d, conics, splat_opacities, colors) and lists (isect_splats, "
+                "tile_offsets), got ",
+                splats_in.size(), " and ", lists.size(), " tensors");
+  BLITZGS_CHECK(composited.size() == 4, kOp,
+                "composited must be (transmittances, last_ids, packed_splats, tile_order), got ",
+                composited.size(), " tensors");
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
-  const Splats splats = backward_splats(kOp, splats_in, backgrounds, lists, grid);
+  const Splats splats(kOp, splats_in[0], splats_in[1], splats_in[2], splats_in[3], backgrounds, lists[0],
+                      lists[1], grid);
   if (gradients) check_gradients(kOp, splats, *gradients);
-  BLITZGS_CHECK(!gradients || !v_alphas, kOp, "v_alphas needs gradients in columns");
-  const Composited composited(kOp, splats, composited_in, v_renders, v_alphas);
-  const std::int64_t n_splats = gradients ? 0 : splats.n_splats;
-  Tensor v_means2d = make_empty(splats.means2d, {n_splats, 2});
-  Tensor v_conics = make_empty(splats.means2d, {n_splats, 3});
-  Tensor v_opacities = make_empty(splats.means2d, {n_splats});
-  Tensor v_colors = make_empty(splats.means2d, {n_splats, splats.n_channels});
-  Tensor v_means2d_abs = make_empty(splats.means2d, {absgrad ? n_splats : 0, 2});
-  DeviceScope scope(splats.means2d);
+  BLITZGS_CHECK(!gradients || !v_alphas_in, kOp, "v_alphas needs gradients in columns");
+  const auto last_ids = checked<std::int32_t>(kOp, "last_ids", composited[1], {n_cameras, height, width});
+  const auto order =
+      checked_in_place<std::int32_t>(kOp, "tile_order", composited[3], {-1, kTileOrderClasses});
+  const auto packed = checked_in_place<std::uint8_t>(
+      kOp, "packed_splats", composited[2],
+      {-1, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
+  const bool ordered = order.size(0) > 0;
+  // The number of tiles that the forward pass composited.
+  const std::int64_t tiles = ordered ? order.size(0) - 1 : grid.count();
+  BLITZGS_CHECK(packed.size(0) >= splats.n_splats && tiles >= grid.tile_end - grid.tile_begin &&
+                    reinterpret_cast<std::uintptr_t>(packed.data()) % 64 == 0,
+                kOp, "packed_splats and tile_order must be as rasterize_fwd returned them, for ",
+                splats.n_splats, " splats and ", grid.tile_end - grid.tile_begin, " tiles or more, got ",
+                packed.size(0), " and ", tiles);
+  const RasterizeAux aux{packed, packed.size(0), order.data_if(ordered), tiles};
+  const Tensor& like = splats.means2d;
+  const std::int64_t n_splats = gradients ? 0 : splats.n_splats, n_isects = splats.isect_splats.size(0);
+  DeviceScope scope(like);
+  return dispatch_floating(like, [&]<class T>() -> std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> {
+    const auto transmittances = checked<T>(kOp, "transmittances", composited[0], {n_cameras, height, width}),
+               v_renders =
+                   checked<T>(kOp, "v_renders", v_renders_in, {n_cameras, height, width, splats.n_channels});
+    const auto v_alphas = checked<T>(kOp, "v_alphas", v_alphas_in, {n_cameras, height, width});
+    const RasterizeSaved<T> saved{transmittances, last_ids, v_renders, v_alphas};
+    const auto v_means2d = make<T>(like, {n_splats, 2}), v_conics = make<T>(like, {n_splats, 3}),
+               v_opacities = make<T>(like, {n_splats}),
+               v_colors = make<T>(like, {n_splats, splats.n_channels}),
+               v_means2d_abs = make<T>(like, {absgrad ? n_splats : 0, 2});
 #ifdef BLITZGS_BACKEND_CUDA
-  if (gradients) {
-    cuda::rasterize_bwd_packed(splats.input<float>(), composited.saved<float>(), splats.isect_splats.size(0),
-                               composited.aux(), deterministic, absgrad, mutable_data<float>(*gradients),
-                               scope.workspace, scope.stream);
-    return {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs};
-  }
+    if (gradients) {
+      cuda::rasterize_bwd_packed(splats.input<T>(), saved, n_isects, aux, deterministic, absgrad,
+                                 mutable_data<T>(*gradients), scope.workspace, scope.stream);
+      return {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs};
+    }
 #endif
-  dispatch_floating(splats.means2d, [&]<class T>() {
-    const RasterizeGradients<T> columns{mutable_data<T>(v_means2d), mutable_data<T>(v_conics),
-                                        mutable_data<T>(v_opacities), mutable_data<T>(v_colors),
-                                        absgrad ? mutable_data<T>(v_means2d_abs) : nullptr};
-    backend::rasterize_bwd(splats.input<T>(), composited.saved<T>(), splats.isect_splats.size(0),
-                           composited.aux(), deterministic, columns, scope.workspace, scope.stream);
+    backend::rasterize_bwd<T>(splats.input<T>(), saved, n_isects, aux, deterministic,
+                              {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs.data_if(absgrad)},
+                              scope.workspace, scope.stream);
+    return {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs};
   });
-  return {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs};
 }
 
 #ifdef BLITZGS_BACKEND_CUDA
@@ -206,7 +170,7 @@ CompositedTensors rasterize_fwd_into(const Tensor& means2d, const Tensor& conics
                                      const std::optional<Tensor>& backgrounds, const Tensor& isect_splats,
                                      const Tensor& tile_offsets, std::int64_t n_cameras, std::int64_t width,
                                      std::int64_t height, std::int64_t tile_size, std::int64_t tile_begin,
-                                     std::int64_t tile_end, Tensor gradients,
+                                     std::int64_t tile_end, const Tensor& gradients,
                                      const std::optional<Tensor>& known_splats) {
   constexpr const char* kOp = "rasterize_fwd_";
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
@@ -217,38 +181,32 @@ CompositedTensors rasterize_fwd_into(const Tensor& means2d, const Tensor& conics
 }
 #endif
 
-constexpr const char* kPixelSplats = "pixel_splats";
-
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> pixel_splats(
     const Tensor& means2d, const Tensor& conics, const Tensor& opacities, const Tensor& isect_splats,
     const Tensor& tile_offsets, const std::optional<Tensor>& slots_in, std::int64_t n_rows,
     std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
     std::int64_t strongest) {
-  const TileGrid grid = checked_tile_grid(kPixelSplats, n_cameras, width, height, tile_size, 0, -1);
-  const ListedSplats splats(kPixelSplats, means2d, conics, opacities, isect_splats, tile_offsets, grid);
-  const std::int64_t pixels = n_cameras * width * height;
-  const std::optional<Tensor> slots =
-      checked(kPixelSplats, "slots", slots_in, ScalarType::Int, {n_cameras, height, width});
-  BLITZGS_CHECK(strongest >= 0 && strongest < (1 << 24), kPixelSplats,
-                "strongest must be 0 to 2^24 - 1, got ", strongest);
-  BLITZGS_CHECK(slots ? n_rows >= 0 : n_rows == pixels, kPixelSplats,
+  constexpr const char* kOp = "pixel_splats";
+  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, 0, -1);
+  const ListedSplats splats(kOp, means2d, conics, opacities, isect_splats, tile_offsets, grid);
+  const auto slots = checked<std::int32_t>(kOp, "slots", slots_in, {n_cameras, height, width});
+  BLITZGS_CHECK(strongest >= 0 && strongest < (1 << 24), kOp, "strongest must be 0 to 2^24 - 1, got ",
+                strongest);
+  BLITZGS_CHECK(slots ? n_rows >= 0 : n_rows == n_cameras * width * height, kOp,
                 "n_rows must be the number of rows that slots name, and without slots the number of "
                 "pixels, got ",
                 n_rows);
-  Tensor transmittances = make_empty(means2d, {n_rows}),
-         counts = make_empty(means2d, {n_rows}, ScalarType::Int),
-         medians = make_empty(means2d, {n_rows}, ScalarType::Int),
-         ids = make_empty(means2d, {n_rows, strongest}, ScalarType::Int),
-         weights = make_empty(means2d, {n_rows, strongest});
+  const auto counts = make<std::int32_t>(means2d, {n_rows}), medians = make<std::int32_t>(means2d, {n_rows}),
+             ids = make<std::int32_t>(means2d, {n_rows, strongest});
   DeviceScope scope(means2d);
-  dispatch_floating(means2d, [&]<class T>() {
-    const PixelSplats<T> out{data_or_null<std::int32_t>(slots),  n_rows,
-                             static_cast<int>(strongest),        mutable_data<T>(transmittances),
-                             mutable_data<std::int32_t>(counts), mutable_data<std::int32_t>(medians),
-                             mutable_data<std::int32_t>(ids),    mutable_data<T>(weights)};
-    backend::pixel_splats(splats.input<T>(), out, scope.workspace, scope.stream);
+  return dispatch_floating(means2d, [&]<class T>() -> std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> {
+    const auto transmittances = make<T>(means2d, {n_rows}), weights = make<T>(means2d, {n_rows, strongest});
+    backend::pixel_splats<T>(
+        splats.input<T>(),
+        {slots, n_rows, static_cast<int>(strongest), transmittances, counts, medians, ids, weights},
+        scope.workspace, scope.stream);
+    return {transmittances, counts, medians, ids, weights};
   });
-  return {transmittances, counts, medians, ids, weights};
 }
 
 }  // namespace

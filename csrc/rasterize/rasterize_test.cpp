@@ -1,9 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "rasterize/rasterize.h"
 
+#include <algorithm>
+#include <numeric>
 #include <vector>
 
 #include "common/catch.h"
+#include "importance/importance.h"
 #include "intersect/intersect.h"
 
 namespace {
@@ -103,4 +106,21 @@ TEST_CASE("the gradient predicts a small step") {
     REQUIRE(v_means[i] == Approx(slope(scene.means2d[i])).epsilon(1e-4).margin(1e-4));
     REQUIRE(v_abs[i] >= std::fabs(v_means[i]));
   }
+}
+
+TEST_CASE("each pixel's splats and each splat's pixels are the same pairs") {
+  Scene<float> scene;
+  scene.intersect_splats();
+  std::vector<std::int64_t> weights(2), squares(2);
+  std::vector<std::int32_t> pixels(2), counts(800), medians(800), ids(800);
+  std::vector<float> strongest(800);
+  cpu::contributions(scene.input(), {weights.data(), pixels.data(), squares.data()}, scene.workspace,
+                     nullptr);
+  cpu::pixel_splats(scene.input(),
+                    PixelSplats<float>{nullptr, 800, 1, scene.rest.data(), counts.data(), medians.data(),
+                                       ids.data(), strongest.data()},
+                    scene.workspace, nullptr);
+  REQUIRE(std::accumulate(counts.begin(), counts.end(), 0) == pixels[0] + pixels[1]);
+  REQUIRE(std::count(ids.begin(), ids.end(), -1) == std::count(counts.begin(), counts.end(), 0));
+  REQUIRE((pixels[0] > pixels[1] && pixels[1] > 0 && weights[1] > squares[1]));
 }

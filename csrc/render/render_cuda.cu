@@ -33,34 +33,12 @@ __global__ void __launch_bounds__(kThreads) gather_rows_kernel(const __grid_cons
   }
 }
 
-}  // namespace
-
-void gather_rows(const GatherRows& gather, Workspace&, CudaStream stream) {
-  if (gather.n == 0 || gather.n_columns == 0) return;
-  const dim3 blocks(blocks_for(gather.n, kThreads), static_cast<unsigned>(gather.n_columns));
-  gather_rows_kernel<<<blocks, kThreads, 0, stream>>>(gather);
-  check_launch("gather_rows");
-}
-
-namespace {
-
 // One thread per row.
 __global__ void __launch_bounds__(kThreads)
     number_rows_kernel(const NumberedRows numbered, const ProjectCapacity capacity) {
   const std::int64_t u = blockIdx.x * std::int64_t{kThreads} + threadIdx.x;
   if (u < fitting(capacity).visible) number_row(numbered, static_cast<std::int32_t>(u));
 }
-
-}  // namespace
-
-void number_rows(const NumberedRows& numbered, const ProjectCapacity& capacity, CudaStream stream) {
-  if (capacity.sizes.visible == 0) return;
-  number_rows_kernel<<<blocks_for(capacity.sizes.visible, kThreads), kThreads, 0, stream>>>(numbered,
-                                                                                            capacity);
-  check_launch("color_rows");
-}
-
-namespace {
 
 // One thread per entry.
 __global__ void __launch_bounds__(kThreads) fill_entries_kernel(const EmptyEntries fill) {
@@ -85,6 +63,20 @@ __global__ void __launch_bounds__(kThreads) arrange_splats_kernel(const ArrangeS
 }
 
 }  // namespace
+
+void gather_rows(const GatherRows& gather, Workspace&, CudaStream stream) {
+  if (gather.n == 0 || gather.n_columns == 0) return;
+  const dim3 blocks(blocks_for(gather.n, kThreads), static_cast<unsigned>(gather.n_columns));
+  gather_rows_kernel<<<blocks, kThreads, 0, stream>>>(gather);
+  check_launch("gather_rows");
+}
+
+void number_rows(const NumberedRows& numbered, const ProjectCapacity& capacity, CudaStream stream) {
+  if (capacity.sizes.visible == 0) return;
+  number_rows_kernel<<<blocks_for(capacity.sizes.visible, kThreads), kThreads, 0, stream>>>(numbered,
+                                                                                            capacity);
+  check_launch("color_rows");
+}
 
 void fill_entries(const EmptyEntries& fill, CudaStream stream) {
   const std::int64_t words = fill.entries * fill.column.words;

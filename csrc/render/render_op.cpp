@@ -3,9 +3,7 @@
 
 #include <functional>
 #include <numeric>
-#include <optional>
 #include <tuple>
-#include <vector>
 
 #include "common/rows.h"
 #include "project/project_op.h"
@@ -31,9 +29,7 @@ Tensor rows_of(const Tensor& tensor, std::int64_t length) {
 
 // Words of 4 bytes in the elements of a row behind its first `axis` dimensions.
 std::int64_t words_behind(const Tensor& column, std::int64_t axis) {
-  std::int64_t words = static_cast<std::int64_t>(column.element_size()) / 4;
-  for (; axis < column.dim(); ++axis) words *= column.size(axis);
-  return words;
+  return static_cast<std::int64_t>(column.element_size()) / 4 * elements_behind(column, axis);
 }
 
 void check_column(const char* op, const Tensor& column) {
@@ -123,8 +119,7 @@ const std::int64_t* checked_totals(const OptionalTensor& totals) {
 
 // The columns of splats that their colours are computed from, and those that hide a splat.
 struct ColoredSplats {
-  const Tensor &visible_ids, &splat_offsets, &camera_ids;
-  Tensor &opacities, &radii, &tiles_touched;
+  const Tensor &visible_ids, &splat_offsets, &camera_ids, &opacities, &radii, &tiles_touched;
 };
 
 // The visible rows of the Gaussians and the colours of their splats: colors, numbers, indices, rows.
@@ -134,35 +129,32 @@ TensorList color_rows(const TensorList& gaussians, const TensorList& sh, const T
   check_group(kRender, "gaussians (means, quats, scales, opacities)", gaussians, 4, 4);
   check_floating(kRender, "means", gaussians[0]);
   const std::int64_t U = splats.visible_ids.numel(), P = splats.camera_ids.numel();
-  check_in_place(kRender, "visible_ids", splats.visible_ids, ScalarType::Int, {U});
-  check_in_place(kRender, "splat_offsets", splats.splat_offsets, ScalarType::Int, {U + 1});
-  check_in_place(kRender, "camera_ids", splats.camera_ids, ScalarType::Int, {P});
+  const auto visible_ids = checked_in_place<std::int32_t>(kRender, "visible_ids", splats.visible_ids, {U}),
+             offsets =
+                 checked_in_place<std::int32_t>(kRender, "splat_offsets", splats.splat_offsets, {U + 1}),
+             camera_ids = checked_in_place<std::int32_t>(kRender, "camera_ids", splats.camera_ids, {P}),
+             radii = checked_in_place<std::int32_t>(kRender, "radii", splats.radii, {P, 2}),
+             tiles = checked_in_place<std::int32_t>(kRender, "tiles_touched", splats.tiles_touched, {P});
   check_in_place(kRender, "splat_opacities", splats.opacities, gaussians[0].scalar_type(), {P});
-  check_in_place(kRender, "radii", splats.radii, ScalarType::Int, {P, 2});
-  check_in_place(kRender, "tiles_touched", splats.tiles_touched, ScalarType::Int, {P});
   const ProjectCapacity capacity{{U, P}, totals};
   TensorList found =
       gathered_rows(kRender, gaussians, sh, splats.visible_ids, totals ? totals + kTotalVisible : nullptr);
   const ProjectArguments p(kRender, found, viewmats, Ks, options);
-  Tensor numbers = make_empty(splats.visible_ids, {U}),
-         indices = make_empty(splats.visible_ids, {U}, ScalarType::Long);
-  Tensor colors = make_empty(p.means, {p.sh ? P : 0, 3});
+  const auto numbers = make<std::int32_t>(visible_ids, {U});
+  const auto indices = make<std::int64_t>(visible_ids, {U});
+  const Tensor colors = make_empty(p.means, {p.sh ? P : 0, 3});
   DeviceScope scope(p.means);
   auto* row_of_splat = scope.workspace.allocate<std::int32_t>(P);
-  backend::number_rows(
-      {data<std::int32_t>(splats.visible_ids), data<std::int32_t>(splats.splat_offsets),
-       mutable_data<std::int32_t>(numbers), mutable_data<std::int64_t>(indices), row_of_splat},
-      capacity, scope.stream);
+  backend::number_rows({visible_ids, offsets, numbers, indices, row_of_splat}, capacity, scope.stream);
   if (p.sh) {
     dispatch_floating(p.means, [&]<class T>() {
       ProjectColumns<T> columns{};
       columns.ids.gaussian_ids = row_of_splat;
-      // The kernels of project_fwd write the ids; those of this op only read them.
-      columns.ids.camera_ids = const_cast<std::int32_t*>(data<std::int32_t>(splats.camera_ids));
+      columns.ids.camera_ids = camera_ids;
       columns.values.colors = mutable_data<T>(colors);
       columns.values.opacities = mutable_data<T>(splats.opacities);
-      columns.values.radii = mutable_data<std::int32_t>(splats.radii);
-      columns.values.tiles_touched = mutable_data<std::int32_t>(splats.tiles_touched);
+      columns.values.radii = radii;
+      columns.values.tiles_touched = tiles;
       backend::color_splats(p.inputs<T>(), capacity, columns, scope.workspace, scope.stream);
     });
   }
@@ -179,21 +171,19 @@ Tensor joined(const Tensor& colors, const Tensor& depths) {
   return torch::stable::detail::to<Tensor>(stack[0]);
 }
 
-TensorList render(const Tensor& means2d, const Tensor& conics, Tensor splat_opacities, const Tensor& depths,
-                  const Tensor& camera_ids, const Tensor& visible_ids, const Tensor& splat_offsets,
-                  Tensor radii, Tensor tiles_touched, const OptionalTensor& channels_in, bool with_depth,
-                  const TensorList& gaussians, const TensorList& sh, const Tensor& viewmats, const Tensor& Ks,
-                  std::int64_t width, std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree,
-                  double near_plane, double far_plane, double eps2d, double radius_clip, bool antialiased,
-                  bool raw, const FloatList& fade, const OptionalTensor& backgrounds, std::int64_t n_isects,
+TensorList render(const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities,
+                  const Tensor& depths, const Tensor& camera_ids, const Tensor& visible_ids,
+                  const Tensor& splat_offsets, const Tensor& radii, const Tensor& tiles_touched,
+                  const OptionalTensor& channels_in, bool with_depth, const TensorList& gaussians,
+                  const TensorList& sh, const Tensor& viewmats, const Tensor& Ks, BLITZGS_PROJECT_OPTIONS,
+                  const FloatList& fade, const OptionalTensor& backgrounds, std::int64_t n_isects,
                   bool backward_follows, const OptionalTensor& totals_in) {
   const std::int64_t* totals = checked_totals(totals_in);
   OptionalTensor n_splats;
   if (totals) n_splats = view_of(*totals_in, {1}, {1}, kTotalSplats);
   TensorList rows;
   if (!gaussians.empty()) {
-    const auto options = checked_options(kRender, width, height, tile_size, sh_degree, near_plane, far_plane,
-                                         eps2d, radius_clip, antialiased, raw, fade);
+    const auto options = checked_options(kRender, BLITZGS_PROJECT_OPTION_NAMES, fade);
     rows =
         color_rows(gaussians, sh, viewmats, Ks, options,
                    {visible_ids, splat_offsets, camera_ids, splat_opacities, radii, tiles_touched}, totals);
@@ -207,7 +197,7 @@ TensorList render(const Tensor& means2d, const Tensor& conics, Tensor splat_opac
                                      std::get<0>(lists), std::get<1>(lists), views, width, height, tile_size,
                                      0, -1, /*clear_rest=*/true, backward_follows, n_splats);
   const Tensor& transmittances = std::get<1>(outputs);
-  Tensor alphas = make_empty(transmittances, {views, height, width});
+  const Tensor alphas = make_empty(transmittances, {views, height, width});
   DeviceScope scope(alphas);
   dispatch_floating(alphas, [&]<class T>() {
     backend::for_each_row(Alphas<T>{data<T>(transmittances), mutable_data<T>(alphas), alphas.numel()},
@@ -275,20 +265,19 @@ std::vector<Tensor> make_targets(const std::vector<Tensor>& columns, std::size_t
     // Rows of a splat's gradient lie in a longer table: a column of it is read as it is.
     const bool strided = from == 1 && rows_are_contiguous(column, 1);
     held.push_back(strided ? column : as_contiguous(column));
-    const auto element_words = static_cast<std::int64_t>(column.element_size()) / 4;
     BLITZGS_CHECK(column.element_size() % 4 == 0, kArrangeSplats,
                   "columns must have elements of 4 or 8 bytes, got ",
                   torch::headeronly::toString(column.scalar_type()));
     std::vector<std::int64_t> shape = to;
-    std::int64_t words = element_words;
     for (auto axis = static_cast<std::int64_t>(from); axis < column.dim(); ++axis) {
       shape.push_back(column.size(axis));
-      words *= column.size(axis);
     }
+    const std::int64_t words = words_behind(column, static_cast<std::int64_t>(from));
     targets.push_back(make_empty(column, shape));
-    moves.columns[moves.n_columns++] = {static_cast<const std::uint32_t*>(held.back().const_data_ptr()),
-                                        static_cast<std::uint32_t*>(targets.back().mutable_data_ptr()), words,
-                                        strided ? column.stride(0) * element_words : words};
+    moves.columns[moves.n_columns++] = {
+        static_cast<const std::uint32_t*>(held.back().const_data_ptr()),
+        static_cast<std::uint32_t*>(targets.back().mutable_data_ptr()), words,
+        strided ? column.stride(0) * words_behind(column, column.dim()) : words};
   }
   return targets;
 }

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Films, and `blitzgs render` along paths and from cameras of one's own."""
 
-import builtins
 import json
 import resource
+import sys
 
 import cv2
 import numpy as np
@@ -74,14 +74,7 @@ def test_what_is_no_film_is_kept(tmp_path):
 
 
 def test_without_the_package_the_message_says_what_to_install(tmp_path, monkeypatch):
-    imported = builtins.__import__
-
-    def without_av(name, *rest, **options):
-        if name == "av":
-            raise ImportError("no av")
-        return imported(name, *rest, **options)
-
-    monkeypatch.setattr(builtins, "__import__", without_av)
+    monkeypatch.setitem(sys.modules, "av", None)
     refused(ImportError, r'pip install "blitzgs\[film\]"', check_film, tmp_path / "a.mp4", 64, 48)
 
 

@@ -11,7 +11,7 @@ import torch
 
 from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
 from blitzgs.config.schedule import Schedule
-from blitzgs.distributed import shared_memory
+from blitzgs.distributed import group, shared_memory
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import MAX_VALUES, SharedMemory, control_words
 from blitzgs.frame.ownership import TileOwners
@@ -281,9 +281,9 @@ def test_ranks_on_one_gpu_need_to_be_told(monkeypatch):
     locations = [("host", 0), ("host", 1), ("host", 0)]
     monkeypatch.setattr(torch.cuda, "can_device_access_peer", lambda mine, other: mine != other)
     gpu = torch.device("cuda:0")
-    assert "under the same number" in shared_memory.find_obstacle(locations, Ranks(device=gpu))
-    assert shared_memory.find_obstacle(locations, Ranks(device=gpu, shares_gpu=True)) is None
-    assert shared_memory.find_obstacle(locations[:2], Ranks(device=gpu)) is None
+    assert "under the same number" in group.find_obstacle(locations, Ranks(device=gpu))
+    assert group.find_obstacle(locations, Ranks(device=gpu, shares_gpu=True)) is None
+    assert group.find_obstacle(locations[:2], Ranks(device=gpu)) is None
 
 
 def _falls_back(ranks):

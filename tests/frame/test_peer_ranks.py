@@ -14,8 +14,7 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import Shared
-from blitzgs.frame.render import backward_splats, render_frame
-from blitzgs.frame.survey import survey
+from blitzgs.frame.render import backward_splats, render_frame, survey
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.frame.transport import PeerTransport, peer
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, PeerWayBack, room_for

@@ -14,9 +14,15 @@ from blitzgs.distributed.shared_memory import Shared
 from blitzgs.frame.render import render_frame, run_attempts
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.frame.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport, peer
-from blitzgs.frame.transport.collective import CollectiveWayBack
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT
-from blitzgs.frame.transport.protocol import CapacityEstimate, Exchange, ExchangeResult, Traffic, Transport
+from blitzgs.frame.transport.protocol import (
+    CapacityEstimate,
+    Exchange,
+    ExchangeResult,
+    Traffic,
+    Transport,
+    WayBack,
+)
 from blitzgs.ops.exchange import scatter_splats
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project_splats
@@ -361,5 +367,5 @@ def test_sums_return_to_the_splats_that_were_sent(splats, world_size):
         expected.index_add_(0, which, group)
     ranks = SimpleNamespace(all_to_all=lambda *_: returned)
     traffic = SimpleNamespace(sent=counts, received=counts, own=Sizes(0, splats, 0))
-    way_back = CollectiveWayBack(ranks, traffic, places)
+    way_back = WayBack(ranks, traffic, places)
     assert torch.equal(way_back.return_sums(returned), expected)

@@ -13,8 +13,8 @@ from blitzgs.ops.host import PinnedNumbers
 from blitzgs.ops.projection_types import Views
 from blitzgs.ops.rows import put_rows_, take_rows
 from blitzgs.table.blocks import BlockIndex
-from blitzgs.table.layouts import CULL, sectors_in
 from blitzgs.table.placement import place
+from blitzgs.table.table import CULL, sectors_in
 from tests.helpers import DEVICES, refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
 from tests.training.tiny import random_gaussians

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs.config.fields import PopulationConfig
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.counter_random import hash_keys, normal
@@ -196,11 +197,9 @@ def test_children_have_their_parents_phi_and_cull_row():
 
 
 def test_the_tightest_limit_wins_and_is_named():
-    def limit(**changed):
-        none = {
-            "max_gaussians": 0, "pixels_per_gaussian": 0.0, "gaussians_per_point": 0.0, "memory_count": None,
-        }  # fmt: skip
-        return growth_limit(**none | {"pixels": 1_000_000, "points": 3_000} | changed)
+    def limit(points=3_000, memory_count=None, **changed):
+        none = {"max_gaussians": 0, "pixels_per_gaussian": 0.0, "gaussians_per_point": 0.0}
+        return growth_limit(PopulationConfig(**none | changed), 1_000_000, points, memory_count)
 
     by_pixels = GrowthLimit(41_666, "population.pixels_per_gaussian")
     by_points = GrowthLimit(31_500, "population.gaussians_per_point")
@@ -289,7 +288,7 @@ def test_floaters_are_weak_and_far_or_large():
     ])  # fmt: skip
     means = torch.cat([sound, extra])
     scales = torch.full((len(means), 3), -2.0) + 0.1 * torch.rand(len(means), 3)
-    scales[-2, 1] = 3.0
+    scales[len(sound)], scales[-2, 1] = -2.0, 3.0
     counted = torch.full((len(means),), 9)
     counted[-5:] = torch.tensor([1, 1, 0, 1, 3])
     found = floaters(means, scales, counted, 1)

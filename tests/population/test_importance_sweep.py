@@ -12,8 +12,7 @@ from blitzgs.call import contributions
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import integer_mass_prefix
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import RenderOptions
-from blitzgs.frame.survey import survey
+from blitzgs.frame.render import RenderOptions, survey
 from blitzgs.ops.projection_types import Views
 from blitzgs.population import importance
 from blitzgs.population.importance import (

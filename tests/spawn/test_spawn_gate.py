@@ -4,6 +4,7 @@
 import dataclasses
 import json
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,12 @@ from blitzgs.spawn.candidates import FEATURES, Candidates
 from blitzgs.spawn.fit import Spawns, auc, best_feature, fit, judge
 from blitzgs.spawn.gate import (
     GateError,
-    RandomVeto,
-    RankVeto,
-    SampledVeto,
     SpawnGate,
     gate_file,
     info_path,
+    random_veto,
+    rank_veto,
+    sampled_veto,
     veto_lowest,
 )
 from tests.distributed.rank_harness import run_ranks
@@ -127,7 +128,11 @@ def _veto(ranks, path):
     mine = torch.arange(1000) % 5 % ranks.world_size == ranks.rank
     own = Candidates(some.parents[mine], some.is_split[mine], some.features[mine], some.time)
     known = SpawnGate(path)
-    vetoes = RankVeto(known, 0.6), RandomVeto(0.6, 4), SampledVeto(known, 0.6, 4)
+    vetoes = (
+        partial(rank_veto, known, 0.6),
+        partial(random_veto, 0.6, 4),
+        partial(sampled_veto, known, 0.6, 4),
+    )
     return [own.parents[veto(own, ranks)].tolist() for veto in vetoes]
 
 
@@ -147,7 +152,7 @@ def test_a_sampled_veto_keeps_candidates_in_proportion_to_their_odds(gate):
     kept = np.zeros(60)
     for event in range(events):
         at = dataclasses.replace(some, time=event)
-        kept += ~SampledVeto(known, 0.6, 1)(at, Ranks()).numpy()
+        kept += ~sampled_veto(known, 0.6, 1, at, Ranks()).numpy()
     g, expected = np.random.default_rng(0), np.zeros(60)
     for split in (False, True):
         rows = np.flatnonzero(some.is_split.numpy() == split)
@@ -180,13 +185,15 @@ def test_a_sampled_veto_compares_odds_beyond_the_range_of_numbers(low):
     some = with_odds([low] * 50 + [low + 1000] * 50)
     kept = []
     for time in range(2):
-        vetoed = SampledVeto(Known(), 0.6, 1)(dataclasses.replace(some, time=time), Ranks())
+        vetoed = sampled_veto(Known(), 0.6, 1, dataclasses.replace(some, time=time), Ranks())
         assert vetoed[:50].all() and vetoed[50:].sum() == 10
         kept.append(vetoed)
     assert not torch.equal(*kept)  # among equal odds, chance decides
 
 
-@pytest.mark.parametrize("veto", [RandomVeto(0.5, 7), SampledVeto(Known(), 0.5, 7)], ids=["random", "sample"])
+@pytest.mark.parametrize(
+    "veto", [partial(random_veto, 0.5, 7), partial(sampled_veto, Known(), 0.5, 7)], ids=["random", "sample"]
+)
 def test_vetoes_are_independent_of_the_draw_of_a_pass_at_the_same_time(veto):
     """The first importance pass draws among the same Gaussians by the same seed and time."""
     some = with_odds([0.0] * 2000)

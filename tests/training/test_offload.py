@@ -8,7 +8,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import render_view
-from blitzgs.runs.lod import model_gate
+from blitzgs.runs.run_files import model_gate
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.pool import Pool, PoolError
 from blitzgs.table.table import GaussianTable

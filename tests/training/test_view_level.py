@@ -18,9 +18,8 @@ from blitzgs.frame.render import render_frame
 from blitzgs.population.importance import is_culled
 from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import image_metrics
-from blitzgs.runs.lod import lod_gate, model_gate
-from blitzgs.table.layouts import CULL
-from blitzgs.table.table import GaussianTable
+from blitzgs.runs.run_files import lod_gate, model_gate
+from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.training import view_level
 from blitzgs.training.events import evaluate
 from blitzgs.training.step import Stepper

@@ -18,8 +18,7 @@ from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.importance import ViewBatch, is_culled, sweep
 from blitzgs.table.blocks import BlockIndex
-from blitzgs.table.layouts import CULL, sectors_in
-from blitzgs.table.table import GaussianTable
+from blitzgs.table.table import CULL, GaussianTable, sectors_in
 from blitzgs.training.batches import Batch
 from blitzgs.training.step import Stepper
 from blitzgs.view.gate import SAMPLE, LodGate, ModelGate, ViewGate, centres_of

@@ -3,19 +3,22 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-import torch
 import torch.distributed as dist
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport.protocol import Arrived, CapacityEstimate, ExchangeResult, Traffic, stage_ended
-from blitzgs.ops.exchange import PLACE_SPLATS, gather_splats, scatter_splats, words_per_splat
+from blitzgs.frame.transport.protocol import (
+    Arrived,
+    CapacityEstimate,
+    ExchangeResult,
+    Traffic,
+    WayBack,
+    stage_ended,
+)
+from blitzgs.ops.exchange import gather_splats, scatter_splats, words_per_splat
 from blitzgs.ops.host import to_host
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats
-from blitzgs.ops.splat_gradients import SplatGradients
 
 
 class CollectiveTransport:
@@ -82,57 +85,10 @@ class CollectiveExchange:
         self._result: ExchangeResult | None = None
         # All ranks decide the same, because they have estimated the same number of blocks.
         if capacity is None or needed.blocks <= capacity.blocks:
-            way_back = CollectiveWayBack(ranks, traffic, places)
+            way_back = WayBack(ranks, traffic, places)
             self._result = ExchangeResult(own, splats, visible, traffic, way_back)
         stage_ended("exchange")
 
     def finish(self) -> tuple[Sizes, ExchangeResult | None]:
         """See `Exchange.finish`; the host has known all numbers since the splats were sent."""
         return self._needed, self._result
-
-
-class CollectiveWayBack(NamedTuple):
-    """Returns gradients by an all-to-all, and adds them up at the owner in the order of ranks."""
-
-    ranks: Ranks
-    traffic: Traffic  # numbers of splats sent between the ranks
-    places: Tensor  # positions of this rank's own splats among those that it sent, from `scatter_splats`
-
-    def check_still_valid(self) -> None:
-        """Do nothing, because a frame does not overwrite the data of an earlier one."""
-
-    def cleared_table(self) -> None:
-        """Return None: any memory can be used."""
-
-    def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
-        """See `WayBack.return_gradients`."""
-        columns, traffic = gradients.side_by_side(), self.traffic
-        returned = self.ranks.all_to_all(columns, traffic.received, traffic.sent)
-        return gradients.sum_returned(returned, self.places, traffic.sent, traffic.own.splats)
-
-    def return_sums(self, sums: Tensor) -> Tensor:
-        """See `WayBack.return_sums`."""
-        return return_sums(sums, self.places, self.traffic, self.ranks)
-
-
-def return_sums(sums: Tensor, places: Tensor, traffic: Traffic, ranks: Ranks) -> Tensor:
-    """Send integer sums of splats to their owners and add them up; see `WayBack.return_sums`.
-
-    `sums`: int64 [R, C], sums of the splats that arrived here. `places`: positions of this rank's own splats
-    among those that it sent.
-    """
-    returned = ranks.all_to_all(sums, traffic.received, traffic.sent)
-    total = sums.new_zeros(traffic.own.splats, sums.shape[1])
-    lanes = torch.arange(PLACE_SPLATS, device=sums.device)
-    for group, runs in zip(returned.split(traffic.sent), places.unbind(1), strict=True):
-        if group.shape[0] == 0:
-            continue
-        # The splats of a run are consecutive. `runs` has the position of the first one, and bits that tell
-        # which splats of the run were sent (csrc/exchange/places.h).
-        here = runs[:, None] >> (32 + lanes) & 1
-        at = (runs[:, None] & 0xFFFFFFFF) + here.cumsum(1) - here
-        # Splats that were not sent take any row, times zero: leaving them out would need their number, for
-        # which the host would wait.
-        rows = group[at.flatten()[: total.shape[0]].clamp(max=group.shape[0] - 1)]
-        total += rows * here.flatten()[: total.shape[0], None]
-    return total

@@ -39,7 +39,7 @@ process.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -47,8 +47,14 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import SharedMemory
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport.collective import return_sums
-from blitzgs.frame.transport.protocol import Arrived, CapacityEstimate, ExchangeResult, Traffic, stage_ended
+from blitzgs.frame.transport.protocol import (
+    Arrived,
+    CapacityEstimate,
+    ExchangeResult,
+    Traffic,
+    WayBack,
+    stage_ended,
+)
 from blitzgs.ops.exchange import place_runs
 from blitzgs.ops.host import current_stream
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of
@@ -180,10 +186,9 @@ class PeerExchange:
             return traffic.needed, None
         visible = self._shared.sums[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
         composited = self._buffers.splats.first(sum(traffic.received))
-        way_back = PeerWayBack(
-            self._ranks, self._memory, self._generation, self._buffers.tables, traffic,
-            self._places[: place_runs(traffic.own.splats)],
-        )  # fmt: skip
+        places = self._places[: place_runs(traffic.own.splats)]
+        shared = self._memory, self._generation, self._buffers.tables
+        way_back = PeerWayBack(self._ranks, traffic, places, *shared)
         own = splats_of(self._own, traffic.own)
         return traffic.needed, ExchangeResult(own, composited, visible, traffic, way_back)
 
@@ -196,15 +201,13 @@ class PeerExchange:
         return self._traffic
 
 
-class PeerWayBack(NamedTuple):
+@dataclass(frozen=True)
+class PeerWayBack(WayBack):
     """Lets owners read gradients in the memory of the ranks that added them up."""
 
-    ranks: Ranks
     memory: SharedMemory  # the memory that the ranks share
     generation: int  # number of the frame, `SharedMemory.generation`
     tables: Sequence[Tensor]  # table of splat gradients of each rank, float32 [length, 12], mapped here
-    traffic: Traffic  # numbers of splats sent between the ranks
-    places: Tensor  # positions of this rank's own splats among those that it sent, as from `scatter_splats`
 
     def check_still_valid(self) -> None:
         """See `WayBack.check_still_valid`."""
@@ -224,7 +227,3 @@ class PeerWayBack(NamedTuple):
         self.memory.barrier()  # C
         mine = zip(self.tables, self.traffic.starts, self.traffic.sent, strict=True)
         return SplatGradients([table[start : start + n] for table, start, n in mine], self.places)
-
-    def return_sums(self, sums: Tensor) -> Tensor:
-        """See `WayBack.return_sums`."""
-        return return_sums(sums, self.places, self.traffic, self.ranks)

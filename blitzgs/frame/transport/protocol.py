@@ -20,14 +20,18 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+import torch
 from torch import Tensor
 
+from blitzgs.ops.exchange import PLACE_SPLATS
 from blitzgs.ops.host import HostCopy
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, Sizes, Splats
 
 if TYPE_CHECKING:
+    from blitzgs.distributed.group import Ranks
     from blitzgs.frame.tiles import TileAssignment
     from blitzgs.ops.splat_gradients import SplatGradients
 
@@ -127,23 +131,39 @@ class Exchange(Protocol):
         """
 
 
-class WayBack(Protocol):
-    """Returns the gradients, and sums, of one frame's splats to the owners of their Gaussians."""
+@dataclass(frozen=True)
+class WayBack:
+    """Returns gradients and sums of one frame's splats to the owners of their Gaussians, by an all-to-all.
+
+    The owners add them up in the order of the ranks.
+    """
+
+    ranks: Ranks
+    traffic: Traffic  # numbers of splats sent between the ranks
+    places: Tensor  # positions of this rank's own splats among those that it sent, from `scatter_splats`
 
     def check_still_valid(self) -> None:
         """Check that gradients of this frame can still be returned.
 
-        RuntimeError: a later frame has overwritten this frame's splats.
+        RuntimeError: a later frame has overwritten this frame's splats, which happens only where ranks share
+        memory.
         """
 
     def cleared_table(self) -> Tensor | None:
-        """Zero `gradient_table` for another backward pass, when no rank reads it any more. Collective."""
+        """Zero `gradient_table` for another backward pass, when no rank reads it any more. Collective.
+
+        Returns None if there is none, so that any memory can be used.
+        """
+        return None
 
     def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
         """Return the gradients of this rank's own splats. Collective.
 
         `gradients`: gradients of the splats that arrived, in `gradient_table` if there is one.
         """
+        columns, traffic = gradients.side_by_side(), self.traffic
+        returned = self.ranks.all_to_all(columns, traffic.received, traffic.sent)
+        return gradients.sum_returned(returned, self.places, traffic.sent, traffic.own.splats)
 
     def return_sums(self, sums: Tensor) -> Tensor:
         """Return integer sums over the tiles of each rank to the splats' owners, and add them up. Collective.
@@ -152,6 +172,22 @@ class WayBack(Protocol):
         own splats; zero for splats that touch no tile. Integers add up exactly, so the result does not depend
         on the number of ranks.
         """
+        traffic = self.traffic
+        returned = self.ranks.all_to_all(sums, traffic.received, traffic.sent)
+        total = sums.new_zeros(traffic.own.splats, sums.shape[1])
+        lanes = torch.arange(PLACE_SPLATS, device=sums.device)
+        for group, runs in zip(returned.split(traffic.sent), self.places.unbind(1), strict=True):
+            if group.shape[0] == 0:
+                continue
+            # The splats of a run are consecutive. `runs` has the position of the first one, and bits that
+            # tell which splats of the run were sent (csrc/exchange/places.h).
+            here = runs[:, None] >> (32 + lanes) & 1
+            at = (runs[:, None] & 0xFFFFFFFF) + here.cumsum(1) - here
+            # Splats that were not sent take any row, times zero: leaving them out would need their number,
+            # for which the host would wait.
+            rows = group[at.flatten()[: total.shape[0]].clamp(max=group.shape[0] - 1)]
+            total += rows * here.flatten()[: total.shape[0], None]
+        return total
 
 
 class Transport(Protocol):

@@ -76,15 +76,8 @@ def _keep_sorted(state: TrainingState, event: Event, spread_now: int, is_sorted:
 
 def population_limit(state: TrainingState) -> GrowthLimit | None:
     """Return the tightest limit on the population; None if there is none. Every rank calls this."""
-    population = state.config.population
-    return growth_limit(
-        population.max_gaussians,
-        training_pixels(state),
-        population.pixels_per_gaussian,
-        len(state.capture.points),
-        population.gaussians_per_point,
-        memory_limit(state.table, state.ranks),
-    )
+    points, memory = len(state.capture.points), memory_limit(state.table, state.ranks)
+    return growth_limit(state.config.population, training_pixels(state), points, memory)
 
 
 def _over_all_ranks(state: TrainingState, counts: dict[str, int]) -> tuple[dict[str, int], int]:

@@ -15,7 +15,7 @@ from blitzgs.config.schedule import Event
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, evenly_ordered, worst_views
-from blitzgs.runs.lod import model_gate
+from blitzgs.runs.run_files import model_gate
 from blitzgs.training.state import TrainingState
 from blitzgs.util.output import write_file
 

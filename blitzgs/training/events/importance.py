@@ -15,7 +15,7 @@ from blitzgs.config.schedule import Event
 from blitzgs.population.importance import Importance, ViewBatch, sample_by_score, sweep, top_by_score
 from blitzgs.population.redistribution import redistribute
 from blitzgs.runs.guard import ModelLostError, check_table
-from blitzgs.runs.lod import model_gate
+from blitzgs.runs.run_files import model_gate
 from blitzgs.spawn.lineage import Cause
 from blitzgs.table.blocks import sort_rows
 from blitzgs.table.table import opacity_logit

@@ -15,6 +15,7 @@ from blitzgs.config.schedule import Event
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import save_cameras
 from blitzgs.runs.checkpoint import CheckpointError, Saving
+from blitzgs.runs.run_files import TrainedModel
 from blitzgs.training.state import TrainingState
 from blitzgs.util.output import is_lack_of_space
 
@@ -124,17 +125,9 @@ def _save(state: TrainingState, folder: Path, in_background: bool = False) -> Sa
     shared = state.owners.columns() if state.ranks.world_size > 1 else {}
     if state.stepper.exposures is not None:
         shared |= state.stepper.exposures.columns()
-    return run_files.save(
-        folder,
-        state.table,
-        state.progress,
-        state.space,
-        state.config,
-        state.ranks,
-        state.run_id,
-        {name: column.clone() for name, column in shared.items()},
-        in_background,
-    )
+    shared = {name: column.clone() for name, column in shared.items()}
+    model = TrainedModel(state.config, state.progress, state.space, state.table, state.run_id, shared=shared)
+    return run_files.save(folder, model, state.ranks, in_background)
 
 
 def _report(state: TrainingState, error: CheckpointError, what_next: str) -> None:

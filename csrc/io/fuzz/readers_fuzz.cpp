@@ -51,7 +51,7 @@ std::istringstream stream_of(Input input) {
 [[maybe_unused]] void ply(Input input) {
   std::istringstream in = stream_of(input);
   const io::PlyTable table = io::read_ply(in, "f");
-  if (table.rows.size() != table.count * table.row_bytes()) __builtin_trap();
+  if (table.rows.size() != table.count * io::row_bytes(table.properties)) __builtin_trap();
 }
 
 // The first byte chooses the kind of file, and whether observations or tracks are read.
