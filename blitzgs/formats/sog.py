@@ -58,14 +58,14 @@ def write_sog(path: Path, source: GaussianSource) -> None:
     ValueError: there is no Gaussian, or a value cannot be shown. OSError: the file cannot be written, or
     `path` is no regular file.
     """
-    count, survey = len(source), _survey(source)
-    scales_book, colors_book = _codebook(survey.scales), _codebook(survey.colors)
-    palette = _palette(survey.rest, survey.shown, count) if source.degree > 0 else None
+    count, (least, most, scales, colors, rest, shown) = len(source), _survey(source)
+    scales_book, colors_book = _codebook(scales), _codebook(colors)
+    palette = _palette(rest, shown, count) if source.degree > 0 else None
     codes = {name: np.empty((count, channels), dtype=np.uint8) for name, channels in _CHANNELS.items()}
     first = 0
     for block in unit_blocks(source):
         rows, first = slice(first, first + len(block)), first + len(block)
-        shares = (_logs(block) - survey.least) / (survey.most - survey.least).clamp_min(1e-12)
+        shares = (_logs(block) - least) / (most - least).clamp_min(1e-12)
         places = (shares * 65535).round().int().numpy()
         codes["means_l"][rows], codes["means_u"][rows] = places & 255, places >> 8
         codes["scales"][rows] = _labels(block.scales, scales_book)
@@ -80,7 +80,7 @@ def write_sog(path: Path, source: GaussianSource) -> None:
         "asset": {"generator": "BlitzGS"},
         "count": count,
         "antialias": is_antialiased(source),
-        "means": {"mins": survey.least.tolist(), "maxs": survey.most.tolist(), "files": []},
+        "means": {"mins": least.tolist(), "maxs": most.tolist(), "files": []},
         "scales": {"codebook": scales_book.tolist(), "files": []},
         "quats": {"files": []},
         "sh0": {"codebook": colors_book.tolist(), "files": []},
@@ -102,18 +102,8 @@ def write_sog(path: Path, source: GaussianSource) -> None:
         archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
 
 
-class _Survey(NamedTuple):
-    """What is known of a model before it is written: `_logs` at the ends, and samples of its columns."""
-
-    least: Tensor
-    most: Tensor
-    scales: Tensor
-    colors: Tensor
-    rest: Tensor
-    shown: Tensor
-
-
-def _survey(source: GaussianSource) -> _Survey:
+def _survey(source: GaussianSource) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return the least and the largest `_logs`, and samples: scales, colours, other SH, opacity lengths."""
     ends: list[list[Tensor]] = [[], [], []]
     samples: list[list[Tensor]] = [[], [], [], []]
     step = max(1, len(source) // (_SAMPLE * _PALETTE))
@@ -131,7 +121,7 @@ def _survey(source: GaussianSource) -> _Survey:
     scales, colors, rest, shown = (torch.cat(found) for found in samples)
     # The ends are in the samples, because codebooks span them.
     scales, colors = (torch.cat(pair) for pair in zip((scales, colors), others, strict=True))
-    return _Survey(reach[0], reach[1], scales, colors, rest, shown)
+    return reach[0], reach[1], scales, colors, rest, shown
 
 
 def _logs(block: Gaussians) -> Tensor:
