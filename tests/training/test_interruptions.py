@@ -89,9 +89,9 @@ def test_training_goes_on_while_a_checkpoint_is_written(tmp_path, monkeypatch, r
     saved, may_write, then = {}, threading.Event(), []
     save, write = run_files.save, checkpoint.write_shard
 
-    def noted(folder, table, *others):
-        saved.setdefault("columns", {name: table[name].clone() for name in table})
-        return save(folder, table, *others)
+    def noted(folder, model, *others):
+        saved.setdefault("columns", {name: model.table[name].clone() for name in model.table})
+        return save(folder, model, *others)
 
     def write_late(*arguments):
         then.append(may_write.wait(60 if room else 0))
