@@ -20,9 +20,7 @@ from blitzgs.distributed.group import Ranks
 from tests.helpers import needs_cuda
 
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(
-    ["torch", "torch.distributed", "blitzgs.cli.train", "tests.training.tiny", "tests.capture.helpers"]
-)
+CONTEXT.set_forkserver_preload(["torch", "torch.distributed", "blitzgs.cli.train", "tests.training.tiny"])
 
 
 def _child(function, rank, world_size, port, timeout_seconds, join, device, transport, arguments, pipe):
