@@ -70,10 +70,11 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
     folder = photographs.folder
     check_outside(capture, folder)
     work = capture / WORK
-    if not work.is_dir() and (capture / "sparse").exists():
+    if not (work / _STATE).is_file() and (capture / "sparse").exists():
         raise FileExistsError(
             f"{capture} has a model that blitzgs sfm did not make: choose another folder for the capture"
         )
+    links = _links(photographs, capture)
     work.mkdir(parents=True, exist_ok=True)
     with at_work(work) as lock:
         state = _state(work, photographs, settings)
@@ -105,7 +106,7 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
         models = sorted(Path(job.models).glob("[0-9]*"), key=count_images, reverse=True)
         if not models or not count_images(models[0]):
             raise StageError(_no_poses(photographs, work))
-        _write_capture(models[0], photographs, capture)
+        _write_capture(models[0], links, capture)
         _write_frame(Path(job.georeference), capture / GEO)
         return examine(capture, work, photographs, job, models)
 
@@ -148,20 +149,25 @@ def _state(work: Path, photographs: Photographs, settings: Settings) -> dict[str
     return state
 
 
-def _write_capture(model: Path, photographs: Photographs, capture: Path) -> None:
-    """Write the model, and links to the photographs and their masks."""
+def _links(photographs: Photographs, capture: Path) -> dict[Path, Path]:
+    """Return the links of a capture to photographs and their masks (FileExistsError: one is another file)."""
     folder = photographs.folder
-    links = {"images": folder}
+    links = {capture / "images": folder}
     if any(photographs.masks):
-        links["masks"] = next(root / "masks" for root in (folder, folder.parent) if (root / "masks").is_dir())
-    for name, target in links.items():
-        link = capture / name
-        if link.exists() and link.samefile(target):
-            continue
-        if link.exists():
+        roots = (root / "masks" for root in (folder, folder.parent))
+        links[capture / "masks"] = next(root for root in roots if root.is_dir())
+    for link, target in links.items():
+        if link.exists() and not link.samefile(target):
             raise FileExistsError(f"{link} is not {target}: choose another folder for the capture")
-        link.unlink(missing_ok=True)
-        link.symlink_to(target.resolve(), target_is_directory=True)
+    return links
+
+
+def _write_capture(model: Path, links: dict[Path, Path], capture: Path) -> None:
+    """Write the model and the links."""
+    for link, target in links.items():
+        if not link.exists():
+            link.unlink(missing_ok=True)
+            link.symlink_to(target.resolve(), target_is_directory=True)
     sparse = capture / "sparse" / "0"
     sparse.mkdir(parents=True, exist_ok=True)
     for name in FILES:

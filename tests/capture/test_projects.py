@@ -2,6 +2,7 @@
 """Projects of other programs give the pixels, points and world of the capture that they were written from."""
 
 import json
+import shutil
 import warnings
 
 import numpy as np
@@ -192,6 +193,12 @@ def test_a_label_without_a_suffix_finds_its_photograph_in_a_folder(tmp_path):
     loaded = load_capture(tmp_path / "export.xml")
     assert [camera.image_path.name for camera in loaded.cameras] == [f"a{i}.JPG" for i in range(6)]
     assert loaded.cameras[0].name == "flight_1/a0.JPG"
+    (images := tmp_path / "images").joinpath("flight_2").mkdir()
+    shutil.copy(images / "flight_1/a0.JPG", images / "flight_2")
+    with pytest.raises(ValueError, match=r"2 files could be the photograph a0 \(flight_1/a0.JPG, flight_2/a"):
+        load_capture(tmp_path / "export.xml")
+    shutil.copy(images / "flight_1/a0.JPG", images)
+    assert load_capture(tmp_path / "export.xml").cameras[0].name == "a0.JPG"
 
 
 def test_several_projects_are_refused_by_name(tmp_path):

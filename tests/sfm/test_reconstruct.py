@@ -261,6 +261,11 @@ def test_what_cannot_work_is_said(tmp_path, monkeypatch, capsys):
     assert "whose files are read: choose a folder outside it" in message("photos", "photos/capture")
     (tmp_path / "other/sparse").mkdir(parents=True)
     assert "has a model that blitzgs sfm did not make" in message("photos", "other")
+    (tmp_path / "other/sfm").mkdir()  # as `blitzgs refine` leaves it
+    assert "has a model that blitzgs sfm did not make" in message("photos", "other")
+    (tmp_path / "others/images").mkdir(parents=True)
+    assert "photos: choose another folder for the capture" in message("photos", "others")
+    assert not (tmp_path / "others/sfm").exists()
     with monkeypatch.context() as patch:
         patch.setattr("importlib.util.find_spec", lambda name: None)
         patch.setenv("PATH", "")

@@ -101,7 +101,10 @@ def read_project(
     names = _with_suffixes(root / images, root, [_relative(view.name) for view in project.views])
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)
-        raise ValueError(f"{found.file}: there are two photographs called {twice}")
+        raise ValueError(
+            f"{found.file}: there are two photographs called {twice}, and nothing tells them apart: give all "
+            "photographs names of their own, and align them again"
+        )
     lenses = _lenses(found, project, names, root, images)
     paths = find_images(root, images, names, lenses, downscale)
     if project.lost:
@@ -122,7 +125,7 @@ def _relative(name: str) -> str:
 
 
 def _with_suffixes(folder: Path, root: Path, names: Sequence[str]) -> list[str]:
-    """Complete names without a suffix, as Metashape's labels are, where one file fits."""
+    """Complete names without a suffix, as Metashape's labels are (ValueError: several files fit one)."""
     if all(PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
         return list(names)
     base = folder if folder.is_dir() else root
@@ -132,12 +135,15 @@ def _with_suffixes(folder: Path, root: Path, names: Sequence[str]) -> list[str]:
         if path.suffix.lower() in IMAGE_SUFFIXES:
             for key in {str(path.with_suffix("")), path.stem}:
                 stems[key].append(file)
-    fits = {
-        name: stems[name][0]
-        for name in names
-        if len(stems.get(name, ())) == 1 and PurePosixPath(name).suffix.lower() not in IMAGE_SUFFIXES
-    }
-    return [fits.get(name, name) for name in names]
+    found = []
+    for name in names:
+        fits = [] if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES else stems.get(name, [])
+        fits = [file for file in fits if str(PurePosixPath(file).with_suffix("")) == name] or fits
+        if len(fits) > 1:
+            shown = ", ".join(fits[:3])
+            raise ValueError(f"{base}: {len(fits)} files could be the photograph {name} ({shown}): keep one")
+        found.append(fits[0] if fits else name)
+    return found
 
 
 def _lenses(
