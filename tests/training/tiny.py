@@ -61,9 +61,7 @@ class Capture:
     extent: float
     offset: np.ndarray = field(default_factory=lambda: np.array([10.0, 20.0, 30.0]))
     root: Path = Path("/nowhere")
-    about: SimpleNamespace = field(
-        default_factory=lambda: SimpleNamespace(source=SimpleNamespace(frame=None), random_points=False)
-    )
+    about: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(frame=None, random_points=False))
     apart: list[int] = field(default_factory=list)
 
     @property
