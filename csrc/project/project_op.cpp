@@ -55,9 +55,11 @@ struct SplatTensors {
 template <class T>
 class TorchSplats final : public SplatMemory<T> {
  public:
-  // ids: the persistent ids of the Gaussians; none: the ids of the splats are not wanted.
-  TorchSplats(const Tensor& like, bool with_colors, bool with_masks, const std::int64_t* ids,
-              const std::optional<ProjectSizes>& capacity, SplatTensors* tensors)
+  // ids: the persistent ids of the Gaussians, of which there may be none; absent: the ids of the splats are
+  // not wanted.
+  TorchSplats(const Tensor& like, bool with_colors, bool with_masks,
+              const OptionalValues<const std::int64_t>& ids, const std::optional<ProjectSizes>& capacity,
+              SplatTensors* tensors)
       : like_(like),
         with_colors_(with_colors),
         with_masks_(with_masks),
@@ -81,7 +83,7 @@ class TorchSplats final : public SplatMemory<T> {
              add<T>(t_.opacities, {P}), add<T>(t_.colors, {with_colors_ ? P : 0, 3}),
              add<Int>(t_.radii, {P, 2}), add<Int>(t_.tiles_touched, {P}),
              add<Long>(t_.rank_masks, {with_masks_ ? P : 0}).data_if(with_masks_),
-             add<Long>(t_.splat_ids, {ids_ ? P : 0}).data_if(ids_ != nullptr), ids_}};
+             add<Long>(t_.splat_ids, {ids_.has_value() ? P : 0}).data_if(ids_.has_value()), ids_}};
   }
 
  private:
@@ -94,7 +96,7 @@ class TorchSplats final : public SplatMemory<T> {
 
   const Tensor& like_;
   bool with_colors_, with_masks_;
-  const std::int64_t* ids_;
+  const OptionalValues<const std::int64_t>& ids_;
   std::optional<ProjectSizes> capacity_;
   SplatTensors& t_;
 };

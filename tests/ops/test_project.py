@@ -6,9 +6,16 @@ import torch
 
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project
-from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, ProjectionOptions, WeightedViews
+from blitzgs.ops.projection_types import (
+    VIEW_TOTALS,
+    ProjectionInputs,
+    ProjectionOptions,
+    Sizes,
+    WeightedViews,
+)
 from tests.helpers import (
     BACKENDS,
+    DEVICES,
     PARAMETERS,
     orbit_camera,
     random_scene,
@@ -235,6 +242,16 @@ def test_each_splat_knows_the_ranks_that_composite_its_tiles():
     assert torch.equal(splats.rank_masks, masks) and masks.unique().numel() > 2
     assert torch.equal(totals[VIEW_TOTALS:][:2], torch.bincount(splats.camera_ids, minlength=2))
     assert totals[:3].tolist() == [len(splats.visible_ids), len(splats.depths), splats.tiles_touched.sum()]
+
+
+@pytest.mark.parametrize("n", [0, 3])
+@pytest.mark.parametrize("device", DEVICES)
+def test_all_columns_that_are_sent_have_the_room_that_was_asked_for(n, device):
+    scene = random_scene(n=n, cameras=2, device=device)
+    inputs = inputs_of(scene)._replace(ids=torch.arange(n, device=device))
+    projected = inputs.project(Sizes(64, 64, 0), [(0, 4), (4, 9)])
+    room = 64 if device == "cuda" else int(projected.n_splats)
+    assert {len(column) for column in (*projected.for_compositing, projected.splats.rank_masks)} == {room}
 
 
 @pytest.mark.parametrize("n, cameras", [(0, 2), (5, 0), (0, 0)])
