@@ -129,6 +129,13 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
     assert (tmp_path / "file").read_text() == "new" and len(list(tmp_path.iterdir())) == 1
 
 
+def test_an_error_names_the_file_that_was_asked_for(tmp_path):
+    path = tmp_path / "missing" / "figures.json"
+    with pytest.raises(FileNotFoundError) as caught:
+        write_file(path, "{}")
+    assert caught.value.filename == str(path)
+
+
 def test_a_full_disk_names_the_file_that_was_asked_for(tmp_path):
     path = tmp_path / "figures.json"
     with pytest.raises(OSError, match="No space left") as caught, new_file(path) as partial:
