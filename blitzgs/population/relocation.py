@@ -98,10 +98,16 @@ def relocate(
     # Sharing must not reduce the opacity below the limit, or the Gaussian would count as dead. With moments
     # of zero a row would move by several times its learning rate in its next steps, as Adam's bias correction
     # is that of the run, not of the row. Each event copies the most opaque Gaussians, and such steps of all
-    # of them undo what a run has learnt (docs/decisions.md).
-    least = opacity_logit(rules.min_opacity)
-    moments = (*table.exp_avgs, *table.exp_avg_sqs)
-    share_rows_(table["opacities"], table["scales"], moments, sources, copies + 1, least)
+    # of them undo what a run has learnt (docs/decisions.md). No variable keeps the columns, because `replace`
+    # frees those that it makes longer.
+    share_rows_(
+        table["opacities"],
+        table["scales"],
+        (*table.exp_avgs, *table.exp_avg_sqs),
+        sources,
+        copies + 1,
+        opacity_logit(rules.min_opacity),
+    )
     new = _copies(table, parents, copies, time, step)
     if lineage is not None and features is not None:
         lineage.born(Births(new["id"], new["parent"], new["means"], features), step)
