@@ -19,7 +19,7 @@ from scenes import aerial
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.tiles import write_tiles
-from blitzgs.runs import lod, run_files
+from blitzgs.runs import run_files
 from blitzgs.training import setup
 from blitzgs.training.trainer import Trainer
 from tests.formats.test_tiles import SCENE, city
@@ -79,7 +79,7 @@ FLAGS = ("schedule.iterations=60", "view.lod=true", "schedule.densify_until=40")
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("popping") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        for module in (setup, lod):  # levels so near that the tiny scene has several
+        for module in (setup, run_files):  # levels so near that the tiny scene has several
             patch.setattr(module, "FORK", 1.3)
         Trainer(tiny_config(*FLAGS), *tiny_scene(), folder, Ranks()).train()
         yield folder

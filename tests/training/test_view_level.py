@@ -216,7 +216,7 @@ def test_render_honours_the_gate(tmp_path):
 
 def test_a_gate_that_no_training_view_has_is_not_applied_elsewhere(tmp_path, monkeypatch):
     """Coarse levels that no training view shows alone are not shown alone by any other view."""
-    monkeypatch.setattr("blitzgs.runs.lod.MOST_KEPT", 0.0)
+    monkeypatch.setattr("blitzgs.runs.run_files.MOST_KEPT", 0.0)
     trainer, _ = train(tmp_path)
     progress = trainer.state.progress
     assert progress.finest_level is not None and set(progress.gated_views) == {"0"}
