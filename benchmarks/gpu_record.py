@@ -6,11 +6,11 @@
     python benchmarks/gpu_record.py --age                 # how many commits ago the record was made
 
 Needs built kernels, torch and pytest; the package need not be installed. The tests run in one pytest process
-for each entry of tests/, and DIR/gpu_record.json is written again after each, so a run that is cut off leaves
-what it had ("complete" is then false). After --minutes it ends by itself, and an entry is cut off after
---entry-minutes; --resume goes on with a record of the same commit and card, and repeats what was cut off.
-A file that cannot be collected counts as an error; where a process dies, its files are run one by one. Exit
-status: 0 if all ran and passed. `benchmarks/report.py` puts the record into README and docs.
+for each entry of tests/, --jobs at a time, and DIR/gpu_record.json is written again after each, so a run that
+is cut off leaves what it had ("complete" is then false). After --minutes it ends by itself, and an entry is
+cut off after --entry-minutes; --resume goes on with a record of the same commit and card, and repeats what
+was cut off. A file that cannot be collected counts as an error; where a process dies, its files are run one
+by one. Exit status: 0 if all ran and passed. `benchmarks/report.py` puts the record into README and docs.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -229,7 +230,13 @@ class Record:
 
 
 def make_record(
-    record: Record, tests: list[Path], mark: str, folder: Path, end: float, longest: float = float("inf")
+    record: Record,
+    tests: list[Path],
+    mark: str,
+    folder: Path,
+    end: float,
+    longest: float = float("inf"),
+    jobs: int = 1,
 ) -> bool:
     """Fill the record until it is complete or the time is over.
 
@@ -240,6 +247,7 @@ def make_record(
         folder: for logs.
         end: of `time.monotonic`.
         longest: seconds that an entry of the tests may take.
+        jobs: entries of the tests that run side by side.
 
     Returns:
         Whether all ran and passed.
@@ -249,20 +257,31 @@ def make_record(
             record.content["bench"][name] = bench_rows(name, bench(name, folder, end))
             record.write()
     rooms = record.content["rooms"]
-    for target in entries(tests):
-        name = f"{target.parent.name}/{target.stem}"
-        if name in rooms:
-            continue
+
+    def run(target: Path) -> Outcome:
         if time.monotonic() >= end:
-            break
-        outcome = run_pytest(target, mark, folder, min(end, time.monotonic() + longest))
-        rooms[name] = asdict(outcome)
-        record.write()
-        counts = ", ".join(f"{getattr(outcome, kind)} {kind}" for kind in COUNTS)
-        print(f"{name}: {counts} in {outcome.seconds:.0f} s ({outcome.state})", flush=True)
-    else:
-        record.content["complete"] = all(room["state"] != "cut off" for room in rooms.values())
-        record.write()
+            return Outcome(state="cut off")
+        return run_pytest(target, mark, folder, min(end, time.monotonic() + longest))
+
+    # The largest first, so that none runs alone in the end.
+    size = {
+        target: sum(p.stat().st_size for p in (target, *target.rglob("test_*.py")))
+        for target in entries(tests)
+    }
+    todo = {
+        f"{target.parent.name}/{target.stem}": target
+        for target in sorted(size, key=size.__getitem__, reverse=True)
+    }
+    with ThreadPoolExecutor(jobs) as pool:
+        names = {pool.submit(run, target): name for name, target in todo.items() if name not in rooms}
+        for done in as_completed(names):
+            outcome, name = done.result(), names[done]
+            rooms[name] = asdict(outcome)
+            record.write()
+            counts = ", ".join(f"{getattr(outcome, kind)} {kind}" for kind in COUNTS)
+            print(f"{name}: {counts} in {outcome.seconds:.0f} s ({outcome.state})", flush=True)
+    record.content["complete"] = all(room["state"] != "cut off" for room in rooms.values())
+    record.write()
     sums = record.content["tests"]
     broken = any("error" in row for found in record.content["bench"].values() for row in found)
     return record.content["complete"] and not (sums["failed"] or sums["errors"] or broken)
@@ -300,6 +319,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--minutes", type=float, default=60, help="end after this time (%(default)s)")
     parser.add_argument("--entry-minutes", type=float, default=20,
                         help="cut off a folder of tests after this time (%(default)s)")  # fmt: skip
+    parser.add_argument("--jobs", type=int, default=max(1, (os.cpu_count() or 1) // 4),
+                        help="entries of tests/ that run side by side (%(default)s)")  # fmt: skip
     parser.add_argument("--resume", action="store_true", help="go on with a record that was cut off")
     parser.add_argument("--age", action="store_true", help="only tell the age of the record; status 0")
     parser.add_argument("--tests", type=Path, nargs="+", default=[harness.ROOT / "tests"],
@@ -329,7 +350,7 @@ def main(arguments: list[str] | None = None) -> int:
     logs.mkdir(parents=True, exist_ok=True)
     record = Record(path, about, args.resume)
     tests = [test.resolve() for test in args.tests]
-    passed = make_record(record, tests, args.mark, logs, end, 60 * args.entry_minutes)
+    passed = make_record(record, tests, args.mark, logs, end, 60 * args.entry_minutes, args.jobs)
     print(f"{path}: {'complete' if record.content['complete'] else 'cut off; go on with --resume'}")
     return 0 if passed else 1
 

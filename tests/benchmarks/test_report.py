@@ -112,7 +112,7 @@ def test_counts_hold_although_a_file_is_not_collected_and_a_process_dies(tmp_pat
     write(tmp_path, FILES)
     record = gpu_record.Record(tmp_path / "gpu_record.json", ABOUT, resume=False)
     end = time.monotonic() + 100
-    assert not gpu_record.make_record(record, [tmp_path / "tests"], "not other", tmp_path, end)
+    assert not gpu_record.make_record(record, [tmp_path / "tests"], "not other", tmp_path, end, jobs=2)
     content = json.loads((tmp_path / "gpu_record.json").read_text())
     assert content["complete"]
     tests = content["tests"]
