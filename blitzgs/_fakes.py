@@ -172,14 +172,17 @@ def _scatter_splats(a: Arguments) -> tuple[Tensor, Tensor]:
 
 _FAKES: dict[str, Callable[[Arguments], Any]] = {
     "arrange_splats": lambda a: [t.new_empty(*a.shape, *t.shape[1:]) for t in a.columns],
+    "bracket_keys": lambda a: _longs(a.gone, len(a.gone) + len(a.blocks)),
     "contributions": _contributions,
     "cull_blocks": _cull_blocks,
+    "draw_weights": lambda a: _longs(a.opacities, len(a.opacities)),
     "find_non_finite": lambda a: _ints(a.columns[0]),
     "first_rows": lambda a: [t.new_empty(n, *t.shape[1:]) for t, n in zip(a.columns, a.lengths, strict=True)],
     "gather_splats": lambda a: [_ints(a.packed, sum(a.group_sizes), width) for width in a.widths],
     "hash_key": lambda a: torch.empty_like(a.hashes),
     "intersect": _intersect,
     "key_histogram": lambda a: _longs(a.keys, 1 << a.width),
+    "keys_up_to": lambda a: torch.empty_like(a.keys, dtype=torch.bool),
     "knn_distances": lambda a: a.points.new_empty(a.points.shape[0], a.k),
     "l1_ssim_fwd_bwd": lambda a: (a.renders.new_empty(()), _contiguous(a.renders)),
     # Six rules of four numbers, two steps and a number, to a multiple of four numbers.
@@ -197,6 +200,10 @@ _FAKES: dict[str, Callable[[Arguments], Any]] = {
     "rasterize_bwd": _rasterize_bwd,
     "rasterize_fwd": _rasterize_fwd,
     "render": _render,
+    "residual_draws": lambda a: (
+        torch.empty_like(a.weights),
+        torch.empty_like(a.weights, dtype=torch.float32),
+    ),
     "rows_of_sectors": lambda a: a.sectors.new_empty(a.n, a.sectors.shape[1] // _WORD_BITS),
     "sampling_keys": lambda a: torch.empty_like(a.weights),
     "scatter_splats": _scatter_splats,

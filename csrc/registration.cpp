@@ -247,8 +247,14 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "position_noise_(Tensor(a!) means, Tensor quats, Tensor scales, Tensor opacities, Tensor ids, Tensor "
       "visible_ids, int seed, int step, float threshold, float strength) -> ()");
 
-  // Relocation: what N Gaussians at one place composite; and rows that stand for `copies` Gaussians from now
-  // on. moments: Adam's first moments of all parameters, then the second ones.
+  // Relocation: weights of a draw; the whole draws of each row, and keys for the rest; what N Gaussians at
+  // one place composite; and rows that stand for `copies` Gaussians from now on. moments: Adam's first
+  // moments of all parameters, then the second ones.
+  m.def("draw_weights(Tensor opacities, Tensor causes) -> Tensor");
+  m.def(
+      "residual_draws(Tensor weights, Tensor ids, int draws, int total, int seed, int event) -> (Tensor "
+      "whole, "
+      "Tensor keys)");
   m.def("overlap(Tensor opacities, Tensor copies) -> Tensor");
   m.def(
       "share_rows_(Tensor(a!) opacities, Tensor(b!) scales, Tensor(c!)[] moments, Tensor rows, "
@@ -269,6 +275,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Rows of columns in another order; and rows of columns overwritten by others, or (no `fresh`) by zeros.
   m.def("take_rows_(Tensor(a!)[] out, Tensor[] columns, Tensor rows) -> ()");
   m.def("put_rows_(Tensor(a!)[] columns, Tensor rows, Tensor[] fresh) -> ()");
+  // Which new Gaussians take the rows of those that leave.
+  m.def("bracket_keys(Tensor gone, Tensor blocks) -> Tensor");
+  m.def(
+      "match_brackets_(Tensor(a!) rows, Tensor(b!) is_left, Tensor keys, Tensor order, Tensor gone, Tensor "
+      "by_block) -> ()");
   // The first rows of columns, in the same memory without autograd's knowledge.
   m.def("first_rows(Tensor[] columns, int[] lengths) -> Tensor[]");
 
@@ -284,9 +295,12 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Hashes with one more key: a tensor, or a number where it is absent.
   m.def("hash_key(Tensor hashes, Tensor? keys, int number) -> Tensor");
 
-  // Keys that sample without replacement, and counts of keys by a digit of their bits.
+  // Keys that sample without replacement, and the k-th smallest key: counts of keys by a digit of their bits,
+  // the digit that k lies in, and the keys up to the one that was found.
   m.def("sampling_keys(Tensor weights, Tensor ids, int seed, int event) -> Tensor");
   m.def("key_histogram(Tensor keys, Tensor prefix, int shift, int width) -> Tensor");
+  m.def("find_digit_(Tensor(a!) search, Tensor counts) -> ()");
+  m.def("keys_up_to(Tensor keys, Tensor limit) -> Tensor");
 
   // A number that is 0 if all values of the columns are finite and none of `nonzero` is 0.
   m.def("find_non_finite(Tensor[] columns, Tensor[] nonzero) -> Tensor");

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.ops.counter_random import KEY_BITS, key_histogram, key_of_bits
+from blitzgs.ops.counter_random import KEY_BITS, find_digit_, key_histogram, keys_up_to
 from blitzgs.ops.importance import CHOICE_STEP, STEPS, TIES_STEP, MassCut
 
 # Digits of a threshold search, most significant first. The first digit of a score is its exponent and three
@@ -43,25 +43,24 @@ def smallest(keys: Tensor, ids: Tensor, k: int, ranks: Ranks) -> Tensor:
     """
     if k < 0:
         raise ValueError(f"smallest: k must not be negative, got {k}")
-    invalid = torch.stack((keys.isnan().sum(), torch.tensor(len(keys), device=keys.device)))
+    invalid = torch.stack((keys.isnan().sum(), torch.full((), len(keys), device=keys.device)))
     n_invalid, total = ranks.all_reduce(invalid).tolist()
     if n_invalid:
         raise ValueError(f"smallest: {n_invalid} of {total} keys are NaN")
     if k == 0 or k >= total:
         return torch.full_like(keys, k > 0, dtype=torch.bool)
-    left = torch.full((1,), k, device=keys.device)
-    prefix, shift = torch.zeros_like(left), KEY_BITS
+    search, shift = _search(k, keys.device), KEY_BITS
     for width in _KEY_DIGITS:
         shift -= width
-        counts = ranks.all_reduce(key_histogram(keys, prefix, shift, width))
-        digit, left = _descend(counts, left)
-        prefix = (prefix << width) | digit
-    limit = key_of_bits(prefix)
-    tied = keys == limit
+        find_digit_(search, ranks.all_reduce(key_histogram(keys, search[:1], shift, width)))
+    chosen = keys_up_to(keys, search[:1])
     # Usually all tied rows are selected.
-    if bool(counts[digit] > left):
-        _keep_smallest_ids(tied, ids, left, ranks)
-    return tied.logical_or_(keys < limit)
+    if bool(search[2] > search[1]):
+        below = keys_up_to(keys, search[:1] - 1)
+        tied = chosen ^ below
+        _keep_smallest_ids(tied, ids, search[1], ranks)
+        chosen = tied.logical_or_(below)
+    return chosen
 
 
 def mass_prefix(scores: Tensor, ids: Tensor, fraction: float, ranks: Ranks) -> Tensor:
@@ -92,7 +91,7 @@ def mass_prefix(scores: Tensor, ids: Tensor, fraction: float, ranks: Ranks) -> T
     threshold, left = _mass_threshold(keys, mantissas, decimal_share(fraction), ranks)
     tied = keys == threshold
     if ranks.all_reduce(tied.sum()).item() > left:
-        _keep_smallest_ids(tied, ids, torch.tensor([left], device=keys.device), ranks)
+        _keep_smallest_ids(tied, ids, left, ranks)
     return tied.logical_or_(keys < threshold)
 
 
@@ -145,22 +144,21 @@ def integer_mass_prefix(
     return cut.chosen
 
 
-def _keep_smallest_ids(tied: Tensor, ids: Tensor, k: Tensor, ranks: Ranks) -> None:
-    """Unmark, of the marked rows of all ranks, all but the k with the smallest ids; k: int64 [1], > 0."""
+def _search(k: int | Tensor, device: torch.device) -> Tensor:
+    """Begin a search for the k-th smallest number (see `find_digit_`)."""
+    search = torch.zeros(3, dtype=torch.int64, device=device)
+    search[1] = k
+    return search
+
+
+def _keep_smallest_ids(tied: Tensor, ids: Tensor, k: int | Tensor, ranks: Ranks) -> None:
+    """Unmark, of the marked rows of all ranks, all but the k with the smallest ids; k > 0."""
     rows = tied.nonzero().squeeze(1)
-    left, last, shift = k, torch.zeros_like(k), sum(_ID_DIGITS)
+    search, shift = _search(k, ids.device), sum(_ID_DIGITS)
     for width in _ID_DIGITS:
         shift -= width
-        digit, left = _descend(_histogram(ids[rows], last, shift, width, None, ranks), left)
-        last = (last << width) | digit
-    tied[rows] = ids[rows] <= last
-
-
-def _descend(counts: Tensor, left: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the digit [1] at which counts [digits] reach `left` [1], and how many are left before it."""
-    ends = counts.cumsum(0)
-    digit = (ends < left).sum(0, keepdim=True).clamp(max=len(counts) - 1)
-    return digit, left - (ends - counts).gather(0, digit)
+        find_digit_(search, _histogram(ids[rows], search[0], shift, width, None, ranks))
+    tied[rows] = ids[rows] <= search[0]
 
 
 def _mass_threshold(keys: Tensor, mantissas: Tensor, share: Fraction, ranks: Ranks) -> tuple[int, int]:

@@ -87,7 +87,22 @@ def key_histogram(keys: Tensor, prefix: Tensor, shift: int, width: int) -> Tenso
     return counts
 
 
-def key_of_bits(bits: Tensor) -> Tensor:
-    """Return the keys, float32, with the given ordered bits (int64)."""
-    bits = bits ^ torch.where(bits >> (KEY_BITS - 1) > 0, 1 << (KEY_BITS - 1), (1 << KEY_BITS) - 1)
-    return bits.to(torch.int32).view(torch.float32)
+def find_digit_(search: Tensor, counts: Tensor) -> None:
+    """Take the digit at which counts reach the number of keys that a search is still to find.
+
+    Args:
+        search: int64 [3], changed in place: the digits so far, as a number; how many keys are still to be
+            found under them, from 1 on; and how many keys have them, which is only written. If there are too
+            few keys, the last digit is taken.
+        counts: of the keys by their next digit, int64 [2^width].
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes.
+    """
+    torch.ops.blitzgs.find_digit_(search, counts)
+
+
+def keys_up_to(keys: Tensor, limit: Tensor) -> Tensor:
+    """Mark the keys, float32 [N], whose ordered bits are at most `limit` (int64 [1]); bool [N]."""
+    marks: Tensor = torch.ops.blitzgs.keys_up_to(keys, limit)
+    return marks

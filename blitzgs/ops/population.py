@@ -112,6 +112,40 @@ def overlap(opacities: Tensor, copies: Tensor) -> Tensor:
     return overlaps
 
 
+def draw_weights(opacities: Tensor, causes: Tensor) -> Tensor:
+    """Return opacities as weights of a draw, int64 [N], in units of 2^-31; 0 for rows with a cause of death.
+
+    `opacities`: float32 [N], logits. `causes`: uint8 [N]. RuntimeError: wrong shapes or dtypes.
+    """
+    weights: Tensor = torch.ops.blitzgs.draw_weights(opacities, causes)
+    return weights
+
+
+def residual_draws(
+    weights: Tensor, ids: Tensor, draws: int, total: int, seed: int, event: int
+) -> tuple[Tensor, Tensor]:
+    """Divide draws in proportion to weights: whole numbers for certain, and keys that draw the rest.
+
+    Residual resampling (Liu and Chen 1998): row i gets floor(draws w_i / total) draws; those that are left go
+    to the rows with the smallest keys, which are `sampling_keys` of what the rows are short of.
+
+    Args:
+        weights: w, int64 [N], 0 to 2^31.
+        ids: int64 [N], persistent.
+        draws: below 2^31.
+        total: sum of the weights of all ranks.
+        event: number that differs between draws.
+
+    Returns:
+        Whole draws, int64 [N], and keys, float32 [N].
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes, or `total` is not positive.
+    """
+    whole, keys = torch.ops.blitzgs.residual_draws(weights, ids, draws, total, seed, event)
+    return whole, keys
+
+
 def share_rows_(
     opacities: Tensor, scales: Tensor, moments: Sequence[Tensor], rows: Tensor, copies: Tensor, least: float
 ) -> None:

@@ -12,8 +12,14 @@ from torch.nn.functional import softplus
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
-from blitzgs.ops.counter_random import sampling_keys
-from blitzgs.ops.population import MAX_COPIES, overlap, position_noise_, share_rows_
+from blitzgs.ops.population import (
+    MAX_COPIES,
+    draw_weights,
+    overlap,
+    position_noise_,
+    residual_draws,
+    share_rows_,
+)
 from blitzgs.ops.rows import take_rows
 from blitzgs.optim.table_adam import Pending
 from blitzgs.population.density import (
@@ -28,10 +34,6 @@ from blitzgs.spawn.candidates import spawn_features
 from blitzgs.spawn.lineage import Births, Cause, Lineage
 from blitzgs.table.placement import place
 from blitzgs.table.table import PARAMETERS, GaussianTable, opacity_logit
-
-# Opacities are the weights of the draw, as integers in units of 2^-31, so that sums do not depend on the
-# order.
-_WEIGHT_BITS = 31
 
 
 @torch.no_grad()
@@ -77,10 +79,9 @@ def relocate(
         replace.
     """
     opacities = table["opacities"] if pending is None else pending.current("opacities")
-    dead = death_causes(table, rules, opacities, pending) != 0
-    weights = (opacities.double().sigmoid().float().double() * 2**_WEIGHT_BITS).long()
-    weights.masked_fill_(dead, 0)
-    own = torch.stack((dead.new_tensor(len(table), dtype=torch.int64), dead.sum(), weights.sum()))
+    causes = death_causes(table, rules, opacities, pending)
+    dead, weights = causes != 0, draw_weights(opacities, causes)
+    own = torch.stack((torch.full((), len(table), device=dead.device), dead.sum(), weights.sum()))
     both = torch.stack((own, ranks.all_reduce(own.clone())))
     (_, n_dead, _), (population, deaths, total) = both.tolist()
     grown = math.floor(population * (1.0 + growth))
@@ -162,11 +163,9 @@ def draw_in_proportion(
     """
     if total == 0 or count <= 0:
         return torch.zeros_like(weights)
-    shares = weights * count
-    whole = shares.div(total, rounding_mode="floor")
-    rest = count - int(ranks.all_reduce(whole.sum()))
     # Other draws use their event's time, which is >= 0, so a negative number gives separate keys.
-    keys = sampling_keys((shares - whole * total).float(), ids, seed, -1 - time)
+    whole, keys = residual_draws(weights, ids, count, total, seed, -1 - time)
+    rest = count - int(ranks.all_reduce(whole.sum()))
     return whole.add_(smallest(keys, ids, rest, ranks)).clamp_(max=MAX_COPIES - 1)
 
 

@@ -12,8 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from blitzgs.ops.blocks import BLOCK_ROWS
-from blitzgs.table.blocks import morton_order
+from blitzgs.ops.blocks import BLOCK_ROWS, morton_keys
 from blitzgs.table.table import Placement
 
 
@@ -30,27 +29,13 @@ def place(count: int, gone: Tensor, beside: Tensor, means: Tensor) -> Placement:
         beside: int64 [M], rows near which the new Gaussians lie, such as their parents'; they may be leaving.
         means: float32 [M, 3], positions of the new Gaussians.
     """
-    leaving, joining, device = len(gone), len(beside), gone.device
+    leaving, joining = len(gone), len(beside)
     blocks, by_block = torch.sort(beside // BLOCK_ROWS, stable=True)
-    gone_blocks = gone // BLOCK_ROWS
-    # Brackets before each, of the other kind.
-    before_gone = torch.searchsorted(blocks, gone_blocks)
-    before_new = torch.searchsorted(gone_blocks, blocks, right=True)
-    numbers_gone, numbers_new = (torch.arange(n, device=device) for n in (leaving, joining))
     # Brackets of one depth open and close in turn. Sorted by depth and place, pairs are neighbours.
-    depths = torch.cat((numbers_gone + 1 - before_gone, before_new - numbers_new))
-    places = torch.cat((numbers_gone + before_gone, numbers_new + before_new))
-    order = (depths * (leaving + joining + 1) + places).argsort()
-    depths, opens = depths[order], order < leaving
-    is_pair = opens[:-1] & ~opens[1:] & (depths[:-1] == depths[1:])
-    # The last entry of these lists takes what is no pair, as the host does not know the number of pairs.
-    first, second = order[:-1].where(is_pair, leaving), (order[1:] - leaving).where(is_pair, joining)
-    rows = torch.cat((gone, gone.new_full((1,), count)))
-    new = gone.new_full((joining + 1,), -1)
-    new[torch.cat((by_block, by_block.new_full((1,), joining)))[second]] = rows[first]
-    is_left = torch.ones(leaving + 1, dtype=torch.bool, device=device)
-    is_left[first] = False
-    new, is_left = new[:-1], is_left[:-1]
+    keys, order = torch.ops.blitzgs.bracket_keys(gone, blocks).sort()
+    new = torch.full_like(by_block, -1)
+    is_left = torch.ones_like(gone, dtype=torch.bool)
+    torch.ops.blitzgs.match_brackets_(new, is_left, keys, order, gone, by_block)
 
     # Rows that are left and new Gaussians that are left come together one by one; those that are appended are
     # in Morton order.
@@ -58,7 +43,8 @@ def place(count: int, gone: Tensor, beside: Tensor, means: Tensor) -> Placement:
     left = gone.new_empty(leaving + 1)
     left[(rank_left - 1).where(is_left, leaving)] = gone
     n_left = rank_left[-1:].sum()
-    along = morton_order(means) if joining > leaving else numbers_new
+    keys = morton_keys(means) if joining > leaving else torch.arange(joining, device=gone.device)
+    along = keys.sort(stable=True).indices
     is_placed = new[along] >= 0
     rank = (~is_placed).cumsum(0) - 1
     others = left[rank.clamp(0, leaving)].where(rank < n_left, count + rank - n_left)

@@ -66,21 +66,26 @@ void check_columns(const CheckedColumns<T>&, CudaStream);
 //
 //   key_histogram: keys float [n], prefix int64 [1], shift, width -> counts int64 [2^width]
 //
-// counts the keys with ordered bits b, b >> (shift + width) = prefix, by the digit (b >> shift) mod 2^width;
-// blitzgs/distributed/selection.py finds the k-th smallest key over all ranks by such counts. Each op reads
-// its inputs once.
+// counts the keys with ordered bits b, b >> (shift + width) = prefix, by the digit (b >> shift) mod 2^width.
+// blitzgs/distributed/selection.py finds the k-th smallest key over all ranks by such counts: find_digit_
+// takes the next digit, and keys_up_to marks the keys that are not above the one that was found. Each op
+// reads its inputs once.
+
+BLITZGS_HD float sampling_key(float weight, std::int64_t id, std::int64_t seed, std::int64_t event) {
+  const std::uint64_t hash = hash_key(hash_key(hash_key(0, seed), event), id);
+  return static_cast<float>(-std::log(uniform_of(hash)) / static_cast<double>(weight));
+}
 
 struct SamplingKeys {
   const float* weights;
   const std::int64_t* ids;
   std::int64_t n, seed, event;
   float* keys;
-};
 
-BLITZGS_HD float sampling_key(const SamplingKeys& args, std::int64_t i) {
-  const std::uint64_t hash = hash_key(hash_key(hash_key(0, args.seed), args.event), args.ids[i]);
-  return static_cast<float>(-std::log(uniform_of(hash)) / static_cast<double>(args.weights[i]));
-}
+  BLITZGS_HD void operator()(std::int64_t i) const {
+    keys[i] = sampling_key(weights[i], ids[i], seed, event);
+  }
+};
 
 // Adds one more key to hashes: a tensor [n], or the same number for all.
 struct HashKey {
@@ -120,9 +125,38 @@ BLITZGS_HD int digit_of(const KeyHistogram& args, std::int64_t prefix, float key
   return static_cast<int>(head & ((std::uint64_t{1} << args.width) - 1));
 }
 
+// Takes the digit at which counts reach the number of keys that are still to be found.
+//
+// search int64 [3]: the digits so far, the number of keys still to be found under them (from 1 on), and the
+// number of keys that have them, which is written only.
+struct FindDigit {
+  const std::int64_t* counts;  // [2^width]
+  int width;
+  std::int64_t* search;
+};
+
+// Ends a search at `digit`, before which there are `before` keys.
+BLITZGS_HD void take_digit(const FindDigit& args, std::int64_t digit, std::int64_t before) {
+  args.search[0] = args.search[0] << args.width | digit;
+  args.search[1] -= before;
+  args.search[2] = args.counts[digit];
+}
+
+// Marks the keys whose ordered bits are at most `limit`.
+struct KeysUpTo {
+  const float* keys;
+  const std::int64_t* limit;  // [1]
+  std::int64_t n;
+  bool* marks;
+
+  BLITZGS_HD void operator()(std::int64_t i) const {
+    marks[i] = std::int64_t{ordered_bits(keys[i])} <= *limit;
+  }
+};
+
 namespace BLITZGS_BACKEND {
-void sampling_keys(const SamplingKeys&, CudaStream);
 void key_histogram(const KeyHistogram&, CudaStream);
+void find_digit(const FindDigit&, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

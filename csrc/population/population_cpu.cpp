@@ -49,16 +49,19 @@ void copy_rows(const CopyRows& copy, CudaStream) {
   });
 }
 
-void sampling_keys(const SamplingKeys& args, CudaStream) {
-  parallel_rows(args.n, 1 << 12, [&](std::int64_t i) { args.keys[i] = sampling_key(args, i); });
-}
-
 void key_histogram(const KeyHistogram& args, CudaStream) {
   std::fill_n(args.counts, std::int64_t{1} << args.width, 0);
   for (std::int64_t i = 0; i < args.n; ++i) {
     const int digit = digit_of(args, *args.prefix, args.keys[i]);
     if (digit >= 0) ++args.counts[digit];
   }
+}
+
+void find_digit(const FindDigit& args, CudaStream) {
+  const std::int64_t last = (std::int64_t{1} << args.width) - 1;
+  std::int64_t digit = 0, before = 0;
+  while (digit < last && before + args.counts[digit] < args.search[1]) before += args.counts[digit++];
+  take_digit(args, digit, before);
 }
 
 template <class T>

@@ -9,6 +9,7 @@
 #include "population/columns.h"
 #include "population/density.h"
 #include "population/knn.h"
+#include "population/placement.h"
 #include "population/relocation.h"
 
 namespace blitzgs::cuda {
@@ -85,12 +86,6 @@ bool launch_if_whole(const CopyRows& copy, CudaStream stream) {
 
 constexpr int kKeyThreads = 512, kResident = 4;  // blocks per multiprocessor
 
-// keys [n] (columns.h), one thread per item.
-__global__ void __launch_bounds__(kKeyThreads) sampling_keys_kernel(const SamplingKeys args) {
-  const std::int64_t i = blockIdx.x * std::int64_t{kKeyThreads} + threadIdx.x;
-  if (i < args.n) args.keys[i] = sampling_key(args, i);
-}
-
 // Adds to counts [2^width] (columns.h), one thread per key in a grid-stride loop. A block counts in shared
 // memory first.
 __global__ void __launch_bounds__(kKeyThreads) key_histogram_kernel(const KeyHistogram args) {
@@ -107,6 +102,23 @@ __global__ void __launch_bounds__(kKeyThreads) key_histogram_kernel(const KeyHis
   for (int i = threadIdx.x; i < digits; i += kKeyThreads) {
     if (counts[i] > 0) atomicAdd(reinterpret_cast<unsigned long long*>(args.counts + i), counts[i]);
   }
+}
+
+// One block; each thread adds up its part of the counts.
+__global__ void __launch_bounds__(kKeyThreads) find_digit_kernel(const FindDigit args) {
+  __shared__ typename cub::BlockScan<std::int64_t, kKeyThreads>::TempStorage scratch;
+  const std::int64_t digits = std::int64_t{1} << args.width, part = (digits + kKeyThreads - 1) / kKeyThreads;
+  const std::int64_t begin = threadIdx.x * part, end = begin + part < digits ? begin + part : digits;
+  const std::int64_t wanted = args.search[1];
+  std::int64_t sum = 0, before;
+  for (std::int64_t digit = begin; digit < end; ++digit) sum += args.counts[digit];
+  cub::BlockScan<std::int64_t, kKeyThreads>(scratch).ExclusiveSum(sum, before);
+  __syncthreads();  // all have read what one of them writes
+  const bool is_last = begin < digits && end == digits;
+  if (before >= wanted || (before + sum < wanted && !is_last)) return;
+  std::int64_t digit = begin;
+  while (digit < end - 1 && before + args.counts[digit] < wanted) before += args.counts[digit++];
+  take_digit(args, digit, before);
 }
 
 // Nearest neighbours (knn.h).
@@ -194,19 +206,20 @@ template void for_each_row(const DensityStats<float>&, CudaStream);
 template void for_each_row(const SpawnFeatures&, CudaStream);
 template void for_each_row(const HashKey&, CudaStream);
 template void for_each_row(const Overlap&, CudaStream);
+template void for_each_row(const DrawWeights&, CudaStream);
+template void for_each_row(const ResidualDraws&, CudaStream);
+template void for_each_row(const ShareMoments&, CudaStream);
 template void for_each_row(const ShareRows&, CudaStream);
+template void for_each_row(const BracketKeys&, CudaStream);
+template void for_each_row(const MatchBrackets&, CudaStream);
+template void for_each_row(const SamplingKeys&, CudaStream);
+template void for_each_row(const KeysUpTo&, CudaStream);
 
 void copy_rows(const CopyRows& copy, CudaStream stream) {
   if (copy.n == 0 || copy.row_bytes == 0) return;
   if (launch_if_whole<uint4>(copy, stream) || launch_if_whole<uint2>(copy, stream)) return;
   if (launch_if_whole<std::uint32_t>(copy, stream)) return;
   launch_if_whole<std::uint8_t>(copy, stream);
-}
-
-void sampling_keys(const SamplingKeys& args, CudaStream stream) {
-  if (args.n == 0) return;
-  sampling_keys_kernel<<<blocks_for(args.n, kKeyThreads), kKeyThreads, 0, stream>>>(args);
-  check_launch("sampling_keys");
 }
 
 void key_histogram(const KeyHistogram& args, CudaStream stream) {
@@ -216,6 +229,11 @@ void key_histogram(const KeyHistogram& args, CudaStream stream) {
       std::min(blocks_for(args.n, kKeyThreads), static_cast<unsigned>(kResident * multiprocessors()));
   key_histogram_kernel<<<blocks, kKeyThreads, 0, stream>>>(args);
   check_launch("key_histogram");
+}
+
+void find_digit(const FindDigit& args, CudaStream stream) {
+  find_digit_kernel<<<1, kKeyThreads, 0, stream>>>(args);
+  check_launch("find_digit");
 }
 
 template <class T>

@@ -5,6 +5,7 @@
 #include "common/rows.h"
 #include "population/columns.h"
 #include "population/knn.h"
+#include "population/placement.h"
 #include "population/relocation.h"
 
 namespace blitzgs {
@@ -132,6 +133,31 @@ Tensor overlap(const Tensor& opacities_in, const Tensor& copies_in) {
   return overlaps;
 }
 
+Tensor draw_weights(const Tensor& opacities_in, const Tensor& causes_in) {
+  constexpr const char* kOp = "draw_weights";
+  const auto opacities = checked<float>(kOp, "opacities", opacities_in, {-1});
+  const std::int64_t n = opacities.size(0);
+  const auto causes = checked<std::uint8_t>(kOp, "causes", causes_in, {n});
+  const auto weights = make<std::int64_t>(opacities, {n});
+  DeviceScope scope(opacities);
+  backend::for_each_row(DrawWeights{opacities, causes, n, weights}, scope.stream);
+  return weights;
+}
+
+std::tuple<Tensor, Tensor> residual_draws(const Tensor& weights_in, const Tensor& ids_in, std::int64_t draws,
+                                          std::int64_t total, std::int64_t seed, std::int64_t event) {
+  constexpr const char* kOp = "residual_draws";
+  const auto weights = checked<std::int64_t>(kOp, "weights", weights_in, {-1});
+  const std::int64_t n = weights.size(0);
+  const auto ids = checked<std::int64_t>(kOp, "ids", ids_in, {n});
+  BLITZGS_CHECK(total > 0, kOp, "total must be positive, got ", total);
+  const auto whole = make<std::int64_t>(weights, {n});
+  const auto keys = make<float>(weights, {n});
+  DeviceScope scope(weights);
+  backend::for_each_row(ResidualDraws{weights, ids, n, draws, total, seed, event, whole, keys}, scope.stream);
+  return {whole, keys};
+}
+
 void share_rows_(const Tensor& opacities_in, const Tensor& scales, const std::vector<Tensor>& moments,
                  const Tensor& rows_in, const Tensor& copies_in, double least) {
   constexpr const char* kOp = "share_rows_";
@@ -140,24 +166,54 @@ void share_rows_(const Tensor& opacities_in, const Tensor& scales, const std::ve
   const auto rows = checked<std::int64_t>(kOp, "rows", rows_in, {-1});
   const std::int64_t n = rows.size(0);
   const auto copies = checked<std::int64_t>(kOp, "copies", copies_in, {n});
-  ShareRows args{opacities,
-                 checked_in_place<float>(kOp, "scales", scales, {count, 3}),
-                 {},
-                 rows,
-                 copies,
-                 n,
-                 static_cast<float>(least)};
-  BLITZGS_CHECK(moments.size() == ShareRows::kColumns, kOp, "there must be ", ShareRows::kColumns,
+  const ShareRows shared{opacities, checked_in_place<float>(kOp, "scales", scales, {count, 3}),
+                         rows,      copies,
+                         n,         static_cast<float>(least)};
+#ifdef BLITZGS_BACKEND_CUDA
+  constexpr int kLanes = 16;
+#else
+  constexpr int kLanes = 1;
+#endif
+  ShareMoments scaled{shared, {}, kLanes, n * kLanes};
+  BLITZGS_CHECK(moments.size() == ShareMoments::kColumns, kOp, "there must be ", ShareMoments::kColumns,
                 " moments, got ", moments.size());
-  for (int c = 0; c < ShareRows::kColumns; ++c) {
+  for (int c = 0; c < ShareMoments::kColumns; ++c) {
     check_dtype(kOp, "a moment", moments[c], ScalarType::Float);
     check_written(kOp, "a moment", moments[c], rows);
     BLITZGS_CHECK(moments[c].size(0) == count, kOp, "a moment must have ", count, " rows, got ",
                   shape_of(moments[c]));
-    args.moments[c] = {mutable_data<float>(moments[c]), static_cast<int>(elements_behind(moments[c]))};
+    scaled.moments[c] = {mutable_data<float>(moments[c]), static_cast<int>(elements_behind(moments[c]))};
   }
   DeviceScope scope(opacities);
-  backend::for_each_row(args, scope.stream);
+  backend::for_each_row(scaled, scope.stream);
+  backend::for_each_row(shared, scope.stream);
+}
+
+Tensor bracket_keys(const Tensor& gone_in, const Tensor& blocks_in) {
+  constexpr const char* kOp = "bracket_keys";
+  const auto gone = checked<std::int64_t>(kOp, "gone", gone_in, {-1});
+  const auto blocks = checked<std::int64_t>(kOp, "blocks", blocks_in, {-1});
+  const std::int64_t leaving = gone.size(0), joining = blocks.size(0), n = leaving + joining;
+  const auto keys = make<std::int64_t>(gone, {n});
+  DeviceScope scope(gone);
+  backend::for_each_row(BracketKeys{gone, blocks, leaving, joining, n, keys}, scope.stream);
+  return keys;
+}
+
+void match_brackets_(const Tensor& rows_in, const Tensor& is_left_in, const Tensor& keys_in,
+                     const Tensor& order_in, const Tensor& gone_in, const Tensor& by_block_in) {
+  constexpr const char* kOp = "match_brackets_";
+  const auto gone = checked<std::int64_t>(kOp, "gone", gone_in, {-1});
+  const auto by_block = checked<std::int64_t>(kOp, "by_block", by_block_in, {-1});
+  const std::int64_t leaving = gone.size(0), joining = by_block.size(0), n = leaving + joining;
+  const auto keys = checked<std::int64_t>(kOp, "keys", keys_in, {n});
+  const auto order = checked<std::int64_t>(kOp, "order", order_in, {n});
+  const auto rows = checked_in_place<std::int64_t>(kOp, "rows", rows_in, {joining});
+  const auto is_left = checked_in_place<bool>(kOp, "is_left", is_left_in, {leaving});
+  DeviceScope scope(gone);
+  const std::int64_t neighbours = n > 0 ? n - 1 : 0;
+  backend::for_each_row(MatchBrackets{keys, order, gone, by_block, leaving, neighbours, n + 1, rows, is_left},
+                        scope.stream);
 }
 
 Tensor sampling_keys(const Tensor& weights_in, const Tensor& ids_in, std::int64_t seed, std::int64_t event) {
@@ -166,7 +222,7 @@ Tensor sampling_keys(const Tensor& weights_in, const Tensor& ids_in, std::int64_
   const auto ids = checked<std::int64_t>(kOp, "ids", ids_in, {weights.size(0)});
   const auto keys = make<float>(weights, {weights.size(0)});
   DeviceScope scope(weights);
-  backend::sampling_keys({weights, ids, weights.size(0), seed, event, keys}, scope.stream);
+  backend::for_each_row(SamplingKeys{weights, ids, weights.size(0), seed, event, keys}, scope.stream);
   return keys;
 }
 
@@ -181,6 +237,30 @@ Tensor key_histogram(const Tensor& keys_in, const Tensor& prefix_in, std::int64_
   backend::key_histogram(
       {keys, prefix, keys.size(0), static_cast<int>(shift), static_cast<int>(width), counts}, scope.stream);
   return counts;
+}
+
+void find_digit_(const Tensor& search_in, const Tensor& counts_in) {
+  constexpr const char* kOp = "find_digit_";
+  const auto search = checked_in_place<std::int64_t>(kOp, "search", search_in, {3});
+  const auto counts = checked<std::int64_t>(kOp, "counts", counts_in, {-1});
+  const std::int64_t n = counts.size(0);
+  int width = 0;
+  while ((std::int64_t{1} << width) < n) ++width;
+  BLITZGS_CHECK(n > 0 && (std::int64_t{1} << width) == n, kOp, "there must be a power of two counts, got ",
+                n);
+  DeviceScope scope(search);
+  backend::find_digit({counts, width, search}, scope.stream);
+}
+
+Tensor keys_up_to(const Tensor& keys_in, const Tensor& limit_in) {
+  constexpr const char* kOp = "keys_up_to";
+  const auto keys = checked<float>(kOp, "keys", keys_in, {-1});
+  const auto limit = checked<std::int64_t>(kOp, "limit", limit_in, {1});
+  const std::int64_t n = keys.size(0);
+  const auto marks = make<bool>(keys, {n});
+  DeviceScope scope(keys);
+  backend::for_each_row(KeysUpTo{keys, limit, n, marks}, scope.stream);
+  return marks;
 }
 
 Tensor find_non_finite(const std::vector<Tensor>& columns_in, const std::vector<Tensor>& nonzero_in) {
@@ -288,9 +368,15 @@ BLITZGS_REGISTER(m) {
   m.impl("put_rows_", TORCH_BOX(&blitzgs::put_rows_));
   m.impl("hash_key", TORCH_BOX(&blitzgs::hash_with_key));
   m.impl("overlap", TORCH_BOX(&blitzgs::overlap));
+  m.impl("draw_weights", TORCH_BOX(&blitzgs::draw_weights));
+  m.impl("residual_draws", TORCH_BOX(&blitzgs::residual_draws));
   m.impl("share_rows_", TORCH_BOX(&blitzgs::share_rows_));
+  m.impl("bracket_keys", TORCH_BOX(&blitzgs::bracket_keys));
+  m.impl("match_brackets_", TORCH_BOX(&blitzgs::match_brackets_));
   m.impl("sampling_keys", TORCH_BOX(&blitzgs::sampling_keys));
   m.impl("key_histogram", TORCH_BOX(&blitzgs::key_histogram));
+  m.impl("find_digit_", TORCH_BOX(&blitzgs::find_digit_));
+  m.impl("keys_up_to", TORCH_BOX(&blitzgs::keys_up_to));
   m.impl("find_non_finite", TORCH_BOX(&blitzgs::find_non_finite));
   m.impl("tree_sums", TORCH_BOX(&blitzgs::tree_sums));
   m.impl("spawn_features", TORCH_BOX(&blitzgs::spawn_features));

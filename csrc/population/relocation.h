@@ -1,13 +1,46 @@
 // SPDX-License-Identifier: Apache-2.0
-// Relocation (3DGS-MCMC, Kheradmand et al. 2024, eq. 9): N equal Gaussians at one place look like one before.
+// Relocation (3DGS-MCMC, Kheradmand et al. 2024): draws the Gaussians that are copied, and shares what N
+// equal Gaussians at one place have, so that they look like one before (eq. 9).
 #pragma once
 #include <cmath>
 #include <cstdint>
 
 #include "common/kernel.h"
 #include "math/gaussian.h"
+#include "population/columns.h"
 
 namespace blitzgs {
+
+// Opacities as weights of a draw: integers in units of 2^-31, so that sums do not depend on the order. Rows
+// with a cause of death have the weight 0.
+struct DrawWeights {
+  const float* opacities;      // [n], logits
+  const std::uint8_t* causes;  // [n]
+  std::int64_t n;
+  std::int64_t* weights;
+
+  BLITZGS_HD void operator()(std::int64_t i) const {
+    const auto opacity = static_cast<float>(sigmoid(static_cast<double>(opacities[i])));
+    weights[i] = causes[i] ? 0 : static_cast<std::int64_t>(opacity * 2147483648.0);
+  }
+};
+
+// Residual resampling (Liu and Chen 1998): of `draws` draws in proportion to weights that add up to `total`,
+// the whole numbers that each row gets for certain, and keys (columns.h) that draw the rest without
+// replacement in proportion to what is left.
+struct ResidualDraws {
+  const std::int64_t* weights;  // [n], 0 to 2^31
+  const std::int64_t* ids;      // [n]
+  std::int64_t n, draws, total, seed, event;
+  std::int64_t* whole;
+  float* keys;
+
+  BLITZGS_HD void operator()(std::int64_t i) const {
+    const std::int64_t share = weights[i] * draws;
+    whole[i] = share / total;
+    keys[i] = sampling_key(static_cast<float>(share - whole[i] * total), ids[i], seed, event);
+  }
+};
 
 // The integral along a line through the centre of what N Gaussians of opacity o composite, over that of one
 // of opacity 1:
@@ -36,43 +69,64 @@ struct Overlap {
 
 // Lets rows of a table stand for N copies each: opacities and scales are shared (the logits and logarithms of
 // o' = 1 - (1 - o)^(1/N) and s' = s o / overlap(o', N)), and Adam's moments are scaled as the gradients are.
-//
-// Each of N Gaussians in one place has 1/N of the gradient of the Gaussian before. That of the logit changes
-// by the factor o' / o, since (1 - o')^N = 1 - o. Second moments change by the squares. One thread per row.
 struct ShareRows {
-  static constexpr int kColumns = 10;  // first moments of all parameters, then second moments
-  struct Moments {
-    float* values;  // [N, width]
-    int width;
-  };
   float* opacities;            // [N], logits
   float* scales;               // [N, 3], logarithms
-  Moments moments[kColumns];   // the fourth parameter is the opacity
   const std::int64_t* rows;    // [n], each once
   const std::int64_t* copies;  // [n], the row itself included
   std::int64_t n;
   float least;  // sharing does not reduce a logit below this
 
+  // -log(1 - o) / N: the part of it that each of the copies has.
+  BLITZGS_HD double depth(double logit, std::int64_t i) const {
+    // -log(1 - o) = softplus(logit)
+    return (std::log1p(std::exp(-std::fabs(logit))) + larger(logit, 0.0)) / static_cast<double>(copies[i]);
+  }
+
+  BLITZGS_HD float shared_logit(double depth) const {
+    return larger(static_cast<float>(std::log(std::expm1(depth))), least);
+  }
+
   BLITZGS_HD void operator()(std::int64_t i) const {
     const std::int64_t row = rows[i];
-    const double logit = opacities[row], count = static_cast<double>(copies[i]);
-    const double log_complement = std::log1p(std::exp(-std::fabs(logit)));
-    // -log(1 - o) = softplus(logit), and log(o) = -softplus(-logit).
-    const double depth = (log_complement + larger(logit, 0.0)) / count;
-    const double log_opacity = -(log_complement + larger(-logit, 0.0));
-    const double factor = log_opacity - std::log(overlap_of(-std::expm1(-depth), copies[i]));
-    const float shared = larger(static_cast<float>(std::log(std::expm1(depth))), least);
-    opacities[row] = shared;
+    const double logit = opacities[row], part = depth(logit, i);
+    // log(o) = -softplus(-logit)
+    const double log_opacity = -(std::log1p(std::exp(-std::fabs(logit))) + larger(-logit, 0.0));
+    const double factor = log_opacity - std::log(overlap_of(-std::expm1(-part), copies[i]));
+    opacities[row] = shared_logit(part);
     for (int axis = 0; axis < 3; ++axis) {
       float& scale = scales[3 * row + axis];
       scale = static_cast<float>(scale + factor);
     }
-    const double share = 1 / count, dimmed = sigmoid(static_cast<double>(shared)) / sigmoid(logit);
+  }
+};
+
+// Scales the moments of rows before ShareRows shares their opacities.
+//
+// Each of N Gaussians in one place has 1/N of the gradient of the Gaussian before. That of the logit changes
+// by the factor o' / o, since (1 - o')^N = 1 - o. Second moments change by the squares. On CUDA, neighbouring
+// threads scale neighbouring values of a row.
+struct ShareMoments {
+  static constexpr int kColumns = 10;  // first moments of all parameters, then second moments
+  struct Moments {
+    float* values;  // [N, width]
+    int width;
+  };
+  ShareRows rows;
+  Moments moments[kColumns];  // the fourth parameter is the opacity
+  int lanes;                  // threads of a row
+  std::int64_t n;             // rows times lanes
+
+  BLITZGS_HD void operator()(std::int64_t item) const {
+    const std::int64_t i = item / lanes, row = rows.rows[i];
+    const double logit = rows.opacities[row], share = 1 / static_cast<double>(rows.copies[i]);
+    const double dimmed =
+        sigmoid(static_cast<double>(rows.shared_logit(rows.depth(logit, i)))) / sigmoid(logit);
     for (int c = 0; c < kColumns; ++c) {
       const double by = c % 5 == 3 ? dimmed : share;
-      const float factor_of_column = static_cast<float>(c < 5 ? by : by * by);
+      const float factor = static_cast<float>(c < 5 ? by : by * by);
       float* const values = moments[c].values + row * moments[c].width;
-      for (int k = 0; k < moments[c].width; ++k) values[k] *= factor_of_column;
+      for (int k = static_cast<int>(item % lanes); k < moments[c].width; k += lanes) values[k] *= factor;
     }
   }
 };

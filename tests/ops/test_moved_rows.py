@@ -8,7 +8,14 @@ import torch
 
 from blitzgs.ops import host
 from blitzgs.ops.blocks import BLOCK_ROWS, rows_of_sectors, sectors_of_rows, seen_blocks, swap_blocks_
-from blitzgs.ops.counter_random import KEY_BITS, key_histogram, key_of_bits, sampling_keys, uniform
+from blitzgs.ops.counter_random import (
+    KEY_BITS,
+    find_digit_,
+    key_histogram,
+    keys_up_to,
+    sampling_keys,
+    uniform,
+)
 from blitzgs.ops.host import PinnedNumbers
 from blitzgs.ops.projection_types import Views
 from blitzgs.ops.rows import put_rows_, take_rows
@@ -321,8 +328,10 @@ def test_digits_of_keys_are_counted_under_a_prefix(device, count):
     ordered = torch.tensor(
         [2**31 + b if v >= 0 else 2**31 - 1 - b for v, b in zip(values, bits, strict=True)]
     )
-    assert torch.equal(key_of_bits(ordered.long()), keys.abs().where(keys == 0, keys))
     keys = keys.to(device)
+    for limit in ordered[:3].tolist() + [-1, 2**31, 2**32]:
+        up_to = keys_up_to(keys, torch.tensor([limit], device=device))
+        assert torch.equal(up_to.cpu(), ordered <= limit)
     first = key_histogram(keys, torch.zeros(1, dtype=torch.int64, device=device), shift, 11)
     assert torch.equal(first.cpu(), torch.bincount(ordered.long() >> shift, minlength=2048))
     for prefix in (2**10, 2**11 - 1, 2**10 + 511) if count else ():
@@ -331,14 +340,34 @@ def test_digits_of_keys_are_counted_under_a_prefix(device, count):
         assert torch.equal(second.cpu(), torch.bincount(under >> shift - 10 & 1023, minlength=1024))
 
 
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("width", [0, 5, 9, 11, 13])
+def test_a_search_takes_the_digit_that_its_number_lies_in(device, width):
+    counts = torch.randint(3, (1 << width,), generator=torch.Generator().manual_seed(width))
+    counts[::3] = 0
+    counts[-1] += 1
+    ends = counts.cumsum(0)
+    for k in {1, 2, int(ends[-1]) // 2 + 1, int(ends[-1]), int(ends[-1]) + 1}:
+        search = torch.tensor([5, k, -1], device=device)
+        find_digit_(search, counts.to(device))
+        digit = min(int((ends < k).sum()), len(ends) - 1)
+        before = int(ends[digit] - counts[digit])
+        assert search.tolist() == [5 << width | digit, k - before, int(counts[digit])]
+
+
 def test_errors_name_the_value_of_sampling():
     with pytest.raises(RuntimeError, match=r"ids must have shape \[3\], got \[2\]"):
         sampling_keys(torch.ones(3), torch.arange(2), 0, 0)
     with pytest.raises(RuntimeError, match="a digit must have 1 to 11 of 32 bits, got 12 after 20"):
         key_histogram(torch.ones(3), torch.zeros(1, dtype=torch.int64), 20, 12)
 
+    with pytest.raises(RuntimeError, match="there must be a power of two counts, got 6"):
+        find_digit_(torch.zeros(3, dtype=torch.int64), torch.zeros(6, dtype=torch.int64))
+
 
 def test_opcheck_of_sampling():
+    torch.library.opcheck(torch.ops.blitzgs.keys_up_to, (torch.rand(9), torch.tensor([3])))
+    torch.library.opcheck(torch.ops.blitzgs.find_digit_, (torch.tensor([0, 1, 0]), torch.tensor([1, 2])))
     torch.library.opcheck(torch.ops.blitzgs.sampling_keys, (torch.rand(9), torch.arange(9), 1, 2))
     prefix = torch.zeros(1, dtype=torch.int64)
     torch.library.opcheck(torch.ops.blitzgs.key_histogram, (torch.rand(9), prefix, 21, 11))

@@ -11,8 +11,8 @@ import torch
 from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.ops.counter_random import hash_keys
-from blitzgs.ops.population import MAX_COPIES, share_rows_
+from blitzgs.ops.counter_random import hash_keys, sampling_keys
+from blitzgs.ops.population import MAX_COPIES, draw_weights, residual_draws, share_rows_
 from blitzgs.optim import table_adam
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.density import DensityRules
@@ -203,6 +203,21 @@ def test_rows_that_stand_for_copies_equal_torch_s(device):
         torch.testing.assert_close(column.cpu(), wanted, rtol=3e-7, atol=0)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_draws_and_what_is_left_of_them_equal_torch_s(device):
+    g = torch.Generator().manual_seed(6)
+    opacities, causes = torch.randn(5000, generator=g) * 4, torch.randint(2, (5000,), generator=g).byte()
+    ids = torch.randperm(5000, generator=g)
+    weights = draw_weights(opacities.to(device), causes.to(device)).cpu()
+    expected = (opacities.double().sigmoid().float().double() * 2**31).long()
+    assert torch.equal(weights, expected.masked_fill(causes != 0, 0))
+    draws, total = 1 << 30, int(weights.sum())
+    whole, keys = residual_draws(weights.to(device), ids.to(device), draws, total, 3, -8)
+    assert torch.equal(whole.cpu(), weights * draws // total)
+    rest = (weights * draws % total).float()
+    torch.testing.assert_close(keys.cpu(), sampling_keys(rest, ids, 3, -8), rtol=1e-7, atol=0)
+
+
 def test_errors_and_opcheck_of_the_ops_of_relocation():
     rows, moments = torch.tensor([1]), [torch.zeros(2, 3) for _ in range(10)]
     shared = (torch.zeros(2), torch.zeros(2, 3), moments, rows, torch.tensor([3]), -2.0)
@@ -210,6 +225,14 @@ def test_errors_and_opcheck_of_the_ops_of_relocation():
     torch.library.opcheck(torch.ops.blitzgs.overlap, (torch.rand(3).double(), torch.tensor([1, 2, 3])))
     for key in (torch.tensor([5]), None):
         torch.library.opcheck(torch.ops.blitzgs.hash_key, (rows, key, 3))
+    torch.library.opcheck(torch.ops.blitzgs.draw_weights, (torch.rand(3), torch.zeros(3).byte()))
+    torch.library.opcheck(torch.ops.blitzgs.residual_draws, (torch.arange(3), torch.arange(3), 2, 3, 4, 5))
+    gone = torch.tensor([1, 300])
+    torch.library.opcheck(torch.ops.blitzgs.bracket_keys, (gone, gone))
+    matched = torch.zeros_like(gone), gone > 0, torch.arange(4), torch.arange(4), gone, gone
+    torch.library.opcheck(torch.ops.blitzgs.match_brackets_, matched)
+    with pytest.raises(RuntimeError, match="total must be positive, got 0"):
+        residual_draws(torch.arange(3), torch.arange(3), 2, 0, 4, 5)
     with pytest.raises(RuntimeError, match="there must be 10 moments, got 9"):
         share_rows_(*shared[:2], moments[1:], *shared[3:])
     with pytest.raises(RuntimeError, match=r"a moment must have 2 rows, got \[3, 3\]"):
