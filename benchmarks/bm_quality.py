@@ -15,7 +15,7 @@ gsplat-default-reset (with the resets of opacities that 1.5.3 skips by mistake) 
 (`benchmarks/opponents/spatial_partition.py`).
 
 --stress YAML runs the stress grid of a configuration (`benchmarks/quality_plan.py`) instead of recipes, and
-writes stress.md.
+writes stress.md; --only "schedule=25.B=(4|16)$" chooses a part of it.
 
 Every run is a process. By default, each GPU has one run at a time. With more (--per-gpu) the models are as
 good, but times no longer compare, and the table says so. When a run ends, it writes a JSON file into
@@ -31,6 +31,7 @@ import argparse
 import dataclasses
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -222,6 +223,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--recipe", action="append", default=[], metavar='"NAME=SOURCE [--FIELD=VALUE]"')
     parser.add_argument("--seeds", type=int, nargs="+", help="of the trainings (default: 0)")
     parser.add_argument("--stress", metavar="YAML", help="run the stress grid of this configuration")
+    parser.add_argument("--only", metavar="REGEX", default="", help="of recipes, those whose names have this")
     parser.add_argument(
         "--evaluate-at",
         type=positive,
@@ -260,6 +262,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if args.stress is not None:
             recipes |= stress_recipes(args.stress)
             seeds, evaluate_at = args.seeds or STRESS_SEEDS, []
+        recipes = {name: source for name, source in recipes.items() if re.search(args.only, name)}
         quality_report.collect(args.out, args.collect or [])
         specs = []
         if captures or recipes or args.collect is None:
@@ -267,7 +270,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             specs = runs_of(captures, recipes, seeds, evaluate_at, args.lpips, device, args.ranks)
             if args.ranks > 1 and (args.per_gpu > 1 or 0 < args.gpus < args.ranks):
                 raise ValueError(f"--ranks {args.ranks} needs as many --gpus, and --per-gpu 1")
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, re.error) as error:
         parser.error(str(error))
     work(specs, Pool(args.out, args.gpus, args.per_gpu, args.ranks), args.minutes)
     print(quality_report.report(args.out))
