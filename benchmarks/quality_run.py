@@ -150,7 +150,10 @@ def train_ours(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:
         trainer.recorder, trainer.lpips = recorder, load_lpips(spec.lpips)
         if trainer.train() is None:
             raise InterruptedError("stopped by a signal")
-    return figures(recorder, trainer.state.progress.peak_gaussians) | {"population": trainer.population}
+    return figures(recorder, trainer.state.progress.peak_gaussians) | {
+        "population": trainer.population,
+        "largest_fall": trainer.state.curve.fall,
+    }
 
 
 def train_opponent(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:

@@ -46,11 +46,13 @@ def test_runs_are_done_once_and_a_failure_stops_no_other(tmp_path, capture, caps
     assert 0 < first["seconds"] < last["seconds"] == done["seconds"]
     assert done["peak_gaussians"] >= done["gaussians"] > 0 and done["peak_memory_bytes"] > 0
     assert list(done["views"].values()) == [pytest.approx(last["test"]["psnr"])]
+    row = quality_plan.stress_markdown([done | {"recipe": "base+schedule=50+B=4"}]).splitlines()[-1]
+    assert row.endswith(f"| {last['test']['psnr']:.2f} | 0.00 | {done['largest_fall']:.2f} |")
     assert broken["status"] == "failed" and "missing.txt" in broken["error"]
 
     # A second call repeats no finished run. A budget of no time starts no run.
     written = {path: path.stat().st_mtime_ns for path in (out / "runs").glob("tiny.ours*")}
-    assert bm_quality.main([*flags, "--seeds", "3"]) == 0
+    assert bm_quality.main([*flags, "--seeds", "3", "--only", "^ours$"]) == 0
     assert bm_quality.main([*flags, "--seeds", "3", "4", "--minutes", "0"]) == 0
     assert "1 runs left" in capsys.readouterr().out
     assert written == {path: path.stat().st_mtime_ns for path in (out / "runs").glob("tiny.ours*")}
