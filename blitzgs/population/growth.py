@@ -71,6 +71,8 @@ def memory_limit(table: GaussianTable, ranks: Ranks) -> int | None:
         available = torch.cuda.mem_get_info(ranks.device)[0] + reserved["current"]
         scratch = allocated["peak"] - allocated["current"]
     count = rows_that_fit(len(table), sum(sizes), max(sizes), available, scratch)
+    if ranks.world_size == 1:
+        return count
     # The ranks' shards stay equal to within `MAX_IMBALANCE`, so the fullest GPU decides for all.
     fewest = ranks.all_reduce(torch.tensor([-count], device=ranks.device), "max")
     return -int(fewest.item()) * ranks.world_size
