@@ -312,3 +312,16 @@ TEST_CASE("damaged and cut headers are refused") {
   REQUIRE(header_problem(bytes("\xff\xd8\xff"sv)) == "f: truncated JPEG: the file ends inside its header");
   REQUIRE(header_problem(bytes("\x89PNG\r\n\x1a\n\0\0\0\x0d"sv)).find("truncated PNG") != std::string::npos);
 }
+
+TEST_CASE("formats are known by their content") {
+  const auto format = [](std::string_view text) { return read(bytes(text)).format; };
+  REQUIRE(format("\0\0\0\x10"
+                 "ftypheic\0\0\0\0"sv) == "HEIC");
+  REQUIRE(format("\0\0\0\x14"
+                 "ftypmif1\0\0\0\0avif"sv) == "AVIF");
+  REQUIRE((format("RIFF\0\0\0\0WEBPVP8 "sv) == "WebP" && format("8BPS\0\1"sv) == "Photoshop"));
+  REQUIRE((format("anything"sv).empty() && format(""sv).empty()));
+  REQUIRE((read(rgba(1)).alpha == Alpha::kAssociated && read(rgba(2)).alpha == Alpha::kStraight));
+  REQUIRE((read(rgba(0)).alpha == Alpha::kNone && read(rgba(0)).extras == 1 && read(rgba(2)).extras == 0));
+  REQUIRE((read(rgba(2, 6)).orientation == 6 && read(rgba(2, 9)).orientation == 1));
+}

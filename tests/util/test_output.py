@@ -65,9 +65,9 @@ def test_inputs_are_never_overwritten(tmp_path):
     (photos / "a.png").write_bytes(b"photograph")
     (tmp_path / "out").mkdir()
     inputs = [photos / "a.png"]
-    refused(OSError, "would lie among the inputs", OutputFolder(photos, inputs).paths, ["b.png"], ".png")
+    refused(OSError, "among .*photos/a.png", OutputFolder(photos, inputs).paths, ["b.png"], ".png")
     (tmp_path / "alias").symlink_to(photos)
-    refused(OSError, "would lie among the", OutputFolder(tmp_path / "alias", inputs).paths, ["a.png"], ".png")
+    refused(OSError, "among the inputs", OutputFolder(tmp_path / "alias", inputs).paths, ["a.png"], ".png")
     (tmp_path / "out" / "sub").symlink_to(photos)
     with pytest.raises(OSError, match="out/sub leads out of .*remove that link"):
         OutputFolder(tmp_path / "out", inputs).paths(["sub/a.png"], ".png")
