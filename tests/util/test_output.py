@@ -175,6 +175,13 @@ def test_axes_have_round_numbers(points, most, columns, rows):
     assert [label.text for label in below] == rows
 
 
+def test_a_label_is_below_its_point():
+    chart = ElementTree.fromstring(line_chart({"": [(0, 1), (600, 2), (750, 3)]}, "images", "Gaussians"))
+    points = next(chart.iter(f"{NAMESPACE}polyline")).get("points").split()
+    (label,) = (text for text in chart.iter(f"{NAMESPACE}text") if text.text == "600")
+    assert label.get("x") == points[1].split(",")[0]
+
+
 def test_names_of_lines_are_above_the_chart():
     names = ("one", "two", "three")
     chart = ElementTree.fromstring(line_chart({name: [(0, 0), (1, 1)] for name in names}, "x", "y"))
