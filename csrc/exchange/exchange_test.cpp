@@ -3,6 +3,7 @@
 
 #include "common/catch.h"
 #include "exchange/scatter.h"
+#include "exchange/tile_costs.h"
 
 using namespace blitzgs;
 
@@ -81,4 +82,19 @@ TEST_CASE("splats beyond a group's size are dropped", "[scatter]") {
   cpu::scatter({{{column}, {0, 1}, 1}, masks, 4}, make_groups({2}), targets, &place, workspace, nullptr);
   REQUIRE((packed[0] == 1 && packed[1] == 2 && packed[2] == -1));
   REQUIRE((place.first == 0 && place.bits == 15));
+}
+
+TEST_CASE("pieces spread over their tiles", "[tile_costs]") {
+  // Two views of five tiles in pieces of two: costs 8 + 8 twice, 8 + 0 twice and 8 + 1016 once. A view
+  // without costs of its own has those of the similar view.
+  const std::uint16_t coarse[] = {0x4800, 0, 0x63f0}, fine[] = {0x4800, 0x4800, 0, 0, 0x63f0};
+  const std::uint16_t *pieces[] = {coarse, coarse}, *guessed[] = {nullptr, coarse}, *tiles[] = {fine, fine};
+  TestWorkspace workspace;
+  for (std::int64_t parts = 1; parts < 12; ++parts) {
+    std::vector<std::int64_t> a(parts + 1), b(parts + 1), c(parts + 1);
+    cpu::divide_tiles({pieces, 2, nullptr, 0, 5, 2, 8}, parts, workspace, a.data());
+    cpu::divide_tiles({guessed, 2, pieces, 1, 5, 2, 8}, parts, workspace, b.data());
+    cpu::divide_tiles({tiles, 2, nullptr, 0, 5, 1, 8}, parts, workspace, c.data());
+    REQUIRE((a == c && b == c));
+  }
 }

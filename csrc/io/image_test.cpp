@@ -114,6 +114,20 @@ TEST_CASE("bytes after the last block are skipped as decoders do, if they are no
   REQUIRE(mentions(jpeg(16, 8, {0x3f, 0xfe, 0xff, 0xd0, 0x3f}, 0xc0, 1), "go on after the last block"));
 }
 
+TEST_CASE("a JPEG without Huffman tables has the standard ones") {
+  const auto bare = [](const Bytes& data, std::uint8_t tables) {
+    Bytes out = {0xff, 0xd8};
+    append(out, segment(0xc0, {8, 0, 16, 0, 16, 1, 1, 0x11, 0}));
+    append(out, segment(0xda, {1, 1, tables, 0, 63, 0}));
+    append(out, data);
+    append(out, {0xff, 0xd9});
+    return out;
+  };
+  // A flat block is 00 and 1010 in the tables of brightness, 00 and 00 in those of colour.
+  REQUIRE((problem(bare({0x28, 0xa2, 0x8a}, 0x00)).empty() && problem(bare({0x00, 0x00}, 0x11)).empty()));
+  REQUIRE(mentions(bare({0x28}, 0x00), "image data end before the last block"));
+}
+
 TEST_CASE("cut JPEGs are refused wherever they end") {
   for (const std::uint8_t frame : {0xc0, 0xc2}) {
     const Bytes file = jpeg(16, 16, {0x00, 0x00, 0x00, 0x00}, frame);
@@ -311,4 +325,17 @@ TEST_CASE("damaged and cut headers are refused") {
           std::string::npos);
   REQUIRE(header_problem(bytes("\xff\xd8\xff"sv)) == "f: truncated JPEG: the file ends inside its header");
   REQUIRE(header_problem(bytes("\x89PNG\r\n\x1a\n\0\0\0\x0d"sv)).find("truncated PNG") != std::string::npos);
+}
+
+TEST_CASE("formats are known by their content") {
+  const auto format = [](std::string_view text) { return read(bytes(text)).format; };
+  REQUIRE(format("\0\0\0\x10"
+                 "ftypheic\0\0\0\0"sv) == "HEIC");
+  REQUIRE(format("\0\0\0\x14"
+                 "ftypmif1\0\0\0\0avif"sv) == "AVIF");
+  REQUIRE((format("RIFF\0\0\0\0WEBPVP8 "sv) == "WebP" && format("8BPS\0\1"sv) == "Photoshop"));
+  REQUIRE((format("anything"sv).empty() && format(""sv).empty()));
+  REQUIRE((read(rgba(1)).alpha == Alpha::kAssociated && read(rgba(2)).alpha == Alpha::kStraight));
+  REQUIRE((read(rgba(0)).alpha == Alpha::kNone && read(rgba(0)).extras == 1 && read(rgba(2)).extras == 0));
+  REQUIRE((read(rgba(2, 6)).orientation == 6 && read(rgba(2, 9)).orientation == 1));
 }

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "project/project.h"
 
+#include <algorithm>
 #include <numeric>
 #include <random>
 #include <vector>
@@ -13,7 +14,7 @@ namespace {
 
 // 2500 Gaussians (three blocks of candidates) around the origin, seen by three cameras on the z axis.
 struct World {
-  static constexpr int kCount = 2500, kViews = 3, kBasis = 4;
+  static constexpr int kCount = 2500, kViews = 3, kBasis = 16;
   std::vector<double> means, quats, scales, opacities, sh, viewmats, Ks;
 
   World() {
@@ -38,7 +39,7 @@ struct World {
   }
 
   ProjectInputs<double> inputs() const {
-    const ProjectOptions<double> options{40, 30, 16, 1, kBasis, 0.05, 1e10, 0.3, 0.0, true, true};
+    const ProjectOptions<double> options{40, 30, 16, 3, kBasis, 0.05, 1e10, 0.3, 0.0, true, true};
     return {means.data(), quats.data(), scales.data(), opacities.data(), sh.data(), viewmats.data(),
             Ks.data(),    nullptr,      nullptr,       kCount,           kViews,    options};
   }
@@ -46,7 +47,7 @@ struct World {
 
 struct Projected final : SplatMemory<double> {
   ProjectSizes sizes{};
-  std::vector<std::int64_t> totals;
+  std::vector<std::int64_t> totals, rank_masks;
   std::vector<std::int32_t> gaussian_ids, camera_ids, visible_ids, splat_offsets, radii, tiles;
   std::vector<double> means2d, conics, depths, opacities, colors;
 
@@ -61,15 +62,15 @@ struct Projected final : SplatMemory<double> {
     return {
         {sized(gaussian_ids, P), sized(camera_ids, P), sized(visible_ids, U), sized(splat_offsets, U + 1)},
         {sized(means2d, 2 * P), sized(conics, 3 * P), sized(depths, P), sized(opacities, P),
-         sized(colors, 3 * P), sized(radii, 2 * P), sized(tiles, P), nullptr, nullptr, nullptr}};
+         sized(colors, 3 * P), sized(radii, 2 * P), sized(tiles, P), sized(rank_masks, P), nullptr, nullptr}};
   }
 };
 
-Projected project(const ProjectInputs<double>& in) {
+Projected project(const ProjectInputs<double>& in, const RankTiles& ranks = {}) {
   Projected p;
   TestWorkspace workspace;
-  p.totals.resize(project_totals(in.n_views, 0));
-  cpu::project(in, {}, p, p.totals.data(), workspace, nullptr);
+  p.totals.resize(project_totals(in.n_views, ranks.n_ranks));
+  cpu::project(in, ranks, p, p.totals.data(), workspace, nullptr);
   return p;
 }
 
@@ -113,4 +114,26 @@ TEST_CASE("the backward pass is the derivative of the splats") {
   REQUIRE(slope(&world.means[3 * id]) == Approx(v_means[3 * (U / 3)]).epsilon(1e-5).margin(1e-3));
   REQUIRE(slope(&world.scales[3 * id]) == Approx(v_scales[3 * (U / 3)]).epsilon(1e-5).margin(1e-3));
   REQUIRE(slope(&world.viewmats[3]) == Approx(v_viewmats[3]).epsilon(1e-4));
+}
+
+TEST_CASE("each splat knows the ranks that composite its tiles, and the totals count them") {
+  const World world;
+  // Four ranks share the 18 tiles of three views of 3 x 2; the second has none.
+  const Projected p = project(world.inputs(), {{0, 7, 7, 12}, {7, 7, 12, 18}, 4});
+  const std::int64_t* of_rank = p.totals.data() + kTotalViews + World::kViews;  // splats and their tiles
+  std::int64_t tiles = 0;
+  for (int m = 0; m < 4; ++m) {
+    REQUIRE(of_rank[2 * m] == std::count_if(p.rank_masks.begin(), p.rank_masks.end(),
+                                            [&](std::int64_t mask) { return mask >> m & 1; }));
+    REQUIRE((of_rank[2 * m] == 0) == (m == 1));
+    tiles += of_rank[2 * m + 1];
+  }
+  REQUIRE(tiles == p.totals[kTotalTiles]);
+}
+
+TEST_CASE("arrays are zeroed to their ends") {
+  std::vector<float> values(9, 7.f);
+  float* const v = values.data();
+  cpu::zero_arrays(ZeroedArrays<float>{{v, v + 3, v + 4, nullptr, v + 6}, {2, 1, 1, 0, 2}}, nullptr);
+  REQUIRE(values == std::vector<float>{0, 0, 7, 0, 0, 7, 0, 0, 7});
 }

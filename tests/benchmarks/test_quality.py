@@ -16,7 +16,7 @@ import quality_report
 import quality_run
 import torch
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer
-from opponents.spatial_partition import HALO, LEAST_SEEN, Grid, coverage, divide
+from opponents.spatial_partition import HALO, LEAST_SEEN, Grid, coverage, divide, makespan
 from quality_plan import SAFE, RunSpec, runs_of
 
 from blitzgs.distributed.group import Ranks
@@ -154,7 +154,7 @@ def test_several_ranks_train_one_run_to_the_same_model(tmp_path, capture):
 
 
 def test_a_capture_without_a_view_to_measure_is_named():
-    refused(ValueError, "nothing can be measured: all pixels of the", quality_run.means_of, {"views": {}})
+    refused(ValueError, "nothing .* all pixels of the views are masked", quality_run.means_of, {"views": {}})
 
 
 def test_every_recipe_of_the_grid_can_be_configured(tmp_path):
@@ -242,6 +242,11 @@ def test_cameras_in_a_line_have_no_grid(flight):
     flight.cameras = [nadir(x, 0.0) for x in range(5)]
     flight.train = list(range(5))
     refused(ValueError, "span no plane", Grid, flight, 2, 2)
+
+
+def test_blocks_are_shared_among_gpus():
+    assert makespan([4.0, 3.0, 3.0, 2.0], 1) == 12.0 and makespan([5.0], 4) == 5.0
+    assert makespan([2.0, 3.0, 4.0, 3.0], 2) == 6.0
 
 
 def test_a_partition_is_trained_merged_and_measured_beside_the_whole(tmp_path, capture):

@@ -214,13 +214,13 @@ def test_intrinsics_that_are_not_finite_or_rounded_are_no_error(device):
 def test_a_camera_refuses_intrinsics_of_no_pinhole(row, column, value):
     pose = np.eye(4)
     assert checked_camera("a", 32, 24, GOOD, pose).width == 32
-    refused(ValueError, r"K must be \[\[fx, 0", checked_camera, "a", 32, 24, wrong(row, column, value), pose)
+    refused(ValueError, r"K must .*fx, 0, cx\]", checked_camera, "a", 32, 24, wrong(row, column, value), pose)
 
 
 def test_a_pose_has_a_last_row():
     pose = np.eye(4)
     pose[3] = 1, 2, 3, 4
-    refused(ValueError, "the last row of world_to_camera must be 0", checked_camera, "a", 32, 24, GOOD, pose)
+    refused(ValueError, "last row of .* must be 0, 0, 0, 1", checked_camera, "a", 32, 24, GOOD, pose)
 
 
 GAUSSIANS = ("means", "quats", "scales", "opacities", "colors")

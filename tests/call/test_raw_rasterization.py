@@ -242,15 +242,15 @@ def test_optimizers_may_be_one_of_any_class():
     expected = raw(p, scene)[0]
     for optimizer_class in (torch.optim.Adam, LazyAdam):
         assert torch.equal(raw(p, scene, optimizers=optimizer_class(p.values()))[0], expected)
-    refused(TypeError, "optimizers must be an optimiser, or a mapping or a", raw, p, scene, optimizers=None)
+    refused(TypeError, "optimizers must be .* mapping or a sequence .* NoneT", raw, p, scene, optimizers=None)
 
 
 def test_wrong_shapes_are_refused_by_name():
     scene = random_scene(n=20)
     p = raw_parameters(scene)
-    refused(ValueError, r"shN must be \[N, K, 3\] with N = 20, got", raw, {**p, "shN": p["shN"][:19]}, scene)
-    refused(ValueError, r"means must be \[N, 3\], got \[1, 20", raw, {**p, "means": p["means"][None]}, scene)
-    refused(ValueError, "shN is on meta and means on cpu", raw, {**p, "shN": p["shN"].to("meta")}, scene)
+    refused(ValueError, r"shN must be .* N = 20, got \[19, 15, 3\]", raw, {**p, "shN": p["shN"][:19]}, scene)
+    refused(ValueError, r"means must be .*, got \[1, 20, 3\]", raw, {**p, "means": p["means"][None]}, scene)
+    refused(ValueError, "shN is on meta .* cpu; move one", raw, {**p, "shN": p["shN"].to("meta")}, scene)
     with pytest.raises(TypeError, match=r"quats must be a torch\.Tensor, got ndarray"):
         raw({**p, "quats": p["quats"].detach().numpy()}, scene)
     with pytest.raises(ValueError, match="sh_degree 3 needs 16 SH coefficients, got 4"):

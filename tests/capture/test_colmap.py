@@ -162,6 +162,16 @@ def test_the_complete_model_is_read_where_files_of_another_kind_are_left(tmp_pat
     refused(FileNotFoundError, "images.bin is missing", colmap.read_model, tmp_path)
 
 
+def test_what_the_files_cannot_hold_is_not_written(tmp_path):
+    reconstruction(NAMES, 64, 48).write_binary(str(tmp_path))
+    model = colmap.read_model(tmp_path)
+    model.images.names[1] = "a\nb"
+    refused(ValueError, r"name .a\\nb. is empty or has a NUL", colmap.write_model, tmp_path / "out", model)
+    model.cameras[0].params = model.cameras[0].params[:-1]
+    refused(ValueError, "camera 1: 3 parameters do not fit PIN", colmap.write_model, tmp_path / "out", model)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("name", [" a.jpg", "a.jpg ", "\ta.jpg", "a.jpg\r", "\va.jpg", "a.jpg\f", " "])
 def test_blanks_of_names_are_kept(tmp_path, name):
     reconstruction(NAMES, 64, 48).write_binary(str(tmp_path))

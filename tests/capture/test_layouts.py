@@ -36,7 +36,7 @@ def test_nothing_to_load_is_said_clearly(tmp_path):
     refused(FileNotFoundError, "has images but not their cameras: blitzgs sfm", load_capture, tmp_path)
     (tmp_path / "sparse" / "1").mkdir(parents=True)
     (tmp_path / "sparse" / "1" / "cameras.bin").touch()
-    refused(FileNotFoundError, "there is a COLMAP model in .*sparse/1: .* to", load_capture, tmp_path)
+    refused(FileNotFoundError, "a COLMAP model in .*sparse/1: .* to .*sparse/0", load_capture, tmp_path)
     shutil.rmtree(tmp_path / "sparse")
     (tmp_path / "transforms.json").write_text('{"frames": []}')
     with pytest.raises(ValueError, match=f"{tmp_path}: its COLMAP model or transforms.json lists no images"):
@@ -44,11 +44,11 @@ def test_nothing_to_load_is_said_clearly(tmp_path):
     pose = np.eye(4).tolist()
     frame = {"file_path": "gone.png", "camera_angle_x": 1.0, "transform_matrix": pose}
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
-    refused(ValueError, r"transforms.json: frame 0: the image .*gone.png does not", load_capture, tmp_path)
+    refused(ValueError, "transforms.json: frame 0: .*gone.png does not exist", load_capture, tmp_path)
     (tmp_path / "transforms.json").unlink()
     write_capture(tmp_path, NAMES[:2])
     refused(ValueError, "downscale must be at least 1, got 0.5", load_capture, tmp_path, downscale=0.5)
-    refused(ValueError, "undistort must be one of crop, mask, got", load_capture, tmp_path, undistort="none")
+    refused(ValueError, "undistort .* of crop, mask, got 'none'", load_capture, tmp_path, undistort="none")
     with pytest.raises(FileNotFoundError, match="2 of 2 images .* with --data.images=FOLDER") as caught:
         load_capture(tmp_path, images="elsewhere", allow_missing=True)
     assert not isinstance(caught.value, MissingImagesError)  # leaving out all views is no remedy
@@ -145,7 +145,7 @@ def test_an_image_of_two_frames_is_refused(tmp_path, again):
     for name in ("a.png", "b.png"):
         write_image(tmp_path / name, smooth_image(48, 64))
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
-    refused(ValueError, r"transforms.json: images of more than one frame: a[^b]*", load_capture, tmp_path)
+    refused(ValueError, "s.json: images of more than one frame: a[^b]*; keep one", load_capture, tmp_path)
 
 
 def test_missing_images_of_transforms_are_named_by_their_paths(tmp_path):

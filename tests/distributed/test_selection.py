@@ -71,7 +71,7 @@ def test_empty_and_invalid():
     assert smallest(none, no_ids, 3, ALONE).shape == (0,)
     assert mass_prefix(none, no_ids, 0.5, ALONE).shape == (0,)
     ids = torch.arange(3)
-    refused(ValueError, "1 of 3 keys are", smallest, torch.tensor([1.0, float("nan"), 2.0]), ids, 1, ALONE)
+    refused(ValueError, "1 of .* NaN", smallest, torch.tensor([1.0, float("nan"), 2.0]), ids, 1, ALONE)
     with pytest.raises(ValueError, match="2 scores are negative or not finite"):
         mass_prefix(torch.tensor([1.0, -1.0, float("inf")]), ids, 0.5, ALONE)
     refused(ValueError, "k must not be negative", smallest, torch.ones(3), ids, -1, ALONE)
@@ -245,7 +245,7 @@ def test_one_process_without_a_group_is_one_rank():
 )
 def test_unsupported_distributed_options_are_refused(options):
     arguments = {**vars(random_scene(n=20)), **options}
-    refused(ValueError, "distributed=True supports no", blitzgs.rasterization, **arguments, distributed=True)
+    refused(ValueError, "supports no batch dimensions", blitzgs.rasterization, **arguments, distributed=True)
 
 
 ROOT = Path(__file__).parents[2]

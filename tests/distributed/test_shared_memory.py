@@ -174,7 +174,7 @@ def _overtaken(ranks):
     transport = PeerTransport(ranks)
     frame = render_frame(table, views, OPTIONS, assignment=assignment, transport=transport)
     render_frame(table, views, OPTIONS, assignment=assignment)  # another transport with the same memory
-    refused(RuntimeError, "a later exchange has", backward_splats, frame, torch.ones_like(frame.renders))
+    refused(RuntimeError, "later .* overwritten", backward_splats, frame, torch.ones_like(frame.renders))
     return True
 
 
@@ -244,7 +244,7 @@ def test_sums_and_numbers_use_different_words(alone):
     assert words[0].isdisjoint(words[1])
     for place in (0, 1):
         assert set.union(*numbers[place::2]).isdisjoint(set.union(*sums[place::2]))
-    refused(RuntimeError, "invalid for input", memory.share, torch.zeros(MAX_VALUES + 1, dtype=torch.int64))
+    refused(RuntimeError, "for input of size", memory.share, torch.zeros(MAX_VALUES + 1, dtype=torch.int64))
 
 
 def test_boards_alternate_between_two_halves_and_grow(alone, monkeypatch):
@@ -263,7 +263,7 @@ def test_boards_alternate_between_two_halves_and_grow(alone, monkeypatch):
 
 
 def _refused(rank):
-    refused(RuntimeError, "peer is impossible: not every rank", Ranks.from_environment, "cpu", 30.0, "peer")
+    refused(RuntimeError, "peer is .* not every .* a GPU", Ranks.from_environment, "cpu", 30.0, "peer")
     return True
 
 

@@ -265,12 +265,12 @@ def test_errors_name_the_value():
         }
         return MassCut.begin(*(items | changes).values(), 2)
 
-    refused(RuntimeError, r"share must be in \[0, 1\] with at most 9", cut().take_steps, (3, 2), 0, STEPS)
+    refused(RuntimeError, r"share .* at most 9 decimals, got 3 / 2", cut().take_steps, (3, 2), 0, STEPS)
     with pytest.raises(RuntimeError, match=rf"steps must be in \[0, {STEPS}\], got 0 to {STEPS + 1}"):
         cut().take_steps(SHARE, 0, STEPS + 1)
     with pytest.raises(RuntimeError, match=r"segments must have shape \[3\], got \[2\]"):
         cut(segments=torch.zeros(2, dtype=torch.int32)).take_steps(SHARE, 0, STEPS)
-    refused(RuntimeError, "owners must be Int, got", cut(owners=torch.arange(3)).take_steps, SHARE, 0, STEPS)
+    refused(RuntimeError, "owners must .* got Long", cut(owners=torch.arange(3)).take_steps, SHARE, 0, STEPS)
 
 
 def test_mass_cut_opcheck():
@@ -328,7 +328,7 @@ def test_wrong_arguments():
     with pytest.raises(RuntimeError, match=r"is_split must have shape \[6\], got \[5\]"):
         spawn_features(table, rows, is_split[:5], TIME, EXTENT, LEVELS)
     refused(RuntimeError, "extent must be positive", spawn_features, table, rows, is_split, TIME, 0.0, LEVELS)
-    refused(RuntimeError, "level_count must be", spawn_features, table, rows, is_split, TIME, EXTENT, 0)
+    refused(RuntimeError, "level_.* positive", spawn_features, table, rows, is_split, TIME, EXTENT, 0)
 
 
 def test_spawn_features_opcheck():

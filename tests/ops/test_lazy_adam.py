@@ -286,7 +286,7 @@ def test_a_schedule_makes_its_tables_once(steps, dtype):
 
 def test_a_schedule_of_another_dtype_is_refused():
     state, _ = one_update(dtype=torch.float64)
-    refused(RuntimeError, "final_rules must have", state.catch_up, None, schedule_of(4000, torch.float32), 5)
+    refused(RuntimeError, "rules must have shape", state.catch_up, None, schedule_of(4000, torch.float32), 5)
 
 
 @pytest.mark.cuda

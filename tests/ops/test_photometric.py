@@ -193,10 +193,10 @@ def test_images_without_pixels_have_no_weights(device, size):
 
 def test_errors_name_the_value():
     x, targets, _ = images()
-    refused(RuntimeError, r"targets must have shape \[2, 53, 70, 3\], got", photometric_sums, x, targets[:1])
-    refused(RuntimeError, r"must be a range of the 40 tiles", photometric_sums, x, targets, None, 16, 3, 41)
-    refused(RuntimeError, "masks must be Byte, got", photometric_sums, x, targets, torch.ones(2, 53, 70))
-    refused(RuntimeError, r"targets \(if not uint8\) must be Float", photometric_sums, x, targets.double())
+    refused(RuntimeError, r"targets .* \[2, 53, 70, 3\], got \[1, 5", photometric_sums, x, targets[:1])
+    refused(RuntimeError, r"of the 40 tiles, got \[3, 41\)", photometric_sums, x, targets, None, 16, 3, 41)
+    refused(RuntimeError, "masks must .* got Float", photometric_sums, x, targets, torch.ones(2, 53, 70))
+    refused(RuntimeError, r"\(if not uint8\) .*, got Double", photometric_sums, x, targets.double())
     weights = torch.ones(2)
     with pytest.raises(RuntimeError, match=r"samples must have shape \[2\], got \[3\]"):
         photometric_fwd_bwd(x, targets, None, weights, weights, samples=torch.ones(3))

@@ -76,8 +76,8 @@ def test_a_hundred_thousand_equal_points(device):
 
 
 def test_knn_distances_errors_name_the_value():
-    refused(RuntimeError, r"^blitzgs::knn_distances: k must be in \[1", knn_distances, torch.zeros(4, 3), 33)
-    refused(RuntimeError, r"points must have shape \[\*, 3\], got \[4", knn_distances, torch.zeros(4, 2), 3)
+    refused(RuntimeError, r"^blitzgs::knn_.*: k must .* 32\], got 33", knn_distances, torch.zeros(4, 3), 33)
+    refused(RuntimeError, r"points .* shape \[\*, 3\], got \[4, 2\]", knn_distances, torch.zeros(4, 2), 3)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -293,14 +293,14 @@ def test_errors_name_the_argument():
         project(
             scene.means, scene.means, scene.scales, scene.opacities, None, scene.viewmats, scene.Ks, 8, 8
         )  # fmt: skip
-    refused(RuntimeError, "sh has 4 coefficients, sh_degree 3", project_scene, scene, sh=scene.colors[:, :4])
+    refused(RuntimeError, "sh has 4 .*, sh_degree 3 needs 16", project_scene, scene, sh=scene.colors[:, :4])
     refused(RuntimeError, "sh_degree must be 0 to 3, got 4", project_scene, scene, sh_degree=4)
     with pytest.raises(RuntimeError, match="near_plane must be less than far_plane, got nan and 1e"):
         project_scene(scene, near_plane=math.nan)
     for wrong in ({"eps2d": -0.3}, {"eps2d": math.nan}, {"eps2d": math.inf}, {"radius_clip": math.nan}):
-        refused(RuntimeError, "eps2d must be finite, and eps2d and", project_scene, scene, **wrong)
-    refused(RuntimeError, "at most 32 views in one launch, got", project_scene, random_scene(n=1, cameras=33))
-    refused(RuntimeError, "active_ids must be Int, got", project_scene, scene, active_ids=torch.arange(2))
+        refused(RuntimeError, "eps2d must .* radius_clip at least 0", project_scene, scene, **wrong)
+    refused(RuntimeError, "at most 32 views in .*, got 33", project_scene, random_scene(n=1, cameras=33))
+    refused(RuntimeError, "active_ids must .* got Long", project_scene, scene, active_ids=torch.arange(2))
 
 
 def inputs_of(scene):
@@ -335,7 +335,7 @@ def test_groups_of_arguments_are_checked():
         ({"ids": torch.arange(3)}, r"ids must have shape \[4\], got \[3\]"),
     ):
         refused(RuntimeError, text, inputs._replace(**change).project, None)
-    refused(RuntimeError, "a begin and an end for each of at most 63", inputs.project, None, [(0, 1)] * 64)
+    refused(RuntimeError, "a begin .* at most 63 ranks, got 128", inputs.project, None, [(0, 1)] * 64)
 
 
 def test_compiles_into_one_graph_with_the_same_gradients():

@@ -352,7 +352,7 @@ def test_errors_name_the_value():
     refused(RuntimeError, r"first must be in \[0, 13\], got 14", tile_costs, sums, 14, 1, 1)
     refused(RuntimeError, "grain must be at least 1, got 0", tile_costs, sums, 1, 2, 0)
     refused(RuntimeError, "there must be views", divide_tiles, [], [half], 4, 1, 8, 2)
-    refused(RuntimeError, r"costs of a view must have shape \[5\], got", divide_tiles, [half], [], 5, 1, 8, 2)
+    refused(RuntimeError, r"of a view must .* \[5\], got \[4\]", divide_tiles, [half], [], 5, 1, 8, 2)
     with pytest.raises(RuntimeError, match=r"costs of a similar view must have shape \[4\], got \[0\]"):
         divide_tiles([half], [half[:0]], 4, 1, 8, 2)
     refused(RuntimeError, "must be Half, got Float", divide_tiles, [half.float()], [], 4, 1, 8, 2)

@@ -86,8 +86,8 @@ def test_arrange_splats_errors_name_the_value():
     places = places_of("cpu", ordered=True, splats=4)
     refused(RuntimeError, r"columns must have 4 rows, got \[3\]", places.arrange, [torch.zeros(3)])
     refused(RuntimeError, r"dimensions of the arrangement, got \[3\]", places.gather, [torch.zeros(3)])
-    refused(RuntimeError, "elements of 4 or 8 bytes", places.arrange, [torch.zeros(4, dtype=torch.float16)])
-    refused(RuntimeError, "`under` is for a last column of", places.arrange, [torch.zeros(4)], torch.zeros(4))
+    refused(RuntimeError, "of 4 or 8 bytes, got Half", places.arrange, [torch.zeros(4, dtype=torch.float16)])
+    refused(RuntimeError, "under.* last column of numbers", places.arrange, [torch.zeros(4)], torch.zeros(4))
     with pytest.raises(RuntimeError, match="5 entries cannot be an order of 4 splats"):
         places._replace(shape=(5,)).arrange([torch.zeros(4)])
     with pytest.raises(RuntimeError, match=r"under must have 602 values, got \[301\]"):
@@ -112,7 +112,7 @@ def test_first_rows_share_their_memory(device):
 
 
 def test_first_rows_errors_name_the_value():
-    refused(RuntimeError, "first_rows: 1 columns need a length", first_rows, [torch.zeros(4, 3)], [1, 2])
+    refused(RuntimeError, "first_rows: 1 columns need .* got 2", first_rows, [torch.zeros(4, 3)], [1, 2])
 
 
 class Rows(torch.autograd.Function):
@@ -232,7 +232,7 @@ def test_scatter_errors_name_the_value():
     with pytest.raises(RuntimeError, match=r"a column must have shape \[4, \*\], got \[3, 1\]"):
         scatter_splats([torch.zeros(4), torch.zeros(3)], masks, [4])
     refused(RuntimeError, "at most 8 columns", scatter_splats, [torch.zeros(4)] * 9, masks, [4])
-    refused(RuntimeError, "group_sizes must have 1 to 63", scatter_splats, [torch.zeros(4)], masks, [0] * 64)
+    refused(RuntimeError, "group_.* 1 to 63 .*, got 64", scatter_splats, [torch.zeros(4)], masks, [0] * 64)
     with pytest.raises(RuntimeError, match=r"packed must have shape \[4\], got \[3\]"):
         gather_splats(torch.zeros(3, dtype=torch.int32), [torch.zeros(1, 2)], [1, 1])
     with pytest.raises(RuntimeError, match=r"values must have shape \[3, 1\], got \[2, 1\]"):

@@ -73,7 +73,7 @@ def test_tree_sums_errors_name_the_value():
         tree_sums(torch.rand(2, 3), roots, nodes[:, :3], leaves, depth)
     with pytest.raises(RuntimeError, match="features must be Float, got Double"):
         tree_sums(torch.rand(2, 3).double(), roots, nodes, leaves, depth)
-    refused(RuntimeError, "at most 32 features", tree_sums, torch.rand(2, 33), roots, nodes, leaves, depth)
+    refused(RuntimeError, "at most 32 .*, got 33", tree_sums, torch.rand(2, 33), roots, nodes, leaves, depth)
 
 
 def test_tree_sums_opcheck():
@@ -270,7 +270,7 @@ def test_a_report_of_tiles_alone_and_of_nothing(device):
 
 def test_report_op_errors_name_the_value():
     work, target = torch.zeros(5, dtype=torch.int32), torch.zeros(5)
-    refused(RuntimeError, r"must be a range of the 5 tiles, got", report_, None, work, (3, 6), 0, 1, [target])
+    refused(RuntimeError, r"range of the 5 tiles, got \[3, 6\)", report_, None, work, (3, 6), 0, 1, [target])
     with pytest.raises(RuntimeError, match=r"a target must have shape \[9\], got \[5\]"):
         report_(torch.zeros(1, 2, 2, dtype=torch.float64), work, (0, 5), 1, 2, [target])
     refused(RuntimeError, r"rank must be in \[0, 2\), got 2", report_, None, work, (0, 5), 2, 2, [target])

@@ -51,15 +51,15 @@ def test_wrong_use_is_refused():
             LazyAdam([param]).load_state_dict(saved.state_dict())
     saved, fewer = LazyAdam([param]), LazyAdam([torch.ones(2, 3, requires_grad=True)])
     saved.step()
-    refused(ValueError, r"a parameter is \[2, 3\] and its saved", fewer.load_state_dict, saved.state_dict())
+    refused(ValueError, r"is \[2, 3\] .* saved exp_avg \[4, 3\]", fewer.load_state_dict, saved.state_dict())
     assert not fewer.state
     half = torch.ones(4, 3, dtype=torch.float16, requires_grad=True)
     half.grad = torch.ones_like(half)
     refused(ValueError, r"one of shape \[4, 3\] is torch.float16; convert it", LazyAdam([half]).step)
     optimizer = LazyAdam([{"params": [param], "name": "means"}])
-    refused(ValueError, r"rows for \['means'\] are needed, got", optimizer.append, {"x": torch.ones(1, 3)})
+    refused(ValueError, r"rows for .'means'. .* got \['x'\]", optimizer.append, {"x": torch.ones(1, 3)})
     refused(ValueError, "mask must be bool", optimizer.keep, torch.ones(4))
-    refused(ValueError, "one parameter and a 'name'", LazyAdam([param]).keep, torch.ones(4, dtype=torch.bool))
+    refused(ValueError, "one .* a 'name' of its own", LazyAdam([param]).keep, torch.ones(4, dtype=torch.bool))
     param.grad = torch.ones_like(param)
     optimizer.step()
     with pytest.raises(ValueError, match="moments=True takes all rows"):

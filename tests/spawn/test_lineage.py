@@ -294,7 +294,7 @@ def _full_disk_of_one_rank(ranks, folder):
     if ranks.rank == ranks.world_size - 1:
         parquet.write_table = write_table
     for _ in range(2):
-        refused(OSError, "the lineage could not be written: .*No space left", lineage.flush_and_check, ids, 1)
+        refused(OSError, "lineage could not be written: .*No space left on", lineage.flush_and_check, ids, 1)
     parquet.write_table = real
     ledger = lineage.flush_and_check(ids, 1)
     lineage.close()

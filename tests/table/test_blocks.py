@@ -330,7 +330,7 @@ def test_errors_name_the_value():
     with pytest.raises(RuntimeError, match="capacity_blocks must be for 1 block or more, got 0"):
         index.active(table, Views(*make_views(1), WIDTH, HEIGHT), (NEAR, FAR, 0.3), capacity_blocks=0)
     table.keep(torch.arange(len(table)) < 100)
-    refused(RuntimeError, r"bounds must have shape \[1, 8\], got", active_of, index, table, *make_views(1))
+    refused(RuntimeError, r"bounds must .* \[1, 8\], got \[12, 8\]", active_of, index, table, *make_views(1))
 
 
 @pytest.mark.parametrize("device", DEVICES)

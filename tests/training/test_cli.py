@@ -210,6 +210,15 @@ def test_mistakes_with_files_name_them(trained, tmp_path, failure):
     assert "images/run is in " in among and "choose a folder outside it" in among
 
 
+def test_figures_of_training_views_are_called_so(trained, tmp_path, capsys, failure):
+    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.02", "data.split=0")
+    assert main(["train", "--data", str(trained[0]), "--out", str(tmp_path / "run"), *flags]) == 0
+    shown, summary = capsys.readouterr().out, json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert "evaluation of TRAINING views (none is held out)" in shown and summary["split"] == "train"
+    assert "no view is held out: the figures are those of the training views" in shown
+    assert "no test views: choose another --split" in failure("eval", tmp_path / "run")
+
+
 def test_show_config_and_help(capsys):
     assert main(["train", "--show-config", "--schedule.batch_size=4"]) == 0
     assert json.loads(capsys.readouterr().out)["schedule"]["batch_size"] == 4

@@ -5,6 +5,7 @@ import errno
 import itertools
 import json
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -345,6 +346,15 @@ def test_another_error_than_lack_of_space_saves_elsewhere_at_once(tmp_path, monk
     if elsewhere:
         assert run_files.restore(saved, Ranks()).progress.step == 100
         assert open_run(saved).cameras().test == [3] and len(open_run(saved).model()) > 0
+
+
+def test_a_file_in_the_place_of_the_checkpoints_ends_the_run_with_the_model_saved(tmp_path, monkeypatch):
+    def replace_folder(trainer):
+        shutil.rmtree(tmp_path / "checkpoints")
+        (tmp_path / "checkpoints").touch()
+
+    at_step(monkeypatch, 50, replace_folder)
+    refused(checkpoint.CheckpointError, "The model is saved in .*rescued_", trainer(tmp_path).train)
 
 
 def test_a_lineage_that_cannot_be_written_waits_as_well(tmp_path, monkeypatch):

@@ -288,6 +288,9 @@ def test_the_memory_of_a_known_population(capture):
     assert found.gaussians == 400
     assert found.device_bytes == 400 * row + 2 * WIDTH * HEIGHT * 100
     assert found.host_bytes == 2_000_000_000 + 3 * VIEWS * WIDTH * HEIGHT
+    flat = "population.max_gaussians=400", "schedule.batch_size=2", "model.sh_degree=0"
+    fewer = found.device_bytes - estimate(config_of(*flat), capture, True, 2).device_bytes
+    assert fewer == 400 * (3 * 45 * 4 + 180 - 12)  # of the rest of SH, and a widest column of 3 values
     on_cpu = estimate(config_of("population.max_gaussians=400", "schedule.batch_size=2"), capture, False, 2)
     assert on_cpu.device_bytes == 0
     assert on_cpu.host_bytes == 400_000_000 + 3 * VIEWS * WIDTH * HEIGHT + found.device_bytes

@@ -185,14 +185,6 @@ def test_a_fully_masked_view_counts_for_nothing(tmp_path, capsys):
     assert "psnr" not in summary and "evaluation: all pixels are masked" in capsys.readouterr().out
 
 
-def test_figures_of_training_views_are_called_so(tmp_path, capsys):
-    capture, images = tiny_scene()
-    capture.train, capture.test = list(range(8)), []
-    summary = Trainer(tiny_config("schedule.iterations=2"), capture, images, tmp_path, Ranks()).train()
-    assert summary["split"] == "train"
-    assert "evaluation of TRAINING views (none is held out)" in capsys.readouterr().out
-
-
 def test_a_model_without_gaussians_is_no_result(tmp_path):
     config = tiny_config("population.min_opacity=0.98")
     running = Trainer(config, *tiny_scene(), tmp_path / "a", Ranks())

@@ -167,6 +167,7 @@ def test_ranks_draw_together(trained, drawer, scene):
     ],
 )
 def test_impossible_looks_are_refused(change, what):
+    np.testing.assert_allclose(intrinsics(200, 100, np.pi / 2), [[50, 0, 100], [0, 50, 50], [0, 0, 1]])
     fields = {"viewmat": np.eye(4), "K": intrinsics(8, 8, 1.0), "width": 8, "height": 8}
     refused(ValueError, what, Look, **fields | change)
 
