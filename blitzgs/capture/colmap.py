@@ -12,6 +12,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -170,7 +171,8 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
 def write_model(folder: Path | str, model: ColmapModel) -> None:
     """Write a sparse model as .bin files, creating the folder.
 
-    ValueError: a camera's parameters do not fit its model, or a name cannot stand in the file.
+    ValueError: a camera's parameters do not fit its model, a name cannot stand in the file, or columns have
+    different lengths. Nothing is written then.
     """
     for camera in model.cameras:
         if len(camera.params) != len(camera_models()[camera.model]):
@@ -178,8 +180,12 @@ def write_model(folder: Path | str, model: ColmapModel) -> None:
     for name in model.images.names:
         if not name or "\0" in name or "\n" in name:
             raise ValueError(f"images: the name {name!r} is empty or has a NUL or line break in it")
+    try:
+        contents = list(_bytes_of(model))
+    except ValueError as error:
+        raise ValueError(f"columns of the model have different lengths: {error}") from error
     Path(folder).mkdir(parents=True, exist_ok=True)
-    for name, content in zip(FILES, _bytes_of(model), strict=True):
+    for name, content in zip(FILES, contents, strict=True):
         Path(folder, f"{name}.bin").write_bytes(content)
 
 
@@ -207,8 +213,7 @@ def _bytes_of(model: ColmapModel) -> Iterator[bytes]:
 def _joined(heads: list[bytes], offsets: npt.NDArray[np.uint64], rows: npt.NDArray[np.void]) -> bytes:
     """Return the number of records, and for each its head, the number of its rows, and these."""
     parts, data, size = [struct.pack("<Q", len(heads))], rows.tobytes(), rows.itemsize
-    ends = offsets.tolist()
-    for head, begin, end in zip(heads, ends, ends[1:], strict=False):
+    for head, (begin, end) in zip(heads, pairwise(offsets.tolist()), strict=True):
         parts += [head, struct.pack("<Q", end - begin), data[begin * size : end * size]]
     return b"".join(parts)
 
