@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.redistribution import global_positions
 from blitzgs.runs.checkpoint_files import DAMAGE, Shard, finish, opened, verified, write_shard
+from blitzgs.util.errors import warn
 from blitzgs.util.output import check_space, explain, is_lack_of_space
 
 SHARED = "shared.safetensors"
@@ -161,7 +161,7 @@ class Saving:
                 self.deleting = _delete_old(self._directory, self._keep)
             except OSError as error:
                 # The new checkpoint is complete; the next save tries to delete the old ones again.
-                warnings.warn(f"an older checkpoint could not be deleted: {error}", stacklevel=2)
+                warn(f"an older checkpoint could not be deleted: {error}")
         return path
 
 
@@ -204,7 +204,7 @@ def load_latest(
             refused.append(str(error))
             continue
         if refused and ranks.rank == 0:
-            warnings.warn(f"{'; '.join(refused)}; using {name}", stacklevel=2)
+            warn(f"{'; '.join(refused)}; using {name}")
         return Loaded(columns, state, shared, name, refused)
     if refused:
         raise CheckpointError(f"no sound checkpoint in {directory}: {'; '.join(refused)}")

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.frame.tiles import TileAssignment, collect_images
 from blitzgs.ops.photometric import ssim
-from blitzgs.util.errors import explain_memory
+from blitzgs.util.errors import explain_memory, warn
 from blitzgs.util.output import OutputFolder
 from blitzgs.util.progress import Report
 from blitzgs.view.gate import ModelGate
@@ -229,7 +228,7 @@ def _over_all_ranks(
     if masked and ranks.rank == 0:
         shown = ", ".join(masked[:5]) + (", ..." if len(masked) > 5 else "")
         text = f"{len(masked)} of {len(names)} views cannot be measured, as they are masked: {shown}"
-        warnings.warn(text, stacklevel=3)
+        warn(text)
     views = {name: found[name] for name in names if name in found}
     result: dict[str, Any] = {}
     for metric in METRICS:
@@ -277,7 +276,7 @@ class _Files:
     def _failed(self, error: OSError) -> None:
         if not self._optional:
             raise error
-        warnings.warn(f"the evaluation could not write a file and goes on without it: {error}", stacklevel=2)
+        warn(f"the evaluation could not write a file and goes on without it: {error}")
 
 
 FOLDER, INDEX = "previews", "views.json"

@@ -7,7 +7,6 @@ import dataclasses
 import json
 import math
 import os
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -35,6 +34,7 @@ from blitzgs.runs.folder_checks import check_own
 from blitzgs.runs.run_files import Progress, TrainedModel, lod_gate
 from blitzgs.runs.world import trained_table
 from blitzgs.table.table import PARAMETERS, GaussianTable
+from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import Report
 from blitzgs.view.gate import LodGate
@@ -330,7 +330,7 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
             refused.append(f"checkpoint {path} is damaged: {error}")
             continue
         if refused:
-            warnings.warn(f"{'; '.join(refused)}; using {name}", stacklevel=2)
+            warn(f"{'; '.join(refused)}; using {name}")
         check_own(folder, path, str(manifest.state.get("run", "")), Ranks())
         progress, space, config = run_files.parsed(manifest.state, path)
         run_files.compare_with_file(config, folder / run_files.CONFIG)

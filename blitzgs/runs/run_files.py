@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from blitzgs.table.blocks import sort_rows
 from blitzgs.table.host_table import HostTable, available_bytes
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
+from blitzgs.util.errors import warn
 from blitzgs.view.gate import LodGate, ModelGate
 from blitzgs.view.levels import FOOTPRINT_STEPS
 from blitzgs.view.views import Space
@@ -256,7 +256,7 @@ def compare_with_file(config: Config, path: Path) -> None:
     except ConfigError as error:
         what = f"cannot be read ({error})"
     if what:
-        warnings.warn(f"{path} {what}: the configuration in the checkpoint is used", stacklevel=3)
+        warn(f"{path} {what}: the configuration in the checkpoint is used")
 
 
 def check_resumable(saved: Config, wanted: Config) -> None:

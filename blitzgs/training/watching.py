@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -14,6 +13,7 @@ from blitzgs.runs.run_files import model_gate
 from blitzgs.table.pool import Pool
 from blitzgs.training.events import save
 from blitzgs.training.state import TrainingState
+from blitzgs.util.errors import warn
 from blitzgs.view.draw import Drawer, DrawingError, Subject
 from blitzgs.view.look import Look, Picture, Watcher, Wish
 
@@ -94,10 +94,7 @@ class Watching:
             return getattr(self._watcher, method)(*arguments)
         except Exception as error:
             watcher, self._watcher = self._watcher, None
-            warnings.warn(
-                f"the viewer failed ({type(error).__name__}: {error}); training goes on without it",
-                stacklevel=3,
-            )
+            warn(f"the viewer failed ({type(error).__name__}: {error}); training goes on without it")
             with contextlib.suppress(Exception):
                 watcher.close()
             return None

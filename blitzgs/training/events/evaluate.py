@@ -17,6 +17,7 @@ from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, evenly_ordered, worst_views
 from blitzgs.runs.run_files import model_gate
 from blitzgs.training.state import TrainingState
+from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 
 # The number of side-by-side pictures that an evaluation writes.
@@ -70,7 +71,7 @@ def _write_trained(state: TrainingState, indices: Sequence[int], folder: Path) -
         if state.ranks.rank == 0:
             write_file(folder / run_files.TRAINED_VIEWS, json.dumps(metrics, indent=1) + "\n")
     except (OSError, PhotographError) as error:
-        warnings.warn(f"the metrics of training views are not written: {error}", stacklevel=3)
+        warn(f"the metrics of training views are not written: {error}")
 
 
 def measure(
