@@ -166,22 +166,23 @@ def restore(
     The Gaussians go to `device`, else to the ranks' device. CheckpointError: all checkpoints are damaged, or
     the newest is of another version or of another run.
     """
-    loaded = checkpoint.load_latest(
-        folder / CHECKPOINTS, ranks, device or ranks.device, lambda c: bad_column(GaussianTable(c)), only
+    problem, device = lambda columns: bad_column(GaussianTable(columns)), device or ranks.device
+    found = checkpoint.newest(
+        folder / CHECKPOINTS, ranks, lambda path: checkpoint.load(path, ranks, device, problem), only
     )
-    if loaded is None:
+    if found is None:
         return None
+    loaded, path, refused = found
     state = loaded.state
-    check_own(folder, folder / CHECKPOINTS / loaded.name, str(state.get("run", "")), ranks)
-    why = "the newest sound one" if loaded.refused else "the newest"
-    skipped = f"; {len(loaded.refused)} newer refused" if loaded.refused else ""
-    progress, space, config = parsed(state, folder / CHECKPOINTS / loaded.name)
+    check_own(folder, path, str(state.get("run", "")), ranks)
+    why = f"the newest sound one; {len(refused)} newer refused" if refused else "the newest"
+    progress, space, config = parsed(state, path)
     table = GaussianTable(loaded.columns)
-    if len(list((folder / CHECKPOINTS / loaded.name).glob("shard_*"))) != ranks.world_size:
+    if len(list(path.glob("shard_*"))) != ranks.world_size:
         # Each rank had an order of its own, and the spread is of another number of blocks.
         sort_rows(table)
         progress.sorted_spread = 0
-    source = f"{loaded.name} ({why}{skipped})"
+    source = f"{path.name} ({why})"
     return TrainedModel(config, progress, space, table, state.get("run", ""), source, loaded.shared)
 
 
