@@ -224,6 +224,11 @@ def load_cameras(folder: Path) -> RunCameras:
         raise ValueError(f"{path} is damaged ({error}): give the capture with --data DIR instead") from error
 
 
+def stored_cameras(folder: Path) -> RunCameras:
+    """Return a run's cameras; none if it is older than their file (ValueError: it is damaged)."""
+    return load_cameras(folder) if (folder / CAMERAS).exists() else RunCameras([], [], [], [])
+
+
 def input_files(capture: Capture) -> list[Path]:
     """Return the paths of a capture's photographs and masks, which no command may overwrite."""
     images = [camera.image_path for camera in capture.cameras]

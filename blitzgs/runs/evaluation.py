@@ -30,9 +30,8 @@ from blitzgs.ops.photometric import ssim
 from blitzgs.util.errors import explain_memory, warn
 from blitzgs.util.output import OutputFolder
 from blitzgs.util.progress import Report
-from blitzgs.view.gate import ModelGate
 from blitzgs.view.views import CameraLike, ViewSet
-from blitzgs.view.visible import TableOrPool, VisibleFinder
+from blitzgs.view.visible import Subject, VisibleFinder
 
 Lpips = Callable[[Tensor, Tensor], Tensor]
 Stops = Callable[[], bool]
@@ -129,12 +128,11 @@ def render_view(
 
 
 def evaluate(
-    gaussians: TableOrPool,
+    subject: Subject,
     views: ViewSet,
     cameras: Sequence[CameraLike],
     images: ImageStore,
     indices: Sequence[int],
-    options: RenderOptions,
     folder: Path | None,
     owners: TileOwners,
     *,
@@ -143,7 +141,6 @@ def evaluate(
     report: Report | None = None,
     inputs: Iterable[Path] = (),
     optional_files: bool = False,
-    lod: ModelGate | None = None,
     stops: Stops | None = None,
 ) -> dict[str, Any]:
     """Render views and compare them with their photographs; the ranks take turns at comparing.
@@ -154,7 +151,6 @@ def evaluate(
             side; if not 0, the previews of the report are written too.
         report: called with (views rendered, number of views) after each view.
         optional_files: if a file cannot be written, warn instead of raising an error; used during training.
-        lod: leaves out Gaussians whose octree level is too fine for their distance; None: no gate.
         stops: asked after each round in which every rank compares one view; if it returns True, the
             evaluation ends. It must return the same on every rank. None: never stop.
 
@@ -175,14 +171,14 @@ def evaluate(
     lost: str | None = None
     previews = Previews(folder, set(chosen)) if folder is not None and pictures > 0 else None
     own = list(indices[ranks.rank :: ranks.world_size])
-    finder = VisibleFinder(gaussians, lod)
+    finder = VisibleFinder(subject.gaussians, subject.lod)
     for position, index in enumerate(indices):
         turn, destination = divmod(position, ranks.world_size)
         if destination == 0:
             if stops is not None and position > 0 and stops():
                 raise EvaluationStoppedError
             images.prefetch(own[turn : turn + 4])
-        render = render_view(finder, views, index, options, owners, destination)
+        render = render_view(finder, views, index, subject.options, owners, destination)
         if report is not None:
             report(position + 1, len(indices))
         if render is None:

@@ -29,8 +29,8 @@ from blitzgs.table.table import GaussianTable
 from blitzgs.util.errors import warn
 from blitzgs.view.gate import LodGate, ModelGate
 from blitzgs.view.levels import FOOTPRINT_STEPS
-from blitzgs.view.views import Space
-from blitzgs.view.visible import TableOrPool
+from blitzgs.view.views import Space, render_options
+from blitzgs.view.visible import Subject, TableOrPool
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
@@ -111,18 +111,22 @@ class TrainedModel:
         """Gain and bias of each training photograph, [T, 2, 3]; None if the run has none."""
         return stored_exposures(self.shared)
 
-    def gaussians_on(self, device: torch.device) -> TableOrPool:
-        """Return the Gaussians that views are rendered from on a device.
+    def subject(self, ranks: Ranks) -> Subject:
+        """Return what views are rendered from, on the ranks' device. Collective.
 
         With a pool, the first call moves the table into memory that the pool can reach. PoolError: the pool
         has room for fewer than two blocks.
         """
-        if self.pool_bytes == 0:
-            return self.table
-        if self.config.memory.resident_gb == 0:
-            sort_rows(self.table)
-        self.table = HostTable(self.table.release(), pinned=device.type == "cuda")
-        return Pool(self.table, device, self.pool_bytes, None)
+        gate = lod_gate(self.config, self.progress)
+        options = render_options(self.config, self.space, self.progress.sh_degree, gate)
+        lod = model_gate(self.config, self.progress, self.table, ranks)
+        gaussians: TableOrPool = self.table
+        if self.pool_bytes > 0:
+            if self.config.memory.resident_gb == 0:
+                sort_rows(self.table)
+            self.table = HostTable(self.table.release(), pinned=ranks.device.type == "cuda")
+            gaussians = Pool(self.table, ranks.device, self.pool_bytes, None)
+        return Subject(gaussians, options, self.space, lod)
 
 
 def save(folder: Path, model: TrainedModel, ranks: Ranks, in_background: bool = False) -> checkpoint.Saving:
