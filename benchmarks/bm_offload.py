@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
+from blitzgs.runs.cameras import RunCamera
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Pool, PoolError
@@ -48,18 +49,7 @@ HEIGHT, LOOKS_DOWN = 150.0, math.radians(60)
 REACH = 400.0  # metres from the middle to the outermost points that cameras look at
 
 
-@dataclass(frozen=True)
-class Camera:
-    """A camera with the fields that training reads."""
-
-    name: str
-    width: int
-    height: int
-    K: np.ndarray
-    world_to_camera: np.ndarray
-
-
-def survey(scene: BenchmarkScene) -> list[Camera]:
+def survey(scene: BenchmarkScene) -> list[RunCamera]:
     """Return cameras with the scene's intrinsics at all places of the survey, line by line."""
     K = scene.Ks[0].double().cpu().numpy()
     cameras = []
@@ -67,7 +57,7 @@ def survey(scene: BenchmarkScene) -> list[Camera]:
         places = np.linspace(-REACH, REACH, VIEWS_A_LINE)
         for y in places if line % 2 == 0 else places[::-1]:
             pose = look_at((x, y - HEIGHT / math.tan(LOOKS_DOWN), HEIGHT), (x, y, 0.0)).double().numpy()
-            cameras.append(Camera(f"{len(cameras):03}", scene.width, scene.height, K, pose))
+            cameras.append(RunCamera(f"{len(cameras):03}", scene.width, scene.height, K, pose))
     return cameras
 
 

@@ -27,9 +27,10 @@ from blitzgs.distributed.group import Ranks, extend_memory_in_place
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
-from blitzgs.view.draw import Drawer, Subject, intrinsics
+from blitzgs.view.draw import Drawer, intrinsics
 from blitzgs.view.look import Look
 from blitzgs.view.views import Space, render_options
+from blitzgs.view.visible import Subject
 from blitzgs.viewer.studio import Opened, Studio, box_of, open_model
 from blitzgs.viewer.world import SCALE, Exhibit, World, looking
 
@@ -49,10 +50,10 @@ def synthetic(count: int, device: str) -> Opened:
     space = Space((0.0, 0.0, 0.0), unit, 1.0)
     options = render_options(Config(), space, 3)
     exhibit = Exhibit(
-        title="benchmark", space=space, sh_degree=3, near=options.near_plane, far=options.far_plane,
-        background=options.background, levels=False, lod=False, smooth=False, box=box_of(table["means"]),
+        title="benchmark", space=space, sh_degree=3, background=options.background,
+        levels=False, lod=False, smooth=False, box=box_of(table["means"]),
     )  # fmt: skip
-    return Opened(exhibit, Subject(table, options, unit, None), table, Ranks(device=torch.device(device)))
+    return Opened(exhibit, Subject(table, options, space, None), Ranks(device=torch.device(device)))
 
 
 def orbit(opened: Opened) -> tuple[list[float], float, float]:

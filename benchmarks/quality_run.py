@@ -31,6 +31,7 @@ from blitzgs.training.inputs import open_capture
 from blitzgs.training.records import peak_memory_bytes, population_report
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.views import Space, ViewSet, render_options
+from blitzgs.view.visible import Subject
 
 # Image counts at which gsplat's results are commonly quoted. Training views are measured there and at the
 # end.
@@ -165,10 +166,8 @@ def train_opponent(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:
     lpips, owners = load_lpips(spec.lpips), TileOwners(ranks)
 
     def measure_now(indices: Sequence[int]) -> dict[str, Any]:
-        table, how = trainer.table(), trainer.render_options
-        return evaluate(
-            table, trainer.views, capture.cameras, images, indices, how, None, owners, lpips=lpips
-        )
+        subject = Subject(trainer.table(), trainer.render_options, trainer.space, None)
+        return evaluate(subject, trainer.views, capture.cameras, images, indices, None, owners, lpips=lpips)
 
     quoted = [options.scaled(step) for step in QUOTED_STEPS]
     recorder, seconds = Recorder(spec, quoted, trainer.total, capture, ranks.device), 0.0
@@ -198,8 +197,8 @@ def train_partition(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:
     lpips, owners = load_lpips(spec.lpips), TileOwners(ranks)
 
     def measure_now(indices: Sequence[int]) -> dict[str, Any]:
-        how = render_options(config, space, merged.sh_degree)
-        return evaluate(merged.table, views, capture.cameras, images, indices, how, None, owners, lpips=lpips)
+        subject = Subject(merged.table, render_options(config, space, merged.sh_degree), space, None)
+        return evaluate(subject, views, capture.cameras, images, indices, None, owners, lpips=lpips)
 
     done = sum(block["images"] for block in merged.blocks)
     seconds = split_seconds + merged.merge_seconds + sum(block["seconds"] for block in merged.blocks)

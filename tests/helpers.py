@@ -127,6 +127,17 @@ def orbit_camera(angle: float, distance: float = 3.0, lift: float = 0.4) -> Tens
     return viewmat
 
 
+def look_at_origin(position) -> np.ndarray:
+    """World-to-camera [4, 4] at a position [3], float64, with z up in the world."""
+    forward = -position / np.linalg.norm(position)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return pose
+
+
 def reference_images(scene: Scene, backgrounds: Tensor | None = None, **options) -> list[ReferenceImage]:
     """Render each view of the scene by definition, in float64."""
     return [

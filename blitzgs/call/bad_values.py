@@ -7,7 +7,6 @@ gradient.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from itertools import count
@@ -21,11 +20,10 @@ from blitzgs._library import below_autograd
 from blitzgs.call.arguments import Gaussians
 from blitzgs.call.layout import Layout
 from blitzgs.ops.host import HostCopy, to_host
+from blitzgs.util.errors import warn
 
 # Relative to the focal length: below the rounding of float32, and far below a pixel; as in the projection.
 _LEAST_SKEW = 1e-6
-# Calls between a public function and its caller, for warnings: `blitzgs._torch.not_compiled`.
-WRAPPED = {"raw_rasterization": 1}
 
 
 def warn_of_gradient(function: str) -> None:
@@ -39,10 +37,9 @@ def warn_of_gradient(function: str) -> None:
 
 @cache
 def _warn_of_gradient(function: str) -> None:
-    warnings.warn(
+    warn(
         f"blitzgs.{function}: Ks requires a gradient and gets none, as in gsplat; pass Ks.detach()",
         RuntimeWarning,
-        stacklevel=4 + WRAPPED.get(function, 0),
     )
 
 
@@ -184,27 +181,22 @@ def watch_for_non_finite(
         if not torch.ops.blitzgs.find_non_finite(columns, opacities).item():
             return
     if names := ", ".join(non_finite(gaussians)):
-        ending = "are not rendered. meta['non_finite'] has their indices."
-        _warn(function, names, ending, stacklevel=5 + WRAPPED.get(function, 0))
+        _warn(function, names, "are not rendered. meta['non_finite'] has their indices.")
 
 
-def warn_of_non_finite(gaussians: Gaussians, function: str, stacklevel: int) -> None:
-    """Check all arguments, warn of values that are not finite, and name the first Gaussians or views.
-
-    `stacklevel`: how many calls away the public function's caller is, from 1 for this function.
-    """
+def warn_of_non_finite(gaussians: Gaussians, function: str) -> None:
+    """Check all arguments, warn of values that are not finite, and name the first Gaussians or views."""
     found = {name: indices[:5].tolist() for name, indices in non_finite(gaussians).items()}
     if found:
         shown = "; ".join(f"{name}, first at {', '.join(map(str, at))}" for name, at in found.items())
-        _warn(function, shown, "contribute nothing", stacklevel + 1)
+        _warn(function, shown, "contribute nothing")
 
 
-def _warn(function: str, where: str, ending: str, stacklevel: int) -> None:
-    warnings.warn(
+def _warn(function: str, where: str, ending: str) -> None:
+    warn(
         f"blitzgs.{function}: NaN or infinite values in {where}; the Gaussians or views that have them "
         f"{ending}",
         RuntimeWarning,
-        stacklevel=stacklevel,
     )
 
 

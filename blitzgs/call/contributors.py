@@ -87,7 +87,7 @@ def contributions(
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     gaussians = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, "D")
-    warn_of_non_finite(gaussians, "contributions", stacklevel=4)  # torch.no_grad is one more call
+    warn_of_non_finite(gaussians, "contributions")
     check_intrinsics([Ks])
     shape = (len(viewmats), len(means))
     weights = torch.zeros(shape, dtype=torch.float64, device=means.device)

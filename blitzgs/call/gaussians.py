@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import warnings
 from functools import lru_cache
 from itertools import count
 from typing import Any
@@ -17,7 +16,7 @@ from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_loss, pixel_counts, ssim
 from blitzgs.ops.population import MAX_COPIES, overlap, position_noise_
-from blitzgs.util.errors import check_tensor
+from blitzgs.util.errors import check_tensor, warn
 from blitzgs.util.rotations import quaternion_matrices
 
 _TRIANGLE = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
@@ -277,9 +276,8 @@ def _warn_of_range(targets: Tensor) -> None:
     if next(_float_calls) or (targets.is_cuda and torch.cuda.is_current_stream_capturing()):
         return
     if (most := float(targets.detach().amax())) > _MOST:
-        warnings.warn(
-            f"blitzgs.l1_ssim: targets go to {most:g}: they are uint8, or floats from 0 to 1 (targets / 255)",
-            stacklevel=3,
+        warn(
+            f"blitzgs.l1_ssim: targets go to {most:g}: they are uint8, or floats from 0 to 1 (targets / 255)"
         )
 
 

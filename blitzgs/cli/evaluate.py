@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from pathlib import Path
 
@@ -19,14 +18,12 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import input_files, warn_of_changes
 from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
-from blitzgs.runs.run_files import lod_gate, model_gate
-from blitzgs.runs.world import check_seen, gate_of, model_of_file
+from blitzgs.runs.world import check_seen, subject_of_file
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.training.understood import largest_size
 from blitzgs.util.progress import image_progress
 from blitzgs.util.terminal import printable
-from blitzgs.view.gate import ModelGate
-from blitzgs.view.views import Space, ViewSet, render_options
+from blitzgs.view.views import Space, ViewSet
 
 HELP = """\
 Compare renders of a run's held-out views with their photographs, or those of a model of another program:
@@ -84,35 +81,30 @@ def run(args: argparse.Namespace) -> int:
         capture, images = open_capture(config, ranks, "--allow-missing")
         if path.is_file():
             check_seen(found, path, capture)
-            model = model_of_file(
-                found, config, Space.of(capture.offset, capture.extent), capture.near, ranks
-            )
-            gate, config = gate_of(found, model.space.unit), model.config
-            lod = None if gate is None else ModelGate(gate, math.inf, model.table, ranks)
+            space = Space.of(capture.offset, capture.extent)
+            config = changed(config, "model", near=capture.near / (space.unit * space.extent))
+            subject = subject_of_file(found, config, space, ranks)
             folder = args.out or path.with_name(f"{path.name}.evaluation") / args.split
         else:
             check_capture(model.space, capture, run_folder)
             if ranks.rank == 0:
                 warn_of_changes(run_folder, capture)
-            gate = lod_gate(config, model.progress)
-            lod = model_gate(config, model.progress, model.table, ranks)
+            subject = model.subject(ranks)
             folder = args.out or run_folder / run_files.EVALUATION / args.split
         indices = arguments.chosen_views(args.split, capture, path)
         with image_progress("Comparing", ranks.rank == 0) as report:
             result = evaluate(
-                model.gaussians_on(ranks.device),
-                ViewSet(list(capture.cameras), model.space, ranks.device),
+                subject,
+                ViewSet(list(capture.cameras), subject.space, ranks.device),
                 capture.cameras,
                 images,
                 indices,
-                render_options(config, model.space, model.progress.sh_degree, gate),
                 folder,
                 TileOwners(ranks),
                 pictures=args.pictures,
                 lpips=load_lpips(args.lpips),
                 report=report,
                 inputs=input_files(capture),
-                lod=lod,
             )
         if ranks.rank == 0:
             print(json.dumps({name: value for name, value in result.items() if name != "views"}, indent=1))

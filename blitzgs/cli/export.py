@@ -22,6 +22,7 @@ from blitzgs.formats.gaussians import GaussianSource, check_memory, is_antialias
 from blitzgs.formats.models import FORMATS, Format, check_replaces, offset_of, open_gaussians
 from blitzgs.formats.selection import Selected, Selection, read_polygon
 from blitzgs.formats.web_page import check_replaces_page
+from blitzgs.runs.cameras import stored_cameras
 from blitzgs.runs.clean import cleaned
 from blitzgs.runs.export import (
     COORDINATES,
@@ -34,7 +35,7 @@ from blitzgs.runs.export import (
     source_of,
     without_antialiasing,
 )
-from blitzgs.runs.folder import Model, open_run
+from blitzgs.runs.folder import Model, open_run, subject_of
 from blitzgs.runs.run_files import run_and_checkpoint
 from blitzgs.runs.world import in_world, load_world_frame
 from blitzgs.util.output import write_file
@@ -273,7 +274,6 @@ def _export_run(
     flags = "--classic, --clean, --most and --coordinates world need the model in memory"
     # The model is read with the optimiser's two moments, and copied.
     check_memory(f"{flags}; {run_folder} holds", len(opened), opened.degree, copies=4)
-    from blitzgs.viewer.studio import open_model
     from blitzgs.viewer.web import contributions
 
     kept, score = None, None
@@ -281,7 +281,7 @@ def _export_run(
         folder = open_run(run_folder)
         model = folder.model(ranks.device, checkpoint)
         if args.most is not None:
-            score = contributions(open_model(args.model, ranks)).cpu()
+            score = contributions(subject_of(model), stored_cameras(run_folder).cameras, ranks).cpu()
         if args.clean is not None:
             kept = _cleaned(model, run_folder, args, path, ranks)
         if args.classic and not model.config.model.antialiased:

@@ -29,15 +29,14 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, RunCameras, input_files, load_cameras
 from blitzgs.runs.evaluation import render_view
-from blitzgs.runs.run_files import lod_gate, model_gate
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.util.output import OutputFolder
 from blitzgs.util.progress import image_progress
-from blitzgs.view.draw import Drawer, Subject
+from blitzgs.view.draw import Drawer
 from blitzgs.view.look import MAX_PIXELS, Look, Mode
-from blitzgs.view.views import CameraLike, Space, ViewSet, render_options, viewmat
-from blitzgs.view.visible import VisibleFinder
+from blitzgs.view.views import CameraLike, ViewSet, viewmat
+from blitzgs.view.visible import Subject, VisibleFinder
 from blitzgs.viewer.film import SUFFIX, Film, check_film, new_film, read_film
 from blitzgs.viewer.studio import Opened, box_of, open_model
 
@@ -143,7 +142,7 @@ def _renders(
 
     Every rank goes through all views; `destination` depends on the position, and other ranks get None.
     """
-    views, subject = ViewSet(list(opened.cameras), opened.space, ranks.device), opened.subject
+    views, subject = ViewSet(list(opened.cameras), opened.subject.space, ranks.device), opened.subject
     finder, owners = VisibleFinder(subject.gaussians, subject.lod), TileOwners(ranks)
     for position, index in enumerate(opened.indices):
         yield index, render_view(finder, views, index, subject.options, owners, destination(position))
@@ -189,7 +188,7 @@ def _render_pictures(args: argparse.Namespace, opened: Rendered, ranks: Ranks) -
                 output.write(colours[index], content)
             for mode in modes:
                 camera = opened.cameras[index]
-                pose = viewmat(camera, opened.space)
+                pose = viewmat(camera, opened.subject.space)
                 look = Look(pose, np.asarray(camera.K), camera.width, camera.height, mode)
                 picture = drawer.draw(look) if drawer else None
                 if picture is not None:
@@ -202,9 +201,10 @@ def _render_pictures(args: argparse.Namespace, opened: Rendered, ranks: Ranks) -
 def _depth_step(opened: Rendered) -> float:
     """Return the depth of one step of a 16-bit picture, for which the farthest corner of the box fits."""
     corners = np.array(list(itertools.product(*opened.box.T)))
-    centres = camera_centres(np.stack([viewmat(opened.cameras[i], opened.space) for i in opened.indices]))
+    space = opened.subject.space
+    centres = camera_centres(np.stack([viewmat(opened.cameras[i], space) for i in opened.indices]))
     farthest = max(float(np.linalg.norm(corners - centre, axis=1).max()) for centre in centres)
-    return farthest * opened.space.unit / 65534
+    return farthest * space.unit / 65534
 
 
 def _png16(values: npt.NDArray[np.float32]) -> bytes:
@@ -236,7 +236,6 @@ class Rendered:
     """A model and the views to render of it."""
 
     subject: Subject  # the model, with this rank's Gaussians
-    space: Space  # maps the trained world to the capture's
     # Corners of a box that holds nearly all Gaussians, float64 [2, 3], trained units.
     box: npt.NDArray[np.float64]
     cameras: Sequence[CameraLike]  # all cameras; pictures are named by all of them
@@ -249,32 +248,28 @@ def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> 
     """Open the model, and choose the cameras. Collective."""
     if args.model.is_file():
         opened = _open_ply(args, ranks)
-        subject, space, box = opened.subject, opened.exhibit.space, opened.exhibit.box
+        subject, box = opened.subject, opened.exhibit.box
         stored, exposures = None, None
     else:
         folder, checkpoint = run_files.run_and_checkpoint(args.model)
         model = run_files.open_model(folder, ranks, args.data, args.resident_gb, checkpoint)
-        space, exposures = model.space, model.exposures
+        exposures = model.exposures
         box = _shared_box(model.table, ranks)
         stored = _stored_cameras(args, folder, model, ranks)
-        options = render_options(
-            model.config, space, model.progress.sh_degree, lod_gate(model.config, model.progress)
-        )
-        lod = model_gate(model.config, model.progress, model.table, ranks)
-        subject = Subject(model.gaussians_on(ranks.device), options, space.unit, lod)
+        subject = model.subject(ranks)
     cameras: Sequence[CameraLike]
     if args.cameras is not None:
-        cameras = read_cameras(args.cameras, np.array(space.offset))
+        cameras = read_cameras(args.cameras, np.array(subject.space.offset))
     elif film is not None:
-        cameras = film.cameras(space, stored.cameras if stored else (), box)
+        cameras = film.cameras(subject.space, stored.cameras if stored else (), box)
     elif stored is not None:
         shown = _exposures(exposures, stored) if args.exposure else {}
         indices = chosen_views(args.split, stored, args.model)
-        return Rendered(subject, space, box, stored.cameras, indices, stored.inputs, shown)
+        return Rendered(subject, box, stored.cameras, indices, stored.inputs, shown)
     else:
         raise ValueError(f"{args.model} has no cameras: use --path, --cameras or the folder of a run")
     inputs = stored.inputs if stored else []
-    return Rendered(subject, space, box, cameras, range(len(cameras)), inputs, {})
+    return Rendered(subject, box, cameras, range(len(cameras)), inputs, {})
 
 
 def _open_ply(args: argparse.Namespace, ranks: Ranks) -> Opened:

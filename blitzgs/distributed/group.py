@@ -231,13 +231,13 @@ class Ranks:
             dist.all_gather_object(parts, value)
         return parts
 
-    def broadcast_object(self, value: T, source: int = 0) -> T:
-        """Return rank `source`'s `value` on every rank."""
+    def broadcast_object(self, value: T) -> T:
+        """Return rank 0's `value` on every rank."""
         if self.world_size == 1:
             return value
         holder: list[Any] = [value]
         with self.watchdog.waiting("broadcast_object"):
-            dist.broadcast_object_list(holder, src=source, device=self.device)
+            dist.broadcast_object_list(holder, device=self.device)
         result: T = holder[0]
         return result
 

@@ -70,8 +70,8 @@ class TileRanges:
         """Mark the pixels of a rank's tiles, bool [B, H, W]."""
         return pixels_of_tiles(self.n_views, self.width, self.height, self.tile_size, *self.of(rank), device)
 
-    def pixel_rows(self, rank: int, margin: int = LOSS_HALO) -> list[tuple[int, int]]:
-        """Return the rows [y0, y1) of each view's image that a rank's tiles and a margin around them cover.
+    def pixel_rows(self, rank: int) -> list[tuple[int, int]]:
+        """Return the rows [y0, y1) of each view's image that the loss of a rank's tiles reads.
 
         (0, 0) for a view of which the rank owns no tile.
         """
@@ -79,8 +79,8 @@ class TileRanges:
         rows = []
         for first in range(0, self.n_views * tiles_per_view, tiles_per_view):
             low, high = max(begin - first, 0), min(end - first, tiles_per_view)
-            y0 = low // tiles_x * self.tile_size - margin
-            y1 = ((high - 1) // tiles_x + 1) * self.tile_size + margin
+            y0 = low // tiles_x * self.tile_size - LOSS_HALO
+            y1 = ((high - 1) // tiles_x + 1) * self.tile_size + LOSS_HALO
             rows.append((max(y0, 0), min(y1, self.height)) if low < high else (0, 0))
         return rows
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
@@ -25,6 +24,7 @@ from blitzgs.optim.lazy_adam_checks import (
     check_saved,
     groups_by_name,
 )
+from blitzgs.util.errors import warn
 
 # Entries of a parameter's state: the step up to which each row's values, and its moments, are current,
 # counted from `GrowingSchedule.begin`. A state without them, as `torch.optim.Adam` has it, is up to date.
@@ -214,9 +214,7 @@ class LazyAdam(torch.optim.Optimizer):
 
     def bring_up_to_date(self) -> None:
         """Deprecated name of `catch_up(moments=True)`."""
-        warnings.warn(
-            "LazyAdam.bring_up_to_date() is now catch_up(moments=True)", FutureWarning, stacklevel=2
-        )
+        warn("LazyAdam.bring_up_to_date() is now catch_up(moments=True)", FutureWarning)
         self.catch_up(moments=True)
 
     def state_dict(self) -> dict[str, Any]:

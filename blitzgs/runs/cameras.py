@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import os
-import warnings
 import zlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +19,7 @@ from torch import Tensor
 from blitzgs.capture.cameras import MAX_SIDE, Float64
 from blitzgs.capture.capture import Capture
 from blitzgs.runs.checkpoint_files import DAMAGE
+from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 from blitzgs.view.views import CameraLike
 
@@ -163,11 +163,10 @@ def warn_of_changes(folder: Path, capture: Capture) -> None:
     changed = [name for name, stamp in before.items() if stamp and now.get(name, "") not in ("", stamp)]
     if changed:
         more = ", ..." if len(changed) > _NAMED else ""
-        warnings.warn(
+        warn(
             f"{len(changed)} of {len(now)} photographs or their masks have changed since the run in {folder} "
             f"began: {', '.join(changed[:_NAMED])}{more}; unless these replace damaged ones, put "
-            "the earlier ones back or start another run",
-            stacklevel=2,
+            "the earlier ones back or start another run"
         )
 
 
@@ -223,6 +222,11 @@ def load_cameras(folder: Path) -> RunCameras:
         raise
     except (*DAMAGE, OverflowError) as error:
         raise ValueError(f"{path} is damaged ({error}): give the capture with --data DIR instead") from error
+
+
+def stored_cameras(folder: Path) -> RunCameras:
+    """Return a run's cameras; none if it is older than their file (ValueError: it is damaged)."""
+    return load_cameras(folder) if (folder / CAMERAS).exists() else RunCameras([], [], [], [])
 
 
 def input_files(capture: Capture) -> list[Path]:

@@ -12,21 +12,23 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.redistribution import global_positions
-from blitzgs.runs.checkpoint_files import DAMAGE, Shard, finish, opened, verified, write_shard
+from blitzgs.runs.checkpoint_files import DAMAGE, Manifest, Shard, finish, opened, verified, write_shard
+from blitzgs.util.errors import warn
 from blitzgs.util.output import check_space, explain, is_lack_of_space
+
+T = TypeVar("T")
 
 SHARED = "shared.safetensors"
 _NAME = re.compile(r"checkpoint_(\d{6,})")
@@ -161,7 +163,7 @@ class Saving:
                 self.deleting = _delete_old(self._directory, self._keep)
             except OSError as error:
                 # The new checkpoint is complete; the next save tries to delete the old ones again.
-                warnings.warn(f"an older checkpoint could not be deleted: {error}", stacklevel=2)
+                warn(f"an older checkpoint could not be deleted: {error}")
         return path
 
 
@@ -169,62 +171,42 @@ class Saving:
 class Loaded:
     """A checkpoint in memory."""
 
-    columns: dict[str, Tensor]  # columns of this rank's shard
+    columns: dict[str, Tensor]  # columns of this rank's shard, [N_rank, ...], on the device
     state: dict[str, Any]  # the state that was saved with them
-    shared: dict[str, Tensor]  # tensors that are the same on all ranks; empty if none were stored
-    name: str  # name of the checkpoint
-    refused: list[str]  # for each newer checkpoint, why it was not used
+    shared: dict[str, Tensor]  # tensors that are the same on all ranks, on the CPU; empty if none were stored
 
 
-def load_latest(
-    directory: str | os.PathLike[str],
-    ranks: Ranks,
-    device: torch.device | str,
-    problem: Callable[[dict[str, Tensor]], str | None] = lambda columns: None,
-    only: str | None = None,
-) -> Loaded | None:
-    """Load this rank's share of the newest sound checkpoint.
+def newest(
+    directory: Path, ranks: Ranks, read: Callable[[Path], T], only: str | None = None
+) -> tuple[T, Path, list[str]] | None:
+    """Read the newest sound checkpoint. Collective.
 
     A damaged checkpoint is refused, and the one before it is tried. A warning names the refused checkpoints,
     the reasons, and the checkpoint that is used.
 
-    `directory`: folder given to `Saving`. `problem`: returns what is wrong with a shard's columns, or None.
-    `only`: name of the one checkpoint to load; None: the newest. Returns the checkpoint; None if the folder
-    has none. CheckpointError: checkpoints exist, but none is sound.
+    `directory`: folder given to `Saving`. `read`: reads a checkpoint; refuses it on every rank, with a
+    CheckpointError. `only`: name of the one checkpoint to read; None: the newest. Returns what `read`
+    returned, the checkpoint, and why each newer one was refused; None if the folder has no checkpoint.
+    CheckpointError: checkpoints exist, but none is sound.
     """
-    found = ranks.broadcast_object(names_of(Path(directory)) if ranks.rank == 0 else [])
-    refused = []
+    found = ranks.broadcast_object(names_of(directory) if ranks.rank == 0 else [])
+    refused: list[str] = []
     for name in reversed(found) if only is None else [only]:
         try:
-            columns, state, shared = load(Path(directory) / name, ranks, device)
-            wrong = [text for text in ranks.all_gather_object(problem(columns)) if text]
-            if wrong:
-                raise CheckpointError(f"checkpoint {Path(directory) / name} is refused: {'; '.join(wrong)}")
+            content = read(directory / name)
         except CheckpointError as error:
             refused.append(str(error))
             continue
         if refused and ranks.rank == 0:
-            warnings.warn(f"{'; '.join(refused)}; using {name}", stacklevel=2)
-        return Loaded(columns, state, shared, name, refused)
+            warn(f"{'; '.join(refused)}; using {name}")
+        return content, directory / name, refused
     if refused:
         raise CheckpointError(f"no sound checkpoint in {directory}: {'; '.join(refused)}")
     return None
 
 
-def load(
-    path: str | os.PathLike[str], ranks: Ranks, device: torch.device | str
-) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Tensor]]:
-    """Load this rank's share of one checkpoint.
-
-    With the world size that it was saved with, each rank gets its own shard unchanged. With another one the
-    rows are redistributed: rank m gets the positions = m (mod M) of the global order
-    (`sharding.global_positions`), and opens only the files that hold some of these rows.
-
-    `path`: folder returned by `Saving.finish`. Returns the columns of this rank's shard, name ->
-    [N_rank, ...]; the state; and the tensors that are the same on all ranks, on the CPU. CheckpointError: on
-    every rank, when a file is missing, torn or altered.
-    """
-    path = Path(path)
+def sound_manifest(path: Path, ranks: Ranks) -> Manifest:
+    """Return the manifest of a checkpoint whose files are sound; CheckpointError: on every rank, else."""
     manifest, problem = None, None
     try:
         # Each rank checks some of the files, so that every file is read for its digest once.
@@ -235,11 +217,32 @@ def load(
     problems = [text for text in ranks.all_gather_object(problem) if text]
     if problems or manifest is None:
         raise CheckpointError(f"checkpoint {path} is damaged: {'; '.join(sorted(set(problems)))}")
-    shared = {}
+    return manifest
+
+
+def load(
+    path: Path,
+    ranks: Ranks,
+    device: torch.device | str,
+    problem: Callable[[dict[str, Tensor]], str | None] = lambda columns: None,
+) -> Loaded:
+    """Load this rank's share of one checkpoint. Collective.
+
+    With the world size that it was saved with, each rank gets its own shard unchanged. With another one the
+    rows are redistributed: rank m gets the positions = m (mod M) of the global order
+    (`sharding.global_positions`), and opens only the files that hold some of these rows.
+
+    `path`: folder returned by `Saving.finish`. `problem`: returns what is wrong with a shard's columns, or
+    None. CheckpointError: on every rank, when a file is missing, torn or altered, or a shard has a problem.
+    """
+    manifest, shared = sound_manifest(path, ranks), {}
     if manifest.shared is not None:
         with opened(path / manifest.shared.file) as file:
             shared = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    return read_share(path, manifest.shards, ranks, torch.device(device)), manifest.state, shared
+    columns = read_share(path, manifest.shards, ranks, torch.device(device))
+    if wrong := [text for text in ranks.all_gather_object(problem(columns)) if text]:
+        raise CheckpointError(f"checkpoint {path} is refused: {'; '.join(wrong)}")
+    return Loaded(columns, manifest.state, shared)
 
 
 def read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.device) -> dict[str, Tensor]:

@@ -18,7 +18,6 @@ from blitzgs.capture.cameras import downscaled_size, scaled_matrix
 from blitzgs.capture.pictures import encode_image, strip
 from blitzgs.config.fields import ScoreRule
 from blitzgs.distributed.group import Ranks
-from blitzgs.frame.render import RenderOptions
 from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.population import CELL_BITS, voxel_keys
@@ -26,11 +25,11 @@ from blitzgs.ops.projection_types import Views
 from blitzgs.population.importance import Importance, ViewBatch, is_culled, sweep
 from blitzgs.runs.cameras import RunCamera, RunCameras
 from blitzgs.runs.evaluation import image_metrics
-from blitzgs.runs.folder import Model
-from blitzgs.table.table import PARAMETERS, GaussianTable
+from blitzgs.runs.folder import Model, subject_of
+from blitzgs.table.table import PARAMETERS
 from blitzgs.util.output import write_file
-from blitzgs.view.gate import ModelGate
-from blitzgs.view.views import CameraLike, Space, render_options, viewmat
+from blitzgs.view.views import CameraLike, viewmat
+from blitzgs.view.visible import Subject
 
 # Contributions are measured, and pictures drawn, at most so wide.
 _WIDTH = 800
@@ -39,23 +38,17 @@ _LABELS = ("before", "after", "what goes")
 
 
 def contributions(
-    table: GaussianTable,
-    cameras: Sequence[CameraLike],
-    space: Space,
-    options: RenderOptions,
-    ranks: Ranks,
-    lod: ModelGate | None,
-    rule: ScoreRule = "weight",
+    subject: Subject, cameras: Sequence[CameraLike], ranks: Ranks, rule: ScoreRule = "weight"
 ) -> Importance:
     """Measure what each Gaussian contributes to views of these cameras, in small pictures."""
     batches = []
     for column, camera in enumerate(map(_small, cameras)):
         viewmats, Ks = (  # noqa: N806
-            torch.from_numpy(matrix).float()[None].to(table.device)
-            for matrix in (viewmat(camera, space), camera.K)
+            torch.from_numpy(matrix).float()[None].to(ranks.device)
+            for matrix in (viewmat(camera, subject.space), camera.K)
         )
         batches.append(ViewBatch([column], Views(viewmats, Ks, camera.width, camera.height)))
-    return sweep(table, batches, len(batches), options, ranks, rule=rule, lod=lod)
+    return sweep(subject.gaussians, batches, len(batches), subject.options, ranks, rule=rule, lod=subject.lod)
 
 
 @dataclass(frozen=True)
@@ -84,11 +77,8 @@ def cleaned(
 
     `photograph` returns the photograph of a camera; None: there are none.
     """
-    table = GaussianTable.of_parameters({name: getattr(model, name) for name in (*PARAMETERS, "level")})
-    gate = None if model.lod is None else model.lod.gate
-    options = render_options(model.config, model.space, model.sh_degree, gate)
     views = [cameras.cameras[index] for index in cameras.train]
-    cull = contributions(table, views, model.space, options, ranks, model.lod).cull
+    cull = contributions(subject_of(model), views, ranks).cull
     removed = floaters(model.means, model.scales, views_counting(cull, len(views)), most_views)
     kept, picture = ~removed, None
     if bool(removed.any()):

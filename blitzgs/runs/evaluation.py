@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,12 +27,11 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.frame.tiles import TileAssignment, collect_images
 from blitzgs.ops.photometric import ssim
-from blitzgs.util.errors import explain_memory
+from blitzgs.util.errors import explain_memory, warn
 from blitzgs.util.output import OutputFolder
 from blitzgs.util.progress import Report
-from blitzgs.view.gate import ModelGate
 from blitzgs.view.views import CameraLike, ViewSet
-from blitzgs.view.visible import TableOrPool, VisibleFinder
+from blitzgs.view.visible import Subject, VisibleFinder
 
 Lpips = Callable[[Tensor, Tensor], Tensor]
 Stops = Callable[[], bool]
@@ -130,12 +128,11 @@ def render_view(
 
 
 def evaluate(
-    gaussians: TableOrPool,
+    subject: Subject,
     views: ViewSet,
     cameras: Sequence[CameraLike],
     images: ImageStore,
     indices: Sequence[int],
-    options: RenderOptions,
     folder: Path | None,
     owners: TileOwners,
     *,
@@ -144,7 +141,6 @@ def evaluate(
     report: Report | None = None,
     inputs: Iterable[Path] = (),
     optional_files: bool = False,
-    lod: ModelGate | None = None,
     stops: Stops | None = None,
 ) -> dict[str, Any]:
     """Render views and compare them with their photographs; the ranks take turns at comparing.
@@ -155,7 +151,6 @@ def evaluate(
             side; if not 0, the previews of the report are written too.
         report: called with (views rendered, number of views) after each view.
         optional_files: if a file cannot be written, warn instead of raising an error; used during training.
-        lod: leaves out Gaussians whose octree level is too fine for their distance; None: no gate.
         stops: asked after each round in which every rank compares one view; if it returns True, the
             evaluation ends. It must return the same on every rank. None: never stop.
 
@@ -176,14 +171,14 @@ def evaluate(
     lost: str | None = None
     previews = Previews(folder, set(chosen)) if folder is not None and pictures > 0 else None
     own = list(indices[ranks.rank :: ranks.world_size])
-    finder = VisibleFinder(gaussians, lod)
+    finder = VisibleFinder(subject.gaussians, subject.lod)
     for position, index in enumerate(indices):
         turn, destination = divmod(position, ranks.world_size)
         if destination == 0:
             if stops is not None and position > 0 and stops():
                 raise EvaluationStoppedError
             images.prefetch(own[turn : turn + 4])
-        render = render_view(finder, views, index, options, owners, destination)
+        render = render_view(finder, views, index, subject.options, owners, destination)
         if report is not None:
             report(position + 1, len(indices))
         if render is None:
@@ -229,7 +224,7 @@ def _over_all_ranks(
     if masked and ranks.rank == 0:
         shown = ", ".join(masked[:5]) + (", ..." if len(masked) > 5 else "")
         text = f"{len(masked)} of {len(names)} views cannot be measured, as they are masked: {shown}"
-        warnings.warn(text, stacklevel=3)
+        warn(text)
     views = {name: found[name] for name in names if name in found}
     result: dict[str, Any] = {}
     for metric in METRICS:
@@ -277,7 +272,7 @@ class _Files:
     def _failed(self, error: OSError) -> None:
         if not self._optional:
             raise error
-        warnings.warn(f"the evaluation could not write a file and goes on without it: {error}", stacklevel=2)
+        warn(f"the evaluation could not write a file and goes on without it: {error}")
 
 
 FOLDER, INDEX = "previews", "views.json"

@@ -7,7 +7,6 @@ import dataclasses
 import json
 import math
 import os
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,8 +27,7 @@ from blitzgs.formats.selection import Selected, Selection
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint, run_files
 from blitzgs.runs.cameras import SHARED_EXPOSURES
-from blitzgs.runs.checkpoint import CheckpointError
-from blitzgs.runs.checkpoint_files import DAMAGE, Shard, opened, verified
+from blitzgs.runs.checkpoint_files import Shard, opened
 from blitzgs.runs.folder import Model, model_of
 from blitzgs.runs.folder_checks import check_own
 from blitzgs.runs.run_files import Progress, TrainedModel, lod_gate
@@ -320,30 +318,23 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
     damaged, or the newest is of another version or of another run.
     """
     run_files.check_is_run(folder)
-    refused = []
-    names = checkpoint.names_of(folder / run_files.CHECKPOINTS)
-    for name in reversed(names) if only is None else [only]:
-        path = folder / run_files.CHECKPOINTS / name
-        try:
-            manifest = verified(path)
-        except DAMAGE as error:
-            refused.append(f"checkpoint {path} is damaged: {error}")
-            continue
-        if refused:
-            warnings.warn(f"{'; '.join(refused)}; using {name}", stacklevel=2)
-        check_own(folder, path, str(manifest.state.get("run", "")), Ranks())
-        progress, space, config = run_files.parsed(manifest.state, path)
-        run_files.compare_with_file(config, folder / run_files.CONFIG)
-        gate = lod_gate(config, progress)
-        trained = _Shards(path, manifest.shards, config, progress.step, space.extent, gate is not None)
-        exposed = False
-        if manifest.shared is not None:
-            with opened(path / manifest.shared.file) as shared:
-                exposed = SHARED_EXPOSURES in shared.keys()  # noqa: SIM118
-        return RunSource(trained, space, _comments(config, space, gate, exposed), config, progress)
-    if refused:
-        raise CheckpointError(f"no sound checkpoint in {folder}: {'; '.join(refused)}")
-    raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
+    alone = Ranks()
+    found = checkpoint.newest(
+        folder / run_files.CHECKPOINTS, alone, lambda path: checkpoint.sound_manifest(path, alone), only
+    )
+    if found is None:
+        raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
+    manifest, path, _ = found
+    check_own(folder, path, str(manifest.state.get("run", "")), alone)
+    progress, space, config = run_files.parsed(manifest.state, path)
+    run_files.compare_with_file(config, folder / run_files.CONFIG)
+    gate = lod_gate(config, progress)
+    trained = _Shards(path, manifest.shards, config, progress.step, space.extent, gate is not None)
+    exposed = False
+    if manifest.shared is not None:
+        with opened(path / manifest.shared.file) as shared:
+            exposed = SHARED_EXPOSURES in shared.keys()  # noqa: SIM118
+    return RunSource(trained, space, _comments(config, space, gate, exposed), config, progress)
 
 
 @dataclass

@@ -26,9 +26,10 @@ from blitzgs.runs import run_files
 from blitzgs.runs.cameras import RunCamera, RunCameras, checked_camera, load_cameras
 from blitzgs.runs.log import LOG, records
 from blitzgs.runs.run_files import TrainedModel, model_gate
-from blitzgs.table.table import PARAMETERS
+from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.gate import ModelGate, centres_of
 from blitzgs.view.views import CameraLike, Space, render_options, viewmat
+from blitzgs.view.visible import Subject
 
 
 @dataclass(frozen=True, repr=False)
@@ -243,6 +244,14 @@ class RunFolder:
         except ValueError as error:
             raise ValueError(f"{path} is damaged: {error}") from error
         return content
+
+
+def subject_of(model: Model) -> Subject:
+    """Return what views of a model are rendered from."""
+    table = GaussianTable.of_parameters({name: getattr(model, name) for name in (*PARAMETERS, "level")})
+    gate = None if model.lod is None else model.lod.gate
+    options = render_options(model.config, model.space, model.sh_degree, gate)
+    return Subject(table, options, model.space, model.lod)
 
 
 def model_of(found: TrainedModel, device: torch.device) -> Model:

@@ -12,7 +12,6 @@ import secrets
 import shutil
 import socket
 import time
-import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from blitzgs.runs.cameras import CAMERAS
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.log import LOG, records
 from blitzgs.table.table import GaussianTable
+from blitzgs.util.errors import warn
 from blitzgs.util.terminal import amount
 
 LOCK = ".lock"
@@ -75,10 +75,9 @@ def _lock(path: Path) -> tuple[int | None, str | None]:
             if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
                 raise
             os.close(descriptor)
-            warnings.warn(
+            warn(
                 f"{path.parent} is on a file system without locks ({error.strerror}): nothing keeps a second "
-                "run out of it",
-                stacklevel=2,
+                "run out of it"
             )
             return None, None
     os.ftruncate(descriptor, 0)
@@ -150,9 +149,8 @@ def check_room(folder: Path, table: GaussianTable, ranks: Ranks, most_gaussians:
     most = max(rows, most_gaussians)
     wanted = 2 * most * row
     if free < wanted and ranks.rank == 0:
-        warnings.warn(
-            f"{folder}: {amount(free)} are free; two checkpoints of {most:,} Gaussians take {amount(wanted)}",
-            stacklevel=2,
+        warn(
+            f"{folder}: {amount(free)} are free; two checkpoints of {most:,} Gaussians take {amount(wanted)}"
         )
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from datetime import timedelta
@@ -21,6 +20,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
+from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import Report, lines
 from blitzgs.util.terminal import printable
@@ -261,9 +261,7 @@ class _Failures:
             if kind not in self._warned:
                 self._warned.add(kind)
                 with contextlib.suppress(OSError):
-                    warnings.warn(
-                        f"{kind}: {error}; training goes on, records may be missing there", stacklevel=4
-                    )
+                    warn(f"{kind}: {error}; training goes on, records may be missing there")
 
 
 def records(path: Path) -> Iterator[dict[str, Any]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,10 +26,11 @@ from blitzgs.table.blocks import sort_rows
 from blitzgs.table.host_table import HostTable, available_bytes
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
+from blitzgs.util.errors import warn
 from blitzgs.view.gate import LodGate, ModelGate
 from blitzgs.view.levels import FOOTPRINT_STEPS
-from blitzgs.view.views import Space
-from blitzgs.view.visible import TableOrPool
+from blitzgs.view.views import Space, render_options
+from blitzgs.view.visible import Subject, TableOrPool
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
@@ -111,18 +111,22 @@ class TrainedModel:
         """Gain and bias of each training photograph, [T, 2, 3]; None if the run has none."""
         return stored_exposures(self.shared)
 
-    def gaussians_on(self, device: torch.device) -> TableOrPool:
-        """Return the Gaussians that views are rendered from on a device.
+    def subject(self, ranks: Ranks) -> Subject:
+        """Return what views are rendered from, on the ranks' device. Collective.
 
         With a pool, the first call moves the table into memory that the pool can reach. PoolError: the pool
         has room for fewer than two blocks.
         """
-        if self.pool_bytes == 0:
-            return self.table
-        if self.config.memory.resident_gb == 0:
-            sort_rows(self.table)
-        self.table = HostTable(self.table.release(), pinned=device.type == "cuda")
-        return Pool(self.table, device, self.pool_bytes, None)
+        gate = lod_gate(self.config, self.progress)
+        options = render_options(self.config, self.space, self.progress.sh_degree, gate)
+        lod = model_gate(self.config, self.progress, self.table, ranks)
+        gaussians: TableOrPool = self.table
+        if self.pool_bytes > 0:
+            if self.config.memory.resident_gb == 0:
+                sort_rows(self.table)
+            self.table = HostTable(self.table.release(), pinned=ranks.device.type == "cuda")
+            gaussians = Pool(self.table, ranks.device, self.pool_bytes, None)
+        return Subject(gaussians, options, self.space, lod)
 
 
 def save(folder: Path, model: TrainedModel, ranks: Ranks, in_background: bool = False) -> checkpoint.Saving:
@@ -166,22 +170,23 @@ def restore(
     The Gaussians go to `device`, else to the ranks' device. CheckpointError: all checkpoints are damaged, or
     the newest is of another version or of another run.
     """
-    loaded = checkpoint.load_latest(
-        folder / CHECKPOINTS, ranks, device or ranks.device, lambda c: bad_column(GaussianTable(c)), only
+    problem, device = lambda columns: bad_column(GaussianTable(columns)), device or ranks.device
+    found = checkpoint.newest(
+        folder / CHECKPOINTS, ranks, lambda path: checkpoint.load(path, ranks, device, problem), only
     )
-    if loaded is None:
+    if found is None:
         return None
+    loaded, path, refused = found
     state = loaded.state
-    check_own(folder, folder / CHECKPOINTS / loaded.name, str(state.get("run", "")), ranks)
-    why = "the newest sound one" if loaded.refused else "the newest"
-    skipped = f"; {len(loaded.refused)} newer refused" if loaded.refused else ""
-    progress, space, config = parsed(state, folder / CHECKPOINTS / loaded.name)
+    check_own(folder, path, str(state.get("run", "")), ranks)
+    why = f"the newest sound one; {len(refused)} newer refused" if refused else "the newest"
+    progress, space, config = parsed(state, path)
     table = GaussianTable(loaded.columns)
-    if len(list((folder / CHECKPOINTS / loaded.name).glob("shard_*"))) != ranks.world_size:
+    if len(list(path.glob("shard_*"))) != ranks.world_size:
         # Each rank had an order of its own, and the spread is of another number of blocks.
         sort_rows(table)
         progress.sorted_spread = 0
-    source = f"{loaded.name} ({why}{skipped})"
+    source = f"{path.name} ({why})"
     return TrainedModel(config, progress, space, table, state.get("run", ""), source, loaded.shared)
 
 
@@ -256,7 +261,7 @@ def compare_with_file(config: Config, path: Path) -> None:
     except ConfigError as error:
         what = f"cannot be read ({error})"
     if what:
-        warnings.warn(f"{path} {what}: the configuration in the checkpoint is used", stacklevel=3)
+        warn(f"{path} {what}: the configuration in the checkpoint is used")
 
 
 def check_resumable(saved: Config, wanted: Config) -> None:

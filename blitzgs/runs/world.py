@@ -17,18 +17,18 @@ from blitzgs.capture.capture import Capture
 from blitzgs.capture.lengths import nearest_depths
 from blitzgs.capture.world import GEO, WorldFrame, read_world_frame
 from blitzgs.config.fields import Config
-from blitzgs.config.files import changed
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.models import offset_of
 from blitzgs.ops.harmonics import spherical_harmonics
 from blitzgs.runs.folder import Model
-from blitzgs.runs.run_files import Progress, TrainedModel
+from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.output import write_file
 from blitzgs.util.rotations import quaternions
-from blitzgs.view.gate import LodGate
-from blitzgs.view.views import Space
+from blitzgs.view.gate import LodGate, ModelGate
+from blitzgs.view.views import Space, render_options
+from blitzgs.view.visible import Subject
 
 
 def save_world_frame(folder: Path, frame: WorldFrame) -> Path:
@@ -115,9 +115,12 @@ def trained_columns(found: Gaussians, space: Space, ranks: Ranks) -> dict[str, T
 
 
 def trained_table(found: Gaussians, space: Space, ranks: Ranks) -> GaussianTable:
-    """Return this rank's Gaussians on its device, in the order of `trained_columns`, for rendering only."""
+    """Return this rank's Gaussians on its device, neighbours beside each other, for rendering only."""
     columns = trained_columns(found, space, ranks)
-    return GaussianTable.of_parameters({name: column.to(ranks.device) for name, column in columns.items()})
+    order = morton_order(columns["means"])
+    return GaussianTable.of_parameters(
+        {name: column[order].to(ranks.device) for name, column in columns.items()}
+    )
 
 
 def check_seen(found: Gaussians, path: Path, capture: Capture) -> None:
@@ -140,8 +143,14 @@ def gate_of(found: Gaussians, unit: float) -> LodGate | None:
     return LodGate(float(distance) / unit, float(fork), int(count), int(finest), smooth is not None)
 
 
-def model_of_file(found: Gaussians, config: Config, space: Space, near: float, ranks: Ranks) -> TrainedModel:
-    """Return a model to be rendered in the views of a capture; `near` is in the capture's unit."""
-    progress = Progress(step=0, sh_degree=found.degree, level_count=1, peak_gaussians=len(found), seconds=0.0)
-    config = changed(config, "model", near=near / (space.unit * space.extent))
-    return TrainedModel(config, progress, space, trained_table(found, space, ranks))
+def subject_of_file(
+    found: Gaussians, config: Config, space: Space, ranks: Ranks, most_kept: float = math.inf
+) -> Subject:
+    """Return what views of the Gaussians of a file are rendered from. Collective if the file has an LOD gate.
+
+    `most_kept`: see `ModelGate`.
+    """
+    table, gate = trained_table(found, space, ranks), gate_of(found, space.unit)
+    options = render_options(config, space, found.degree, gate)
+    lod = None if gate is None else ModelGate(gate, math.inf if gate.smooth else most_kept, table, ranks)
+    return Subject(table, options, space, lod)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -27,6 +26,7 @@ from blitzgs.capture.names import IMAGE_SUFFIXES
 from blitzgs.sfm.engine import has_pycolmap, run_pycolmap
 from blitzgs.sfm.reconstruct import WORK, at_work
 from blitzgs.sfm.report import misses
+from blitzgs.util.errors import warn
 from blitzgs.util.output import check_outside
 from blitzgs.util.progress import image_progress
 
@@ -99,10 +99,9 @@ def refine(root: Path, capture: Path) -> Refined:
     ):
         raise FileExistsError(f"{capture} is not empty: choose another folder for the refined capture")
     if len(models) > 1:
-        warnings.warn(
+        warn(
             f"of {len(models)} COLMAP models, {folder.relative_to(root)} is refined, with {models[0][1]} "
-            f"images; {capture} does not have the others",
-            stacklevel=2,
+            f"images; {capture} does not have the others"
         )
     work = capture / WORK
     work.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import warnings
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -32,6 +31,7 @@ from blitzgs.distributed.selection import decimal_share, smallest
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.population import tree_sums
 from blitzgs.spawn.candidates import FEATURES, Candidates, Veto
+from blitzgs.util.errors import warn
 from blitzgs.util.output import check_replaceable, write_file
 
 FORMAT = 1
@@ -320,7 +320,7 @@ def open_spawn_gate(config: Config, capture: Capture, ranks: Ranks, known: str) 
         )
     if ranks.rank == 0:
         for problem in reasons_against(gate, config, capture):
-            warnings.warn(f"spawn gate {path}: {problem}", stacklevel=2)
+            warn(f"spawn gate {path}: {problem}")
     if population.gate_rule == "sample":
         return partial(sampled_veto, gate, population.gate_rate, config.seed), digest
     return partial(rank_veto, gate, population.gate_rate), digest

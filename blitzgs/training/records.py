@@ -7,7 +7,6 @@ import contextlib
 import math
 import platform
 import resource
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
@@ -27,6 +26,7 @@ from blitzgs.training.batches import Batch
 from blitzgs.training.loss import batch_psnr, opacity_term, photometric, scale_term
 from blitzgs.training.state import TrainingState
 from blitzgs.util.charts import line_chart
+from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 
 PICTURE = "trajectory.svg"
@@ -92,7 +92,7 @@ def write_picture(state: TrainingState, report: dict[str, Any]) -> None:
     try:
         write_file(state.folder / PICTURE, line_chart({"": points}, "images", "Gaussians"))
     except OSError as error:
-        warnings.warn(f"the population's picture was not written: {error}", stacklevel=2)
+        warn(f"the population's picture was not written: {error}")
 
 
 def _logged(path: Path, run_id: str) -> list[tuple[int, int]]:

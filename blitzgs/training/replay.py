@@ -23,7 +23,6 @@ import json
 import math
 import os
 import shutil
-import warnings
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -47,6 +46,7 @@ from blitzgs.spawn.candidates import Candidates, Veto
 from blitzgs.spawn.gate import SpawnGate, random_veto, rank_veto, sampled_veto, veto_draws
 from blitzgs.spawn.lineage_parts import read_lineage
 from blitzgs.training.trainer import Trainer
+from blitzgs.util.errors import warn
 
 REFERENCE = "reference"
 ARMS = (REFERENCE, "oracle", "oracle_rate", "gate", "gate_sampled", "random")
@@ -225,11 +225,10 @@ def _held_back(known: Tensor, spawned: Tensor, ranks: Ranks) -> float:
     """Return the share of the reference's candidates that became no Gaussians; warn if it is large."""
     share = int(torch.isin(known, spawned, invert=True).sum()) / max(1, len(known))
     if share > 0.5 and ranks.rank == 0:
-        warnings.warn(
+        warn(
             f"the limit of the population held back {share:.0%} of the reference's candidates, so all "
             "arms may end alike: replay a run with a higher limit (population.max_gaussians, "
-            "pixels_per_gaussian, gaussians_per_point)",
-            stacklevel=3,
+            "pixels_per_gaussian, gaussians_per_point)"
         )
     return share
 

@@ -22,7 +22,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.render import RenderOptions
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs.log import RunLog
-from blitzgs.runs.run_files import Progress, lod_gate
+from blitzgs.runs.run_files import Progress, lod_gate, model_gate
 from blitzgs.spawn.candidates import Veto
 from blitzgs.spawn.lineage import Lineage
 from blitzgs.table.table import GaussianTable
@@ -30,6 +30,7 @@ from blitzgs.training.agreement import SaveClock
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
 from blitzgs.view.views import Space, ViewSet, render_options
+from blitzgs.view.visible import Subject
 
 # Log records whose mean is compared: the views of one batch differ by more than a fall.
 WINDOW = 16
@@ -138,6 +139,11 @@ class TrainingState:
         """The render options at the run's present spherical-harmonics degree."""
         lod = lod_gate(self.config, self.progress)
         return render_options(self.config, self.space, self.progress.sh_degree, lod)
+
+    def subject(self) -> Subject:
+        """Return what views of the present model are rendered from. Collective if there is an LOD gate."""
+        lod = model_gate(self.config, self.progress, self.table, self.ranks)
+        return Subject(self.stepper.gaussians, self.render_options, self.space, lod)
 
     def start_clock(self) -> None:
         """Count training time from now on, in addition to the time before a resume."""

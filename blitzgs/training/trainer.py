@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import json
 import time
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -51,6 +50,7 @@ from blitzgs.training.setup import set_up
 from blitzgs.training.state import never
 from blitzgs.training.understood import hints_of, largest_size
 from blitzgs.training.watching import Watching
+from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import Laps
 from blitzgs.view.look import Watcher
@@ -271,11 +271,10 @@ class Trainer:
             return
         self._warned_of_masks = True
         if self.state.ranks.rank == 0:
-            warnings.warn(
+            warn(
                 f"{masked} of the first {read} training views are masked by more than {MAX_MASKED:.0%}: "
                 "black excludes a pixel and white counts. Invert the masks if they mean the opposite, or "
-                "train without them (--data.masks=false)",
-                stacklevel=2,
+                "train without them (--data.masks=false)"
             )
 
     def _write_record(self) -> None:
@@ -369,5 +368,5 @@ class Trainer:
                     state.lineage.describe(lineage_subject(state.config, state.capture))
                 write_file(state.folder / run_files.SUMMARY, json.dumps(summary, indent=1) + "\n")
             except OSError as error:
-                warnings.warn(f"the model is saved, its summary is not: {error}", stacklevel=2)
+                warn(f"the model is saved, its summary is not: {error}")
         return summary

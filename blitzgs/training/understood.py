@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections import Counter
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ from blitzgs.capture.lengths import NEAR_OF_EXTENT, depths_seen, sampled
 from blitzgs.config.fields import Config
 from blitzgs.training.inputs import sharing_hint
 from blitzgs.training.state import TrainingState
+from blitzgs.util.errors import warn
 from blitzgs.util.terminal import printable
 
 # Photographs that are decoded before the training, and views that are compared with the points.
@@ -109,29 +109,26 @@ def _warn_of_pictures(capture: Capture, pictures: Pictures, near: float) -> None
         ("saturated", means > _SATURATED, "are they overexposed, or is model.background white behind alpha?"),
     ):
         if 2 * hit.sum() > len(means):
-            warnings.warn(
+            warn(
                 f"{int(hit.sum())} of {len(means)} photographs that were looked at are {what}, and so will "
-                f"the model be: {cause}",
-                stacklevel=3,
+                f"the model be: {cause}"
             )
     if len(means) and not capture.about.random_points and _BLACK <= float(np.median(means)) <= _SATURATED:
         mean = float(capture.colors.mean())
         if not _BLACK <= mean <= _SATURATED:
             what = "black" if mean < _BLACK else "saturated"
-            warnings.warn(
+            warn(
                 f"the points' colours are {what} (mean {mean:.0f} of 255), and the photographs are not: "
-                "the model starts with a wrong picture; are the colours read from the right fields?",
-                stacklevel=3,
+                "the model starts with a wrong picture; are the colours read from the right fields?"
             )
     views = capture.train[:_PROJECTED]
     points = sampled(capture.points, len(capture.cameras))
     depths = [depths_seen(capture.cameras[i], points) for i in views]
     cut = sum(len(d) > 0 and bool(d.max() <= near) for d in depths)
     if 2 * cut > len(views):
-        warnings.warn(
+        warn(
             f"{cut} of the first {len(views)} training views have all their points in front of the near "
-            f"plane ({near:.4g}) and will be black: lower model.near, or set it to 0 for a plane by depths",
-            stacklevel=3,
+            f"plane ({near:.4g}) and will be black: lower model.near, or set it to 0 for a plane by depths"
         )
 
 

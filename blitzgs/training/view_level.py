@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
 
 from blitzgs.capture.capture import Capture, train_views_fingerprint
 from blitzgs.config.schedule import Event
@@ -13,6 +12,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs.run_files import Progress, level_fork, lod_gate, model_gate
 from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.training.state import TrainingState
+from blitzgs.util.errors import warn
 from blitzgs.view.gate import ViewGate, lod_bits
 from blitzgs.view.levels import FOOTPRINT_LEVELS, footprint_levels, footprint_sizes
 
@@ -91,10 +91,9 @@ def keep_to_views(table: GaussianTable, progress: Progress, capture: Capture, ra
         if CULL in table:
             del table[CULL]
             if ranks.rank == 0:
-                warnings.warn(
+                warn(
                     f"the checkpoint was trained on other views than the {len(capture.train)} of today: the "
-                    "cull mask is dropped, and comes back with the next importance pass, if there is one",
-                    stacklevel=2,
+                    "cull mask is dropped, and comes back with the next importance pass, if there is one"
                 )
     return dataclasses.replace(progress, train_views=views)
 

@@ -5,16 +5,15 @@ from __future__ import annotations
 
 import contextlib
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs.run_files import model_gate
 from blitzgs.table.pool import Pool
 from blitzgs.training.events import save
 from blitzgs.training.state import TrainingState
-from blitzgs.view.draw import Drawer, DrawingError, Subject
+from blitzgs.util.errors import warn
+from blitzgs.view.draw import Drawer, DrawingError
 from blitzgs.view.look import Look, Picture, Watcher, Wish
 
 # Seconds between two questions to the watcher while the training is paused and nothing is to be drawn.
@@ -78,13 +77,10 @@ class Watching:
 
     def _drawn(self, look: Look) -> Picture | None:
         state = self._state
-        gaussians = state.stepper.gaussians
-        if isinstance(gaussians, Pool):
+        if isinstance(state.stepper.gaussians, Pool):
             # The pool is filled for the view, and written back with nothing pending.
             state.catch_up()
-        lod = model_gate(state.config, state.progress, state.table, state.ranks)
-        subject = Subject(gaussians, state.render_options, state.space.unit, lod)
-        return Drawer(subject, TileOwners(state.ranks)).draw(look)
+        return Drawer(state.subject(), TileOwners(state.ranks)).draw(look)
 
     def _asked(self, method: str, *arguments: Any) -> Any:
         """Call a method of the watcher; None without one, or if it fails. After an error it is gone."""
@@ -94,10 +90,7 @@ class Watching:
             return getattr(self._watcher, method)(*arguments)
         except Exception as error:
             watcher, self._watcher = self._watcher, None
-            warnings.warn(
-                f"the viewer failed ({type(error).__name__}: {error}); training goes on without it",
-                stacklevel=3,
-            )
+            warn(f"the viewer failed ({type(error).__name__}: {error}); training goes on without it")
             with contextlib.suppress(Exception):
                 watcher.close()
             return None

@@ -23,12 +23,16 @@ if TYPE_CHECKING:
     import torch
 
 
-def warn(text: str) -> None:
+# Between a line of this package and its caller are contexts, and what torch wraps a function in.
+_PASSED = ("blitzgs", "contextlib", "torch")
+
+
+def warn(text: str, category: type[Warning] = UserWarning) -> None:
     """Warn of a user's data; the warning is that of the line that called this package."""
     level, frame = 2, sys._getframe(1).f_back
-    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "blitzgs":
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _PASSED:
         level, frame = level + 1, frame.f_back
-    warnings.warn(text, stacklevel=level + 1)
+    warnings.warn(text, category, stacklevel=level + 1)
 
 
 @contextmanager

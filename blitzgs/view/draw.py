@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import TypeVar, cast
 
@@ -26,7 +26,7 @@ from blitzgs.table.pool import Pool
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.gate import ModelGate
 from blitzgs.view.look import Look, Mode, Picture
-from blitzgs.view.visible import TableOrPool, VisibleFinder, VisibleRows
+from blitzgs.view.visible import Subject, TableOrPool, VisibleFinder, VisibleRows
 
 T = TypeVar("T")
 
@@ -45,18 +45,6 @@ LEVEL_COLOURS = (
     (0.27, 0.00, 0.33), (0.23, 0.32, 0.55), (0.13, 0.57, 0.55), (0.37, 0.79, 0.38), (0.99, 0.91, 0.14),
     (0.99, 0.55, 0.24), (0.84, 0.19, 0.15), (0.55, 0.00, 0.40), (0.90, 0.55, 0.76), (0.65, 0.65, 0.65),
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Subject:
-    """The model that is drawn, as it is at one moment."""
-
-    # This rank's. Pending optimiser steps are not applied, so that looking at a training does not change it;
-    # the rows that wait for them are off by far less than a pixel.
-    gaussians: TableOrPool
-    options: RenderOptions  # how the model is rendered, at its present spherical-harmonics degree
-    unit: float  # length of a trained unit in the capture's unit
-    lod: ModelGate | None  # the LOD gate; None: there is none
 
 
 class DrawingError(RuntimeError):
@@ -105,7 +93,7 @@ class Drawer:
             seen += count.sum()
         assert layered is not None
         behind = subject.options.background if look.background is None else look.background
-        image = self._together(lambda: _image(*layered, look.mode, behind, subject.unit))
+        image = self._together(lambda: _image(*layered, look.mode, behind, subject.space.unit))
         if ranges is not None:
             collect_images(image, ranges, ranks, destination=0)
         if ranks.rank != 0:

@@ -4,23 +4,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from blitzgs.frame.render import RenderOptions
 from blitzgs.ops.blocks import ActiveRows, gate_views_
 from blitzgs.ops.projection_types import Views
 from blitzgs.table.blocks import BlockIndex, Cameras
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.gate import ModelGate
+from blitzgs.view.views import Space
 
 # The Gaussians that views are rendered from: a table on the device, or a table on the host with its pool.
 TableOrPool = GaussianTable | Pool
 
 # Depths are chosen among so many quantiles.
 _DEPTHS = 64
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The model that is drawn, as it is at one moment."""
+
+    # This rank's. Pending optimiser steps are not applied, so that looking at a training does not change it;
+    # the rows that wait for them are off by far less than a pixel.
+    gaussians: TableOrPool
+    options: RenderOptions  # how the model is rendered, at its present spherical-harmonics degree
+    space: Space  # maps the trained world to the capture's
+    lod: ModelGate | None  # the LOD gate; None: there is none
 
 
 class VisibleRows(NamedTuple):

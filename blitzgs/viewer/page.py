@@ -8,13 +8,12 @@ import io
 import secrets
 import threading
 import time
-import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from blitzgs.util.errors import optional_package
+from blitzgs.util.errors import optional_package, warn
 from blitzgs.view.look import Picture
 from blitzgs.viewer.door import Door, is_loopback
 from blitzgs.viewer.frustums import Frustums
@@ -135,7 +134,7 @@ class Page:
             try:
                 ask = visitor.next_ask()
             except Exception as error:  # a browser may send anything
-                warnings.warn(f"the viewer has dropped a visitor: {error}", stacklevel=2)
+                warn(f"the viewer has dropped a visitor: {error}")
                 self.visitors.pop(visitor.client.client_id, None)
                 continue
             if ask is not None:
@@ -167,7 +166,7 @@ class Page:
         except Exception as error:
             # A browser that has gone, or one picture less: neither may end the page or a training.
             if visitor.client.client_id in self.visitors:
-                warnings.warn(f"the viewer could not send a picture: {error}", stacklevel=2)
+                warn(f"the viewer could not send a picture: {error}")
         finally:
             self.send_seconds += time.thread_time() - begin
             self._sending.release()

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,15 +20,14 @@ from blitzgs.formats.models import offset_of, open_gaussians
 from blitzgs.formats.selection import Selected, Selection
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
-from blitzgs.runs.cameras import CAMERAS, load_cameras
+from blitzgs.runs.cameras import stored_cameras
 from blitzgs.runs.export import largest_of_run, open_source
-from blitzgs.runs.folder import open_run
-from blitzgs.runs.world import gate_of, load_world_frame, trained_columns
-from blitzgs.table.blocks import morton_order
+from blitzgs.runs.folder import open_run, subject_of
+from blitzgs.runs.world import load_world_frame, subject_of_file
 from blitzgs.table.table import PARAMETERS, GaussianTable
-from blitzgs.view.draw import Drawer, Subject
-from blitzgs.view.gate import ModelGate
-from blitzgs.view.views import Space, render_options
+from blitzgs.view.draw import Drawer
+from blitzgs.view.views import Space
+from blitzgs.view.visible import Subject, table_of
 from blitzgs.viewer.page import Page
 from blitzgs.viewer.world import Exhibit
 
@@ -42,9 +40,13 @@ class Opened:
 
     exhibit: Exhibit
     subject: Subject
-    table: GaussianTable
     ranks: Ranks
     unread: int = 0
+
+    @property
+    def table(self) -> GaussianTable:
+        """The Gaussians."""
+        return table_of(self.subject.gaussians)
 
     @property
     def bytes(self) -> int:
@@ -81,30 +83,25 @@ def open_model(
     else:
         model = largest_of_run(source, most, ranks.device)
         count, degree = len(source), source.degree
-    columns = {name: getattr(model, name) for name in (*PARAMETERS, "level")}
-    table = GaussianTable.of_parameters(columns)
-    options = render_options(
-        model.config, model.space, model.sh_degree, model.lod.gate if model.lod else None
-    )
-    subject = Subject(table, options, model.space.unit, model.lod)
-    stored = load_cameras(path) if (path / CAMERAS).exists() else None
+    subject = subject_of(model)
+    stored = stored_cameras(path)
     exhibit = Exhibit(
         title=path.resolve().name + (f" {checkpoint}" if checkpoint else ""),
         space=model.space,
         sh_degree=degree,
-        background=options.background,
+        background=subject.options.background,
         levels=bool((model.level > 0).any()),
         lod=model.lod is not None,
         smooth=model.lod is not None and model.lod.gate.smooth,
         box=box_of(model.means),
-        cameras=() if stored is None else stored.cameras,
-        test=() if stored is None else stored.test,
-        photograph=photograph if stored is not None else None,
-        exposures=_exposures(model.exposures, () if stored is None else stored.train),
+        cameras=stored.cameras,
+        test=stored.test,
+        photograph=photograph if stored.cameras else None,
+        exposures=_exposures(model.exposures, stored.train),
         paths=paths or path / "paths",
         frame=load_world_frame(path),
     )
-    return Opened(exhibit, subject, table, ranks, count - len(table))
+    return Opened(exhibit, subject, ranks, count - len(model))
 
 
 def _exposures(found: Tensor | None, train: Sequence[int]) -> dict[int, npt.NDArray[np.float64]]:
@@ -126,27 +123,21 @@ def _open_file(path: Path, ranks: Ranks, paths: Path, most: int | None) -> Opene
     middle, extent = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
     # Centred, so that float32 resolves the positions of a georeferenced model as finely as the file does.
     space = Space.of(middle + np.array(offset_of(found.comments)), max(extent, 1e-6))
-    columns = trained_columns(found, space, Ranks())
-    order = morton_order(columns["means"])
-    table = GaussianTable.of_parameters(
-        {name: column[order].to(ranks.device) for name, column in columns.items()}
-    )
     config = Config(model=ModelConfig(antialiased=is_antialiased(found), near=1e-3))
-    gate = gate_of(found, space.unit)
-    options = render_options(config, space, found.degree, gate)
-    lod = None if gate is None else ModelGate(gate, math.inf if gate.smooth else 0.95, table, ranks)
+    subject = subject_of_file(found, config, space, ranks, most_kept=0.95)
+    lod = subject.lod
     exhibit = Exhibit(
         title=path.name,
         space=space,
         sh_degree=full_degree,
-        background=options.background,
+        background=subject.options.background,
         levels=found.levels is not None,
         lod=lod is not None,
-        smooth=gate is not None and gate.smooth,
+        smooth=lod is not None and lod.gate.smooth,
         box=(box - middle) / space.unit,
         paths=paths,
     )
-    return Opened(exhibit, Subject(table, options, space.unit, lod), table, ranks, count - len(table))
+    return Opened(exhibit, subject, ranks, count - len(found))
 
 
 def box_of(means: Tensor) -> npt.NDArray[np.float64]:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from blitzgs.capture.world import GEOCENTRIC, WorldFrame, converted, reference_system
 from blitzgs.config.fields import Config, ModelConfig
+from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased
 from blitzgs.formats.models import offset_of, open_gaussians
 from blitzgs.formats.selection import opacity_length
@@ -21,7 +22,7 @@ from blitzgs.formats.tiles import upright
 from blitzgs.formats.web_page import WebLevels, WebScene, estimated_bytes, frame_bytes, web_page
 from blitzgs.frame.render import RenderOptions
 from blitzgs.runs import run_files
-from blitzgs.runs.cameras import CAMERAS, load_cameras
+from blitzgs.runs.cameras import stored_cameras
 from blitzgs.runs.clean import contributions as measured
 from blitzgs.runs.export import open_source
 from blitzgs.runs.world import load_world_frame
@@ -30,6 +31,7 @@ from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.util.errors import located
 from blitzgs.view.gate import ModelGate
 from blitzgs.view.views import CameraLike, Space, render_options
+from blitzgs.view.visible import Subject, table_of
 from blitzgs.viewer.studio import Opened, box_of
 from blitzgs.viewer.world import SCALE, World
 
@@ -72,7 +74,8 @@ def web_file(opened: Opened, max_bytes: int) -> WebFile:
     scene = _scene(opened)
     kept = min(visible, int(0.99 * visible * space / estimated_bytes(splats)))
     if kept < visible:
-        rows = rows[contributions(opened)[rows].argsort(descending=True, stable=True)]
+        score = contributions(opened.subject, exhibit.cameras, opened.ranks)
+        rows = rows[score[rows].argsort(descending=True, stable=True)]
     while True:
         if kept < 1:
             raise ValueError(f"a file of {max_bytes / 1e6:g} MB holds no Gaussian: choose a larger --max-mb")
@@ -99,18 +102,17 @@ def _seen(table: GaussianTable) -> Tensor:
     return seen.nonzero()[:, 0]
 
 
-def contributions(opened: Opened) -> Tensor:
+def contributions(subject: Subject, cameras: Sequence[CameraLike], ranks: Ranks) -> Tensor:
     """Return how much each Gaussian contributes to views of the capture.
 
     Without a quarter of the Gaussians of the demo, its views are at 39.6 dB of the whole model's by this
     order, at 35.6 dB by opacity times length, and at 30.9 dB by opacity times area.
     """
-    table, exhibit, subject = opened.table, opened.exhibit, opened.subject
-    if not exhibit.cameras:
+    if not cameras:
+        table = table_of(subject.gaussians)
         return opacity_length(table["opacities"], table["scales"])
-    chosen = np.unique(np.linspace(0, len(exhibit.cameras) - 1, _VIEWS).round().astype(int))
-    cameras = [exhibit.cameras[index] for index in chosen]
-    return measured(table, cameras, exhibit.space, subject.options, opened.ranks, subject.lod).score
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, _VIEWS).round().astype(int))
+    return measured(subject, [cameras[index] for index in chosen], ranks).score
 
 
 def _splats(table: GaussianTable, rows: Tensor, degree: int, levels: bool) -> Gaussians:
@@ -203,8 +205,7 @@ def open_city(path: Path, checked: bool = True) -> City:
         folder, checkpoint = run_files.run_and_checkpoint(path)
         run = open_source(folder, checkpoint)
         source, offset = run, np.array(run.space.offset)
-        if (folder / CAMERAS).exists():
-            cameras = load_cameras(folder).cameras
+        cameras = stored_cameras(folder).cameras
         frame = load_world_frame(folder)
     first = next(iter(source.blocks()), None)
     if first is None or len(first) == 0:

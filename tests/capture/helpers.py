@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blitzgs.capture import colmap
+from tests.helpers import look_at_origin
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -51,7 +52,7 @@ def reconstruction(
     for index, name in enumerate(names, start=1):
         angle = 2 * np.pi * index / max(len(names), 1)
         center = np.array([4 * np.cos(angle), 4 * np.sin(angle), 0.5])
-        pose = pycolmap.Rigid3d(np.hstack([r := look_at(center), (-r @ center)[:, None]]))
+        pose = pycolmap.Rigid3d(look_at_origin(center)[:3])
         image = pycolmap.Image(name=name, camera_id=1, image_id=index)
         image.points2D = pycolmap.Point2DList([pycolmap.Point2D(random.uniform(0, 50, 2)) for _ in points])
         rec.add_image_with_trivial_frame(image, pose)
@@ -59,13 +60,6 @@ def reconstruction(
         elements = [pycolmap.TrackElement(i, k) for i in range(1, len(names) + 1) if (i + k) % 3 or k == 0]
         rec.add_point3D(xyz, pycolmap.Track(elements), random.integers(0, 256, 3).astype(np.uint8))
     return rec
-
-
-def look_at(center: np.ndarray) -> np.ndarray:
-    forward = -center / np.linalg.norm(center)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward])
 
 
 def write_capture(root: Path, names: list[str], width: int = 64, height: int = 48, **camera: object) -> Path:
@@ -165,7 +159,9 @@ class Posed:
         random = np.random.default_rng(4)
         turns = Rotation.from_euler("xyz", random.uniform(-8, 8, (6, 3)), degrees=True).as_matrix()
         places = np.array([[4 * np.cos(a), 4 * np.sin(a), 3 + 0.3 * a] for a in np.arange(6) * 1.1])
-        self.rotations = [turn @ look_at(place) for turn, place in zip(turns, places, strict=True)]
+        self.rotations = [
+            turn @ look_at_origin(place)[:3, :3] for turn, place in zip(turns, places, strict=True)
+        ]
         self.centres = places + self.origin
         self.points = random.uniform(-0.8, 0.8, (40, 3)) + self.origin
         self.colors = random.integers(0, 256, (40, 3))

@@ -15,8 +15,8 @@ from blitzgs.capture.cameras import camera_centres, rectify
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.lengths import NEAR_OF_EXTENT
 from blitzgs.capture.lens import Lens
-from tests.capture.helpers import as_text, look_at, smooth_image, write_image
-from tests.helpers import refused
+from tests.capture.helpers import as_text, smooth_image, write_image
+from tests.helpers import look_at_origin, refused
 
 COUNT, W, H = 12, 64, 48
 NAMES = [f"{i:02d}.png" for i in range(COUNT)]
@@ -28,7 +28,7 @@ def ring(shift, radius=4.0):
     """Poses of a ring of cameras around points at `shift`, and the points."""
     angles = 2 * np.pi * np.arange(COUNT) / COUNT
     centres = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(COUNT, 0.5)], axis=1)
-    rotations = np.stack([look_at(centre) for centre in centres])
+    rotations = np.stack([look_at_origin(centre)[:3, :3] for centre in centres])
     return rotations, centres + shift, np.random.default_rng(2).uniform(-1, 1, (300, 3)) + shift
 
 
@@ -89,7 +89,7 @@ def misplaced(kind, rotations, centres, shift):
         centres[STRAY] = shift + [240.0, 0, 0]
     elif kind == "far and looking back":
         at = np.array([0.1, -600.0, 2.0])
-        rotations[STRAY], centres[STRAY] = look_at(at), shift + at
+        rotations[STRAY], centres[STRAY] = look_at_origin(at)[:3, :3], shift + at
     elif kind == "near infinity":
         centres[STRAY] = shift + [1e12, 0, 0]
     return rotations, centres
@@ -133,7 +133,7 @@ def test_one_camera_that_was_not_aligned_costs_one_view(tmp_path, form, kind, sh
 def test_an_overview_that_shows_the_scene_is_kept_but_decides_on_no_length(tmp_path):
     rotations, centres, points = ring(0)
     at = np.array([0.1, -30.0, 2.0])
-    rotations[STRAY], centres[STRAY] = look_at(at), at
+    rotations[STRAY], centres[STRAY] = look_at_origin(at)[:3, :3], at
     write(tmp_path, "binary", rotations, centres, points)
     capture, said = quiet_load(tmp_path)
     assert (

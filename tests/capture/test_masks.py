@@ -95,27 +95,21 @@ def test_labels_of_all_brightnesses_count_whatever_they_are():
 
 
 @pytest.mark.parametrize(
-    ("pixels", "message"),
+    ("name", "mask", "message"),
     [
-        (np.full(SHAPE, 255), "the masks exclude nothing"),
-        (np.full(SHAPE, 3), "the masks exclude nothing"),
-        (np.full(SHAPE, 0), "the masks exclude every pixel"),
+        ("a.png", np.full(SHAPE, 255), "the masks exclude nothing"),
+        ("a.png", np.full(SHAPE, 3), "the masks exclude nothing"),
+        ("a.png", np.full(SHAPE, 0), "the masks exclude every pixel"),
+        ("a.jpg", grey(0, 1), "exclude every pixel.*lossy files.*as PNG"),
     ],
 )
-def test_masks_without_effect_are_said(tmp_path, pixels, message):
-    root = write_capture(tmp_path, ["a.png", "b.png"])
+def test_masks_without_effect_are_said(tmp_path, name, mask, message):
+    names = [name, name.replace("a", "b")]
+    root = write_capture(tmp_path, names)
     (root / "masks").mkdir()
-    for name in ("a.png", "b.png"):
-        cv2.imwrite(str(root / "masks" / name), pixels.astype(np.uint8))
+    for file in names:
+        cv2.imwrite(str(root / "masks" / file), mask.astype(np.uint8))
     with pytest.warns(UserWarning, match=message):
-        load_capture(root)
-
-
-def test_a_lossy_mask_of_labels_0_and_1_is_said_to_exclude_all(tmp_path):
-    root = write_capture(tmp_path, ["a.jpg"])
-    (root / "masks").mkdir()
-    cv2.imwrite(str(root / "masks" / "a.jpg"), grey(0, 1))
-    with pytest.warns(UserWarning, match="exclude every pixel.*lossy files.*as PNG"):
         load_capture(root)
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.usable import split_views
-from tests.capture.helpers import look_at, reconstruction, smooth_image, write_capture, write_image
-from tests.helpers import refused
+from tests.capture.helpers import reconstruction, smooth_image, write_capture, write_image
+from tests.helpers import look_at_origin, refused
 
 NAMES = ["a/1.jpg", "a/2.jpg", "b/1.jpg", "b/3.jpg"]
 ROOT = Path("/capture")
@@ -85,7 +85,7 @@ def frames(names=FRAMES):
     for i, name in enumerate(names):
         angle, pose = 2 * np.pi * i / 6, np.eye(4)
         centre = np.array([4 * np.cos(angle), 4 * np.sin(angle), 0.5])
-        pose[:3, :3], pose[:3, 3] = look_at(centre).T @ np.diag([1.0, -1, -1]), centre
+        pose[:3, :3], pose[:3, 3] = look_at_origin(centre)[:3, :3].T @ np.diag([1.0, -1, -1]), centre
         found.append({"file_path": name, "transform_matrix": pose.tolist()})
     return found
 

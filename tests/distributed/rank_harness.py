@@ -9,6 +9,7 @@ import multiprocessing
 import multiprocessing.connection
 import os
 import pickle
+import re
 import time
 import traceback
 
@@ -51,6 +52,15 @@ class RankError(AssertionError):
         self.blame = blame
         super().__init__("\n".join(f"--- rank {rank}\n{text}" for rank, text in messages.items()))
         self.messages = messages
+
+
+def all_fail(text, function, *arguments):
+    """Check that both of two ranks fail with a message that the regular expression matches."""
+    with pytest.raises(RankError) as failure:
+        run_ranks(function, 2, *arguments)
+    assert len(failure.value.messages) == 2
+    for message in failure.value.messages.values():
+        assert re.search(text, message), message
 
 
 def on_cuda(*world_sizes):

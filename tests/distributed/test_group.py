@@ -40,7 +40,7 @@ def _collectives(ranks):
         assert got.device == place and got.dtype == dtype
         assert got[:, 0].tolist() == [100 * n + m for n in range(size) for _ in range(counts[n])]
         assert len(ranks.all_to_all(got[:0], [0] * size, [0] * size)) == 0
-    assert ranks.broadcast_object({"from": m}, source=1) == {"from": 1}
+    assert ranks.broadcast_object({"from": m}) == {"from": 0}
     assert ranks.all_gather_object(m) == list(range(size))
     gathered = ranks.all_gather(torch.tensor(m, device=place))
     assert [part.item() for part in gathered] == list(range(size))

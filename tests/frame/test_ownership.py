@@ -113,7 +113,6 @@ def test_pixel_rows_and_composited_tiles():
     assert [plain.composited(rank) for rank in range(4)] == [plain.of(rank) for rank in range(4)]
     assert ranges.pixel_rows(0) == [(0, 42), (0, 0)]
     assert ranges.pixel_rows(2) == [(6, 60), (0, 42)]
-    assert ranges.pixel_rows(2, margin=0) == [(16, 60), (0, 32)]
     assert ranges.pixel_rows(1) == [(0, 0), (0, 0)]
 
 

@@ -20,8 +20,8 @@ from blitzgs.table.table import GaussianTable
 from blitzgs.training.batches import Batch
 from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term
 from tests.distributed.rank_harness import EIGHT, on_each_device, run_ranks
-from tests.helpers import parameter_gradients, sum_parts
-from tests.training.tiny import look_at_origin, random_gaussians
+from tests.helpers import look_at_origin, parameter_gradients, sum_parts
+from tests.training.tiny import random_gaussians
 
 WIDTH, HEIGHT, EXTENT = 150, 90, 0.3
 LOSS = LossConfig(opacity=0.1)

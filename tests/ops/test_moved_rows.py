@@ -84,8 +84,7 @@ def test_errors_name_the_value_of_copy_rows():
         put_rows_([torch.zeros(3, 4)], rows, [torch.zeros(1, 2)])
     with pytest.raises(RuntimeError, match="fresh must be Float, got Double"):
         put_rows_(three, rows, [torch.zeros(1, dtype=torch.float64)])
-    with pytest.raises(RuntimeError, match=r"fresh must have 1 rows, got \[2\]"):
-        put_rows_(three, rows, [torch.zeros(2)])
+    refused(RuntimeError, r"fresh must have 1 rows, got \[2\]", put_rows_, three, rows, [torch.zeros(2)])
     with pytest.raises(RuntimeError, match="fresh must be empty or as many as columns, got 2 for 1"):
         put_rows_(three, rows, three * 2)
 

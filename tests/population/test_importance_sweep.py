@@ -28,8 +28,8 @@ from blitzgs.reference.render import scores as by_definition
 from blitzgs.reference.render import top_mass
 from blitzgs.table.table import GaussianTable
 from tests.distributed.rank_harness import on_cuda, on_each_device, run_ranks
-from tests.helpers import DEVICES, needs_cuda
-from tests.training.tiny import look_at_origin, random_gaussians
+from tests.helpers import DEVICES, look_at_origin, needs_cuda
+from tests.training.tiny import random_gaussians
 
 ALONE = Ranks()
 OPTIONS = RenderOptions(sh_degree=0, near_plane=0.05, far_plane=100.0)

@@ -15,7 +15,7 @@ from safetensors.torch import load_file
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import checkpoint, checkpoint_files, run_files
-from tests.distributed.rank_harness import CONTEXT, RankError, run_ranks
+from tests.distributed.rank_harness import CONTEXT, all_fail, run_ranks
 from tests.helpers import refused, save_checkpoint
 from tests.training.tiny import random_gaussians, tiny_config
 
@@ -45,25 +45,30 @@ def by_id(shards):
     return {name: column[order] for name, column in whole.items()}
 
 
+def latest(directory, ranks=ALONE):
+    found = checkpoint.newest(directory, ranks, lambda path: checkpoint.load(path, ranks, "cpu"))
+    return found and found[0]
+
+
 def test_round_trip_and_format(tmp_path):
     columns, state = table(101), {"iteration": 7, "note": ["ä", 1.5, None]}
     path = save_checkpoint(tmp_path / "checkpoints", columns, state, ALONE)
-    loaded = checkpoint.load_latest(tmp_path / "checkpoints", ALONE, "cpu")
-    assert equal(loaded.columns, columns)
-    assert loaded.state == state and loaded.name == path.name
+    loaded = latest(tmp_path / "checkpoints")
+    assert equal(loaded.columns, columns) and loaded.state == state
+    assert checkpoint.newest(path.parent, ALONE, str) == (str(path), path, [])
     # The shard is an ordinary safetensors file.
     assert equal(load_file(path / "shard_0000_of_0001.safetensors"), columns)
-    assert checkpoint.load_latest(tmp_path / "nothing here", ALONE, "cpu") is None
+    assert latest(tmp_path / "nothing here") is None
     empty = table(0)
     save_checkpoint(tmp_path / "checkpoints", empty, state, ALONE)
-    assert equal(checkpoint.load_latest(tmp_path / "checkpoints", ALONE, "cpu").columns, empty)
+    assert equal(latest(tmp_path / "checkpoints").columns, empty)
 
 
 def test_keeps_the_last_k(tmp_path):
     for iteration in range(5):
         save_checkpoint(tmp_path, table(3, iteration), {"iteration": iteration}, ALONE, keep=2)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint_000003", "checkpoint_000004"]
-    assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 4}
+    assert latest(tmp_path).state == {"iteration": 4}
 
 
 def _flip_bit(path, offset):
@@ -93,7 +98,7 @@ def test_a_damaged_checkpoint_is_refused_by_name(tmp_path, damage, reason):
     with pytest.warns(
         UserWarning, match=f"checkpoint_000001 is damaged.*{reason}.*; using checkpoint_000000"
     ):
-        loaded = checkpoint.load_latest(tmp_path, ALONE, "cpu")
+        loaded = latest(tmp_path)
     assert loaded.state == {"iteration": 1}
     assert equal(loaded.columns, table(50, 1))
     with pytest.raises(checkpoint.CheckpointError, match=f"checkpoint_000001 is damaged.*{reason}"):
@@ -107,7 +112,7 @@ def test_each_damaged_checkpoint_is_named_once(tmp_path):
     for path in paths[1:]:
         (path / "manifest.json").unlink()
     with pytest.warns(UserWarning) as caught:
-        checkpoint.load_latest(tmp_path, ALONE, "cpu")
+        latest(tmp_path)
     (warning,) = caught
     (paths[0] / "manifest.json").unlink()
     with (
@@ -115,7 +120,7 @@ def test_each_damaged_checkpoint_is_named_once(tmp_path):
         pytest.raises(checkpoint.CheckpointError, match="no sound checkpoint") as failure,
     ):
         warnings.simplefilter("error")
-        checkpoint.load_latest(tmp_path, ALONE, "cpu")
+        latest(tmp_path)
     for path in paths:
         assert str(warning.message).count(path.name) == 1
         assert str(failure.value).count(path.name) == 1
@@ -152,7 +157,7 @@ def test_kill_at_any_point_of_a_save(tmp_path):
         exitcode = process.exitcode
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            loaded = checkpoint.load_latest(directory, ALONE, "cpu")
+            loaded = latest(directory)
         found.append(loaded.state["iteration"])
         assert equal(loaded.columns, table(64, found[-1]))
         # The next save clears what was left behind.
@@ -184,7 +189,7 @@ def test_full_disk(tmp_path, monkeypatch):
     with pytest.raises(checkpoint.CheckpointError, match="[kM]B are needed and .* are free") as failure:
         save_checkpoint(tmp_path, table(64), {}, ALONE)
     assert failure.value.lacks_space
-    assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 0}
+    assert latest(tmp_path).state == {"iteration": 0}
 
 
 @pytest.mark.parametrize(
@@ -214,7 +219,7 @@ def test_numbers_may_have_more_than_six_digits(tmp_path):
         path = save_checkpoint(tmp_path, table(4), {"iteration": number}, ALONE, keep=2)
         assert path.name == f"checkpoint_{number}"
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["checkpoint_1000001", "checkpoint_1000002"]
-    assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 1_000_002}
+    assert latest(tmp_path).state == {"iteration": 1_000_002}
 
 
 def _refuse(monkeypatch, method, folder):
@@ -235,7 +240,7 @@ def test_an_old_checkpoint_that_cannot_be_deleted_is_named_and_stays(tmp_path, m
         _refuse(patch, "rename", tmp_path / "checkpoint_000000")
         with pytest.warns(UserWarning, match="could not be deleted.*not permitted.*checkpoint_000000"):
             save_checkpoint(tmp_path, table(3), {"iteration": 2}, ALONE, keep=2)
-    assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 2}
+    assert latest(tmp_path).state == {"iteration": 2}
     save_checkpoint(tmp_path, table(3), {"iteration": 3}, ALONE, keep=2)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint_000002", "checkpoint_000003"]
 
@@ -265,7 +270,7 @@ def _save_shard(ranks, directory, sizes):
 
 
 def _load_shard(ranks, directory):
-    loaded = checkpoint.load_latest(directory, ranks, "cpu")
+    loaded = latest(directory, ranks)
     return loaded.columns, loaded.state
 
 
@@ -289,10 +294,8 @@ def test_save_at_four_ranks_load_at_any_number(tmp_path):
             assert lengths == sizes  # as saved
         else:
             assert max(lengths) - min(lengths) <= 1
-    with pytest.raises(RankError) as failure:
-        run_ranks(_save_with_one_full_disk, 2, tmp_path, [50, 50])
-    for message in failure.value.messages.values():
-        assert "checkpoint_000001 was not saved: rank 1 could not write: a file is larger than" in message
+    text = "checkpoint_000001 was not saved: rank 1 could not write: a file is larger than"
+    all_fail(text, _save_with_one_full_disk, tmp_path, [50, 50])
     assert [p.name for p in tmp_path.iterdir()] == ["checkpoint_000000"]
 
 
@@ -317,7 +320,7 @@ def test_dealing_keeps_the_order_and_opens_only_what_it_needs(tmp_path):
 def test_shared_columns_are_saved_and_checked(tmp_path):
     shared = {"costs": torch.rand(7), "views": torch.arange(3), "none": torch.empty(0, 4)}
     path = save_checkpoint(tmp_path, table(5), {}, ALONE, shared=shared)
-    assert equal(checkpoint.load_latest(tmp_path, ALONE, "cpu").shared, shared)
+    assert equal(latest(tmp_path).shared, shared)
     _flip_bit(path / checkpoint.SHARED, -1)
     refused(checkpoint.CheckpointError, "shared.* not match its SHA-256", checkpoint.load, path, ALONE, "cpu")
     (path / checkpoint.SHARED).unlink()

@@ -142,9 +142,9 @@ def test_fifty_million_gaussians_need_less_than_4_gb(trained, tmp_path, name):
     found = checkpoint.load(max((trained[1] / "checkpoints").glob("c*")), Ranks(), "cpu")
     peaks = {}
     for times in (250, 500):
-        columns = {key: column.repeat(times, *[1] * (column.dim() - 1)) for key, column in found[0].items()}
+        columns = {key: c.repeat(times, *[1] * (c.dim() - 1)) for key, c in found.columns.items()}
         run = tmp_path / str(times)
-        save_checkpoint(run / "checkpoints", columns, found[1], Ranks())
+        save_checkpoint(run / "checkpoints", columns, found.state, Ranks())
         del columns
         command = [sys.executable, "-c", _EXPORT, str(run), name, str(run / f"a.{name}")]
         count, peak = subprocess.run(command, capture_output=True, check=True, text=True).stdout.split()

@@ -24,6 +24,7 @@ from blitzgs.training.replay import OracleVeto, branch_point, event_keys, label_
 from blitzgs.training.trainer import Trainer
 from tests.conftest import LINEAGE
 from tests.distributed.rank_harness import run_ranks
+from tests.helpers import refused
 from tests.spawn.test_spawn_gate import candidates
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, as_flags, at_step, events_of, tiny_config
 
@@ -65,8 +66,7 @@ def test_a_replay_begins_again_if_it_has_trained_no_arm(lineage_run, tmp_path, m
 
     at_step(monkeypatch, 70, fails)
     for _ in range(2):
-        with pytest.raises(RuntimeError, match="no memory"):
-            main(arguments)
+        refused(RuntimeError, "no memory", main, arguments)
         calls.append(sorted(path.name for path in (out / "reference").iterdir()))
     assert calls[0] == calls[1]
     monkeypatch.undo()
@@ -130,8 +130,7 @@ def test_a_damaged_checkpoint_is_named(lineage_run, tmp_path):
     run = shutil.copytree(lineage_run / "run", tmp_path / "run")
     manifest = next((run / "checkpoints").glob("*/manifest.json"))
     manifest.write_text("{}")
-    with pytest.raises(ValueError, match=f"{manifest} is damaged"):
-        branch_point(run, tiny_config(*LINEAGE))
+    refused(ValueError, f"{manifest} is damaged", branch_point, run, tiny_config(*LINEAGE))
 
 
 def test_a_run_without_a_view_to_measure_is_not_replayed(lineage_run, tmp_path, capsys):

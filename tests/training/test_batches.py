@@ -13,8 +13,8 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.training.batches import BatchLoader
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.view.views import Space, ViewSet
-from tests.helpers import DEVICES, refused
-from tests.training.tiny import Camera, Images, look_at_origin
+from tests.helpers import DEVICES, look_at_origin, refused
+from tests.training.tiny import Camera, Images
 
 SIZES = [(48, 32)] * 5 + [(30, 20)] * 3
 EVERY = tuple(range(len(SIZES)))

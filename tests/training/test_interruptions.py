@@ -61,7 +61,7 @@ def test_a_checkpoint_with_nan_is_not_resumed_from(tmp_path):
     running.train()
     table = running.state.table
     table["sh"][3] = float("nan")
-    newest = checkpoint.load_latest(tmp_path / "checkpoints", Ranks(), "cpu")
+    newest = checkpoint.load(max((tmp_path / "checkpoints").iterdir()), Ranks(), "cpu")
     save_checkpoint(tmp_path / "checkpoints", table.columns, newest.state, Ranks())
     with pytest.warns(UserWarning, match="is refused: column 'sh' is not finite.*; using checkpoint_000001"):
         found = run_files.restore(tmp_path, Ranks())
@@ -80,7 +80,7 @@ def test_a_checkpoint_is_written_by_the_clock_by_default(tmp_path, monkeypatch):
     at_step(monkeypatch, 33, ten_minutes_later)
     trainer(tmp_path).train()
     folder = tmp_path / "checkpoints"
-    states = [checkpoint.load(folder / name, Ranks(), "cpu")[1] for name in checkpoints(tmp_path)]
+    states = [checkpoint.load(folder / name, Ranks(), "cpu").state for name in checkpoints(tmp_path)]
     assert [state["progress"]["step"] for state in states] == [33, 100]
 
 
@@ -108,10 +108,10 @@ def test_training_goes_on_while_a_checkpoint_is_written(tmp_path, monkeypatch, r
     at_step(monkeypatch, 33, lambda self: self.state.save_clock.restart(0))
     at_step(monkeypatch, 36, go_on)
     trainer(tmp_path).train()
-    columns, state, _ = checkpoint.load(tmp_path / "checkpoints" / "checkpoint_000000", Ranks(), "cpu")
-    assert state["progress"]["step"] == 33 and then == [room > 0, True]
-    assert columns.keys() == saved["columns"].keys()
-    assert all(torch.equal(column, saved["columns"][name]) for name, column in columns.items())
+    loaded = checkpoint.load(tmp_path / "checkpoints" / "checkpoint_000000", Ranks(), "cpu")
+    assert loaded.state["progress"]["step"] == 33 and then == [room > 0, True]
+    assert loaded.columns.keys() == saved["columns"].keys()
+    assert all(torch.equal(column, saved["columns"][name]) for name, column in loaded.columns.items())
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])

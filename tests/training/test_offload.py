@@ -172,7 +172,7 @@ def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypat
     resident, views = VisibleFinder(table, lod), trainer.state.views
     expected = [render_view(resident, views, i, options, owners) for i in (0, 5)]
     whole = GaussianTable({name: table[name].clone() for name in table})
-    pool = model.gaussians_on(ranks.device)
+    pool = model.subject(ranks).gaussians
     finder = VisibleFinder(pool, lod)
     assert isinstance(pool, Pool) and len(pool.held) < 0.42 * len(whole)
     for i, image in zip((0, 5), expected, strict=True):
@@ -190,7 +190,7 @@ def test_rows_are_sorted_for_a_pool_or_for_another_number_of_ranks(tmp_path):
     restored = run_files.restore(tmp_path / "two", Ranks())
     assert restored.progress.sorted_spread == 0
     model = run_files.open_model(tmp_path / "one", Ranks(), resident_gb=0.1)
-    pool = model.gaussians_on(torch.device("cpu"))
+    pool = model.subject(Ranks()).gaussians
     config = tiny_config(*SETTINGS, "schedule.iterations=20", RESIDENT)
     resumed = Trainer(config, *street(), tmp_path / "one", Ranks(), resume=True)
     for table in (restored.table, pool.table, resumed.state.table):

@@ -30,11 +30,10 @@ from blitzgs.training.trainer import Trainer
 from blitzgs.view.gate import ViewGate
 from blitzgs_synth.generate import generate_city
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import DEVICES, parameter_gradients
+from tests.helpers import DEVICES, look_at_origin, parameter_gradients
 from tests.training.tiny import (
     assert_same_table,
     events_of,
-    look_at_origin,
     random_gaussians,
     tiny_config,
     tiny_scene,

@@ -28,6 +28,7 @@ from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, 
 from blitzgs.ops.projection_types import Views
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.training.trainer import Trainer
+from tests.helpers import look_at_origin
 
 WIDTH, HEIGHT, COUNT = 48, 32, 400
 
@@ -102,16 +103,6 @@ def as_flags(*overrides: str) -> list[str]:
 
 def tiny_config(*overrides: str) -> Config:
     return load_config(None, [*OVERRIDES, *overrides])
-
-
-def look_at_origin(position) -> np.ndarray:
-    forward = -position / np.linalg.norm(position)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ position
-    return pose
 
 
 def tiny_cameras(scale: float) -> list[Camera]:

@@ -16,12 +16,12 @@ from blitzgs.ops.projection_types import Views
 from blitzgs.population.initialisation import _seen_by_more
 from blitzgs.runs.folder import open_run
 from blitzgs.table.table import PARAMETERS, GaussianTable
-from blitzgs.view.draw import LAYER_ROWS, Drawer, Subject, intrinsics
+from blitzgs.view.draw import LAYER_ROWS, Drawer, intrinsics
 from blitzgs.view.gate import LodGate, ModelGate
 from blitzgs.view.levels import BLOCK_POINTS, PointBlocks, measure_levels
 from blitzgs.view.look import MODES, Look
 from blitzgs.view.views import render_options, viewmat
-from blitzgs.view.visible import VisibleFinder
+from blitzgs.view.visible import Subject, VisibleFinder
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import DEVICES, refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
@@ -31,7 +31,7 @@ def subject_of(model, part=slice(None)):
     columns = {name: getattr(model, name)[part] for name in (*PARAMETERS, "level")}
     columns["id"] = torch.arange(len(model), device=model.means.device)[part]
     options = render_options(model.config, model.space, model.sh_degree)
-    return Subject(GaussianTable.of_parameters(columns), options, model.space.unit, model.lod)
+    return Subject(GaussianTable.of_parameters(columns), options, model.space, model.lod)
 
 
 def look_of(model, camera, **choices):

@@ -5,13 +5,13 @@ import json
 import math
 import socket
 import threading
-from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from blitzgs.runs.cameras import RunCamera
 from blitzgs.util.rotations import quaternions
 from blitzgs.view.look import Picture
 from blitzgs.view.views import Space
@@ -25,14 +25,6 @@ from blitzgs.viewer.panel import round_length
 from blitzgs.viewer.settings import Pace
 from blitzgs.viewer.world import World, looking, up_direction
 from tests.helpers import refused
-
-
-@dataclass
-class Camera:
-    K: np.ndarray
-    width: int = 40
-    height: int = 30
-    name: str = "a.png"
 
 
 def camera_at(position, target, up=(0.0, 0.0, 1.0)):
@@ -114,7 +106,7 @@ def test_an_old_path_of_nerfstudio_is_read():
 
 
 def test_a_photograph_lies_where_the_render_shows_its_pixels():
-    camera = Camera(np.array([[35.0, 0, 20], [0, 35, 15], [0, 0, 1]]))
+    camera = RunCamera("a.png", 40, 30, np.array([[35.0, 0, 20], [0, 35, 15], [0, 0, 1]]), np.eye(4))
     photograph = np.random.default_rng(0).integers(0, 255, (30, 40, 3), dtype=np.uint8)
     same = compare.compare("wipe", photograph, photograph, camera, camera.K, 1.0)
     np.testing.assert_array_equal(same.image[:, :-2], photograph[:, :-2])
@@ -128,7 +120,7 @@ def test_a_photograph_lies_where_the_render_shows_its_pixels():
 
 @pytest.mark.parametrize(("size", "columns"), [((900, 200), 3), ((400, 300), 2), ((200, 900), 1)])
 def test_images_side_by_side_are_as_large_as_they_can_be(size, columns):
-    assert compare.grid_columns(Camera(np.eye(3)), *size) == columns
+    assert compare.grid_columns(RunCamera("a.png", 40, 30, np.eye(3), np.eye(4)), *size) == columns
 
 
 def test_numbers_become_colours():

@@ -157,7 +157,8 @@ def test_the_order_is_that_of_contributions(trained):
         torch.from_numpy(poses).float(), torch.from_numpy(np.stack([c.K for c in cameras])).float(),
         cameras[0].width, cameras[0].height,
     )  # fmt: skip
-    np.testing.assert_allclose(contributions(opened), weights.sum(dim=0), rtol=1e-3, atol=1e-4)
+    found = contributions(opened.subject, cameras, Ranks())
+    np.testing.assert_allclose(found, weights.sum(dim=0), rtol=1e-3, atol=1e-4)
 
 
 @needs_chromium
@@ -190,8 +191,8 @@ def test_of_a_large_model_the_largest_gaussians_are_read(trained, tmp_path, monk
         assert len(table) == 100 and opened.unread == len(whole.table) - 100
         assert table["sh"].shape[1] == 1 and opened.exhibit.sh_degree == whole.exhibit.sh_degree
         found = opacity_length(table["opacities"], table["scales"])
-        assert float(found.min()) + math.log(opened.subject.unit) == pytest.approx(
-            least + math.log(whole.subject.unit), abs=1e-4
+        assert float(found.min()) + math.log(opened.subject.space.unit) == pytest.approx(
+            least + math.log(whole.subject.space.unit), abs=1e-4
         )
         assert main(["export", str(source), "--html", str(page)]) == 0
         assert re.search(rf"a.html: \d+ of {len(whole.table):,} Gaussians", capsys.readouterr().out)

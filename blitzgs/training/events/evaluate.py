@@ -15,8 +15,8 @@ from blitzgs.config.schedule import Event
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, evenly_ordered, worst_views
-from blitzgs.runs.run_files import model_gate
 from blitzgs.training.state import TrainingState
+from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 
 # The number of side-by-side pictures that an evaluation writes.
@@ -70,7 +70,7 @@ def _write_trained(state: TrainingState, indices: Sequence[int], folder: Path) -
         if state.ranks.rank == 0:
             write_file(folder / run_files.TRAINED_VIEWS, json.dumps(metrics, indent=1) + "\n")
     except (OSError, PhotographError) as error:
-        warnings.warn(f"the metrics of training views are not written: {error}", stacklevel=3)
+        warn(f"the metrics of training views are not written: {error}")
 
 
 def measure(
@@ -80,19 +80,17 @@ def measure(
     state.catch_up()
     with state.log.work("views measured") as report:
         return evaluate(
-            state.stepper.gaussians,
+            state.subject(),
             state.views,
             state.capture.cameras,
             state.images,
             indices,
-            state.render_options,
             folder,
             TileOwners(state.ranks),
             pictures=PICTURES,
             lpips=lpips,
             report=report,
             optional_files=True,
-            lod=model_gate(state.config, state.progress, state.table, state.ranks),
             stops=state.stops,
         )
 

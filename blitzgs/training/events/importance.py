@@ -15,7 +15,6 @@ from blitzgs.config.schedule import Event
 from blitzgs.population.importance import Importance, ViewBatch, sample_by_score, sweep, top_by_score
 from blitzgs.population.redistribution import redistribute
 from blitzgs.runs.guard import ModelLostError, check_table
-from blitzgs.runs.run_files import model_gate
 from blitzgs.spawn.lineage import Cause
 from blitzgs.table.blocks import sort_rows
 from blitzgs.table.table import opacity_logit
@@ -38,16 +37,17 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
     state.catch_up()
     check_table(state.table, state.progress.step)
     views = len(state.capture.train)
+    subject = state.subject()
     with state.log.work("views surveyed") as report:
         found = sweep(
-            state.stepper.gaussians,
+            subject.gaussians,
             _reported(view_batches(state), report, views),
             views,
-            state.render_options,
+            subject.options,
             state.ranks,
             state.owners,
             cast(ScoreRule, state.config.population.score),
-            model_gate(state.config, state.progress, state.table, state.ranks),
+            subject.lod,
             state.stops,
         )
     found.store(state.table, state.config.view.cull)
