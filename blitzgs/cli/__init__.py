@@ -22,7 +22,7 @@ from types import FrameType
 from typing import cast
 
 from blitzgs import __version__
-from blitzgs.cli.arguments import Parser, check_given_once, flag_meant, split_fields
+from blitzgs.cli.arguments import HelpFormatter, Parser, check_given_once, flag_meant, split_fields
 from blitzgs.util.terminal import Output, printable, surviving_output
 
 HELP = """\
@@ -150,7 +150,7 @@ def _arguments(parser: Parser, command: Parser | None, chosen: str, given: list[
 
 def parser_of(chosen: Container[str]) -> tuple[Parser, dict[str, Parser]]:
     """Return the parser of all commands, and each command's; only the chosen ones' modules are imported."""
-    parser = Parser(prog="blitzgs", description=HELP, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(prog="blitzgs", description=HELP, formatter_class=HelpFormatter)
     parser.add_argument("--version", action="version", version=f"blitzgs {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, (place, summary) in COMMANDS.items():

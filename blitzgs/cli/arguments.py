@@ -6,6 +6,8 @@ from __future__ import annotations
 import argparse
 import difflib
 import re
+import shutil
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -38,7 +40,7 @@ def add_command(
         name,
         help=summary,
         description=description or summary[0].upper() + summary[1:] + ".",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
         add_help=add_help,
     )
     parser.set_defaults(run=function, parser=parser)
@@ -64,7 +66,7 @@ def add_path(parser: argparse._ActionsContainer, name: str, metavar: str, text: 
     parser.add_argument(name, type=named_path, metavar=metavar, help=text, **more)
 
 
-_PATHS = ("FILE", "DIR", "RUN", "OUT")
+_PATHS = ("FILE", "DIR", "RUN")
 _FLAG = re.compile(r"(--[\w-]+)(?: (\S+))?  (.*)", re.DOTALL)
 
 
@@ -74,7 +76,7 @@ def add_flags(
     """Add the flags that a text describes.
 
     A line is "--name METAVAR  help", or "--name  help" for a switch; indented lines go on with the help.
-    `types` has the functions that read values, by name; of others, FILE, DIR, RUN and OUT are paths.
+    `types` has the functions that read values, by name; of others, FILE, DIR and RUN are paths.
     """
     for entry in re.split(r"\n(?=--)", text.strip()):
         match = _FLAG.fullmatch(entry)
@@ -152,6 +154,17 @@ def add_device(parser: argparse.ArgumentParser, shares_gpus: bool = False) -> No
         add_flags(parser, "--share-gpus  with torchrun: let several processes use one GPU (slow)")
 
 
+class HelpFormatter(argparse.HelpFormatter):
+    """Fits the paragraphs of a description to the terminal; one with indented lines stays as it is."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, width=min(110, shutil.get_terminal_size().columns - 2))
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        parts = text.strip().split("\n\n")
+        return "\n\n".join(part if "\n " in f"\n{part}" else textwrap.fill(part, width) for part in parts)
+
+
 class Parser(argparse.ArgumentParser):
     """A parser without abbreviations, whose messages contain no control characters."""
 
@@ -159,8 +172,8 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*arguments, **settings | {"allow_abbrev": False})  # type: ignore[arg-type]
 
     def error(self, message: str) -> NoReturn:
-        """Print the usage and a message, and exit with status 2."""
-        super().error(printable(message))
+        """Print a message without the usage, which is many lines long, and exit with status 2."""
+        self.exit(2, f"{self.prog}: {printable(message)} ({self.prog} --help explains all)\n")
 
 
 def split_fields(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -54,7 +54,7 @@ _IMAGE_ERROR, _GRADIENT_ERROR = 1e-5, 1e-3
 _SLOW_DISK_MB_S = 50
 TIMEOUT = 120.0  # seconds of each test
 _LITTLE_MEMORY = 4 << 30
-_NOT_FOR_USERS = ("test", "lint", "all")
+_NOT_FOR_USERS = ("test", "lint", "docs", "all")
 _LOCAL = "allow connections to 127.0.0.1; until then train with one process"
 _NCCL = "NCCL_DEBUG=WARN blitzgs doctor"
 _REPORT = "report this with `blitzgs doctor --json`"

@@ -66,11 +66,11 @@ program (PLY, compressed PLY, SPZ, SOG, .splat). Films need the package av: pip 
 FLAGS = """
 --cameras FILE  render the cameras of this transforms file or folder of a COLMAP model, in the capture's
     coordinates; no photographs are needed
---path PATH  render the frames of a camera path: a file, or orbit (around the scene), flight (across it) or
-    spline (along the run's cameras)
+--path NAME|FILE  render the frames of a camera path: a file, or orbit (around the scene), flight (across it)
+    or spline (along the run's cameras)
 --size WxH  with --path: pixels (default: the file's, else 1920x1080)
---fps FPS  with --path: frames a second (default: the file's, else 30)
---seconds SECONDS  with --path: duration (default: the file's, else 10)
+--fps N  with --path: frames a second (default: the file's, else 30)
+--seconds S  with --path: duration (default: the file's, else 10)
 --dataparser FILE  with --path: dataparser_transforms.json of the nerfstudio training that the path was made
     for
 --exposure  show training views with the exposure of their photographs (model.exposure), not with the mean
@@ -88,7 +88,7 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     arguments.add_device(parser, shares_gpus=True)
     arguments.add_pool(parser)
     arguments.add_split(parser, "render")
-    arguments.add_path(parser, "--out", "OUT", f"folder for pictures, or FILE{SUFFIX}", required=True)
+    arguments.add_path(parser, "--out", "DIR|FILE", f"folder for pictures, or FILE{SUFFIX}", required=True)
     arguments.add_flags(parser, FLAGS, {"--size": _size, "--fps": _POSITIVE, "--seconds": _POSITIVE})
 
 

@@ -30,6 +30,7 @@ from blitzgs.runs.folder_checks import locked
 from blitzgs.sfm.refine import fit_of
 from blitzgs.training.budget import LEAST_IMAGES, estimate
 from blitzgs.training.inputs import open_capture, read_ahead
+from blitzgs.training.setup import check_unclaimed
 from blitzgs.training.state import TrainingState
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import check_worlds, understood
@@ -56,11 +57,10 @@ these views, and its quality is measured on them at the end.
   blitzgs train --data DIR --out RUN
 
 A GPU trains with the recipe aerial, a CPU with aerial_cpu. --config takes another recipe (compact: fewer
-Gaussians; smoke: a first model in minutes; city: thousands of photographs; paper: the paper's values), a YAML
-file of yours, or "defaults" (the defaults of all fields). Every field is also a flag, for example
---data.downscale=2 --population.max_gaussians=2000000; --help FIELD explains one, --help-fields all of them.
---show-config prints the resulting configuration and stops; --check prints what was understood of the capture
-and stops.
+Gaussians; smoke: a first model in minutes; density: the paper's density control; city: thousands of
+photographs; paper: the paper's values), a YAML file of yours, or "defaults" (the defaults of all fields).
+Every field is also a flag, for example --data.downscale=2 --population.max_gaussians=2000000; --help FIELD
+explains one, --help-fields all of them.
 
 Times in the configuration count the images that were trained on. --schedule.scale=0.5 makes the whole
 schedule half as long; with --minutes=M the run measures its speed and chooses this factor itself.
@@ -167,6 +167,7 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.check:
         return _check(args, config)
+    check_unclaimed(args.out, args.resume)  # before the photographs, which take long
     if (photographs := Path(config.data.path) / config.data.images).is_dir():
         check_outside(args.out, photographs)
     job, laps = config.ranks, Laps(since_start=True)
@@ -258,6 +259,8 @@ def _config(args: argparse.Namespace) -> Config:
         # Set the path directly: YAML does not allow all characters that a path may have.
         config = changed(config, "data", path=os.path.realpath(args.data))
     if args.start is not None:
+        if not args.start.is_file():
+            raise FileNotFoundError(f"--start {args.start}: there is no such file of Gaussians")
         config = changed(config, "model", start=os.path.realpath(args.start))
     return config
 

@@ -29,11 +29,13 @@ from blitzgs.cli.arguments import (
     add_run,
 )
 from blitzgs.distributed.group import Ranks, extend_memory_in_place, resolve_device
+from blitzgs.formats.streamed_sog import META
 from blitzgs.formats.tiles import PAGE, TILESET
 from blitzgs.runs import run_files
 from blitzgs.training.inputs import open_capture
 from blitzgs.util.errors import warn
 from blitzgs.util.terminal import printable
+from blitzgs.viewer.door import is_loopback, unheard
 
 HELP = """\
 Look at a model in the browser. MODEL is the folder of a run, a checkpoint in it, a file of Gaussians of any
@@ -70,6 +72,8 @@ def run(args: argparse.Namespace) -> int:
     """Show a model until Ctrl-C; returns the exit status."""
     if (args.model / TILESET).is_file():
         return serve_tiles(args.model, args.host, args.port)
+    if (args.model / META).is_file():
+        raise ValueError(f"{args.model} is streamed SOG, which SuperSplat shows; blitzgs view needs --tiles")
     from blitzgs.viewer.page import require_viser
 
     require_viser()
@@ -136,18 +140,20 @@ def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
         ) from error
     if not complete or not (folder / PAGE).is_file():
         raise ValueError(
-            f"{folder} was not written by blitzgs export --tiles, or with --spz-tiles: use another viewer"
+            f"{folder} has no page of blitzgs export --tiles: it is another program's, or has SPZ inside "
+            "(--spz-tiles), which CesiumJS shows"
         )
     try:
         return ThreadingHTTPServer((host, port), partial(_Handler, directory=str(folder)))
     except (OSError, OverflowError) as error:
-        raise OSError(f"the viewer cannot listen on {host}:{port}: {error}") from error
+        raise unheard(host, port, error) from error
 
 
 def serve_tiles(folder: Path, host: str, port: int) -> int:
     """Serve until Ctrl-C; returns the exit status."""
     with tiles_server(folder, host, port) as server:
-        print(f"{folder}: open http://{host}:{server.server_port} (Ctrl-C ends)", flush=True)
+        shown = "localhost" if is_loopback(host) else host
+        print(f"{folder}: open http://{shown}:{server.server_port}/ (Ctrl-C ends)", flush=True)
         try:
             server.serve_forever()
         except KeyboardInterrupt:

@@ -191,8 +191,8 @@ def describe(wanted: str) -> str:
     fields = [(section, field) for section, kind in sections.items() for field in _fields(kind)]
     found = [(section, field) for section, field in fields if name in (field, _joined(section, field))]
     if not found:
-        known = [text for section, field in fields for text in (_joined(section, field), field)]
-        close = difflib.get_close_matches(name, [*known, *sections], n=3)
+        known = [_joined(section, field) if "." in name else field for section, field in fields]
+        close = difflib.get_close_matches(name, dict.fromkeys([*known, *sections]), n=3)
         hint = f"did you mean {', '.join(close)}?" if close else "--help-fields describes all fields"
         raise ConfigError(f"{name}: there is no such field of the configuration; {hint}")
     return "\n\n".join(_field(section, field) for section, field in found)

@@ -12,7 +12,7 @@ import secrets
 import shutil
 import socket
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from blitzgs.distributed.group import Ranks
@@ -98,10 +98,7 @@ def check_writable(folder: Path, ranks: Ranks) -> None:
         if written != _PROBE_BYTES:
             problem = f"rank {ranks.rank} ({socket.gethostname()}): the disk is full"
     except OSError as error:
-        reason = (
-            "a file is where a folder is needed" if isinstance(error, FileExistsError) else error.strerror
-        )
-        problem = f"rank {ranks.rank} ({socket.gethostname()}): {reason or error}"
+        problem = f"rank {ranks.rank} ({socket.gethostname()}): {error.strerror or error}"
     try:
         problems = [text for text in ranks.all_gather_object(problem) if text]
         seen = (folder / f"{token}_0").exists()
@@ -115,22 +112,6 @@ def check_writable(folder: Path, ranks: Ranks) -> None:
         raise FolderError(
             f"{folder}: ranks {', '.join(map(str, unseen))} do not see what rank 0 writes there: --out must "
             "be on a file system that all hosts share"
-        )
-
-
-def check_unclaimed(checkpoints: Path, files: Sequence[str], ranks: Ranks) -> None:
-    """Check that a run will not replace files of another program: every run has a folder of checkpoints.
-
-    FileExistsError, on every rank: it is missing, and one of the `files`, which a run writes beside it,
-    exists.
-    """
-    found = None
-    if ranks.rank == 0 and not os.path.lexists(checkpoints):
-        found = next((name for name in files if os.path.lexists(checkpoints.parent / name)), None)
-    if (found := ranks.broadcast_object(found)) is not None:
-        raise FileExistsError(
-            f"{checkpoints.parent} has {found}, which a run would replace, and no checkpoints: choose "
-            "another --out"
         )
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +24,7 @@ from blitzgs.population.initialisation import INITIAL_OPACITY, octree_gaussians
 from blitzgs.population.relocation import PositionNoise
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_cameras, warn_of_changes
-from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
+from blitzgs.runs.folder_checks import check_room, check_writable
 from blitzgs.runs.log import LOG, RunLog
 from blitzgs.runs.run_files import Progress
 from blitzgs.runs.world import check_seen, save_world_frame, trained_columns
@@ -78,7 +79,8 @@ def set_up(
     # a checkpoint is read from it.
     check_alike(config, capture, ranks, resume)
     check_resolution(config, capture)
-    _check_folder(folder, ranks, resume)
+    check_unclaimed(folder, resume)
+    check_writable(folder / run_files.CHECKPOINTS, ranks)
     space = Space.of(capture.offset, capture.extent)
     lap("checks")
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
@@ -141,15 +143,29 @@ def set_up(
     )
 
 
-def _check_folder(folder: Path, ranks: Ranks, resume: bool) -> None:
-    """Check that a run may write to its folder, and that it replaces nothing there."""
-    written = (
-        run_files.CONFIG, CAMERAS, LOG, run_files.SUMMARY, PICTURE, run_files.LINEAGE, run_files.REPORT,
-        EXPOSURES,
-    )  # fmt: skip
-    check_unclaimed(folder / run_files.CHECKPOINTS, written, ranks)
-    check_writable(folder / run_files.CHECKPOINTS, ranks)
-    if not resume and any((folder / run_files.CHECKPOINTS).glob("checkpoint_*")):
+# What a run writes beside its checkpoints.
+_WRITTEN = (
+    run_files.CONFIG, CAMERAS, LOG, run_files.SUMMARY, PICTURE, run_files.LINEAGE, run_files.REPORT, EXPOSURES
+)  # fmt: skip
+
+
+def check_unclaimed(folder: Path, resume: bool) -> None:
+    """Check that a run replaces nothing in its folder; a folder with checkpoints is a run's.
+
+    FileExistsError: the folder holds checkpoints and `resume` is not set, or files of another program that
+    have the names of a run's. NotADirectoryError: the folder or that of its checkpoints is a file.
+    """
+    try:
+        found = os.listdir(folder / run_files.CHECKPOINTS)
+    except FileNotFoundError:
+        for name in _WRITTEN:
+            if os.path.lexists(folder / name):
+                raise FileExistsError(
+                    f"{folder} has {name}, which a run would replace, and no checkpoints: choose another "
+                    "--out"
+                ) from None
+        return
+    if not resume and any(name.startswith("checkpoint_") for name in found):
         raise FileExistsError(
             f"{folder} already holds a run: add --resume to continue it, or choose another --out"
         )

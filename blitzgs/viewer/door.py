@@ -20,6 +20,15 @@ _HEAD_SECONDS = 15.0
 _CHUNK = 1 << 18
 
 
+_Failure = OSError | OverflowError  # the address is not this machine's, or the number is no port
+
+
+def unheard(host: str, port: int, error: _Failure) -> OSError:
+    """Return the message of a viewer that cannot listen at its address."""
+    why = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else error
+    return OSError(f"the viewer cannot listen on {host}:{port} ({why}): choose another port (0: any)")
+
+
 class Door:
     """Listens on an address, on its `port`, and forwards to a port of 127.0.0.1."""
 
@@ -32,7 +41,7 @@ class Door:
         self._behind, self._token, self.port = behind, token, port
         self._loop = asyncio.new_event_loop()
         self._open: set[asyncio.Task[None]] = set()
-        started: list[OSError | None] = []
+        started: list[_Failure | None] = []
         ready = threading.Event()
         self._thread = threading.Thread(
             target=self._serve, args=(host, port, started, ready), daemon=True, name="viewer door"
@@ -40,8 +49,7 @@ class Door:
         self._thread.start()
         ready.wait()
         if started[0] is not None:
-            why = os.strerror(started[0].errno) if started[0].errno else started[0]
-            raise OSError(f"the viewer cannot listen on {host}:{port}: {why}") from started[0]
+            raise unheard(host, port, started[0]) from started[0]
 
     def close(self) -> None:
         """Stop listening and end all connections."""
@@ -49,13 +57,13 @@ class Door:
             self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(timeout=2)
 
-    def _serve(self, host: str, port: int, started: list[OSError | None], ready: threading.Event) -> None:
+    def _serve(self, host: str, port: int, started: list[_Failure | None], ready: threading.Event) -> None:
         asyncio.set_event_loop(self._loop)
         try:
             server = self._loop.run_until_complete(asyncio.start_server(self._visit, host, port))
             self.port = server.sockets[0].getsockname()[1]
         except (OSError, OverflowError) as error:
-            started.append(error if isinstance(error, OSError) else OSError(str(error)))
+            started.append(error)
             ready.set()
             return
         started.append(None)

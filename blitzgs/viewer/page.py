@@ -81,7 +81,8 @@ class Page:
             token = "" if is_loopback(host) else secrets.token_urlsafe(16)
             self._door = Door(host, port, self._server.get_port(), token)
         except OSError:
-            self._server.stop()
+            with contextlib.redirect_stdout(io.StringIO()):
+                self._server.stop()
             raise
         shown = "localhost" if is_loopback(host) else host
         self.url = f"http://{shown}:{self._door.port}/" + (f"{token}/" if token else "")

@@ -151,6 +151,16 @@ def test_help_explains_fields(arguments, texts, capsys):
     assert exit_.value.code == 0 and all(text in shown for text in texts), shown
 
 
+def test_help_fits_the_terminal(capsys, monkeypatch):
+    """Paragraphs are filled to the width; commands keep their lines."""
+    monkeypatch.setenv("COLUMNS", "70")
+    with pytest.raises(SystemExit):
+        main(["eval", "--help"])
+    lines = capsys.readouterr().out.splitlines()
+    assert "  blitzgs eval RUN" in lines
+    assert max(len(line) for line in lines if not line.startswith("  blitzgs")) in range(60, 69)
+
+
 @pytest.mark.parametrize(
     "words, completed",
     [

@@ -147,22 +147,32 @@ def test_torchrun_entry(trained, tmp_path):
         (["synth", "."], 1, "the folder must be given by its name, got '.'"),
         (["synth", "city", "--processes=-2"], 1, "processes must be at least 1, got -2"),
         (["train", "--data", "loop", "--out", "x"], 1, "loop is not a folder"),
-        (["eval", "/nowhere", "--fast"], 2, "unrecognized arguments: --fast\n"),
+        (["eval", "/nowhere", "--fast"], 2, "unrecognized arguments: --fast (blitzgs eval --help"),
         (["eval", "/nowhere", "--pictrues=3"], 2, "--pictrues=3; did you mean --pictures?"),
         (["train", "--data", "d", "--ouut", "x"], 2, "--ouut x; did you mean --out?"),
+        (
+            ["train", "--data", "d", "--out", "x", "--start", "m.ply"],
+            1,
+            "--start m.ply: there is no such file",
+        ),
+        # Before the capture is read, which takes long.
+        (["train", "--data", "d", "--out", "file/x"], 1, "file is a file where a folder is needed"),
+        (["train", "--data", "d", "--out", "old"], 1, "old already holds a run: add --resume"),
     ],
 )
 def test_mistakes_get_a_message(arguments, status, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "300")
     Path("loop").symlink_to("loop")
+    Path("file").touch()
+    Path("old/checkpoints/checkpoint_000000").mkdir(parents=True)
     try:
         result = main(arguments)
     except SystemExit as exit_:
         result = exit_.code
     assert result == status
     printed = capsys.readouterr().err
-    assert message in printed and "Traceback" not in printed
+    assert message in printed and "Traceback" not in printed and "usage:" not in printed
 
 
 def test_another_capture_is_refused(trained, tmp_path, failure):

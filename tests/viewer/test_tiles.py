@@ -118,12 +118,17 @@ def test_damaged_folders_are_refused(tmp_path):
     for text, reason in (
         (good[:200], "tileset.json is damaged"),
         ("[]", "tileset.json is damaged"),
-        (good.replace("BlitzGS", "another"), "was not written by blitzgs export --tiles"),
+        (good.replace("BlitzGS", "another"), "has no page of blitzgs export --tiles"),
     ):
         (folder / "tileset.json").write_text(text)
         refused(ValueError, reason, tiles_server, folder, "127.0.0.1", 0)
     (folder / "tileset.json").write_text(good)
-    refused(OSError, r"cannot listen on 203\.0\.113\.1:0", tiles_server, folder, "203.0.113.1", 0)
+    refused(
+        OSError, r"cannot listen on 203\.0\.113\.1:0 \(Cannot assign", tiles_server, folder, "203.0.113.1", 0
+    )
+    refused(
+        OSError, r"\(bind\(\): port must be 0-65535.*\): choose", tiles_server, folder, "127.0.0.1", 99999
+    )
 
 
 def contents(folder):
@@ -184,6 +189,8 @@ def test_a_file_is_written_as_tiles_and_flags_choose(tmp_path, capsys, failure):
     _, positions = contents(tmp_path / "s")
     np.testing.assert_allclose(np.sort(positions, axis=0), np.sort(means, axis=0), rtol=1e-6)
     capsys.readouterr()
+    assert main(["export", str(tmp_path / "m.splat"), "--streamed-sog", str(tmp_path / "sog")]) == 0
+    assert "sog is streamed SOG, which SuperSplat shows" in failure("view", tmp_path / "sog")
     for flags, reason in (
         (["--tiles", str(tmp_path / "t")], "is not an empty folder"),
         (["--tiles", str(tmp_path / "u"), "--max-mb", "3"], "--max-mb is not for --tiles"),
