@@ -12,6 +12,7 @@ import contextlib
 import hmac
 import ipaddress
 import os
+import socket
 import threading
 from urllib.parse import urlsplit
 
@@ -25,8 +26,13 @@ _Failure = OSError | OverflowError  # the address is not this machine's, or the 
 
 def unheard(host: str, port: int, error: _Failure) -> OSError:
     """Return the message of a viewer that cannot listen at its address."""
-    why = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else error
-    return OSError(f"the viewer cannot listen on {host}:{port} ({why}): choose another port (0: any)")
+    if isinstance(error, OverflowError):
+        why = "ports are 0 to 65535"
+    elif isinstance(error, socket.gaierror):
+        why = "no such host"
+    else:
+        why = os.strerror(error.errno or 0)  # the error's own text may repeat the address
+    return OSError(f"the viewer cannot listen on {host}:{port} ({why}): choose another port (0: any) or host")
 
 
 class Door:

@@ -14,7 +14,8 @@
 #include <optional>
 #include <vector>
 
-namespace blitzgs::api {
+// Hidden as torch's types are: otherwise GCC warns of every field that is a tensor.
+HIDDEN_NAMESPACE_BEGIN(blitzgs, api)
 
 using torch::stable::Tensor;
 
@@ -176,4 +177,4 @@ inline GaussianGradients project_backward(const Gaussians& g, const Cameras& cam
   return {r[0], r[1], r[2], r[3], r[4], r[5]};
 }
 
-}  // namespace blitzgs::api
+HIDDEN_NAMESPACE_END(blitzgs, api)

@@ -224,7 +224,9 @@ def test_the_door_with_a_token(behind):
 
 def test_a_port_in_use_is_an_error(behind):
     taken = rf"cannot listen on 127.0.0.1:{behind} \(Address already in use\): choose another port"
+    unknown = r"nosuch.invalid:0 \(no such host\)"
     refused(OSError, taken, Door, "127.0.0.1", behind, behind, "")
+    refused(OSError, unknown, Door, "nosuch.invalid", 0, behind, "")
 
 
 def test_addresses_of_this_machine():
