@@ -266,9 +266,12 @@ def hints_of(state: TrainingState) -> list[str]:
 
 
 def undistortion_note(capture: Capture) -> str | None:
-    """Return the sizes of the photographs before and after their lenses are undistorted; None: none are."""
+    """Return the sizes of the photographs before and after their lenses are undistorted; None: none are.
+
+    Both are sizes before `data.downscale`, whose pixels no lens takes.
+    """
     sizes = Counter(
-        ((form.lens.width, form.lens.height), (camera.width, camera.height))
+        ((form.lens.width, form.lens.height), (form.width, form.height))
         for camera in capture.cameras
         if not getattr(form := camera.rectification, "is_identity", True)
     )
