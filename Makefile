@@ -73,7 +73,7 @@ demo: venv build
 	$(RUN) blitzgs export $(DEMO)/run --html $(DEMO)/city.html
 	@echo
 	@echo "The model, for a browser:          $(DEMO)/city.html"
-	@echo "Pictures (render | photograph | error): $(DEMO)/run/evaluation"
+	@echo "Pictures, beside photographs:      $(DEMO)/run/evaluation"
 	@echo "Report, for a browser:             $(DEMO)/run/report.html"
 	@echo "The model, for any 3DGS viewer:    $(DEMO)/city.ply"
 	@echo "Another run from the start:        make demo DEMO=runs/another"

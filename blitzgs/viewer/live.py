@@ -27,14 +27,15 @@ _SERIES = {
 class Curves:
     """The numbers of a run's log that are drawn."""
 
-    def __init__(self) -> None:
+    def __init__(self, total: int) -> None:
         self.version = 0  # grows with every record
+        self._total = total  # images of the whole run
         self._points: dict[str, list[tuple[int, float]]] = {name: [] for name in _SERIES}
         self._held_out: list[tuple[int, float]] = []
         self._last: dict[str, Any] = {}
 
     def add(self, t: int, values: Mapping[str, Any]) -> None:
-        """Take a record at time `t` (images): of a step, or of an evaluation of the held-out views."""
+        """Take a record at time `t` (images): of a step, of the held-out views, or of a change of pace."""
         kind = values.get("event")
         if kind is None:
             for name, points in self._points.items():
@@ -43,16 +44,18 @@ class Curves:
             self._last = {"t": t, **values}
         elif kind == "evaluation" and isinstance(psnr := values.get("psnr"), (int, float)):
             self._held_out.append((t, float(psnr)))
+        elif kind == "pace":  # --minutes
+            self._total = values["images"]
         else:
             return
         self.version += 1
 
-    def status(self, total: int) -> str:
+    def status(self) -> str:
         """Return the newest figures as text in Markdown."""
         last = self._last
         if not last:
             return "*no figures yet*"
-        parts = [f"**{last['t']:,}** of {total:,} images"]
+        parts = [f"**{last['t']:,}** of {self._total:,} images"]
         if "loss" in last:
             parts.append(f"loss {last['loss']:.4f}")
         if "psnr" in last:
@@ -116,8 +119,8 @@ class Live:
 
         `total`: images of the whole run. `port`: 0: any free one.
         """
-        self._share, self._total = SHARE, total
-        self._curves = Curves()
+        self._share = SHARE
+        self._curves = Curves(total)
         self._count = 0
         self._paused = self._saves = False
         self._allowed, self._refreshed, self._left_alone = 0.0, 0.0, 0.0
@@ -208,7 +211,7 @@ class Live:
     def _add_folder(self, client: Any) -> None:
         gui = client.gui
         with gui.add_folder("Training"):
-            status = gui.add_markdown(self._curves.status(self._total))
+            status = gui.add_markdown(self._curves.status())
             pause = gui.add_button("Pause")
             save = gui.add_button("Save now", hint="Write a checkpoint after this step")
             share = gui.add_slider(
@@ -246,7 +249,7 @@ class Live:
             if not self._folders or self._curves.version == seen:
                 continue
             seen = self._curves.version
-            text = self._curves.status(self._total)
+            text = self._curves.status()
             for status, _, plots in list(self._folders.values()):
                 status.content = text
                 self._curves.update(plots)

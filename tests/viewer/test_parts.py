@@ -153,13 +153,15 @@ def test_scale_bars_are_round():
 
 
 def test_curves_take_steps_and_evaluations():
-    curves = Curves()
-    assert "no figures" in curves.status(10)
+    curves = Curves(10)
+    assert "no figures" in curves.status()
     curves.add(5, {"loss": 0.5, "psnr": 20.0, "gaussians": 7, "images_per_second": 3.0})
     curves.add(5, {"event": "evaluation", "psnr": 21.0})
     curves.add(6, {"event": "densify", "gaussians": 9})
     assert curves.version == 2
-    assert "held out: 21.00 dB" in curves.status(10)
+    assert "held out: 21.00 dB" in curves.status() and "of 10 images" in curves.status()
+    curves.add(8, {"event": "pace", "images": 9, "scale": 0.9})
+    assert "of 9 images" in curves.status()
 
 
 # -- the door ----------------------------------------------------------------------------------------------
