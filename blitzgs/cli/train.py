@@ -167,7 +167,10 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.check:
         return _check(args, config)
-    check_unclaimed(args.out, args.resume)  # before the photographs, which take long
+    # Before the photographs, which take long.
+    check_unclaimed(args.out, args.resume)
+    if config.model.start and not args.resume and not Path(config.model.start).is_file():
+        raise FileNotFoundError(f"{config.model.start}: there is no such file of Gaussians (--start)")
     if (photographs := Path(config.data.path) / config.data.images).is_dir():
         check_outside(args.out, photographs)
     job, laps = config.ranks, Laps(since_start=True)
@@ -259,8 +262,6 @@ def _config(args: argparse.Namespace) -> Config:
         # Set the path directly: YAML does not allow all characters that a path may have.
         config = changed(config, "data", path=os.path.realpath(args.data))
     if args.start is not None:
-        if not args.start.is_file():
-            raise FileNotFoundError(f"--start {args.start}: there is no such file of Gaussians")
         config = changed(config, "model", start=os.path.realpath(args.start))
     return config
 

@@ -153,7 +153,7 @@ def test_torchrun_entry(trained, tmp_path):
         (
             ["train", "--data", "d", "--out", "x", "--start", "m.ply"],
             1,
-            "--start m.ply: there is no such file",
+            "m.ply: there is no such file of Gaussians (--start)",
         ),
         # Before the capture is read, which takes long.
         (["train", "--data", "d", "--out", "file/x"], 1, "file is a file where a folder is needed"),
