@@ -40,7 +40,7 @@ photograph.
 
 FLAGS = """
 --downscale N  with FILE: reduce both sides of the photographs by this factor, as data.downscale
---out DIR  folder for the results (default: RUN/evaluation/SPLIT)
+--out DIR  folder for the results (default: RUN/evaluation/SPLIT, or FILE.evaluation/SPLIT)
 --pictures N  number of pictures that show a render, its photograph and its error (default: %(default)s)
 --lpips FILE  also measure LPIPS, with this TorchScript module; it takes a render and its photograph,
     [1, 3, H, W] in [-1, 1], and returns their distance
