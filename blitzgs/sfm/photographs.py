@@ -144,14 +144,14 @@ def estimate(sizes: Sequence[tuple[int, int]]) -> str:
     """Return roughly how long the reconstruction takes without a GPU."""
     cores, count = len(os.sched_getaffinity(0)), len(sizes)
     pairs = count * ((count - 1) / 2 if count <= MOST_IN_ALL_PAIRS else _PAIRS_OF_ONE)
-    seconds = (
-        sum(width * height for width, height in sizes) / 1e6 * _FEATURES + pairs * _PAIR + count * _POSE
-    ) / cores
+    shared = sum(width * height for width, height in sizes) / 1e6 * _FEATURES + pairs * _PAIR
+    seconds = shared / cores + count * _POSE
     minutes = max(1, round(seconds / 60))
     taken = "a minute" if minutes == 1 else f"{minutes:,} minutes"
     return f"{taken} on {cores} CPU cores (rough: within a factor of 3)"
 
 
-# Seconds of a core: for a megapixel, a pair and a pose, measured on 75 photographs of 1.9 megapixels.
-_FEATURES, _PAIR, _POSE = 1.8, 0.13, 1.0
+# Seconds of a core for a megapixel and a pair, which cores share, and seconds for a pose, which they hardly
+# do: COLMAP finds one after the other.
+_FEATURES, _PAIR, _POSE = 1.8, 0.13, 2.0
 _PAIRS_OF_ONE = 30

@@ -24,6 +24,9 @@ from blitzgs.sfm.engine import MANY, adopt, least_model, lens_model
 # The standard deviations of a position by GPS in metres, across and up; the second of an altitude that says
 # nothing. Drones state altitudes by barometer, which drift between flights.
 _ACROSS, _UP, _UNKNOWN = 3.0, 15.0, 1e4
+# All of a growing model is adjusted when it has grown by this factor, at most so often, and until the error
+# falls by less than this share: COLMAP's own 1.1, 5 and 0 take half as long again for the same poses.
+_GROWTH, _ADJUSTMENTS, _TOLERANCE = 1.3, 2, 1e-6
 # A model is refined in rounds. The scale of Cauchy's loss is the median miss, in pixels, or at least this;
 # after each round, observations that miss by so many times the scale are left out.
 _ROUNDS, _ITERATIONS, _LEAST_SCALE, _WRONG = 2, 40, 0.5, 4.0
@@ -125,7 +128,10 @@ def cameras(job: dict[str, Any]) -> None:
     options.ba_use_gpu = gpu = pycolmap.has_cuda
     options.use_prior_position = options.use_robust_loss_on_prior_position = job["gps"]
     if job["mapper"] == "incremental":
-        models = pycolmap.incremental_mapping(job["database"], job["photos"], job["models"], options)
+        growing = copy.deepcopy(options)
+        growing.ba_global_frames_ratio = growing.ba_global_points_ratio = _GROWTH
+        growing.ba_global_max_refinements, growing.ba_global_function_tolerance = _ADJUSTMENTS, _TOLERANCE
+        models = pycolmap.incremental_mapping(job["database"], job["photos"], job["models"], growing)
     else:
         models = _all_at_once(job, gpu)
     for number in models:

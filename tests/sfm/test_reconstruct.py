@@ -22,7 +22,7 @@ from blitzgs.cli import main
 from blitzgs.cli import sfm as command
 from blitzgs.config.files import load_config
 from blitzgs.sfm import engine, reconstruct
-from blitzgs.sfm.photographs import Photographs, judge_positions
+from blitzgs.sfm.photographs import Photographs, estimate, judge_positions
 from blitzgs.sfm.pycolmap_stage import features
 from blitzgs.sfm.reconstruct import Settings
 from blitzgs.sfm.report import Reconstruction, _reason, examine
@@ -214,6 +214,12 @@ PLACES = np.array([[47.0, 8.0, 500.0], [47.001, 8.0, 510.0], [47.0, 8.001, 505.0
 def test_positions_are_used_where_they_say_something(places, photographs, expected):
     enough, altitude = judge_positions(places, photographs)
     assert (enough, altitude and enough) == (expected[0], expected[1] and expected[0])
+
+
+@pytest.mark.parametrize(("cores", "told"), [(2, "8 minutes on 2 CPU"), (32, "3 minutes on 32 CPU")])
+def test_poses_take_their_time_on_many_cores(monkeypatch, cores, told):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(cores)))
+    assert estimate([(1593, 1197)] * 75).startswith(told)
 
 
 def test_photographs_of_nothing_have_no_poses(tmp_path, capsys):
