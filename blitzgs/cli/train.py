@@ -169,7 +169,7 @@ def run(args: argparse.Namespace) -> int:
         return _check(args, config)
     # Before the photographs, which take long.
     check_unclaimed(args.out, args.resume)
-    if config.model.start and not args.resume and not Path(config.model.start).is_file():
+    if config.model.start and not args.resume and not Path(config.model.start).exists():
         raise FileNotFoundError(f"{config.model.start}: there is no such file of Gaussians (--start)")
     if (photographs := Path(config.data.path) / config.data.images).is_dir():
         check_outside(args.out, photographs)
