@@ -170,10 +170,13 @@ def restore(
     The Gaussians go to `device`, else to the ranks' device. CheckpointError: all checkpoints are damaged, or
     the newest is of another version or of another run.
     """
-    problem, device = lambda columns: bad_column(GaussianTable(columns)), device or ranks.device
-    found = checkpoint.newest(
-        folder / CHECKPOINTS, ranks, lambda path: checkpoint.load(path, ranks, device, problem), only
-    )
+
+    def load(path: Path) -> checkpoint.Loaded:
+        return checkpoint.load(
+            path, ranks, device or ranks.device, lambda columns: bad_column(GaussianTable(columns))
+        )
+
+    found = checkpoint.newest(folder / CHECKPOINTS, ranks, load, only)
     if found is None:
         return None
     loaded, path, refused = found
